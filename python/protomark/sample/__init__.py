@@ -1,0 +1,1 @@
+"""One small real map, so that everything runs after install."""

@@ -1,0 +1,227 @@
+"""One sequence of keyframes, keypoints, descriptors and landmarks, and its file.
+
+The file is a safetensors file: every array below is a tensor of the same name, and everything
+that is not an array (cameras, image names, provenance) is JSON in the file's metadata.
+`docs/tracks.md` describes it for readers in other languages.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = "protomark-tracks"
+VERSION = 1
+
+# name -> (dtype, shape), with m keyframes, n keypoints, l landmarks, b bytes a descriptor
+_ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+    "keyframe_camera": (np.int32, ("m",)),
+    "cam_from_world": (np.float64, ("m", 3, 4)),
+    "offsets": (np.int64, ("m+1",)),
+    "keypoints": (np.float32, ("n", 2)),
+    "sizes": (np.float32, ("n",)),
+    "angles": (np.float32, ("n",)),
+    "responses": (np.float32, ("n",)),
+    "octaves": (np.int32, ("n",)),
+    "descriptors": (np.uint8, ("n", "b")),
+    "landmark_of_keypoint": (np.int64, ("n",)),
+    "landmark_ids": (np.int64, ("l",)),
+    "landmark_positions": (np.float64, ("l", 3)),
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A COLMAP camera: model name (for example "PINHOLE"), image size and parameters in pixels."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The form that PoseLib and pycolmap take."""
+        return {
+            "model": self.model,
+            "width": self.width,
+            "height": self.height,
+            "params": list(self.params),
+        }
+
+
+@dataclass
+class Tracks:
+    """All observations of one sequence: m keyframes, n keypoints, l landmarks.
+
+    Poses and pixels follow COLMAP: `cam_from_world` maps world to camera coordinates, and the
+    centre of the upper left pixel is (0.5, 0.5).
+
+    Attributes:
+        descriptor: name of the descriptor, for example "freak".
+        cameras: COLMAP camera id -> camera.
+        keyframe_names: m image names.
+        keyframe_camera: (m,) int32, camera id of each keyframe.
+        cam_from_world: (m, 3, 4) float64, rotation and translation.
+        offsets: (m + 1,) int64; the keypoints of keyframe i are rows offsets[i]:offsets[i + 1].
+        keypoints: (n, 2) float32, x and y in pixels.
+        sizes: (n,) float32, diameter of the keypoint in pixels.
+        angles: (n,) float32, orientation in degrees, clockwise, [0, 360), -1 where there is none.
+        responses: (n,) float32, strength given by the detector.
+        octaves: (n,) int32, pyramid level given by the detector.
+        descriptors: (n, bits / 8) uint8, the bytes that OpenCV gives.
+        landmark_of_keypoint: (n,) int64, landmark id of each keypoint, -1 where there is none.
+        landmark_ids: (l,) int64, ascending.
+        landmark_positions: (l, 3) float64, in world coordinates.
+        info: where the tracks come from and how they were made (JSON values).
+    """
+
+    descriptor: str
+    cameras: dict[int, Camera]
+    keyframe_names: list[str]
+    keyframe_camera: NDArray[np.int32]
+    cam_from_world: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    keypoints: NDArray[np.float32]
+    sizes: NDArray[np.float32]
+    angles: NDArray[np.float32]
+    responses: NDArray[np.float32]
+    octaves: NDArray[np.int32]
+    descriptors: NDArray[np.uint8]
+    landmark_of_keypoint: NDArray[np.int64]
+    landmark_ids: NDArray[np.int64]
+    landmark_positions: NDArray[np.float64]
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def bits(self) -> int:
+        """Length of a descriptor in bits."""
+        return 8 * int(self.descriptors.shape[1])
+
+    @property
+    def keyframe_of_keypoint(self) -> NDArray[np.int64]:
+        """(n,) int64, index of each keypoint's keyframe."""
+        return np.repeat(np.arange(len(self.keyframe_names)), np.diff(self.offsets))
+
+    @property
+    def observations(self) -> NDArray[np.int64]:
+        """Rows of the keypoints that see a landmark."""
+        return np.flatnonzero(self.landmark_of_keypoint >= 0)
+
+    def keypoints_of(self, keyframe: int) -> slice:
+        """The rows of one keyframe's keypoints."""
+        return slice(int(self.offsets[keyframe]), int(self.offsets[keyframe + 1]))
+
+    def check(self) -> None:
+        """Raise ValueError, naming the array, if shapes, types or indices do not fit together."""
+        sizes = {
+            "m": len(self.keyframe_names),
+            "m+1": len(self.keyframe_names) + 1,
+            "n": len(self.keypoints),
+            "l": len(self.landmark_ids),
+            "b": self.descriptors.shape[1] if self.descriptors.ndim == 2 else 0,
+        }
+        for name, (dtype, shape) in _ARRAYS.items():
+            array = getattr(self, name)
+            want = tuple(sizes[s] if isinstance(s, str) else s for s in shape)
+            if array.dtype != dtype or array.shape != want:
+                raise ValueError(
+                    f"tracks: {name} is {array.dtype} {array.shape}, "
+                    f"expected {np.dtype(dtype)} {want}"
+                )
+        if sizes["b"] < 1:
+            raise ValueError("tracks: descriptors have no bytes")
+        if self.offsets[0] != 0 or self.offsets[-1] != sizes["n"] or (np.diff(self.offsets) < 0).any():
+            raise ValueError("tracks: offsets do not run from 0 to the number of keypoints")
+        if (np.diff(self.landmark_ids) <= 0).any():
+            raise ValueError("tracks: landmark_ids are not strictly ascending")
+        if len(self.landmark_ids) and self.landmark_ids[0] < 0:
+            raise ValueError("tracks: landmark_ids contains a negative id")
+        seen = self.landmark_of_keypoint[self.landmark_of_keypoint != -1]
+        if not np.isin(seen, self.landmark_ids).all():
+            raise ValueError("tracks: landmark_of_keypoint names a landmark that landmark_ids lacks")
+        for name in ("cam_from_world", "keypoints", "landmark_positions"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"tracks: {name} contains NaN or infinity")
+        for i, camera in enumerate(self.keyframe_camera):
+            if int(camera) not in self.cameras:
+                raise ValueError(
+                    f"tracks: keyframe {self.keyframe_names[i]} names camera {camera}, which is missing"
+                )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file whole or not at all: beside the target, then renamed over it."""
+        from safetensors.numpy import save
+
+        self.check()
+        header = {
+            "format": FORMAT,
+            "version": str(VERSION),
+            "descriptor": self.descriptor,
+            "cameras": json.dumps({str(k): c.as_dict() for k, c in self.cameras.items()}),
+            "keyframe_names": json.dumps(self.keyframe_names),
+            "info": json.dumps(self.info),
+        }
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _ARRAYS}
+        path = Path(path)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(save(arrays, metadata=header))
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Tracks:
+        """Read and check a tracks file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is not a tracks file, or is broken.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such tracks file")
+        try:
+            with safe_open(path, framework="numpy") as file:
+                header = file.metadata() or {}
+                if header.get("format") != FORMAT:
+                    raise ValueError(f"{path}: a safetensors file, but not a Protomark tracks file")
+                if int(header["version"]) > VERSION:
+                    raise ValueError(
+                        f"{path}: tracks version {header['version']}, this Protomark reads up to {VERSION}"
+                    )
+                missing = set(_ARRAYS) - set(file.keys())
+                if missing:
+                    raise ValueError(f"{path}: tracks file lacks {', '.join(sorted(missing))}")
+                arrays = {name: file.get_tensor(name) for name in _ARRAYS}
+            cameras = {
+                int(k): Camera(c["model"], int(c["width"]), int(c["height"]), tuple(c["params"]))
+                for k, c in json.loads(header["cameras"]).items()
+            }
+            tracks = cls(
+                descriptor=header["descriptor"],
+                cameras=cameras,
+                keyframe_names=json.loads(header["keyframe_names"]),
+                info=json.loads(header["info"]),
+                **arrays,
+            )
+            tracks.check()
+        except SafetensorError as error:
+            raise ValueError(f"{path}: not a tracks file, or a broken one ({error})") from None
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path}: broken tracks file ({error!r})") from None
+        return tracks

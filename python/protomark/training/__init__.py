@@ -1,0 +1,1 @@
+"""Training encoders from tracks (PyTorch, `pip install protomark[train]`)."""
