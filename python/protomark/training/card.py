@@ -1,0 +1,141 @@
+"""The card beside a model: what it was trained on, how, and how precise it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from protomark.training.data import Source
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Precision on one sequence, averaged over splits.
+
+    Attributes:
+        sequence: its name.
+        role: "validation" or "report".
+        seeds: how many splits.
+        unaggregated: of the raw descriptors on the same queries.
+        float_precision: of the float network, by dimension.
+        integer_precision: of the integer encoder with int8 prototypes, by dimension.
+    """
+
+    sequence: str
+    role: str
+    seeds: int
+    unaggregated: float
+    float_precision: dict[int, float]
+    integer_precision: dict[int, float]
+
+
+@dataclass(frozen=True)
+class Card:
+    """Everything a card says; also what `protomark train --json` writes.
+
+    Attributes:
+        name: of the encoder.
+        descriptor: that it encodes.
+        bits: length of a descriptor.
+        widths: units of each layer, input and output included.
+        dims: prefixes that may be used alone.
+        bytes: size of the model file.
+        licence: of the weights.
+        sources: training sequences.
+        validation: validation sequences.
+        command: that trains it again.
+        seconds: that training took.
+        machine: processor or accelerator, threads and arithmetic of the training.
+        steps: batches in all.
+        best_step: the one whose weights were kept.
+        figures: precision, by sequence.
+        history: (step, loss, mean validation precision) of each validation.
+    """
+
+    name: str
+    descriptor: str
+    bits: int
+    widths: list[int]
+    dims: list[int]
+    bytes: int
+    licence: str
+    sources: list[Source]
+    validation: list[Source]
+    command: str
+    seconds: float
+    machine: str
+    steps: int
+    best_step: int
+    figures: list[Figures]
+    history: list[tuple[int, float, float]] = field(default_factory=list)
+
+    @property
+    def multiply_adds(self) -> int:
+        """Multiply-adds for one descriptor."""
+        return sum(a * b for a, b in pairwise(self.widths))
+
+    def markdown(self) -> str:
+        """The card as it stands beside the model."""
+        dims = ", ".join(map(str, self.dims))
+        lines = [
+            f"# Encoder `{self.name}`",
+            "",
+            f"Turns {self.descriptor} descriptors of {self.bits} bits into int8 codes of "
+            f"{dims} numbers (each shorter code is the start of the longer one).",
+            "",
+            f"- network: {'-'.join(map(str, self.widths))}, SELU, int8 weights; "
+            f"{self.multiply_adds:,} multiply-adds a descriptor",
+            f"- file: {self.bytes:,} bytes",
+            f"- licence: {self.licence or 'none stated'}",
+            f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "
+            f"the weights of step {self.best_step} kept",
+            "",
+            "Train it again:",
+            "",
+            "```",
+            self.command,
+            "```",
+            "",
+            "## Data",
+            "",
+            "| sequence | used for | keyframes | landmarks | observations | licence |",
+            "|---|---|---|---|---|---|",
+        ]
+        for role, sources in (("training", self.sources), ("validation", self.validation)):
+            lines += [
+                f"| {s.name} | {role} | {s.keyframes} | {s.landmarks} | {s.observations} "
+                f"| {s.licence or 'not stated'} |"
+                for s in sources
+            ]
+        lines += [
+            "",
+            "## Precision",
+            "",
+            "Share of queries whose nearest prototype is their own landmark's: 90 % of the "
+            "keyframes build the map, the others ask. *Float* is the network before rounding, "
+            "*integer* the encoder in this file with int8 prototypes, *unaggregated* all raw "
+            "descriptors on the same queries.",
+            "",
+            "| sequence | splits | unaggregated | dim | bytes a landmark | float | integer "
+            "| ratio to unaggregated |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+        for f in self.figures:
+            for d in self.dims:
+                lines.append(
+                    f"| {f.sequence} ({f.role}) | {f.seeds} | {f.unaggregated:.4f} | {d} | {d + 1} "
+                    f"| {f.float_precision[d]:.4f} | {f.integer_precision[d]:.4f} "
+                    f"| {f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f} |"
+                )
+        return "\n".join(lines) + "\n"
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes else f"{seconds:.0f} s"
+
+
+def describe_data(sources: Sequence[Source]) -> str:
+    """One line for the model file: the sequences and their licences."""
+    return "; ".join(f"{s.name} ({s.licence})" if s.licence else s.name for s in sources)

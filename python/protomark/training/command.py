@@ -1,0 +1,271 @@
+"""What `protomark train` does: read, train, write the model, its card and its figures."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from protomark.console import console, progress_bar, progress_console
+from protomark.tracks.file import Tracks
+from protomark.training.card import Card, Figures, describe_data
+from protomark.training.data import TrainingData, load_training, load_trials, sequence_name
+from protomark.training.network import embed
+from protomark.training.train import (
+    Interrupted,
+    Options,
+    Progress,
+    Trainer,
+    has_fast_bfloat16,
+    keep_freed_memory,
+)
+from protomark.training.validation import Trial, precision
+
+REPORT_SEEDS = (0, 1, 2)
+
+
+def train_encoder(
+    training: Sequence[Path],
+    validation: Sequence[Path],
+    output: Path,
+    options: Options,
+    *,
+    report: Sequence[Path] = (),
+    resume: bool = False,
+    name: str = "",
+    licence: str = "",
+    device: str = "cpu",
+    threads: int = 0,
+    json_path: Path | None = None,
+) -> Card:
+    """Train an encoder and write `output`, its card beside it (.md), and `json_path`.
+
+    A checkpoint is kept beside the output (`<output>.checkpoint`) until training is done.
+
+    Args:
+        training: tracks files to learn from.
+        validation: tracks files to pick the model by.
+        output: the model file to write.
+        options: what decides the weights.
+        report: tracks files on which the finished encoder is measured, and nothing else.
+        resume: continue from the checkpoint.
+        name: of the encoder; the output's stem if empty.
+        licence: of the weights.
+        device: "cpu" or "cuda".
+        threads: for PyTorch on a CPU; 0 for one a core.
+        json_path: where the figures go as JSON.
+
+    Raises:
+        FileNotFoundError: a tracks file, the output's folder, or the checkpoint is missing.
+        ValueError: tracks, options, device or checkpoint do not fit.
+        Interrupted: Ctrl-C; `resume` continues.
+    """
+    import protomark as pm
+
+    options.check()
+    _check_device(device)
+    for path in (output, json_path):
+        if path is not None and not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"{path}: the folder {path.absolute().parent} does not exist")
+    keep_freed_memory()
+    threads = threads or os.cpu_count() or 1
+    torch.set_num_threads(threads)
+    for path in report:
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such tracks file")
+    data = load_training(training, validation)
+    half = has_fast_bfloat16(device)
+    checkpoint = output.with_name(output.name + ".checkpoint")
+    trainer = Trainer(data.views, data.trials, options, checkpoint, data.fingerprint, device, half)
+    if resume:
+        trainer.resume()
+    _run(trainer)
+
+    encoder = pm.Encoder(
+        trainer.quantized.export(),
+        dims=list(options.dims),
+        name=name or output.stem,
+        descriptor=data.descriptor,
+        scale=float(trainer.quantized.scale),
+        data=describe_data(data.sources),
+        licence=licence,
+    )
+    encoder.save(output)
+    figures = []
+    with progress_bar() as bar:
+        files = [(p, "validation") for p in validation] + [(p, "report") for p in report]
+        task = bar.add_task("measuring", total=len(files))
+        for path, role in files:
+            figures.append(_measure(trainer, encoder, path, role, device, threads))
+            bar.advance(task)
+    card = Card(
+        name=encoder.name,
+        descriptor=data.descriptor,
+        bits=data.bits,
+        widths=[data.bits, *trainer.network.hidden, options.dims[-1]],
+        dims=list(options.dims),
+        bytes=output.stat().st_size,
+        licence=licence,
+        sources=data.sources,
+        validation=data.validation_sources,
+        command=_command(data, training, report, output, options, name, licence, device),
+        seconds=trainer.seconds,
+        machine=_machine(device, threads, half),
+        steps=options.steps,
+        best_step=trainer.best_step,
+        figures=figures,
+        history=[(p.step, p.loss, p.mean_precision) for p in trainer.history],
+    )
+    _write(output.with_suffix(".md"), card.markdown())
+    if json_path is not None:
+        _write(json_path, json.dumps(asdict(card), indent=1) + "\n")
+    checkpoint.unlink(missing_ok=True)
+    return card
+
+
+def _run(trainer: Trainer) -> None:
+    """Train behind a progress bar; each validation leaves a line."""
+    with progress_bar() as bar:
+        task = bar.add_task("training", total=trainer.options.steps, completed=trainer.step)
+        mean = 0.0
+
+        def step(done: int, loss: float, progress: Progress | None) -> None:
+            nonlocal mean
+            mean = 0.98 * mean + 0.02 * loss if mean else loss
+            bar.update(task, completed=done, description=f"loss {mean:.3f}")
+            if progress is not None:
+                bar.console.print(_line(progress), highlight=False)
+
+        trainer.run(step)
+
+
+def _line(p: Progress) -> str:
+    found = "  ".join(f"{d}: {value:.4f}" for d, value in p.precision.items())
+    stage = "quantised" if p.quantized else "float"
+    return f"step {p.step:6d}  loss {p.loss:.4f}  precision {found}  ({stage}, {p.seconds:.0f} s)"
+
+
+def _measure(
+    trainer: Trainer, encoder: object, path: Path, role: str, device: str, threads: int
+) -> Figures:
+    import protomark as pm
+
+    assert isinstance(encoder, pm.Encoder)
+    dims = trainer.options.dims
+    trials = load_trials(Tracks.load(path), path, REPORT_SEEDS)
+    floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
+    whole = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
+    return Figures(
+        sequence_name(path),
+        role,
+        len(trials),
+        float(np.mean([unaggregated_precision(t, threads) for t in trials])),
+        {d: float(np.mean([p[d] for p in floats])) for d in dims},
+        {d: float(np.mean([p[d] for p in whole])) for d in dims},
+    )
+
+
+def unaggregated_precision(trial: Trial, threads: int = 1) -> float:
+    """Share of queries whose nearest raw descriptor is one of their own landmark's."""
+    import protomark as pm
+
+    counts = np.diff(np.append(trial.starts, len(trial.support)))
+    landmarks = np.repeat(np.arange(len(trial.starts)), counts)
+    found, _ = pm.hamming_search(trial.queries, trial.support, k=1, threads=threads)
+    return float((landmarks[found[:, 0]] == trial.targets).mean())
+
+
+def _check_device(device: str) -> None:
+    if device != "cpu" and not device.startswith("cuda"):
+        raise ValueError(f"device {device!r} is not known; give cpu or cuda")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError("no CUDA device that this PyTorch can use; train with --device cpu")
+
+
+def _command(
+    data: TrainingData,
+    training: Sequence[Path],
+    report: Sequence[Path],
+    output: Path,
+    options: Options,
+    name: str,
+    licence: str,
+    device: str,
+) -> str:
+    """The command that trains this encoder again, files by name only."""
+    words = ["protomark", "train", *(s.file for s in data.sources)]
+    for source in data.validation_sources:
+        words += ["--validation", source.file]
+    for path in report:
+        words += ["--report", path.name]
+    words += ["-o", output.name]
+    default = Options()
+    if options.dims != default.dims:
+        words += ["--dims", ",".join(map(str, options.dims))]
+    for flag, field in _FLAGS.items():
+        if getattr(options, field) != getattr(default, field):
+            words += [flag, str(getattr(options, field))]
+    for flag, value in (("--name", name), ("--licence", licence)):
+        if value:
+            words += [flag, value]
+    if device != "cpu":
+        words += ["--device", device]
+    return shlex.join(words)
+
+
+_FLAGS = {"--steps": "steps", "--batch": "landmarks", "--seed": "seed"}
+
+
+def _machine(device: str, threads: int, half: bool) -> str:
+    arithmetic = "bfloat16" if half else "float32"
+    if device.startswith("cuda"):
+        return f"{torch.cuda.get_device_name(device)}, {arithmetic}"
+    return f"{platform.machine()}, {threads} thread{'s' if threads != 1 else ''}, {arithmetic}"
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    handle, temporary = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def print_summary(card: Card, output: Path) -> None:
+    """The result of a training, on stdout."""
+    from rich.table import Table
+
+    table = Table("sequence", "unaggregated", "dim", "bytes", "float", "integer", "ratio")
+    for f in card.figures:
+        for d in card.dims:
+            table.add_row(
+                f"{f.sequence} ({f.role})",
+                f"{f.unaggregated:.4f}",
+                str(d),
+                str(d + 1),
+                f"{f.float_precision[d]:.4f}",
+                f"{f.integer_precision[d]:.4f}",
+                f"{f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f}",
+            )
+    console.print(table)
+    console.print(f"{output} ({card.bytes:,} bytes) and {output.with_suffix('.md')}")
+
+
+def explain_interruption(stop: Interrupted, output: Path) -> None:
+    """What to do after Ctrl-C, on stderr."""
+    progress_console.print(
+        f"{stop}; the same command with --resume continues ({output.name}.checkpoint)"
+    )

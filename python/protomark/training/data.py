@@ -1,0 +1,163 @@
+"""Reading tracks for training, with every check that can be made before the first step."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from protomark.console import track
+from protomark.tracks.file import Tracks
+from protomark.training.sampling import Views
+from protomark.training.validation import Trial
+
+MIN_BITS = 64
+MAX_BITS = 1024
+MIN_LANDMARKS = 500
+"""Landmarks with 3 or more views that all training sequences together must have."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the card says of one tracks file.
+
+    Attributes:
+        name: file name up to its first dot.
+        file: file name.
+        keyframes, landmarks, observations: how many there are.
+        licence: from the tracks' `info`, "" if it does not say.
+    """
+
+    name: str
+    file: str
+    keyframes: int
+    landmarks: int
+    observations: int
+    licence: str
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Everything that training reads.
+
+    Attributes:
+        descriptor: name of the descriptor of all tracks.
+        bits: its length.
+        views: training sequences.
+        trials: splits of the validation sequences.
+        sources: the training files.
+        validation_sources: the validation files.
+        fingerprint: SHA-256 of all descriptors and landmarks, hexadecimal.
+    """
+
+    descriptor: str
+    bits: int
+    views: list[Views]
+    trials: list[Trial]
+    sources: list[Source]
+    validation_sources: list[Source]
+    fingerprint: str
+
+
+def sequence_name(path: Path) -> str:
+    """The name of a sequence: its file's name up to the first dot."""
+    return path.name.split(".")[0]
+
+
+def load_trials(
+    tracks: Tracks, path: Path, seeds: Sequence[int], max_queries: int = 10_000
+) -> list[Trial]:
+    """Splits of one sequence, one for each seed."""
+    return [Trial.from_tracks(tracks, sequence_name(path), s, max_queries) for s in seeds]
+
+
+def load_training(
+    training: Sequence[Path],
+    validation: Sequence[Path],
+    seeds: Sequence[int] = (0,),
+    max_queries: int = 5_000,
+) -> TrainingData:
+    """Read and check training and validation tracks.
+
+    Args:
+        training: tracks files to learn from.
+        validation: tracks files to pick the model by, none of them in `training`.
+        seeds: one split of each validation sequence for each.
+        max_queries: queries of one split.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is broken, descriptors are mixed or of a length that cannot be trained,
+            or there is too little to learn from.
+    """
+    if not training:
+        raise ValueError("no training tracks: give at least one tracks file")
+    if not validation:
+        raise ValueError("no validation tracks: give at least one with --validation")
+    both = {p.resolve() for p in training} & {p.resolve() for p in validation}
+    if both:
+        raise ValueError(
+            f"{sorted(both)[0].name} is given for training and for validation; "
+            "validate on a sequence that is not trained on"
+        )
+    descriptor, bits = "", 0
+    views: list[Views] = []
+    trials: list[Trial] = []
+    sources: list[Source] = []
+    digest = hashlib.sha256()
+    for i, path in enumerate(track([*training, *validation], "reading tracks")):
+        tracks = Tracks.load(path)
+        if not views and not trials:
+            descriptor, bits = tracks.descriptor, tracks.bits
+            if not MIN_BITS <= bits <= MAX_BITS:
+                raise ValueError(
+                    f"{path}: descriptors of {bits} bits; encoders are trained for "
+                    f"{MIN_BITS} to {MAX_BITS} bits"
+                )
+        elif (tracks.descriptor, tracks.bits) != (descriptor, bits):
+            raise ValueError(
+                f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but "
+                f"{training[0]} has {descriptor} of {bits}; train on one descriptor at a time"
+            )
+        digest.update(tracks.descriptors.tobytes())
+        digest.update(tracks.landmark_of_keypoint.tobytes())
+        sources.append(_source(tracks, path))
+        if i < len(training):
+            found = Views.from_tracks(tracks, sequence_name(path))
+            if not (found.counts >= 3).any():
+                raise ValueError(
+                    f"{path}: no landmark has 3 or more views, so there is nothing to learn from "
+                    "it; make longer tracks or leave the file out"
+                )
+            views.append(found)
+        else:
+            trials += load_trials(tracks, path, seeds, max_queries)
+    learnable = int(sum((v.counts >= 3).sum() for v in views))
+    if learnable < MIN_LANDMARKS:
+        raise ValueError(
+            f"only {learnable} landmarks have 3 or more views, training needs at least "
+            f"{MIN_LANDMARKS}; give more or longer tracks"
+        )
+    return TrainingData(
+        descriptor,
+        bits,
+        views,
+        trials,
+        sources[: len(training)],
+        sources[len(training) :],
+        digest.hexdigest(),
+    )
+
+
+def _source(tracks: Tracks, path: Path) -> Source:
+    return Source(
+        sequence_name(path),
+        path.name,
+        len(tracks.keyframe_names),
+        len(np.unique(tracks.landmark_of_keypoint[tracks.observations])),
+        len(tracks.observations),
+        str(tracks.info.get("licence", "")),
+    )

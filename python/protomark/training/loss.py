@@ -1,0 +1,64 @@
+"""The prototype loss: a view against the mean of its landmark's other views.
+
+It trains the operation that the map performs. Every query of a batch is classified among all
+prototypes of the batch by a softmax over negative squared distances (Eq. 3 of the paper); its own
+landmark's prototype is the mean (Eq. 1) of the *other* views, as the map has never seen the query.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class PrototypeLoss(nn.Module):
+    """Cross-entropy over the prototypes of a batch, averaged over nested prefixes.
+
+    The first d numbers of an embedding are trained to serve alone, for every d in `dims`
+    (Matryoshka), each with a learned temperature of its own as distances grow with d.
+
+    Args:
+        dims: lengths of the prefixes, the largest at most the embedding's length.
+    """
+
+    def __init__(self, dims: Sequence[int]) -> None:
+        super().__init__()
+        self.dims = tuple(dims)
+        self.log_temperature = nn.Parameter(torch.tensor([math.log(d / 4) for d in self.dims]))
+
+    def forward(self, embeddings: Tensor, landmarks: Tensor, queries: Tensor) -> Tensor:
+        """Loss of one batch.
+
+        Args:
+            embeddings: (n, k) float, one row a view.
+            landmarks: (n,) int64, landmark of each row, numbered 0..m-1, each with a view.
+            queries: (q,) int64, rows to classify; their landmarks have at least 2 views.
+
+        Returns:
+            Scalar: mean over prefixes and queries.
+        """
+        embeddings = embeddings.float()
+        count = torch.bincount(landmarks)
+        total = embeddings.new_zeros(len(count), embeddings.shape[1])
+        total = total.index_add(0, landmarks, embeddings)
+        prototype = total / count[:, None]
+        query = embeddings[queries]
+        target = landmarks[queries]
+        # Leave-one-out mean: the support of a query is everything but itself.
+        own = (total[target] - query) / (count[target] - 1)[:, None]
+
+        losses = []
+        column = target[:, None]
+        for d, log_temperature in zip(self.dims, self.log_temperature, strict=True):
+            # |q - p|^2 without |q|^2, which is the same for all prototypes and cancels.
+            q, p, o = query[:, :d], prototype[:, :d], own[:, :d]
+            inverse = torch.exp(-log_temperature)
+            logits = torch.addmm(-inverse * p.square().sum(1), q, p.T * (2 * inverse))
+            own_logit = inverse * (2 * (q * o).sum(1) - o.square().sum(1))
+            logits = logits.scatter(1, column, own_logit[:, None])
+            losses.append(functional.cross_entropy(logits, target))
+        return torch.stack(losses).mean()

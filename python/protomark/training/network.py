@@ -1,0 +1,96 @@
+"""The encoder as a floating-point network: fully connected layers with SELU in between.
+
+It is the paper's 'funnel': wide, wide, half as wide, then the embedding. Inputs are bits
+as -1 and +1, which keeps them centred for the self-normalising activation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+MAX_WEIGHT_BYTES = 600_000
+"""An encoder that ships is at most this large; one int8 weight is one byte."""
+
+_WIDEST = 512
+
+
+def weight_bytes(bits: int, hidden: Sequence[int], dim: int) -> int:
+    """Bytes of the int8 weights of a network bits -> hidden... -> dim."""
+    widths = [bits, *hidden, dim]
+    return sum(a * b for a, b in pairwise(widths))
+
+
+def default_hidden(bits: int, dim: int) -> tuple[int, int]:
+    """Hidden widths for descriptors of `bits` bits: (h, h / 2), h the widest up to 512 that fits.
+
+    For 512 bits this is the paper's funnel after its first layer of b units, with one such layer
+    more than its three-layer network; longer descriptors get a smaller h so that the int8 weights
+    stay within `MAX_WEIGHT_BYTES`.
+    """
+    width = _WIDEST
+    while weight_bytes(bits, (width, width // 2), dim) > MAX_WEIGHT_BYTES:
+        width -= 32
+    return width, width // 2
+
+
+def unpack_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(n, B) uint8 -> (n, 8 B) uint8 of 0 and 1; bit i is byte i / 8, bit i % 8, low bit first."""
+    return np.unpackbits(descriptors, axis=1, bitorder="little")
+
+
+class EncoderNetwork(nn.Module):
+    """f: signs (n, bits) float32 of -1 and +1 -> embeddings (n, dim) float32.
+
+    Args:
+        bits: length of a descriptor.
+        dim: length of an embedding.
+        hidden: widths of the hidden layers; `default_hidden(bits, dim)` if not given.
+    """
+
+    def __init__(self, bits: int, dim: int, hidden: Sequence[int] | None = None) -> None:
+        super().__init__()
+        self.bits = bits
+        self.dim = dim
+        self.hidden = tuple(hidden) if hidden is not None else default_hidden(bits, dim)
+        widths = [bits, *self.hidden, dim]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+        for layer in self.layers:
+            assert isinstance(layer, nn.Linear)
+            # LeCun normal: what SELU needs to keep activations at mean 0 and variance 1.
+            nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, signs: Tensor) -> Tensor:
+        """Embeddings (n, dim) of signs (n, bits)."""
+        x = signs
+        for layer in self.layers[:-1]:
+            x = torch.selu(layer(x))
+        out: Tensor = self.layers[-1](x)
+        return out
+
+
+def to_signs(descriptors: NDArray[np.uint8], device: torch.device | str = "cpu") -> Tensor:
+    """Packed descriptors (n, B) uint8 -> (n, 8 B) float32 of -1 and +1 on `device`."""
+    bits = torch.from_numpy(unpack_bits(np.ascontiguousarray(descriptors))).to(device)
+    return bits.to(torch.float32).mul_(2).sub_(1)
+
+
+@torch.no_grad()
+def embed(
+    network: nn.Module,
+    descriptors: NDArray[np.uint8],
+    device: torch.device | str = "cpu",
+    batch: int = 4096,
+) -> NDArray[np.float32]:
+    """Embeddings (n, dim) float32 of packed descriptors (n, B) uint8, in full precision."""
+    parts = [
+        network(to_signs(descriptors[i : i + batch], device)).float().cpu().numpy()
+        for i in range(0, len(descriptors), batch)
+    ]
+    return np.concatenate(parts)

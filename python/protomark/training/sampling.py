@@ -1,0 +1,129 @@
+"""Batches of landmarks for training, drawn from tracks.
+
+A batch holds landmarks of one sequence, as confusions live within a scene. Sequences are drawn by
+a power of their size, so that a long one does not drown the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.file import Tracks
+
+
+@dataclass(frozen=True)
+class Views:
+    """All views of one sequence's landmarks, grouped by landmark.
+
+    Attributes:
+        name: name of the sequence.
+        descriptors: (n, B) uint8, sorted by landmark.
+        starts: (l + 1,) int64; the views of landmark i are rows starts[i]:starts[i + 1].
+    """
+
+    name: str
+    descriptors: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+
+    @classmethod
+    def from_tracks(cls, tracks: Tracks, name: str) -> Views:
+        """The observations of `tracks`; landmarks without one are left out."""
+        rows = tracks.observations
+        landmarks = tracks.landmark_of_keypoint[rows]
+        order = np.argsort(landmarks, kind="stable")
+        _, counts = np.unique(landmarks, return_counts=True)
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        return cls(name, np.ascontiguousarray(tracks.descriptors[rows[order]]), starts)
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(l,) int64, number of views of each landmark."""
+        return np.diff(self.starts)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Views of some landmarks.
+
+    Attributes:
+        descriptors: (n, B) uint8, grouped by landmark.
+        landmarks: (n,) int64, 0..m-1 ascending.
+        queries: (q,) int64, rows whose landmark has at least two other views in the batch.
+    """
+
+    descriptors: NDArray[np.uint8]
+    landmarks: NDArray[np.int64]
+    queries: NDArray[np.int64]
+
+
+def random_views(
+    views: Views,
+    landmarks: NDArray[np.int64],
+    limit: int,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Up to `limit` random views of each landmark.
+
+    Returns:
+        rows (n,) int64 of `views.descriptors`, group (n,) int64 as positions in `landmarks`
+        (ascending), rank (n,) int64 of each row within its group, random.
+    """
+    counts = views.counts[landmarks]
+    group = np.repeat(np.arange(len(landmarks)), counts)
+    first = np.cumsum(counts) - counts
+    rows = np.arange(len(group)) - np.repeat(first, counts) + views.starts[landmarks][group]
+    order = np.lexsort((rng.random(len(rows)), group))
+    rank = np.arange(len(rows)) - first[group]
+    keep = rank < limit
+    return rows[order][keep], group[keep], rank[keep]
+
+
+class BatchSampler:
+    """Draws batches from several sequences.
+
+    Args:
+        sequences: at least one, each with landmarks of 3 or more views.
+        landmarks: landmarks in a batch.
+        views: at most this many views of a landmark.
+        queries: at most this many queries of a landmark.
+        balance: sequences are drawn with probability proportional to (number of landmarks with 3
+            or more views) ** balance: 0 draws all alike, 1 draws all landmarks alike.
+        noise: probability that a bit is flipped.
+    """
+
+    def __init__(
+        self,
+        sequences: Sequence[Views],
+        landmarks: int = 1000,
+        views: int = 9,
+        queries: int = 3,
+        balance: float = 0.5,
+        noise: float = 0.0,
+    ) -> None:
+        self.sequences = list(sequences)
+        self.landmarks = landmarks
+        self.views = views
+        self.queries = queries
+        self.noise = noise
+        weight = np.array([(s.counts >= 3).sum() for s in sequences], float) ** balance
+        self.probability = weight / weight.sum()
+
+    def sample(self, rng: np.random.Generator) -> Batch:
+        """One batch; the same state of `rng` gives the same batch."""
+        views = self.sequences[rng.choice(len(self.sequences), p=self.probability)]
+        size = min(self.landmarks, len(views))
+        chosen = rng.choice(len(views), size, replace=False, shuffle=False)
+        rows, group, rank = random_views(views, chosen, self.views, rng)
+        descriptors = views.descriptors[rows]
+        if self.noise:
+            flips = rng.random((len(rows), 8 * descriptors.shape[1]), np.float32) < self.noise
+            descriptors = descriptors ^ np.packbits(flips, axis=1, bitorder="little")
+        enough = np.bincount(group)[group] >= 3
+        return Batch(descriptors, group, np.flatnonzero(enough & (rank < self.queries)))

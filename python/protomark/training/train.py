@@ -1,0 +1,388 @@
+"""The training loop: batches of landmarks in, the integer encoder's weights out.
+
+The first part of the steps trains the float network; then quantisation enters the loop. Every
+`validate_every` steps the precision on validation tracks is measured and a checkpoint is written;
+the model kept is the one whose quantised network was best.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from protomark.training.loss import PrototypeLoss
+from protomark.training.network import EncoderNetwork, embed, to_signs
+from protomark.training.quantization import QuantizedNetwork
+from protomark.training.sampling import BatchSampler, Views
+from protomark.training.validation import Trial, mean_precision
+
+CHECKPOINT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """What decides the weights, besides the data.
+
+    Attributes:
+        dims: prefixes trained to serve alone, ascending; the last is the embedding's length.
+        hidden: widths of the hidden layers, or None for `default_hidden`.
+        steps: batches in all.
+        landmarks: landmarks in a batch.
+        views: at most this many views of a landmark in a batch.
+        queries: at most this many of them are queries.
+        balance: see `BatchSampler`.
+        noise: probability that a bit is flipped.
+        learning_rate: peak rate of Adam, reached after a warm-up, then falling as a cosine.
+        weight_decay: of AdamW.
+        clip: largest norm of the gradient.
+        quantized_share: this last part of the steps has quantisation in the loop.
+        validate_every: steps between validations and checkpoints.
+        seed: of weights and batches.
+    """
+
+    dims: tuple[int, ...] = (8, 16, 32)
+    hidden: tuple[int, ...] | None = None
+    steps: int = 10_000
+    landmarks: int = 1000
+    views: int = 9
+    queries: int = 3
+    balance: float = 0.5
+    noise: float = 0.0
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+    clip: float = 1.0
+    quantized_share: float = 0.25
+    validate_every: int = 500
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raise ValueError, naming the option, if a value makes no sense."""
+        if not self.dims or list(self.dims) != sorted(set(self.dims)) or self.dims[0] < 1:
+            raise ValueError(f"dims {self.dims} must be positive and ascending, as in 8,16,32")
+        if self.dims[-1] > 255:
+            raise ValueError(f"dims {self.dims}: a code has at most 255 numbers")
+        for name in ("steps", "landmarks", "queries", "validate_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, it must be at least 1")
+        if self.landmarks < 2:
+            raise ValueError("a batch needs at least 2 landmarks to tell apart")
+        if self.views < 3:
+            raise ValueError(f"views is {self.views}; a query and its support need at least 3")
+
+    @property
+    def quantized_from(self) -> int:
+        """First step with quantisation in the loop."""
+        return self.steps - max(round(self.steps * self.quantized_share), 1)
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        warm_up = max(min(200, self.steps // 10), 1)
+        if step < warm_up:
+            return self.learning_rate * (step + 1) / warm_up
+        done = (step - warm_up) / max(self.steps - warm_up, 1)
+        return self.learning_rate * (0.01 + 0.99 * (1 + math.cos(math.pi * done)) / 2)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What one validation found.
+
+    Attributes:
+        step: steps done.
+        steps: steps in all.
+        loss: mean training loss since the last validation.
+        precision: validation precision by dimension, of the network as it is in the loop.
+        quantized: whether quantisation is in the loop.
+        seconds: training time so far, over all runs.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    precision: dict[int, float]
+    quantized: bool
+    seconds: float
+
+
+class Interrupted(Exception):
+    """Training was stopped by Ctrl-C after a whole step; the checkpoint is written."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(f"stopped after step {step}")
+        self.step = step
+
+
+class Trainer:
+    """Trains one encoder.
+
+    Args:
+        sequences: training views, all of one descriptor length; see `data.load_training`.
+        trials: validation splits.
+        options: see `Options`.
+        checkpoint: file to write checkpoints to, None for none.
+        fingerprint: of the data, so that a checkpoint is not continued with other data.
+        device: "cpu" or "cuda".
+        half: whether matrix products run in bfloat16.
+    """
+
+    def __init__(
+        self,
+        sequences: Sequence[Views],
+        trials: Sequence[Trial],
+        options: Options,
+        checkpoint: Path | None = None,
+        fingerprint: str = "",
+        device: str = "cpu",
+        half: bool = False,
+    ) -> None:
+        options.check()
+        self.options = options
+        self.trials = trials
+        self.checkpoint = checkpoint
+        self.fingerprint = fingerprint
+        self.device = torch.device(device)
+        self.half = half
+        self.sampler = BatchSampler(
+            sequences,
+            options.landmarks,
+            options.views,
+            options.queries,
+            options.balance,
+            options.noise,
+        )
+        torch.manual_seed(options.seed)
+        bits = 8 * sequences[0].descriptors.shape[1]
+        self.network = EncoderNetwork(bits, options.dims[-1], options.hidden).to(self.device)
+        self.quantized = QuantizedNetwork(self.network)
+        self.loss = PrototypeLoss(options.dims).to(self.device)
+        self.optimizer = torch.optim.AdamW(
+            [
+                {"params": self.network.parameters(), "weight_decay": options.weight_decay},
+                {"params": self.loss.parameters(), "weight_decay": 0.0},
+            ],
+            lr=options.learning_rate,
+        )
+        part = max(4096 // len(sequences), 1)
+        self._calibration = np.concatenate(
+            [s.descriptors[:: max(len(s.descriptors) // part, 1)][:part] for s in sequences]
+        )
+        self.step = 0
+        self.seconds = 0.0
+        self.history: list[Progress] = []
+        self.best = -1.0
+        self.best_step = 0
+        self.best_state: dict[str, Tensor] = {}
+        self._losses: list[float] = []
+
+    def run(self, report: Callable[[int, float, Progress | None], None]) -> None:
+        """Train to the end; afterwards `quantized` holds the best model.
+
+        Args:
+            report: called after every step with the steps done, the loss, and a `Progress` if
+                validation ran.
+
+        Raises:
+            Interrupted: Ctrl-C was pressed.
+            FloatingPointError: the loss is no longer finite.
+        """
+        options = self.options
+        self.network.train()
+        started = time.perf_counter() - self.seconds
+        with _interrupt_flag() as interrupted:
+            while self.step < options.steps:
+                if self.step == options.quantized_from:
+                    self._calibrate()
+                loss = self._train_step()
+                self.step += 1
+                self.seconds = time.perf_counter() - started
+                progress = None
+                if self.step % options.validate_every == 0 or self.step == options.steps:
+                    progress = self._validate()
+                    self.save_checkpoint()
+                report(self.step, loss, progress)
+                if interrupted() and self.step < options.steps:
+                    self.save_checkpoint()
+                    raise Interrupted(self.step)
+        self.quantized.load_state_dict(self.best_state)
+
+    def _train_step(self) -> float:
+        options = self.options
+        # A generator for each step, so that a resumed run needs no generator state.
+        batch = self.sampler.sample(np.random.default_rng([options.seed, self.step]))
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.rate(self.step)
+        model = self.quantized if self.step >= options.quantized_from else self.network
+        signs = to_signs(batch.descriptors, self.device)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
+            embeddings = model(signs)
+        loss = self.loss(
+            embeddings,
+            torch.from_numpy(batch.landmarks).to(self.device),
+            torch.from_numpy(batch.queries).to(self.device),
+        )
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), options.clip)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise FloatingPointError(
+                f"the loss is {value} at step {self.step}; train with a smaller learning rate"
+            )
+        self.optimizer.step()
+        self._losses.append(value)
+        return value
+
+    def _calibrate(self) -> None:
+        self.quantized.calibrate(to_signs(self._calibration, self.device))
+
+    def _validate(self) -> Progress:
+        in_loop = self.step > self.options.quantized_from
+        model = self.quantized if in_loop else self.network
+        found = mean_precision(
+            self.trials, lambda d: embed(model, d, self.device), self.options.dims
+        )
+        progress = Progress(
+            self.step,
+            self.options.steps,
+            float(np.mean(self._losses)),
+            found,
+            in_loop,
+            self.seconds,
+        )
+        self.history.append(progress)
+        self._losses = []
+        score = float(np.mean(list(found.values())))
+        if in_loop and score > self.best:
+            self.best = score
+            self.best_step = self.step
+            self.best_state = {k: v.clone() for k, v in self.quantized.state_dict().items()}
+        return progress
+
+    def save_checkpoint(self) -> None:
+        """Write the checkpoint, whole or not at all."""
+        if self.checkpoint is None:
+            return
+        state = {
+            "version": CHECKPOINT_VERSION,
+            "options": asdict(self.options),
+            "fingerprint": self.fingerprint,
+            "step": self.step,
+            "seconds": self.seconds,
+            "model": self.quantized.state_dict(),
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "history": [asdict(p) for p in self.history],
+            "losses": self._losses,
+            "best": self.best,
+            "best_step": self.best_step,
+            "best_state": self.best_state,
+        }
+        path = self.checkpoint
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                torch.save(state, file)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+
+    def resume(self) -> None:
+        """Continue from the checkpoint.
+
+        Raises:
+            FileNotFoundError: there is no checkpoint.
+            ValueError: it is broken, or of other data or options.
+        """
+        path = self.checkpoint
+        if path is None or not path.is_file():
+            raise FileNotFoundError(f"{path}: no checkpoint to resume; run without --resume")
+        try:
+            state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
+        except Exception as error:
+            raise ValueError(
+                f"{path}: not a checkpoint, or a broken one; delete it and train anew"
+            ) from error
+        if state.get("version") != CHECKPOINT_VERSION:
+            raise ValueError(f"{path}: checkpoint of another version; delete it and train anew")
+        if state["fingerprint"] != self.fingerprint:
+            raise ValueError(
+                f"{path}: checkpoint of other tracks; give the same ones, or train anew"
+            )
+        for name, value in asdict(self.options).items():
+            if state["options"].get(name) != value:
+                raise ValueError(
+                    f"{path}: checkpoint was made with {name} {state['options'].get(name)}, "
+                    f"not {value}; give the same, or train anew without --resume"
+                )
+        self.step = state["step"]
+        self.seconds = state["seconds"]
+        self.quantized.load_state_dict(state["model"])
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.history = [Progress(**p) for p in state["history"]]
+        self._losses = state["losses"]
+        self.best = state["best"]
+        self.best_step = state["best_step"]
+        self.best_state = state["best_state"]
+
+
+@contextmanager
+def _interrupt_flag() -> Iterator[Callable[[], bool]]:
+    """Within, the first Ctrl-C only sets the flag that the yielded function reads.
+
+    An exception in the middle of a step would leave half-updated weights. A second Ctrl-C stops at
+    once.
+    """
+    pressed = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed.is_set
+        return
+
+    def press(signum: int, frame: object) -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+        pressed.set()
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def keep_freed_memory() -> None:
+    """Tell glibc to keep large freed blocks instead of returning them to the system.
+
+    Each step allocates the same large matrices; getting their pages anew costs up to half of a
+    step on a CPU. Does nothing where the C library is another.
+    """
+    m_trim_threshold, m_mmap_max = -1, -4
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    mallopt(m_mmap_max, 0)
+    mallopt(m_trim_threshold, 1 << 30)
+
+
+def has_fast_bfloat16(device: str) -> bool:
+    """Whether bfloat16 matrix products are faster than float32 on this machine."""
+    if device.startswith("cuda"):
+        return torch.cuda.is_bf16_supported()
+    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return bool(supported and supported())
