@@ -96,7 +96,8 @@ def main() -> None:
         app()
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        progress_console.print(f"[bold red]error:[/] {escape(str(text))}", highlight=False, soft_wrap=True)
+        message = f"[bold red]error:[/] {escape(str(text))}"
+        progress_console.print(message, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
 
 

@@ -204,6 +204,7 @@ def integer_forward(layers: list[Layer], descriptors: NDArray[np.uint8]) -> NDAr
         acc = sums.astype(np.int64) + layer["bias"]
         t = (acc * layer["mult"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
         if layer["table"] is None:
-            return np.clip(t, -127, 127).astype(np.int8)
+            codes: NDArray[np.int8] = np.clip(t, -127, 127).astype(np.int8)
+            return codes
         x = layer["table"][np.clip(t, -128, 127) + 128]
     raise ValueError("the last layer has a table; an encoder ends with a layer without one")

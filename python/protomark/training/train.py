@@ -117,8 +117,13 @@ class Progress:
     quantized: bool
     seconds: float
 
+    @property
+    def mean_precision(self) -> float:
+        """Mean over the dimensions; what picks the model."""
+        return sum(self.precision.values()) / len(self.precision)
 
-class Interrupted(Exception):
+
+class Interrupted(Exception):  # noqa: N818 - no error, as KeyboardInterrupt is none
     """Training was stopped by Ctrl-C after a whole step; the checkpoint is written."""
 
     def __init__(self, step: int) -> None:
@@ -265,9 +270,8 @@ class Trainer:
         )
         self.history.append(progress)
         self._losses = []
-        score = float(np.mean(list(found.values())))
-        if in_loop and score > self.best:
-            self.best = score
+        if in_loop and progress.mean_precision > self.best:
+            self.best = progress.mean_precision
             self.best_step = self.step
             self.best_state = {k: v.clone() for k, v in self.quantized.state_dict().items()}
         return progress
@@ -321,7 +325,7 @@ class Trainer:
             raise ValueError(f"{path}: checkpoint of another version; delete it and train anew")
         if state["fingerprint"] != self.fingerprint:
             raise ValueError(
-                f"{path}: checkpoint of other tracks; give the same ones, or train anew"
+                f"{path}: checkpoint of other tracks; give the same ones, or train without --resume"
             )
         for name, value in asdict(self.options).items():
             if state["options"].get(name) != value:
@@ -383,6 +387,6 @@ def keep_freed_memory() -> None:
 def has_fast_bfloat16(device: str) -> bool:
     """Whether bfloat16 matrix products are faster than float32 on this machine."""
     if device.startswith("cuda"):
-        return torch.cuda.is_bf16_supported()
+        return bool(torch.cuda.is_bf16_supported())
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(supported and supported())
