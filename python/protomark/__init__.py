@@ -1,1 +1,32 @@
-"""Protomark: one small integer prototype per landmark instead of all its binary descriptors."""
+"""Protomark: one small integer prototype per landmark instead of all its binary descriptors.
+
+    import protomark as pm
+
+    encoder = pm.Encoder.load("freak")
+    scene = pm.PrototypeMap(encoder)
+    scene.add(landmark_ids, descriptors)
+    ids, distances = scene.search(new_descriptors, k=2)
+"""
+
+from importlib.metadata import version as _version
+
+from protomark._core import (
+    Encoder,
+    FileError,
+    PrototypeMap,
+    SealedMap,
+    hamming_search,
+    open,
+)
+
+__version__ = _version("protomark")
+
+__all__ = [
+    "Encoder",
+    "FileError",
+    "PrototypeMap",
+    "SealedMap",
+    "__version__",
+    "hamming_search",
+    "open",
+]

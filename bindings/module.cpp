@@ -1,0 +1,483 @@
+// The Python module protomark._core: arrays in, arrays out, the GIL released while C++ works.
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/filesystem.h>
+#include <nanobind/stl/map.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <optional>
+
+#include "arrays.h"
+#include "protomark/encoder.h"
+#include "protomark/error.h"
+#include "protomark/hamming.h"
+#include "protomark/map_file.h"
+#include "protomark/prototypes.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace protomark::python {
+namespace {
+
+using Path = std::filesystem::path;
+
+SearchOptions search_options(std::optional<float> max_distance, std::optional<float> ratio,
+                             int threads) {
+  SearchOptions options;
+  options.max_distance = max_distance;
+  options.ratio = ratio;
+  options.threads = threads;
+  return options;
+}
+
+nb::tuple hamming(nb::object queries, nb::object database, std::size_t k,
+                  std::optional<nb::object> landmark_ids, std::optional<int> max_distance,
+                  int threads) {
+  const auto q = descriptors(queries);
+  const auto d = descriptors(database);
+  NewMatrix<std::int64_t> ids(q.shape(0), k);
+  NewMatrix<std::int32_t> distances(q.shape(0), k);
+  HammingOptions options;
+  options.max_distance = max_distance;
+  options.threads = threads;
+  if (landmark_ids) {
+    const auto l = landmarks(*landmark_ids);
+    const nb::gil_scoped_release release;
+    hamming_search(view(q), view(d), view(l), options, ids.view(), distances.view());
+  } else {
+    const nb::gil_scoped_release release;
+    hamming_search(view(q), view(d), options, ids.view(), distances.view());
+  }
+  return nb::make_tuple(ids.release(), distances.release());
+}
+
+// Open and sealed maps search alike.
+template <typename Map>
+nb::tuple search(const Map& map, nb::object queries, std::size_t k,
+                 std::optional<float> max_distance, std::optional<float> ratio, int threads) {
+  const auto q = descriptors(queries);
+  NewMatrix<std::int64_t> ids(q.shape(0), k);
+  NewMatrix<float> distances(q.shape(0), k);
+  {
+    const nb::gil_scoped_release release;
+    map.search(view(q), search_options(max_distance, ratio, threads), ids.view(),
+               distances.view());
+  }
+  return nb::make_tuple(ids.release(), distances.release());
+}
+
+template <typename Map>
+nb::tuple search_codes(const Map& map, nb::object queries, std::size_t k,
+                       std::optional<float> max_distance, std::optional<float> ratio,
+                       int threads) {
+  const auto q = codes(queries);
+  NewMatrix<std::int64_t> ids(q.shape(0), k);
+  NewMatrix<float> distances(q.shape(0), k);
+  {
+    const nb::gil_scoped_release release;
+    map.search_codes(view(q), search_options(max_distance, ratio, threads), ids.view(),
+                     distances.view());
+  }
+  return nb::make_tuple(ids.release(), distances.release());
+}
+
+template <typename Map>
+nb::object prototype(const Map& map, nb::object landmark_ids) {
+  const auto l = landmarks(landmark_ids);
+  NewMatrix<float> means(l.shape(0), map.dim());
+  map.prototypes(view(l), means.view());
+  return means.release();
+}
+
+// What open and sealed maps have in common.
+template <typename Map>
+void bind_reading(nb::class_<Map>& map) {
+  map.def("__len__", &Map::size)
+      .def_prop_ro("encoder", &Map::encoder, "The encoder of this map.")
+      .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
+      .def_prop_ro(
+          "ids", [](const Map& m) { return new_vector(m.ids()); },
+          nb::sig("def ids(self) -> NDArray[numpy.int64]"), "All landmark ids, ascending, (n,) int64.")
+      .def(
+          "counts",
+          [](const Map& m, nb::object ids) { return new_vector(m.counts(view(landmarks(ids)))); },
+          "landmark_ids"_a,
+          nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8]"),
+          "Number of observations in each prototype, (n,) uint8. Raises KeyError for an id that is "
+          "not in the map.")
+      .def("prototype", &prototype<Map>, "landmark_ids"_a,
+           nb::sig("def prototype(self, landmark_ids: ArrayLike) -> NDArray[numpy.float32]"),
+           "Mean codes (Komorowski and Trzcinski, Eq. 1), (n, dim) float32, in code units; a "
+           "sealed map gives them rounded. Raises KeyError for an id that is not in the map.")
+      .def(
+          "positions",
+          [](const Map& m, nb::object ids) {
+            return from_positions(m.positions(view(landmarks(ids))));
+          },
+          "landmark_ids"_a,
+          nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
+          "World coordinates, (n, 3) float64, NaN where there are none. Raises KeyError for an id "
+          "that is not in the map.")
+      .def("search", &search<Map>, "descriptors"_a, "k"_a = 2, "max_distance"_a = nb::none(),
+           "ratio"_a = nb::none(), "threads"_a = 1,
+           nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
+                   "max_distance: float | None = None, ratio: float | None = None, "
+                   "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
+           R"(The k nearest landmarks of each descriptor, exactly; ties go to the smaller id.
+
+Args:
+    descriptors: (q, bits / 8) uint8.
+    k: neighbours to return.
+    max_distance: neighbours further away are left out (Euclidean, code units).
+    ratio: Lowe's ratio test, in (0, 1]: a query keeps its neighbours only where the nearest
+        landmark is closer than ratio times the second nearest.
+    threads: threads to use.
+
+Returns:
+    ids (q, k) int64, nearest first, -1 where there is none, and distances (q, k) float32,
+    Euclidean in code units, infinite where there is none.)")
+      .def("search_codes", &search_codes<Map>, "codes"_a, "k"_a = 2, "max_distance"_a = nb::none(),
+           "ratio"_a = nb::none(), "threads"_a = 1,
+           nb::sig("def search_codes(self, codes: NDArray[numpy.int8], k: int = 2, "
+                   "max_distance: float | None = None, ratio: float | None = None, "
+                   "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
+           "Like search, for descriptors that are encoded already: (q, dim) int8.");
+}
+
+Layer to_layer(nb::dict d) {
+  const auto vector = [&](const char* key, const char* type) {
+    return numpy("ascontiguousarray")(d[key], "dtype"_a = numpy(type));
+  };
+  Layer layer;
+  const auto weights = nb::cast<Matrix<std::int8_t>>(vector("weights", "int8"));
+  const auto bias = nb::cast<Vector<std::int32_t>>(vector("bias", "int32"));
+  const auto mult = nb::cast<Vector<std::int32_t>>(vector("mult", "int32"));
+  layer.outputs = weights.shape(0);
+  layer.inputs = weights.shape(1);
+  layer.weights.assign(weights.data(), weights.data() + weights.size());
+  layer.bias.assign(bias.data(), bias.data() + bias.size());
+  layer.multipliers.assign(mult.data(), mult.data() + mult.size());
+  layer.shift = nb::cast<int>(d["shift"]);
+  if (!d["table"].is_none()) {
+    const auto table = nb::cast<Vector<std::uint8_t>>(vector("table", "uint8"));
+    if (table.size() != layer.table.size()) {
+      throw nb::value_error("a layer's table must have 256 entries");
+    }
+    std::copy_n(table.data(), table.size(), layer.table.begin());
+  }
+  return layer;
+}
+
+nb::dict from_layer(const Layer& layer, bool hidden) {
+  NewMatrix<std::int8_t> weights(layer.outputs, layer.inputs);
+  std::copy(layer.weights.begin(), layer.weights.end(), weights.view().data);
+  nb::dict d;
+  d["weights"] = weights.release();
+  d["bias"] = new_vector(layer.bias);
+  d["mult"] = new_vector(layer.multipliers);
+  d["shift"] = layer.shift;
+  if (hidden) {
+    d["table"] = new_vector(std::vector<std::uint8_t>(layer.table.begin(), layer.table.end()));
+  } else {
+    d["table"] = nb::none();
+  }
+  return d;
+}
+
+void bind_encoder(nb::module_& m) {
+  nb::class_<Encoder>(m, "Encoder",
+                      "A network from packed bits to int8 codes that gives the same bytes on every "
+                      "machine.")
+      .def(
+          "__init__",
+          [](Encoder* self, nb::list layers, std::vector<std::size_t> dims, std::string name,
+             std::string descriptor, float scale, std::string data, std::string licence,
+             std::map<std::string, std::string> notes) {
+            std::vector<Layer> built;
+            for (nb::handle layer : layers) built.push_back(to_layer(nb::cast<nb::dict>(layer)));
+            EncoderInfo info{std::move(name), std::move(descriptor), std::move(data),
+                             std::move(licence), {notes.begin(), notes.end()}};
+            new (self) Encoder(std::move(info), std::move(built), std::move(dims), scale);
+          },
+          "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
+          "licence"_a = "", "notes"_a = nb::dict(),
+          nb::sig("def __init__(self, layers: list[dict[str, Any]], dims: Sequence[int], name: str, "
+                  "descriptor: str, scale: float, data: str = '', licence: str = '', "
+                  "notes: dict[str, str] = {}) -> None"),
+          R"(An encoder from integer layers.
+
+Args:
+    layers: each a dict of weights (out, in) int8, bias (out,) int32, mult (out,) int32, shift, and
+        table (256,) uint8, None in the last layer; docs/format.md says what is computed.
+    dims: lengths at which a code may be cut, ascending, the last one its full length.
+    name, descriptor, data, licence, notes: what the model says of itself.
+    scale: real value of one code unit.
+
+Raises:
+    ValueError: layers do not fit together.)")
+      .def_static(
+          "load",
+          [](nb::object source) {
+            const nb::object path =
+                nb::module_::import_("protomark.models").attr("resolve")(source);
+            return Encoder::load(nb::cast<Path>(path));
+          },
+          "source"_a, nb::sig("def load(source: str | os.PathLike[str]) -> Encoder"),
+          R"(Load an encoder by the name of one that ships ("freak", "orb") or the path of a model file.
+
+Raises:
+    FileError: there is no such model, or the file is not one.)")
+      .def("save", &Encoder::save, "path"_a, nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
+           "Write the model file, whole or not at all. Raises FileError.")
+      .def(
+          "encode",
+          [](const Encoder& encoder, nb::object array, std::optional<std::size_t> dim,
+             int threads) {
+            const auto d = descriptors(array);
+            NewMatrix<std::int8_t> result(d.shape(0), dim.value_or(encoder.dim()));
+            {
+              const nb::gil_scoped_release release;
+              encoder.encode(view(d), result.view(), threads);
+            }
+            return result.release();
+          },
+          "descriptors"_a, "dim"_a = nb::none(), "threads"_a = 1,
+          nb::sig("def encode(self, descriptors: NDArray[numpy.uint8], dim: int | None = None, "
+                  "threads: int = 1) -> NDArray[numpy.int8]"),
+          R"(Codes of descriptors.
+
+Args:
+    descriptors: (n, bits / 8) uint8, the bytes that OpenCV gives.
+    dim: length of a code, one of `dims`; None: the full length.
+    threads: threads to use.
+
+Returns:
+    (n, dim) int8, -127 to 127.)")
+      .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor.")
+      .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
+      .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")
+      .def_prop_ro("scale", &Encoder::scale, "Real value of one code unit.")
+      .def_prop_ro("identity", &Encoder::identity, "SHA-256 of the network, in hexadecimal.")
+      .def_prop_ro("multiply_adds", &Encoder::multiply_adds, "Multiply-adds for one descriptor.")
+      .def_prop_ro(
+          "name", [](const Encoder& e) { return e.info().name; }, "Name of the model.")
+      .def_prop_ro(
+          "descriptor", [](const Encoder& e) { return e.info().descriptor; },
+          "Name of the descriptor that it takes.")
+      .def_prop_ro(
+          "data", [](const Encoder& e) { return e.info().data; }, "What it was trained on.")
+      .def_prop_ro(
+          "licence", [](const Encoder& e) { return e.info().licence; }, "Licence of the model.")
+      .def_prop_ro(
+          "notes",
+          [](const Encoder& e) {
+            return std::map<std::string, std::string>(e.info().notes.begin(), e.info().notes.end());
+          },
+          "Whatever else the model says of itself.")
+      .def_prop_ro(
+          "layers",
+          [](const Encoder& e) {
+            nb::list result;
+            for (std::size_t l = 0; l < e.layers().size(); ++l) {
+              result.append(from_layer(e.layers()[l], l + 1 < e.layers().size()));
+            }
+            return result;
+          },
+          nb::sig("def layers(self) -> list[dict[str, Any]]"),
+          "The integer layers, as the constructor takes them.")
+      .def("__repr__", [](const Encoder& e) {
+        return "<protomark.Encoder '" + e.info().name + "': " + std::to_string(e.bits()) +
+               " bits -> " + std::to_string(e.dim()) + " int8>";
+      });
+}
+
+void bind_open_map(nb::module_& m) {
+  nb::class_<PrototypeMap> map(
+      m, "PrototypeMap",
+      "An open map: one prototype a landmark, kept as an exact integer sum of codes, so that it "
+      "follows every change without rounding.");
+  map.def(
+      "__init__",
+      [](PrototypeMap* self, std::shared_ptr<Encoder> encoder, std::optional<std::size_t> dim) {
+        if (dim == 0) throw nb::value_error("dim must be at least 1");
+        new (self) PrototypeMap(std::move(encoder), dim.value_or(0));
+      },
+      "encoder"_a, "dim"_a = nb::none(),
+      nb::sig("def __init__(self, encoder: Encoder, dim: int | None = None) -> None"),
+      "An empty map whose prototypes have `dim` dimensions, one of encoder.dims; None: all.");
+  bind_reading(map);
+
+  const auto change = [](auto method) {
+    return [method](PrototypeMap& self, nb::object ids, nb::object array, int threads) {
+      const auto l = landmarks(ids);
+      const auto d = descriptors(array);
+      const nb::gil_scoped_release release;
+      (self.*method)(view(l), view(d), threads);
+    };
+  };
+  const auto change_codes = [](auto method) {
+    return [method](PrototypeMap& self, nb::object ids, nb::object array) {
+      const auto l = landmarks(ids);
+      const auto c = codes(array);
+      const nb::gil_scoped_release release;
+      (self.*method)(view(l), view(c));
+    };
+  };
+  map.def("add", change(&PrototypeMap::add), "landmark_ids"_a, "descriptors"_a, "threads"_a = 1,
+          nb::sig("def add(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
+                  "threads: int = 1) -> None"),
+          R"(Add observations (Komorowski and Trzcinski, Eq. 1 and Eq. 2).
+
+Args:
+    landmark_ids: (n,) int64, not negative; unknown ones are new landmarks.
+    descriptors: (n, bits / 8) uint8.
+    threads: threads to encode on.
+
+A landmark with 255 observations has its sum and count halved before one more is added.)")
+      .def("remove", change(&PrototypeMap::remove), "landmark_ids"_a, "descriptors"_a,
+           "threads"_a = 1,
+           nb::sig("def remove(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
+                   "threads: int = 1) -> None"),
+           R"(Take observations back, exactly; a landmark without observations leaves the map.
+
+Raises:
+    KeyError: a landmark is not in the map.
+    ValueError: these observations cannot have been added. Nothing is changed then.)")
+      .def("add_codes", change_codes(&PrototypeMap::add_codes), "landmark_ids"_a, "codes"_a,
+           nb::sig("def add_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> None"),
+           "Like add, for descriptors that are encoded already: (n, dim) int8.")
+      .def("remove_codes", change_codes(&PrototypeMap::remove_codes), "landmark_ids"_a, "codes"_a,
+           nb::sig("def remove_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> None"),
+           "Like remove, for descriptors that are encoded already: (n, dim) int8.")
+      .def(
+          "merge",
+          [](PrototypeMap& self, nb::object into, nb::object source) {
+            const auto a = landmarks(into);
+            const auto b = landmarks(source);
+            const nb::gil_scoped_release release;
+            self.merge(view(a), view(b));
+          },
+          "into"_a, "source"_a,
+          nb::sig("def merge(self, into: ArrayLike, source: ArrayLike) -> None"),
+          "Join each source landmark to the one in `into`, exactly as if all observations had been "
+          "of that one; the sources leave the map. Raises KeyError for an unknown id.")
+      .def(
+          "discard",
+          [](PrototypeMap& self, nb::object ids) {
+            const auto l = landmarks(ids);
+            const nb::gil_scoped_release release;
+            self.discard(view(l));
+          },
+          "landmark_ids"_a, nb::sig("def discard(self, landmark_ids: ArrayLike) -> None"),
+          "Forget landmarks. Raises KeyError for an unknown id.")
+      .def("update", &PrototypeMap::update, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
+           "Join another map of the same encoder and dim: landmarks that both have are summed, the "
+           "rest taken over. Raises ValueError where encoder or dim differ.")
+      .def(
+          "set_positions",
+          [](PrototypeMap& self, nb::object ids, nb::object positions) {
+            const auto l = landmarks(ids);
+            const auto p = to_positions(positions);
+            const nb::gil_scoped_release release;
+            self.set_positions(view(l), p);
+          },
+          "landmark_ids"_a, "positions"_a,
+          nb::sig("def set_positions(self, landmark_ids: ArrayLike, positions: ArrayLike) -> None"),
+          "Set world coordinates, (n, 3) float64; NaN takes a position away. Raises KeyError for an "
+          "unknown id.")
+      .def("save", &PrototypeMap::save, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+           nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
+           "Write the map, whole or not at all. Raises FileError.")
+      .def(
+          "seal",
+          [](const PrototypeMap& self, const Path& path) {
+            const nb::gil_scoped_release release;
+            self.seal(path);
+            return SealedMap(path);
+          },
+          "path"_a, nb::sig("def seal(self, path: str | os.PathLike[str]) -> SealedMap"),
+          "Write a sealed map, whole or not at all, and open it. Raises FileError.")
+      .def("__repr__", [](const PrototypeMap& self) {
+        return "<protomark.PrototypeMap: " + std::to_string(self.size()) + " landmarks, " +
+               std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
+               "'>";
+      });
+}
+
+void bind_sealed_map(nb::module_& m) {
+  nb::class_<SealedMap> map(
+      m, "SealedMap",
+      "A map that only answers, mapped from its file: dim + 1 bytes a landmark, and its position.");
+  bind_reading(map);
+  map.def("__repr__", [](const SealedMap& self) {
+    return "<protomark.SealedMap: " + std::to_string(self.size()) + " landmarks, " +
+           std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
+           "'>";
+  });
+}
+
+void bind_errors(nb::module_& m) {
+  static PyObject* file_error = PyErr_NewExceptionWithDoc(
+      "protomark.FileError", "A file that cannot be read or written, or is not what it should be.",
+      nb::make_tuple(nb::handle(PyExc_OSError), nb::handle(PyExc_ValueError)).ptr(), nullptr);
+  m.attr("FileError") = nb::borrow(file_error);
+  nb::register_exception_translator([](const std::exception_ptr& p, void*) {
+    try {
+      std::rethrow_exception(p);
+    } catch (const FileError& error) {
+      PyErr_SetString(file_error, error.what());
+    } catch (const UnknownLandmark& error) {
+      PyErr_SetString(PyExc_KeyError, error.what());
+    }
+  });
+}
+
+}  // namespace
+}  // namespace protomark::python
+
+NB_MODULE(_core, m) {
+  using namespace protomark;
+  using namespace protomark::python;
+  m.doc() = "The C++ core of Protomark.";
+  bind_errors(m);
+  bind_encoder(m);
+  bind_sealed_map(m);
+  bind_open_map(m);
+  m.def("hamming_search", &hamming, "queries"_a, "database"_a, "k"_a = 2,
+        "landmarks"_a = nb::none(), "max_distance"_a = nb::none(), "threads"_a = 1,
+        nb::sig("def hamming_search(queries: NDArray[numpy.uint8], database: NDArray[numpy.uint8], "
+                "k: int = 2, landmarks: ArrayLike | None = None, max_distance: int | None = None, "
+                "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
+        R"(Exact k nearest neighbours of binary descriptors in Hamming distance.
+
+Args:
+    queries: (q, bits / 8) uint8.
+    database: (n, bits / 8) uint8.
+    k: neighbours to return.
+    landmarks: (n,) int64, the landmark of each row of database. With it, the k nearest *distinct*
+        landmarks are returned, each as far away as its nearest descriptor.
+    max_distance: neighbours further away, in bits, are left out.
+    threads: threads to use.
+
+Returns:
+    Rows of database, or landmark ids, (q, k) int64, nearest first, ties to the smaller, -1 where
+    there is none; and distances (q, k) int32, bits + 1 where there is none.)");
+  m.def(
+      "open",
+      [](const Path& path) -> nb::object {
+        if (map_kind(path) == MapKind::open) return nb::cast(PrototypeMap::load(path));
+        return nb::cast(SealedMap(path));
+      },
+      "path"_a,
+      nb::sig("def open(path: str | os.PathLike[str]) -> PrototypeMap | SealedMap"),
+      "Open a map file: an open map is read, a sealed one mapped. Raises FileError.");
+  m.def("file_sections", &file_sections, "path"_a,
+        "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");
+  m.def("verify_file", &verify_file, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+        "Check every checksum of a model or map file. Raises FileError.");
+}

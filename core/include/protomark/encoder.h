@@ -1,0 +1,89 @@
+// From packed bits to int8 codes, in integers: the same bytes on every machine.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <filesystem>
+#include <memory>
+#include <span>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "protomark/matrix_view.h"
+
+namespace protomark {
+
+// One fully connected layer:
+//   sum  = bias[o] + sum_i weights[o][i] * x[i]
+//   t    = (sum * multipliers[o] + 2^(shift - 1)) >> shift      (64-bit product)
+//   next = table[clamp(t, -128, 127) + 128]                     (hidden layers)
+//   code = clamp(t, -127, 127)                                  (last layer)
+// The first layer's x are the descriptor's bits, 0 or 1, later ones the bytes of the table.
+struct Layer {
+  std::size_t inputs = 0;
+  std::size_t outputs = 0;
+  std::vector<std::int8_t> weights;  // outputs x inputs
+  std::vector<std::int32_t> bias;
+  std::vector<std::int32_t> multipliers;  // positive
+  int shift = 1;                          // 1 to 62
+  std::array<std::uint8_t, 256> table{};
+};
+
+// What a model says of itself: any keys, of which these are always there.
+struct EncoderInfo {
+  std::string name;        // "freak"
+  std::string descriptor;  // "freak"
+  std::string data;        // what it was trained on
+  std::string licence;
+  std::vector<std::pair<std::string, std::string>> notes;
+};
+
+class Encoder {
+ public:
+  // Takes a network. `dims` are the lengths at which a code may be cut, ascending, the last one
+  // the number of outputs; a code times `scale` is the real value. Throws std::invalid_argument
+  // where layers do not fit together or a sum could leave 32 bits.
+  Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims, float scale);
+
+  // Reads and checks a model file. Throws FileError.
+  static Encoder load(const std::filesystem::path& path);
+  // Reads and checks the bytes of a model file; `name` is what errors call them.
+  static Encoder parse(std::span<const std::byte> bytes, const std::string& name);
+  // Writes a model file, whole or not at all. Throws FileError.
+  void save(const std::filesystem::path& path) const;
+  // The bytes of the model file.
+  std::vector<std::byte> serialize() const;
+
+  const EncoderInfo& info() const { return info_; }
+  const std::vector<Layer>& layers() const { return layers_; }
+  std::size_t bits() const { return layers_.front().inputs; }
+  std::size_t bytes() const { return bits() / 8; }
+  std::size_t dim() const { return dims_.back(); }
+  const std::vector<std::size_t>& dims() const { return dims_; }
+  float scale() const { return scale_; }
+  // SHA-256 of the network, in hexadecimal: equal where codes are equal.
+  const std::string& identity() const { return identity_; }
+  // Multiply-adds for one descriptor.
+  std::size_t multiply_adds() const;
+
+  // codes (n x dim) of descriptors (n x bytes), dim = codes.columns, one of dims().
+  // Throws std::invalid_argument where shapes do not fit.
+  void encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads = 1) const;
+
+ private:
+  struct Packed;  // the weights as the kernels read them
+
+  std::vector<std::byte> network_bytes() const;
+  void pack();
+
+  EncoderInfo info_;
+  std::vector<Layer> layers_;
+  std::vector<std::size_t> dims_;
+  float scale_;
+  std::string identity_;
+  std::shared_ptr<const std::vector<Packed>> packed_;
+};
+
+}  // namespace protomark

@@ -1,0 +1,62 @@
+// The sealed map: what a map needs to answer, mapped from its file without parsing.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <filesystem>
+#include <memory>
+#include <span>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "protomark/encoder.h"
+#include "protomark/matrix_view.h"
+#include "protomark/prototypes.h"
+#include "protomark/search.h"
+
+namespace protomark {
+
+enum class MapKind { open, sealed };
+
+// What a map file holds, by its header. Throws FileError where it is no map.
+MapKind map_kind(const std::filesystem::path& path);
+
+// Names and sizes in bytes of the sections of a model or map file. Throws FileError.
+std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path);
+
+// Checks every checksum of a model or map file. Throws FileError.
+void verify_file(const std::filesystem::path& path);
+
+// A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, landmarks to one
+// of 16), 8 more where ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads are
+// safe from any thread.
+class SealedMap {
+ public:
+  // Throws FileError. The large sections are not read; verify_file checks them.
+  explicit SealedMap(const std::filesystem::path& path);
+  ~SealedMap();
+  SealedMap(SealedMap&&) noexcept;
+
+  const std::shared_ptr<const Encoder>& encoder() const;
+  std::size_t dim() const;
+  std::size_t size() const;
+  std::vector<std::int64_t> ids() const;
+
+  // Throw UnknownLandmark. Prototypes are the rounded ones. Positions are 32-bit, relative to the
+  // middle of the map; NaN where there is none.
+  std::vector<std::uint8_t> counts(std::span<const std::int64_t> landmarks) const;
+  void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
+  std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
+
+  void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
+              MatrixView<float> distances) const;
+  void search_codes(Codes queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
+                    MatrixView<float> distances) const;
+
+ private:
+  struct Content;
+  std::unique_ptr<const Content> content_;
+};
+
+}  // namespace protomark

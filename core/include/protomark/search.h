@@ -1,0 +1,53 @@
+// Exact nearest prototypes, in integers.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "protomark/matrix_view.h"
+
+namespace protomark {
+
+// Prototypes as search reads them and as a sealed map stores them: blocks of 16 landmarks; within a
+// block, for every 4 dimensions, 16 landmarks x 4 values. The last block and the last dimensions
+// are padded with zeros. Value d of row r stands at packed_index(r, d, dim).
+struct PackedPrototypes {
+  const std::int8_t* data = nullptr;
+  std::size_t rows = 0;
+  std::size_t dim = 0;
+  const std::int64_t* ids = nullptr;  // landmark of each row; nullptr: the row's number
+};
+
+inline constexpr std::size_t kPackedRows = 16;
+
+constexpr std::size_t packed_dim(std::size_t dim) { return (dim + 3) / 4 * 4; }
+
+constexpr std::size_t packed_size(std::size_t rows, std::size_t dim) {
+  return (rows + kPackedRows - 1) / kPackedRows * kPackedRows * packed_dim(dim);
+}
+
+constexpr std::size_t packed_index(std::size_t row, std::size_t d, std::size_t dim) {
+  return row / kPackedRows * kPackedRows * packed_dim(dim) + d / 4 * 4 * kPackedRows +
+         row % kPackedRows * 4 + d % 4;
+}
+
+struct SearchOptions {
+  // Neighbours further away than this (Euclidean, in code units) are not reported.
+  std::optional<float> max_distance;
+  // Lowe's ratio test: a query keeps its neighbours only where its nearest landmark is closer than
+  // `ratio` times the second nearest landmark, or where there is no second. In (0, 1].
+  std::optional<float> ratio;
+  int threads = 1;
+};
+
+// The k nearest prototypes of each query code, nearest first, ties to the smaller landmark id.
+//
+// ids and distances are (queries x k), k = ids.columns. Distances are Euclidean, in code units: the
+// float nearest to the root of the integer squared distance. Where there is no neighbour the id is
+// -1 and the distance infinite. Throws std::invalid_argument where shapes or options do not fit.
+void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
+            MatrixView<std::int64_t> ids, MatrixView<float> distances);
+
+}  // namespace protomark

@@ -1,0 +1,327 @@
+#include "container.h"
+
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cerrno>
+#include <cstring>
+
+#include "crc32.h"
+#include "protomark/error.h"
+
+namespace protomark {
+namespace {
+
+static_assert(std::endian::native == std::endian::little,
+              "the file format is little-endian; a big-endian machine needs byte swaps here");
+
+constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
+constexpr std::uint32_t kVersion = 1;
+constexpr std::size_t kAlignment = 64;
+constexpr std::uint32_t kMaxSections = 64;
+
+struct Header {
+  char magic[8];
+  std::uint32_t version;
+  std::uint32_t kind;
+  std::uint64_t file_size;
+  std::uint32_t sections;
+  std::uint32_t crc;
+  std::uint8_t reserved[32];
+};
+static_assert(sizeof(Header) == 64);
+
+struct Entry {
+  char name[8];
+  std::uint64_t offset;
+  std::uint64_t size;
+  std::uint32_t crc;
+  std::uint32_t reserved;
+};
+static_assert(sizeof(Entry) == 32);
+
+template <typename T>
+Bytes as_bytes(const T& v) {
+  return std::as_bytes(std::span(&v, 1));
+}
+
+constexpr std::uint64_t align(std::uint64_t n) { return (n + kAlignment - 1) / kAlignment * kAlignment; }
+
+std::string system_error() { return std::strerror(errno); }
+
+// A file being written beside its target; removed unless it is committed.
+class TemporaryFile {
+ public:
+  explicit TemporaryFile(const std::filesystem::path& target) : target_(target) {
+    std::string pattern = target.string() + ".XXXXXX";
+    descriptor_ = ::mkstemp(pattern.data());
+    if (descriptor_ < 0) fail();
+    path_ = pattern;
+    // mkstemp gives 0600; a map is as readable as any file its user makes.
+    const mode_t mask = ::umask(0);
+    ::umask(mask);
+    if (::fchmod(descriptor_, 0666 & ~mask) != 0) fail();
+  }
+  ~TemporaryFile() {
+    if (descriptor_ >= 0) ::close(descriptor_);
+    if (!path_.empty()) ::unlink(path_.c_str());
+  }
+  TemporaryFile(const TemporaryFile&) = delete;
+  TemporaryFile& operator=(const TemporaryFile&) = delete;
+
+  void write(Bytes bytes) {
+    while (!bytes.empty()) {
+      const ssize_t written = ::write(descriptor_, bytes.data(), bytes.size());
+      if (written < 0 && errno == EINTR) continue;
+      if (written < 0) fail();
+      bytes = bytes.subspan(static_cast<std::size_t>(written));
+    }
+  }
+
+  void commit() {
+    if (::fsync(descriptor_) != 0) fail();
+    const int descriptor = std::exchange(descriptor_, -1);
+    if (::close(descriptor) != 0) fail();
+    if (::rename(path_.c_str(), target_.c_str()) != 0) fail();
+    path_.clear();
+    sync_folder();
+  }
+
+ private:
+  [[noreturn]] void fail() const {
+    throw FileError(target_.string() + ": cannot be written: " + system_error());
+  }
+
+  // Without this a power cut may bring the old name back.
+  void sync_folder() const {
+    auto folder = target_.parent_path();
+    if (folder.empty()) folder = ".";
+    const int descriptor = ::open(folder.c_str(), O_RDONLY | O_DIRECTORY);
+    if (descriptor < 0) return;  // a folder may be writable and yet not readable
+    ::fsync(descriptor);
+    ::close(descriptor);
+  }
+
+  std::filesystem::path target_;
+  std::string path_;
+  int descriptor_ = -1;
+};
+
+}  // namespace
+
+const char* describe(FileKind kind) {
+  switch (kind) {
+    case FileKind::encoder:
+      return "an encoder";
+    case FileKind::open_map:
+      return "an open map";
+    case FileKind::sealed_map:
+      return "a sealed map";
+  }
+  return "something unknown";
+}
+
+void ContainerWriter::add(std::string name, Bytes bytes) {
+  sections_.push_back({std::move(name), {}, bytes});
+}
+
+void ContainerWriter::add(std::string name, std::vector<std::byte> bytes) {
+  Section section{std::move(name), std::move(bytes), {}};
+  section.bytes = section.owned;
+  sections_.push_back(std::move(section));
+}
+
+void ContainerWriter::emit(const std::function<void(Bytes)>& sink) const {
+  std::vector<Entry> table;
+  std::uint64_t offset = align(sizeof(Header) + sections_.size() * sizeof(Entry));
+  for (const Section& section : sections_) {
+    Entry entry{};
+    std::memcpy(entry.name, section.name.data(), std::min<std::size_t>(8, section.name.size()));
+    entry.offset = offset;
+    entry.size = section.bytes.size();
+    entry.crc = crc32(section.bytes);
+    table.push_back(entry);
+    offset = align(offset + entry.size);
+  }
+  Header header{};
+  std::memcpy(header.magic, kMagic, sizeof(kMagic));
+  header.version = kVersion;
+  header.kind = static_cast<std::uint32_t>(kind_);
+  header.file_size = offset;
+  header.sections = static_cast<std::uint32_t>(sections_.size());
+  header.crc = crc32(std::as_bytes(std::span(table)), crc32(as_bytes(header)));
+
+  constexpr std::array<std::byte, kAlignment> zeros{};
+  std::uint64_t written = 0;
+  const auto put = [&](Bytes bytes) {
+    sink(bytes);
+    written += bytes.size();
+  };
+  const auto pad = [&] { put(Bytes(zeros).first(align(written) - written)); };
+  put(as_bytes(header));
+  put(std::as_bytes(std::span(table)));
+  pad();
+  for (const Section& section : sections_) {
+    put(section.bytes);
+    pad();
+  }
+}
+
+std::vector<std::byte> ContainerWriter::serialize() const {
+  std::vector<std::byte> result;
+  emit([&](Bytes bytes) { result.insert(result.end(), bytes.begin(), bytes.end()); });
+  return result;
+}
+
+void ContainerWriter::write(const std::filesystem::path& path) const {
+  TemporaryFile file(path);
+  emit([&](Bytes bytes) { file.write(bytes); });
+  file.commit();
+}
+
+void write_file(const std::filesystem::path& path, Bytes bytes) {
+  TemporaryFile file(path);
+  file.write(bytes);
+  file.commit();
+}
+
+ContainerReader::ContainerReader(Bytes file, std::string name)
+    : file_(file), name_(std::move(name)), kind_(FileKind::encoder) {
+  if (file_.size() < sizeof(Header) || std::memcmp(file_.data(), kMagic, sizeof(kMagic)) != 0) {
+    fail("not a Protomark file");
+  }
+  Header header;
+  std::memcpy(&header, file_.data(), sizeof(header));
+  if (header.version != kVersion) {
+    fail("format version " + std::to_string(header.version) + ", this Protomark reads version " +
+         std::to_string(kVersion));
+  }
+  if (header.sections > kMaxSections) fail("its header is broken");
+  const std::size_t table_size = header.sections * sizeof(Entry);
+  if (header.file_size != file_.size()) {
+    fail("it should have " + std::to_string(header.file_size) + " bytes and has " +
+         std::to_string(file_.size()) + (file_.size() < header.file_size ? ": it is cut off" : ""));
+  }
+  if (file_.size() < sizeof(Header) + table_size) fail("its header is broken");
+  const Bytes table = file_.subspan(sizeof(Header), table_size);
+  const std::uint32_t crc = std::exchange(header.crc, 0);
+  if (crc32(table, crc32(as_bytes(header))) != crc) fail("its header does not match its checksum");
+  if (header.kind < 1 || header.kind > 3) fail("it is of a kind that this Protomark does not know");
+  kind_ = static_cast<FileKind>(header.kind);
+
+  std::uint64_t end = sizeof(Header) + table_size;
+  for (std::uint32_t i = 0; i < header.sections; ++i) {
+    Entry entry;
+    std::memcpy(&entry, table.data() + i * sizeof(Entry), sizeof(Entry));
+    if (entry.offset % kAlignment != 0 || entry.offset < end || entry.offset > file_.size() ||
+        entry.size > file_.size() - entry.offset) {
+      fail("its section table is broken");
+    }
+    end = entry.offset + entry.size;
+    const std::string section(entry.name, ::strnlen(entry.name, sizeof(entry.name)));
+    if (find(section) != nullptr) fail("it has two sections '" + section + "'");
+    sections_.push_back({section, entry.offset, entry.size, entry.crc});
+  }
+}
+
+void ContainerReader::expect(FileKind kind) const {
+  if (kind_ != kind) fail(std::string("it holds ") + describe(kind_) + ", not " + describe(kind));
+}
+
+const ContainerReader::Section* ContainerReader::find(std::string_view name) const {
+  const auto found = std::find_if(sections_.begin(), sections_.end(),
+                                  [&](const Section& s) { return s.name == name; });
+  return found == sections_.end() ? nullptr : &*found;
+}
+
+Bytes ContainerReader::checked(const Section& section) const {
+  const Bytes bytes = file_.subspan(section.offset, section.size);
+  if (crc32(bytes) != section.crc) {
+    fail("its section '" + section.name + "' does not match its checksum");
+  }
+  return bytes;
+}
+
+Bytes ContainerReader::read(std::string_view section) const {
+  if (const auto bytes = read_if_there(section)) return *bytes;
+  fail("it lacks the section '" + std::string(section) + "'");
+}
+
+std::optional<Bytes> ContainerReader::read_if_there(std::string_view section) const {
+  const Section* found = find(section);
+  if (found == nullptr) return std::nullopt;
+  return checked(*found);
+}
+
+std::optional<Bytes> ContainerReader::map_if_there(std::string_view section) const {
+  const Section* found = find(section);
+  if (found == nullptr) return std::nullopt;
+  return file_.subspan(found->offset, found->size);
+}
+
+std::vector<std::pair<std::string, std::size_t>> ContainerReader::sections() const {
+  std::vector<std::pair<std::string, std::size_t>> result;
+  for (const Section& section : sections_) result.emplace_back(section.name, section.size);
+  return result;
+}
+
+void ContainerReader::verify() const {
+  for (const Section& section : sections_) checked(section);
+}
+
+void ContainerReader::fail(const std::string& what) const { throw FileError(name_ + ": " + what); }
+
+MappedFile::MappedFile(const std::filesystem::path& path) {
+  const auto fail = [&]() -> void {
+    const std::string why = system_error();
+    throw FileError(path.string() + ": cannot be read: " + why);
+  };
+  const int descriptor = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  if (descriptor < 0) fail();
+  struct stat status;
+  if (::fstat(descriptor, &status) != 0 || !S_ISREG(status.st_mode)) {
+    ::close(descriptor);
+    throw FileError(path.string() + ": not a file");
+  }
+  size_ = static_cast<std::size_t>(status.st_size);
+  if (size_ > 0) {
+    data_ = ::mmap(nullptr, size_, PROT_READ, MAP_SHARED, descriptor, 0);
+    if (data_ == MAP_FAILED) {
+      data_ = nullptr;
+      ::close(descriptor);
+      fail();
+    }
+  }
+  ::close(descriptor);
+}
+
+MappedFile::~MappedFile() {
+  if (data_ != nullptr) ::munmap(data_, size_);
+}
+
+std::string SectionReader::text(std::size_t n) {
+  if (n > rest_.size()) too_short();
+  std::string result(n, '\0');
+  take(result.data(), n);
+  return result;
+}
+
+void SectionReader::finish() const {
+  if (!rest_.empty()) file_->fail("its section '" + section_ + "' is longer than it should be");
+}
+
+void SectionReader::too_short() const {
+  file_->fail("its section '" + section_ + "' is shorter than it should be");
+}
+
+void SectionReader::take(void* to, std::size_t n) {
+  if (n > 0) std::memcpy(to, rest_.data(), n);
+  rest_ = rest_.subspan(n);
+}
+
+}  // namespace protomark

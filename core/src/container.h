@@ -1,0 +1,173 @@
+// The file that models and maps share: a header, a table of sections, the sections.
+//
+//   header   64 bytes: magic "PROTOMRK", u32 version, u32 kind, u64 file size, u32 number of
+//            sections, u32 CRC-32 of header and table (this field taken as 0), 32 bytes of zero
+//   table    32 bytes a section: name (8 bytes, padded with 0), u64 offset, u64 size,
+//            u32 CRC-32 of the section, u32 zero
+//   sections each at a multiple of 64 bytes, in the table's order, gaps filled with zeros
+//
+// Everything is little-endian. docs/format.md says what each kind holds.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <span>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+namespace protomark {
+
+enum class FileKind : std::uint32_t { encoder = 1, open_map = 2, sealed_map = 3 };
+
+const char* describe(FileKind kind);
+
+using Bytes = std::span<const std::byte>;
+
+// Sections in memory that belong to somebody else, to be written as one file.
+class ContainerWriter {
+ public:
+  explicit ContainerWriter(FileKind kind) : kind_(kind) {}
+
+  // `bytes` must stay alive until the file is written.
+  void add(std::string name, Bytes bytes);
+  // Takes the bytes over.
+  void add(std::string name, std::vector<std::byte> bytes);
+
+  std::vector<std::byte> serialize() const;
+  // Writes the file as write_file does, without a copy of the sections.
+  void write(const std::filesystem::path& path) const;
+
+ private:
+  struct Section {
+    std::string name;
+    std::vector<std::byte> owned;
+    Bytes bytes;
+  };
+  void emit(const std::function<void(Bytes)>& sink) const;
+
+  FileKind kind_;
+  std::vector<Section> sections_;
+};
+
+// Writes bytes beside `path`, syncs, renames over it, syncs the folder. On any failure the old file
+// is still there and the new one is gone. Throws FileError.
+void write_file(const std::filesystem::path& path, Bytes bytes);
+
+// A checked view of the bytes of a file. `name` is what errors call it.
+class ContainerReader {
+ public:
+  // Checks header, table and bounds; a section's checksum is checked when it is read. Throws
+  // FileError.
+  ContainerReader(Bytes file, std::string name);
+
+  FileKind kind() const { return kind_; }
+  const std::string& name() const { return name_; }
+  // Throws FileError where the file is of another kind.
+  void expect(FileKind kind) const;
+
+  // A section, checked against its checksum. Throws FileError where it is missing or broken.
+  Bytes read(std::string_view section) const;
+  std::optional<Bytes> read_if_there(std::string_view section) const;
+  // A section whose checksum nobody has checked; for what is mapped and too large to read.
+  std::optional<Bytes> map_if_there(std::string_view section) const;
+  // Names and sizes in bytes, in file order.
+  std::vector<std::pair<std::string, std::size_t>> sections() const;
+  // Checks every section. Throws FileError.
+  void verify() const;
+  // An error about this file.
+  [[noreturn]] void fail(const std::string& what) const;
+
+ private:
+  struct Section {
+    std::string name;
+    std::size_t offset;
+    std::size_t size;
+    std::uint32_t crc;
+  };
+  const Section* find(std::string_view name) const;
+  Bytes checked(const Section& section) const;
+
+  Bytes file_;
+  std::string name_;
+  FileKind kind_;
+  std::vector<Section> sections_;
+};
+
+// A file mapped read-only.
+class MappedFile {
+ public:
+  // Throws FileError where the file cannot be read.
+  explicit MappedFile(const std::filesystem::path& path);
+  ~MappedFile();
+  MappedFile(const MappedFile&) = delete;
+  MappedFile& operator=(const MappedFile&) = delete;
+
+  Bytes bytes() const { return {static_cast<const std::byte*>(data_), size_}; }
+
+ private:
+  void* data_ = nullptr;
+  std::size_t size_ = 0;
+};
+
+// Reads plain values from a section front to back; running past the end throws FileError.
+class SectionReader {
+ public:
+  SectionReader(const ContainerReader& file, std::string_view section)
+      : file_(&file), section_(section), rest_(file.read(section)) {}
+
+  template <typename T>
+  T value() {
+    T v;
+    copy(&v, 1);
+    return v;
+  }
+  template <typename T>
+  std::vector<T> values(std::size_t n) {
+    if (n > rest_.size() / sizeof(T)) too_short();
+    std::vector<T> v(n);
+    copy(v.data(), n);
+    return v;
+  }
+  template <typename T>
+  void copy(T* to, std::size_t n) {
+    if (n > rest_.size() / sizeof(T)) too_short();
+    take(to, n * sizeof(T));
+  }
+  std::string text(std::size_t n);
+  bool empty() const { return rest_.empty(); }
+  // Throws FileError where bytes are left.
+  void finish() const;
+
+ private:
+  [[noreturn]] void too_short() const;
+  void take(void* to, std::size_t n);
+
+  const ContainerReader* file_;
+  std::string section_;
+  Bytes rest_;
+};
+
+// Collects plain values for a section.
+class SectionWriter {
+ public:
+  template <typename T>
+  void value(const T& v) {
+    values(&v, 1);
+  }
+  template <typename T>
+  void values(const T* v, std::size_t n) {
+    const auto* p = reinterpret_cast<const std::byte*>(v);
+    bytes_.insert(bytes_.end(), p, p + n * sizeof(T));
+  }
+  std::vector<std::byte> take() { return std::move(bytes_); }
+
+ private:
+  std::vector<std::byte> bytes_;
+};
+
+}  // namespace protomark

@@ -1,0 +1,86 @@
+// Landmark id -> row, 4 bytes a slot: the slots hold rows, the ids stay in the map's own array.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+namespace protomark {
+
+// Open addressing with linear probing, at most two thirds full, no tombstones.
+class IdIndex {
+ public:
+  static constexpr std::uint32_t kNone = UINT32_MAX;
+
+  // The row of `id`, or kNone. `ids` is the array that rows point into.
+  std::uint32_t find(const std::vector<std::int64_t>& ids, std::int64_t id) const {
+    if (slots_.empty()) return kNone;
+    for (std::size_t s = home(id);; s = next(s)) {
+      if (slots_[s] == kNone || ids[slots_[s]] == id) return slots_[s];
+    }
+  }
+
+  // Takes a row whose id is not there yet.
+  void insert(const std::vector<std::int64_t>& ids, std::uint32_t row) {
+    if (3 * (used_ + 1) > 2 * slots_.size()) grow(ids);
+    place(ids, row);
+    ++used_;
+  }
+
+  // Changes the row of an id that is there.
+  void move(const std::vector<std::int64_t>& ids, std::int64_t id, std::uint32_t to) {
+    slots_[slot_of(ids, id)] = to;
+  }
+
+  // Removes an id that is there; `ids` must still hold it.
+  void erase(const std::vector<std::int64_t>& ids, std::int64_t id) {
+    std::size_t hole = slot_of(ids, id);
+    // Close the gap: whatever follows without a break and may stand in the hole moves back.
+    for (std::size_t s = next(hole); slots_[s] != kNone; s = next(s)) {
+      const std::size_t wanted = home(ids[slots_[s]]);
+      if (((s - wanted) & mask()) >= ((s - hole) & mask())) {
+        slots_[hole] = slots_[s];
+        hole = s;
+      }
+    }
+    slots_[hole] = kNone;
+    --used_;
+  }
+
+ private:
+  std::size_t mask() const { return slots_.size() - 1; }
+  std::size_t next(std::size_t s) const { return (s + 1) & mask(); }
+
+  // The finaliser of SplitMix64 (Steele et al. 2014): neighbouring ids end far apart.
+  std::size_t home(std::int64_t id) const {
+    auto x = static_cast<std::uint64_t>(id) + 0x9e3779b97f4a7c15u;
+    x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
+    x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
+    return static_cast<std::size_t>(x ^ (x >> 31)) & mask();
+  }
+
+  std::size_t slot_of(const std::vector<std::int64_t>& ids, std::int64_t id) const {
+    std::size_t s = home(id);
+    while (ids[slots_[s]] != id) s = next(s);
+    return s;
+  }
+
+  void place(const std::vector<std::int64_t>& ids, std::uint32_t row) {
+    std::size_t s = home(ids[row]);
+    while (slots_[s] != kNone) s = next(s);
+    slots_[s] = row;
+  }
+
+  void grow(const std::vector<std::int64_t>& ids) {
+    const std::vector<std::uint32_t> old = std::move(slots_);
+    slots_.assign(old.empty() ? 16 : 2 * old.size(), kNone);
+    for (const std::uint32_t row : old) {
+      if (row != kNone) place(ids, row);
+    }
+  }
+
+  std::vector<std::uint32_t> slots_;
+  std::size_t used_ = 0;
+};
+
+}  // namespace protomark

@@ -1,0 +1,102 @@
+// Plain C++, for every machine; the definition that the others must match.
+#include "kernels.h"
+
+namespace protomark::kernels {
+namespace {
+
+void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, std::size_t outputs,
+           std::int32_t* sums) {
+  for (std::size_t i = 0; i < n; ++i) {
+    const std::uint8_t* x = inputs + i * layer.inputs;
+    for (std::size_t group = 0; group < outputs; group += kCodeRows) {
+      std::int32_t acc[kCodeRows];
+      for (std::size_t o = 0; o < kCodeRows; ++o) acc[o] = layer.bias[group + o];
+      const std::int8_t* w = layer.weights + group * layer.inputs;
+      for (std::size_t j = 0; j < layer.inputs; j += 4, w += 4 * kCodeRows) {
+        for (std::size_t o = 0; o < kCodeRows; ++o) {
+          acc[o] += w[4 * o] * x[j] + w[4 * o + 1] * x[j + 1] + w[4 * o + 2] * x[j + 2] +
+                    w[4 * o + 3] * x[j + 3];
+        }
+      }
+      for (std::size_t o = 0; o < kCodeRows; ++o) sums[i * outputs + group + o] = acc[o];
+    }
+  }
+}
+
+void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
+                  std::int32_t* offsets) {
+  for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
+    for (std::size_t r = 0; r < kCodeRows; ++r) {
+      std::int32_t sum = 0;
+      for (std::size_t d = 0; d < dim; d += 4) {
+        for (std::size_t j = 0; j < 4; ++j) {
+          const std::int32_t p = packed[d * kCodeRows + 4 * r + j];
+          sum += p * p + 256 * p;
+        }
+      }
+      offsets[b * kCodeRows + r] = sum;
+    }
+  }
+}
+
+std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
+                      std::size_t dim, const std::int32_t* offsets, std::int32_t limit, Hits hits) {
+  std::size_t found = 0;
+  for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
+    std::int32_t dot[kCodeRows] = {};
+    for (std::size_t d = 0; d < dim; d += 4) {
+      const std::int8_t* p = packed + d * kCodeRows;
+      for (std::size_t r = 0; r < kCodeRows; ++r) {
+        dot[r] += p[4 * r] * query[d] + p[4 * r + 1] * query[d + 1] + p[4 * r + 2] * query[d + 2] +
+                  p[4 * r + 3] * query[d + 3];
+      }
+    }
+    for (std::size_t r = 0; r < kCodeRows; ++r) {
+      const std::size_t row = b * kCodeRows + r;
+      const std::int32_t distance = offsets[row] - 2 * dot[r];
+      if (distance <= limit) {
+        hits.rows[found] = static_cast<std::uint32_t>(row);
+        hits.distances[found++] = distance;
+      }
+    }
+  }
+  return found;
+}
+
+// Compilers turn this form into vector code where std::popcount without -mpopcnt is a library call.
+std::uint64_t popcount(std::uint64_t x) {
+  x -= (x >> 1) & 0x5555555555555555u;
+  x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);
+  x = (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0fu;
+  x += x >> 8;
+  x += x >> 16;
+  x += x >> 32;
+  return x & 0xff;
+}
+
+std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed,
+                         std::size_t blocks, std::size_t words, std::int32_t limit, Hits hits) {
+  std::size_t found = 0;
+  for (std::size_t b = 0; b < blocks; ++b, packed += kWordRows * words) {
+    std::uint64_t count[kWordRows] = {};
+    for (std::size_t w = 0; w < words; ++w) {
+      for (std::size_t r = 0; r < kWordRows; ++r) {
+        count[r] += popcount(query[w] ^ packed[w * kWordRows + r]);
+      }
+    }
+    for (std::size_t r = 0; r < kWordRows; ++r) {
+      const auto distance = static_cast<std::int32_t>(count[r]);
+      if (distance <= limit) {
+        hits.rows[found] = static_cast<std::uint32_t>(b * kWordRows + r);
+        hits.distances[found++] = distance;
+      }
+    }
+  }
+  return found;
+}
+
+}  // namespace
+
+const Kernels portable = {"portable", dense, code_offsets, code_scan, hamming_scan};
+
+}  // namespace protomark::kernels

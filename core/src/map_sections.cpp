@@ -1,0 +1,61 @@
+#include "map_sections.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace protomark {
+
+std::vector<std::byte> write_shape(const MapShape& shape) {
+  SectionWriter out;
+  out.value(static_cast<std::uint64_t>(shape.landmarks));
+  out.value(static_cast<std::uint64_t>(shape.dim));
+  out.values(shape.origin.data(), shape.origin.size());
+  return out.take();
+}
+
+MapShape read_shape(const ContainerReader& file, const Encoder& encoder) {
+  SectionReader in(file, section::kShape);
+  MapShape shape;
+  shape.landmarks = in.value<std::uint64_t>();
+  shape.dim = in.value<std::uint64_t>();
+  in.copy(shape.origin.data(), shape.origin.size());
+  in.finish();
+  if (shape.landmarks > UINT32_MAX) file.fail("it claims more landmarks than a map can hold");
+  const auto& dims = encoder.dims();
+  if (std::find(dims.begin(), dims.end(), shape.dim) == dims.end()) {
+    file.fail("its dimension does not fit its encoder");
+  }
+  if (!std::all_of(shape.origin.begin(), shape.origin.end(),
+                   [](double x) { return std::isfinite(x); })) {
+    file.fail("its origin is not finite");
+  }
+  return shape;
+}
+
+std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {
+  return std::make_shared<const Encoder>(
+      Encoder::parse(file.read(section::kEncoder), file.name() + ": encoder"));
+}
+
+void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {
+  if (!ids.empty() && ids.front() < 0) file.fail("it has a negative landmark id");
+  for (std::size_t i = 1; i < ids.size(); ++i) {
+    if (ids[i] <= ids[i - 1]) file.fail("its landmark ids do not ascend");
+  }
+}
+
+Position middle(std::span<const Position> positions) {
+  Position low{}, high{};
+  bool any = false;
+  for (const Position& p : positions) {
+    if (std::isnan(p[0])) continue;
+    for (std::size_t i = 0; i < 3; ++i) {
+      low[i] = any ? std::min(low[i], p[i]) : p[i];
+      high[i] = any ? std::max(high[i], p[i]) : p[i];
+    }
+    any = true;
+  }
+  return {low[0] / 2 + high[0] / 2, low[1] / 2 + high[1] / 2, low[2] / 2 + high[2] / 2};
+}
+
+}  // namespace protomark

@@ -1,0 +1,47 @@
+// The sections that open and sealed maps share.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <vector>
+
+#include "container.h"
+#include "protomark/prototypes.h"
+
+namespace protomark {
+
+namespace section {
+inline constexpr char kEncoder[] = "encoder";     // a whole model file
+inline constexpr char kShape[] = "shape";         // MapShape
+inline constexpr char kIds[] = "ids";             // int64, ascending; sealed: absent for 0 ... n - 1
+inline constexpr char kCounts[] = "counts";       // uint8
+inline constexpr char kSums[] = "sums";           // open: int16, n x dim
+inline constexpr char kPrototypes[] = "protos";   // sealed: int8, packed (protomark/search.h)
+inline constexpr char kPositions[] = "position";  // open: 3 x float64; sealed: 3 x float32
+}  // namespace section
+
+struct MapShape {
+  std::size_t landmarks = 0;
+  std::size_t dim = 0;
+  Position origin{};  // what a sealed map's positions are relative to
+};
+
+std::vector<std::byte> write_shape(const MapShape& shape);
+MapShape read_shape(const ContainerReader& file, const Encoder& encoder);
+std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
+// Throws FileError unless ids are ascending and not negative.
+void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
+// The middle of the positions that are there.
+Position middle(std::span<const Position> positions);
+
+// A section of exactly n values.
+template <typename T>
+std::vector<T> read_section(const ContainerReader& file, const char* name, std::size_t n) {
+  SectionReader in(file, name);
+  std::vector<T> result = in.values<T>(n);
+  in.finish();
+  return result;
+}
+
+}  // namespace protomark
