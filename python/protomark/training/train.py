@@ -202,7 +202,7 @@ class Trainer:
 
         Raises:
             Interrupted: Ctrl-C was pressed.
-            FloatingPointError: the loss is no longer finite.
+            ValueError: the loss is no longer finite.
         """
         options = self.options
         self.network.train()
@@ -244,7 +244,7 @@ class Trainer:
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), options.clip)
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise FloatingPointError(
+            raise ValueError(
                 f"the loss is {value} at step {self.step}; train with a smaller learning rate"
             )
         self.optimizer.step()

@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import protomark as pm
+import pytest
+from protomark.cli import app
+from protomark.tracks.file import Tracks
+from protomark.training.data import load_training
+from training_scene import scene
+from typer.testing import CliRunner
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tracks")
+    made = {
+        "a": scene(seed=1),
+        "b": scene(seed=2),
+        "unseen": scene(seed=3),
+        "other": scene(seed=4, descriptor="else"),
+        "longer": scene(seed=4, bits=256),
+        "tiny": scene(landmarks=40, seed=5),
+        "short": scene(landmarks=600, keyframes=2, seed=6),
+        "narrow": scene(bits=32, seed=7),
+    }
+    paths = {}
+    for name, tracks in made.items():
+        paths[name] = folder / f"{name}.synthetic.safetensors"
+        tracks.save(paths[name])
+    return paths
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["train", *map(str, words)])
+
+
+def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
+    out = tmp_path / "mine.pme"
+    result = run(
+        files["a"], files["b"], "--validation", files["unseen"], "-o", out, "--dims", "4,8",
+        "--steps", 60, "--batch", 200, "--threads", 1, "--licence", "Apache-2.0",
+        "--json", tmp_path / "mine.json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.json", "mine.md", "mine.pme"]
+
+    encoder = pm.Encoder.load(out)
+    assert (encoder.name, encoder.descriptor, encoder.bits) == ("mine", "synthetic", 128)
+    assert list(encoder.dims) == [4, 8]
+    assert encoder.licence == "Apache-2.0"
+    assert encoder.data == "a (CC0-1.0); b (CC0-1.0)"
+    codes = encoder.encode(Tracks.load(files["unseen"]).descriptors)
+    # Clamping is rare, and the codes use what 8 bits offer.
+    assert (np.abs(codes.astype(int)) == 127).mean() < 0.01
+    assert codes.std() > 15
+
+    figures = json.loads((tmp_path / "mine.json").read_text())
+    (validation,) = figures["figures"]
+    assert validation["sequence"] == "unseen"
+    assert validation["integer_precision"]["8"] > 0.3
+    assert validation["integer_precision"]["8"] == pytest.approx(
+        validation["float_precision"]["8"], abs=0.03
+    )
+    assert figures["bytes"] == out.stat().st_size
+    card = (tmp_path / "mine.md").read_text()
+    assert (
+        "protomark train a.synthetic.safetensors b.synthetic.safetensors --validation "
+        "unseen.synthetic.safetensors -o mine.pme --dims 4,8 --steps 60 --batch 200 "
+        "--licence Apache-2.0"
+    ) in card
+    assert f"{validation['integer_precision']['8']:.4f}" in card
+    assert str(tmp_path) not in card
+
+
+@pytest.mark.parametrize(
+    ("training", "validation", "message"),
+    [
+        (["a", "other"], ["unseen"], "one descriptor at a time"),
+        (["a", "longer"], ["unseen"], "one descriptor at a time"),
+        (["a"], ["other"], "one descriptor at a time"),
+        (["a", "b"], ["b"], "not trained on"),
+        (["tiny"], ["unseen"], "give more or longer tracks"),
+        (["a", "short"], ["unseen"], "short.*3 or more views"),
+        (["a"], ["short"], "short.*support observations|short.*evaluated"),
+        (["narrow"], ["unseen"], "64 to 1024 bits"),
+        ([], ["unseen"], "no training tracks"),
+        (["a"], [], "--validation"),
+    ],
+)
+def test_data_that_cannot_be_trained_on(files, training, validation, message):
+    with pytest.raises(ValueError, match=message):
+        load_training([files[n] for n in training], [files[n] for n in validation])
+
+
+def test_a_missing_file_is_named(files, tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_training([files["a"], tmp_path / "nowhere"], [files["unseen"]])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--dims", "8;16"], "list of numbers"),
+        (["--dims", "16,8"], "ascending"),
+        (["--steps", "0"], "steps"),
+        (["--device", "abacus"], "cpu or cuda"),
+        (["--resume"], "without --resume"),
+        (["-o", "no/such/folder/x.pme"], "does not exist"),
+        (["--report", "nowhere.safetensors"], "nowhere"),
+    ],
+)
+def test_bad_options_stop_before_the_first_step(files, tmp_path, words, message):
+    out = tmp_path / "x.pme"
+    result = run(files["a"], "--validation", files["unseen"], "-o", out, *words)
+    assert result.exit_code != 0
+    assert message in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_torch_it_says_what_to_install(files, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    result = run(files["a"], "--validation", files["unseen"], "-o", tmp_path / "x.pme")
+    assert "pip install protomark[train]" in str(result.exception)
