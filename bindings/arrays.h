@@ -25,8 +25,10 @@ using Vector = nb::ndarray<const T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // "float64 (3, 2)", for error messages.
 inline std::string describe(nb::handle array) {
-  return nb::cast<std::string>(nb::str(array.attr("dtype"))) + " " +
-         nb::cast<std::string>(nb::str(array.attr("shape")));
+  const nb::object dtype = array.attr("dtype");
+  const nb::object shape = array.attr("shape");
+  return std::string(nb::str(nb::handle(dtype)).c_str()) + " " +
+         nb::str(nb::handle(shape)).c_str();
 }
 
 inline nb::object numpy(const char* name) { return nb::module_::import_("numpy").attr(name); }
@@ -37,7 +39,7 @@ template <typename T>
 Matrix<T> matrix(nb::handle object, const char* type, const char* what) {
   nb::object array = numpy("asarray")(object);
   if (nb::cast<int>(array.attr("ndim")) != 2 ||
-      !nb::cast<bool>(array.attr("dtype").attr("__eq__")(numpy(type)))) {
+      !array.attr("dtype").equal(numpy("dtype")(type))) {
     throw nb::type_error(
         (std::string(what) + " array is needed, not " + describe(array)).c_str());
   }

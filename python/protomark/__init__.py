@@ -15,8 +15,10 @@ from protomark._core import (
     FileError,
     PrototypeMap,
     SealedMap,
+    file_sections,
     hamming_search,
     open,
+    verify_file,
 )
 
 __version__ = _version("protomark")
@@ -27,6 +29,8 @@ __all__ = [
     "PrototypeMap",
     "SealedMap",
     "__version__",
+    "file_sections",
     "hamming_search",
     "open",
+    "verify_file",
 ]

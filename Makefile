@@ -1,0 +1,65 @@
+# The two commands for a fresh machine are `make demo` and `make test`. All of them make their own
+# virtual environments; PYTHON chooses the interpreter (3.10 or newer).
+PYTHON ?= python3
+SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*') \
+           CMakeLists.txt pyproject.toml constraints.txt
+CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h')
+JOBS := $(shell nproc 2>/dev/null || echo 2)
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: help demo test test-python test-cpp check format clean
+help:
+	@echo "make demo    run the main job on the sample that ships"
+	@echo "make test    run the tests (C++ and Python)"
+	@echo "make check   formatting, lint and types of both languages"
+	@echo "make format  rewrite sources in the project's format"
+
+demo: .venv/installed
+	.venv/bin/protomark demo
+
+test: test-cpp test-python
+
+test-python: .venv-test/installed
+	.venv-test/bin/python -m pytest
+
+test-cpp: .venv-test/installed
+	.venv-test/bin/cmake -S core -B build/core -G Ninja \
+	  -DCMAKE_MAKE_PROGRAM=$(abspath .venv-test/bin/ninja) -DPROTOMARK_BUILD_TESTS=ON \
+	  -DCMAKE_BUILD_TYPE=Release -DCMAKE_EXPORT_COMPILE_COMMANDS=ON > /dev/null
+	.venv-test/bin/cmake --build build/core -j$(JOBS)
+	.venv-test/bin/ctest --test-dir build/core --output-on-failure
+
+check: .venv-check/installed
+	.venv-check/bin/ruff format --check python tests benchmarks examples
+	.venv-check/bin/ruff check python tests benchmarks examples
+	.venv-check/bin/mypy python tests
+	.venv-check/bin/clang-format --dry-run -Werror $(CPP)
+	.venv-check/bin/cmake -S core -B build/tidy -G Ninja \
+	  -DCMAKE_MAKE_PROGRAM=$(abspath .venv-check/bin/ninja) -DPROTOMARK_BUILD_TESTS=OFF \
+	  -DCMAKE_EXPORT_COMPILE_COMMANDS=ON > /dev/null
+	.venv-check/bin/clang-tidy --quiet -p build/tidy $(wildcard core/src/*.cpp)
+
+format: .venv-check/installed
+	.venv-check/bin/ruff format python tests benchmarks examples
+	.venv-check/bin/ruff check --fix python tests benchmarks examples
+	.venv-check/bin/clang-format -i $(CPP)
+
+clean:
+	rm -rf build .venv .venv-test .venv-check
+
+.venv/installed: $(SOURCES)
+	test -x .venv/bin/python || $(PYTHON) -m venv .venv
+	.venv/bin/pip install --quiet .
+	touch $@
+
+.venv-test/installed: $(SOURCES)
+	test -x .venv-test/bin/python || $(PYTHON) -m venv .venv-test
+	.venv-test/bin/pip install --quiet -c constraints.txt cmake ninja
+	.venv-test/bin/pip install --quiet -c constraints.txt '.[test,train]'
+	touch $@
+
+.venv-check/installed: $(SOURCES)
+	test -x .venv-check/bin/python || $(PYTHON) -m venv .venv-check
+	.venv-check/bin/pip install --quiet -c constraints.txt cmake ninja ruff mypy clang-format clang-tidy
+	.venv-check/bin/pip install --quiet -c constraints.txt '.[test,train]'
+	touch $@

@@ -1,0 +1,66 @@
+"""What many tests share: a small encoder with random weights, and how its codes are defined."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import protomark as pm
+
+
+def random_layers(
+    widths: list[int], seed: int = 0, weight_limit: int = 127
+) -> list[dict[str, Any]]:
+    """Integer layers whose sums spread over the whole range of the activation table."""
+    rng = np.random.default_rng(seed)
+    layers = []
+    for i, (inputs, outputs) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+        last = i == len(widths) - 2
+        spread = (0.5 if i == 0 else 128) * weight_limit * inputs**0.5
+        layers.append(
+            {
+                "weights": rng.integers(-weight_limit, weight_limit + 1, (outputs, inputs)).astype(
+                    np.int8
+                ),
+                "bias": rng.integers(-1000, 1000, outputs).astype(np.int32),
+                "mult": (rng.uniform(40, 120, outputs) / spread * 2**30).astype(np.int32) + 1,
+                "shift": 30,
+                "table": None if last else np.sort(rng.integers(0, 256, 256)).astype(np.uint8),
+            }
+        )
+    return layers
+
+
+def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8]) -> Any:
+    """The definition in core/include/protomark/encoder.h, in NumPy."""
+    x = np.unpackbits(descriptors, axis=1, bitorder="little").astype(np.int64)
+    for layer in layers:
+        sums = x @ layer["weights"].T.astype(np.int64) + layer["bias"]
+        t = (sums * layer["mult"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
+        if layer["table"] is None:
+            return np.clip(t, -127, 127).astype(np.int8)
+        x = layer["table"][np.clip(t, -128, 127) + 128].astype(np.int64)
+    raise AssertionError("the last layer has a table")
+
+
+def random_descriptors(n: int, bits: int = 64, seed: int = 0) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (n, bits // 8), dtype=np.uint8)
+
+
+def rounded(means: Any) -> Any:
+    """To integers, halves away from zero."""
+    return (np.sign(means) * np.floor(np.abs(means) + 0.5)).astype(np.int64)
+
+
+@pytest.fixture(scope="session")
+def layers() -> list[dict[str, Any]]:
+    return random_layers([64, 40, 24, 12])
+
+
+@pytest.fixture(scope="session")
+def encoder(layers: list[dict[str, Any]]) -> pm.Encoder:
+    """64 bits to 12 dimensions, prefix of 5: no length is a multiple of a vector's."""
+    return pm.Encoder(layers, [5, 12], name="tiny", descriptor="test", scale=0.02)

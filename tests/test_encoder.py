@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import random_descriptors, random_layers, reference_encode
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import protomark as pm
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    bits=st.sampled_from([64, 72, 256, 488, 512, 1024]),
+    hidden=st.lists(st.integers(1, 70), max_size=3),
+    dim=st.integers(1, 70),
+    n=st.integers(0, 140),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_codes_follow_their_definition(
+    bits: int, hidden: list[int], dim: int, n: int, seed: int
+) -> None:
+    layers = random_layers([bits, *hidden, dim], seed)
+    encoder = pm.Encoder(layers, [dim], name="x", descriptor="x", scale=1.0)
+    descriptors = random_descriptors(n, bits, seed)
+    expected = reference_encode(layers, descriptors)
+    np.testing.assert_array_equal(encoder.encode(descriptors), expected)
+    np.testing.assert_array_equal(encoder.encode(descriptors, threads=3), expected)
+
+
+@pytest.mark.parametrize("extreme", ["all ones", "all zeros", "largest weights", "smallest weights"])
+def test_codes_at_the_extremes(extreme: str) -> None:
+    layers = random_layers([1024, 64, 64, 16])
+    if "weights" in extreme:
+        for layer in layers:
+            layer["weights"][:] = 127 if extreme.startswith("largest") else -128
+            if layer["table"] is not None:
+                layer["table"][:] = 255
+    encoder = pm.Encoder(layers, [16], name="x", descriptor="x", scale=1.0)
+    descriptors = np.full((9, 128), 0 if extreme == "all zeros" else 255, np.uint8)
+    np.testing.assert_array_equal(
+        encoder.encode(descriptors), reference_encode(layers, descriptors)
+    )
+
+
+def test_every_instruction_set_gives_the_same_bytes(tmp_path: Path) -> None:
+    """PROTOMARK_ISA is read once a process, so each set gets a process of its own."""
+    encoder = pm.Encoder(
+        random_layers([512, 96, 48]), [16, 48], name="x", descriptor="x", scale=1.0
+    )
+    encoder.save(tmp_path / "x.pme")
+    descriptors = random_descriptors(333, 512)
+    descriptors[0], descriptors[1] = 0, 255
+    np.save(tmp_path / "in.npy", descriptors)
+    script = (
+        "import sys, numpy as np, protomark as pm\n"
+        "folder, isa = sys.argv[1:]\n"
+        "e = pm.Encoder.load(folder + '/x.pme'); d = np.load(folder + '/in.npy')\n"
+        "m = pm.PrototypeMap(e); m.add(np.arange(len(d)) // 2, d)\n"
+        "h = pm.hamming_search(d, d[::-1], k=3)\n"
+        "np.savez(folder + '/' + isa, e.encode(d), *m.search(d, k=3), *h)\n"
+    )
+    results = {}
+    for isa in ("portable", ""):
+        environment = {**os.environ, "PROTOMARK_ISA": isa}
+        subprocess.run(
+            [sys.executable, "-c", script, str(tmp_path), isa or "best"], env=environment, check=True
+        )
+        results[isa] = dict(np.load(tmp_path / f"{isa or 'best'}.npz"))
+    for name, expected in results["portable"].items():
+        np.testing.assert_array_equal(results[""][name], expected)
+
+
+def test_unknown_instruction_set_is_named() -> None:
+    script = (
+        "import numpy as np, protomark as pm\n"
+        "pm.hamming_search(np.zeros((1, 8), np.uint8), np.zeros((1, 8), np.uint8))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PROTOMARK_ISA": "vax"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode != 0
+    assert "PROTOMARK_ISA=vax" in done.stderr
+
+
+def test_prefix_of_a_code(encoder: pm.Encoder) -> None:
+    descriptors = random_descriptors(100)
+    np.testing.assert_array_equal(
+        encoder.encode(descriptors, dim=5), encoder.encode(descriptors)[:, :5]
+    )
+    assert encoder.dims == [5, 12]
+    with pytest.raises(ValueError, match="gives 5, 12 dimensions, not 7"):
+        encoder.encode(descriptors, dim=7)
+
+
+def test_strided_input_is_taken(encoder: pm.Encoder) -> None:
+    wide = random_descriptors(50, 128)
+    np.testing.assert_array_equal(
+        encoder.encode(wide[:, ::2]), encoder.encode(np.ascontiguousarray(wide[:, ::2]))
+    )
+
+
+def test_wrong_input_is_named(encoder: pm.Encoder) -> None:
+    with pytest.raises(ValueError, match="descriptors have 7 bytes, encoder 'tiny' takes 8"):
+        encoder.encode(np.zeros((3, 7), np.uint8))
+    with pytest.raises(TypeError, match=r"uint8 array is needed, not float32 \(3, 8\)"):
+        encoder.encode(np.zeros((3, 8), np.float32))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"uint8 array is needed, not uint8 \(8,\)"):
+        encoder.encode(np.zeros(8, np.uint8))
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        encoder.encode(np.zeros((3, 8), np.uint8), threads=0)
+
+
+def test_model_file_round_trip(
+    encoder: pm.Encoder, layers: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    made = pm.Encoder(
+        layers,
+        [5, 12],
+        name="tiny",
+        descriptor="test",
+        scale=0.02,
+        data="nothing",
+        licence="CC0-1.0",
+        notes={"time": "1 s", "ümlaut": "a\nb: c"},
+    )
+    made.save(tmp_path / "tiny.pme")
+    read = pm.Encoder.load(tmp_path / "tiny.pme")
+    assert (read.name, read.descriptor, read.data, read.licence) == (
+        "tiny",
+        "test",
+        "nothing",
+        "CC0-1.0",
+    )
+    assert read.notes == {"time": "1 s", "ümlaut": "a\nb: c"}
+    assert read.scale == np.float32(0.02)
+    assert read.bits == 64
+    assert read.dims == [5, 12]
+    # What a model says of itself does not change which codes it gives.
+    assert read.identity == made.identity == encoder.identity
+    descriptors = random_descriptors(20)
+    np.testing.assert_array_equal(read.encode(descriptors), encoder.encode(descriptors))
+    for a, b in zip(read.layers, layers, strict=True):
+        assert a["shift"] == b["shift"]
+        for name in ("weights", "bias", "mult", "table"):
+            np.testing.assert_array_equal(a[name], b[name])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda ls: ls[1].update(shift=0), "layer 1: shift must be 1 to 62"),
+        (lambda ls: ls[0]["mult"].__setitem__(3, 0), "layer 0: multipliers must be positive"),
+        (lambda ls: ls.pop(1), "layer 1 has 24 inputs, 40 are needed"),
+        (lambda ls: ls[0]["bias"].__setitem__(0, 2**31 - 1), "could leave 32 bits"),
+        (lambda ls: ls[2].update(bias=ls[2]["bias"][:3]), "do not match its size"),
+        (lambda ls: ls.clear(), "0 layers"),
+    ],
+)
+def test_layers_that_do_not_fit(change: Any, message: str) -> None:
+    layers = random_layers([64, 40, 24, 12])
+    layers[0]["weights"][0, 0] = 1
+    change(layers)
+    with pytest.raises(ValueError, match=message):
+        pm.Encoder(layers, [12], name="x", descriptor="x", scale=1.0)
+
+
+@pytest.mark.parametrize("dims", [[], [0, 12], [12, 5], [5, 5, 12], [5]])
+def test_dims_that_do_not_fit(layers: list[dict[str, Any]], dims: list[int]) -> None:
+    with pytest.raises(ValueError, match="dims must ascend"):
+        pm.Encoder(layers, dims, name="x", descriptor="x", scale=1.0)
+
+
+def test_unknown_encoder_is_named() -> None:
+    with pytest.raises(FileNotFoundError, match="sift: neither a model file nor a bundled"):
+        pm.Encoder.load("sift")
