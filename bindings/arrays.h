@@ -27,8 +27,7 @@ using Vector = nb::ndarray<const T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 inline std::string describe(nb::handle array) {
   const nb::object dtype = array.attr("dtype");
   const nb::object shape = array.attr("shape");
-  return std::string(nb::str(nb::handle(dtype)).c_str()) + " " +
-         nb::str(nb::handle(shape)).c_str();
+  return std::string(nb::str(nb::handle(dtype)).c_str()) + " " + nb::str(nb::handle(shape)).c_str();
 }
 
 inline nb::object numpy(const char* name) { return nb::module_::import_("numpy").attr(name); }
@@ -38,10 +37,8 @@ inline nb::object numpy(const char* name) { return nb::module_::import_("numpy")
 template <typename T>
 Matrix<T> matrix(nb::handle object, const char* type, const char* what) {
   nb::object array = numpy("asarray")(object);
-  if (nb::cast<int>(array.attr("ndim")) != 2 ||
-      !array.attr("dtype").equal(numpy("dtype")(type))) {
-    throw nb::type_error(
-        (std::string(what) + " array is needed, not " + describe(array)).c_str());
+  if (nb::cast<int>(array.attr("ndim")) != 2 || !array.attr("dtype").equal(numpy("dtype")(type))) {
+    throw nb::type_error((std::string(what) + " array is needed, not " + describe(array)).c_str());
   }
   return nb::cast<Matrix<T>>(numpy("ascontiguousarray")(array));
 }
@@ -105,8 +102,7 @@ nb::object new_vector(std::vector<T> values) {
 }
 
 inline std::vector<Position> to_positions(nb::handle object) {
-  nb::object array =
-      numpy("ascontiguousarray")(object, nb::arg("dtype") = numpy("float64"));
+  nb::object array = numpy("ascontiguousarray")(object, nb::arg("dtype") = numpy("float64"));
   const auto m = nb::cast<nb::ndarray<const double, nb::c_contig, nb::device::cpu>>(array);
   if (m.ndim() != 2 || m.shape(1) != 3) {
     throw nb::type_error(

@@ -65,16 +65,14 @@ nb::tuple search(const Map& map, nb::object queries, std::size_t k,
   NewMatrix<float> distances(q.shape(0), k);
   {
     const nb::gil_scoped_release release;
-    map.search(view(q), search_options(max_distance, ratio, threads), ids.view(),
-               distances.view());
+    map.search(view(q), search_options(max_distance, ratio, threads), ids.view(), distances.view());
   }
   return nb::make_tuple(ids.release(), distances.release());
 }
 
 template <typename Map>
 nb::tuple search_codes(const Map& map, nb::object queries, std::size_t k,
-                       std::optional<float> max_distance, std::optional<float> ratio,
-                       int threads) {
+                       std::optional<float> max_distance, std::optional<float> ratio, int threads) {
   const auto q = codes(queries);
   NewMatrix<std::int64_t> ids(q.shape(0), k);
   NewMatrix<float> distances(q.shape(0), k);
@@ -102,7 +100,8 @@ void bind_reading(nb::class_<Map>& map) {
       .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
       .def_prop_ro(
           "ids", [](const Map& m) { return new_vector(m.ids()); },
-          nb::sig("def ids(self) -> NDArray[numpy.int64]"), "All landmark ids, ascending, (n,) int64.")
+          nb::sig("def ids(self) -> NDArray[numpy.int64]"),
+          "All landmark ids, ascending, (n,) int64.")
       .def(
           "counts",
           [](const Map& m, nb::object ids) { return new_vector(m.counts(view(landmarks(ids)))); },
@@ -200,15 +199,19 @@ void bind_encoder(nb::module_& m) {
              std::map<std::string, std::string> notes) {
             std::vector<Layer> built;
             for (nb::handle layer : layers) built.push_back(to_layer(nb::cast<nb::dict>(layer)));
-            EncoderInfo info{std::move(name), std::move(descriptor), std::move(data),
-                             std::move(licence), {notes.begin(), notes.end()}};
+            EncoderInfo info{std::move(name),
+                             std::move(descriptor),
+                             std::move(data),
+                             std::move(licence),
+                             {notes.begin(), notes.end()}};
             new (self) Encoder(std::move(info), std::move(built), std::move(dims), scale);
           },
           "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
           "licence"_a = "", "notes"_a = nb::dict(),
-          nb::sig("def __init__(self, layers: list[dict[str, Any]], dims: Sequence[int], name: str, "
-                  "descriptor: str, scale: float, data: str = '', licence: str = '', "
-                  "notes: dict[str, str] = {}) -> None"),
+          nb::sig(
+              "def __init__(self, layers: list[dict[str, Any]], dims: Sequence[int], name: str, "
+              "descriptor: str, scale: float, data: str = '', licence: str = '', "
+              "notes: dict[str, str] = {}) -> None"),
           R"(An encoder from integer layers.
 
 Args:
@@ -232,7 +235,8 @@ Raises:
 
 Raises:
     FileError: there is no such model, or the file is not one.)")
-      .def("save", &Encoder::save, "path"_a, nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
+      .def("save", &Encoder::save, "path"_a,
+           nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the model file, whole or not at all. Raises FileError.")
       .def(
           "encode",
@@ -349,10 +353,12 @@ Raises:
     KeyError: a landmark is not in the map.
     ValueError: these observations cannot have been added. Nothing is changed then.)")
       .def("add_codes", change_codes(&PrototypeMap::add_codes), "landmark_ids"_a, "codes"_a,
-           nb::sig("def add_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> None"),
+           nb::sig(
+               "def add_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> None"),
            "Like add, for descriptors that are encoded already: (n, dim) int8.")
       .def("remove_codes", change_codes(&PrototypeMap::remove_codes), "landmark_ids"_a, "codes"_a,
-           nb::sig("def remove_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> None"),
+           nb::sig("def remove_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> "
+                   "None"),
            "Like remove, for descriptors that are encoded already: (n, dim) int8.")
       .def(
           "merge",
@@ -388,7 +394,8 @@ Raises:
           },
           "landmark_ids"_a, "positions"_a,
           nb::sig("def set_positions(self, landmark_ids: ArrayLike, positions: ArrayLike) -> None"),
-          "Set world coordinates, (n, 3) float64; NaN takes a position away. Raises KeyError for an "
+          "Set world coordinates, (n, 3) float64; NaN takes a position away. Raises KeyError for "
+          "an "
           "unknown id.")
       .def("save", &PrototypeMap::save, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
@@ -473,8 +480,7 @@ Returns:
         if (map_kind(path) == MapKind::open) return nb::cast(PrototypeMap::load(path));
         return nb::cast(SealedMap(path));
       },
-      "path"_a,
-      nb::sig("def open(path: str | os.PathLike[str]) -> PrototypeMap | SealedMap"),
+      "path"_a, nb::sig("def open(path: str | os.PathLike[str]) -> PrototypeMap | SealedMap"),
       "Open a map file: an open map is read, a sealed one mapped. Raises FileError.");
   m.def("file_sections", &file_sections, "path"_a,
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");

@@ -50,7 +50,9 @@ Bytes as_bytes(const T& v) {
   return std::as_bytes(std::span(&v, 1));
 }
 
-constexpr std::uint64_t align(std::uint64_t n) { return (n + kAlignment - 1) / kAlignment * kAlignment; }
+constexpr std::uint64_t align(std::uint64_t n) {
+  return (n + kAlignment - 1) / kAlignment * kAlignment;
+}
 
 std::string system_error() { return std::strerror(errno); }
 

@@ -26,7 +26,9 @@ constexpr std::size_t kBatch = 64;
 
 constexpr std::size_t round_up(std::size_t n, std::size_t to) { return (n + to - 1) / to * to; }
 
-[[noreturn]] void invalid(const std::string& what) { throw std::invalid_argument("encoder: " + what); }
+[[noreturn]] void invalid(const std::string& what) {
+  throw std::invalid_argument("encoder: " + what);
+}
 
 // A sum must stay within 32 bits whatever the input is.
 void check_sums(const Layer& layer, bool first, const std::string& where) {
@@ -182,8 +184,8 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
             const std::int64_t t =
                 requantise(sums[i * outputs + o], layer.multipliers[o], layer.shift);
             if (hidden) {
-              x[i * packed.outputs + o] =
-                  layer.table[static_cast<std::size_t>(std::clamp<std::int64_t>(t, -128, 127) + 128)];
+              x[i * packed.outputs + o] = layer.table[static_cast<std::size_t>(
+                  std::clamp<std::int64_t>(t, -128, 127) + 128)];
             } else {
               codes.row(begin + i)[o] =
                   static_cast<std::int8_t>(std::clamp<std::int64_t>(t, -127, 127));

@@ -105,8 +105,7 @@ std::vector<std::uint8_t> SealedMap::counts(std::span<const std::int64_t> landma
   return result;
 }
 
-void SealedMap::prototypes(std::span<const std::int64_t> landmarks,
-                           MatrixView<float> means) const {
+void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const {
   if (means.rows != landmarks.size() || means.columns != dim()) {
     throw std::invalid_argument("means must be landmarks x dim");
   }

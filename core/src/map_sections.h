@@ -12,12 +12,12 @@
 namespace protomark {
 
 namespace section {
-inline constexpr char kEncoder[] = "encoder";     // a whole model file
-inline constexpr char kShape[] = "shape";         // MapShape
-inline constexpr char kIds[] = "ids";             // int64, ascending; sealed: absent for 0 ... n - 1
-inline constexpr char kCounts[] = "counts";       // uint8
-inline constexpr char kSums[] = "sums";           // open: int16, n x dim
-inline constexpr char kPrototypes[] = "protos";   // sealed: int8, packed (protomark/search.h)
+inline constexpr char kEncoder[] = "encoder";    // a whole model file
+inline constexpr char kShape[] = "shape";        // MapShape
+inline constexpr char kIds[] = "ids";            // int64, ascending; sealed: absent for 0 ... n - 1
+inline constexpr char kCounts[] = "counts";      // uint8
+inline constexpr char kSums[] = "sums";          // open: int16, n x dim
+inline constexpr char kPrototypes[] = "protos";  // sealed: int8, packed (protomark/search.h)
 inline constexpr char kPositions[] = "position";  // open: 3 x float64; sealed: 3 x float32
 }  // namespace section
 

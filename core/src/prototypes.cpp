@@ -68,8 +68,8 @@ struct PrototypeMap::Store {
   std::vector<std::int64_t> ids;
   std::vector<std::int16_t> sums;  // rows x dim
   std::vector<std::uint8_t> counts;
-  std::vector<std::int8_t> packed;   // rounded means, see PackedPrototypes
-  std::vector<Position> positions;   // empty while no landmark has one
+  std::vector<std::int8_t> packed;  // rounded means, see PackedPrototypes
+  std::vector<Position> positions;  // empty while no landmark has one
   IdIndex index;
   mutable std::shared_mutex mutex;
 
@@ -280,8 +280,7 @@ void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes c
   }
 }
 
-void PrototypeMap::merge(std::span<const std::int64_t> into,
-                         std::span<const std::int64_t> source) {
+void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source) {
   check_pairs(into.size(), source.size(), "sources");
   const std::unique_lock lock(store_->mutex);
   std::unordered_map<std::int64_t, bool> gone;
@@ -320,10 +319,10 @@ void PrototypeMap::discard(std::span<const std::int64_t> landmarks) {
 void PrototypeMap::update(const PrototypeMap& other) {
   if (&other == this) throw std::invalid_argument("a map cannot be joined to itself");
   if (other.encoder_->identity() != encoder_->identity() || other.dim_ != dim_) {
-    throw std::invalid_argument(
-        "maps of different encoders or dimensions cannot be joined: '" + encoder_->info().name +
-        "' with " + std::to_string(dim_) + ", '" + other.encoder_->info().name + "' with " +
-        std::to_string(other.dim_));
+    throw std::invalid_argument("maps of different encoders or dimensions cannot be joined: '" +
+                                encoder_->info().name + "' with " + std::to_string(dim_) + ", '" +
+                                other.encoder_->info().name + "' with " +
+                                std::to_string(other.dim_));
   }
   const std::scoped_lock lock(store_->mutex, other.store_->mutex);
   const Store& from = *other.store_;
@@ -444,13 +443,13 @@ PrototypeMap PrototypeMap::load(const std::filesystem::path& path) {
   for (std::uint32_t row = 0; row < n; ++row) {
     const int count = store.counts[row];
     const std::int16_t* sum = store.sum(row);
-    if (count == 0 || std::any_of(sum, sum + shape.dim,
-                                  [&](int s) { return std::abs(s) > 127 * count; })) {
+    if (count == 0 ||
+        std::any_of(sum, sum + shape.dim, [&](int s) { return std::abs(s) > 127 * count; })) {
       file.fail("landmark " + std::to_string(store.ids[row]) + " has an impossible prototype");
     }
     const Position position = store.position(row);
-    if (!is_nowhere(position) && !(std::isfinite(position[0]) && std::isfinite(position[1]) &&
-                                   std::isfinite(position[2]))) {
+    if (!is_nowhere(position) &&
+        !(std::isfinite(position[0]) && std::isfinite(position[1]) && std::isfinite(position[2]))) {
       file.fail("landmark " + std::to_string(store.ids[row]) + " has no finite position");
     }
     store.refresh(row);

@@ -28,9 +28,9 @@ std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesy
 // Checks every checksum of a model or map file. Throws FileError.
 void verify_file(const std::filesystem::path& path);
 
-// A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, landmarks to one
-// of 16), 8 more where ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads are
-// safe from any thread.
+// A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, landmarks to
+// one of 16), 8 more where ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads
+// are safe from any thread.
 class SealedMap {
  public:
   // Throws FileError. The large sections are not read; verify_file checks them.

@@ -38,8 +38,7 @@ void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, 
   for (; i + kBatch <= n; i += kBatch) {
     dense_batch<kBatch>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
   }
-  for (; i < n; ++i)
-    dense_batch<1>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
+  for (; i < n; ++i) dense_batch<1>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
 }
 
 void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
@@ -54,16 +53,14 @@ void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim
       norm = _mm512_dpbusd_epi32(norm, magnitude, magnitude);
       sum = _mm512_dpbusd_epi32(sum, ones, p);
     }
-    _mm512_storeu_si512(offsets + b * kCodeRows,
-                        _mm512_add_epi32(norm, _mm512_slli_epi32(sum, 8)));
+    _mm512_storeu_si512(offsets + b * kCodeRows, _mm512_add_epi32(norm, _mm512_slli_epi32(sum, 8)));
   }
 }
 
 std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
                       std::size_t dim, const std::int32_t* offsets, std::int32_t limit, Hits hits) {
   const __m512i limits = _mm512_set1_epi32(limit);
-  const __m512i lanes =
-      _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+  const __m512i lanes = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
   std::size_t found = 0;
   for (std::size_t b = 0; b < blocks; ++b) {
     __m512i dot = _mm512_setzero_si512();
@@ -71,8 +68,8 @@ std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std:
       const __m512i q = _mm512_set1_epi32(load4(query + d));
       dot = _mm512_dpbusd_epi32(dot, q, _mm512_loadu_si512(packed));
     }
-    const __m512i distance = _mm512_sub_epi32(_mm512_loadu_si512(offsets + b * kCodeRows),
-                                              _mm512_slli_epi32(dot, 1));
+    const __m512i distance =
+        _mm512_sub_epi32(_mm512_loadu_si512(offsets + b * kCodeRows), _mm512_slli_epi32(dot, 1));
     const __mmask16 hit = _mm512_cmple_epi32_mask(distance, limits);
     if (hit) {
       const __m512i rows =

@@ -1,0 +1,70 @@
+#include "protomark/prototypes.h"
+
+#include <cmath>
+#include <thread>
+
+#include "check.h"
+#include "protomark/error.h"
+#include "random.h"
+
+using namespace protomark;
+
+int main() {
+  const auto encoder = test::random_encoder();
+  const std::size_t n = 2000, dim = 12;
+  test::Random random(4);
+  const auto ids = random.integers<std::int64_t>(n, 0, 99);
+  const auto codes = random.integers<std::int8_t>(n * dim, -127, 127);
+  const Codes all{codes.data(), n, dim};
+
+  PrototypeMap map(encoder);
+  map.add_codes(ids, all);
+  CHECK(map.size() == 100);
+
+  // Eq. 1, one landmark at a time.
+  for (const std::int64_t id : map.ids()) {
+    std::vector<int> sum(dim, 0);
+    int count = 0;
+    for (std::size_t i = 0; i < n; ++i) {
+      if (ids[i] != id) continue;
+      ++count;
+      for (std::size_t d = 0; d < dim; ++d) sum[d] += all.row(i)[d];
+    }
+    std::vector<float> mean(dim);
+    map.prototypes(std::span(&id, 1), {mean.data(), 1, dim});
+    CHECK(map.counts(std::span(&id, 1))[0] == count);
+    for (std::size_t d = 0; d < dim; ++d) {
+      CHECK(mean[d] == static_cast<float>(sum[d]) / static_cast<float>(count));
+    }
+  }
+
+  // Changes and searches from several threads; sums do not depend on who came first.
+  PrototypeMap shared(encoder);
+  {
+    std::vector<std::jthread> threads;
+    for (std::size_t t = 0; t < 4; ++t) {
+      threads.emplace_back([&, t] {
+        for (std::size_t i = t; i < n; i += 4) {
+          shared.add_codes(std::span(&ids[i], 1), {all.row(i), 1, dim});
+          if (i % 100 == 0) {
+            std::int64_t found;
+            float distance;
+            shared.search_codes({all.row(i), 1, dim}, {}, {&found, 1, 1}, {&distance, 1, 1});
+            CHECK(found >= 0);
+          }
+        }
+      });
+    }
+  }
+  const auto known = map.ids();
+  std::vector<float> a(known.size() * dim), b(a.size());
+  map.prototypes(known, {a.data(), known.size(), dim});
+  shared.prototypes(known, {b.data(), known.size(), dim});
+  CHECK(a == b);
+
+  map.remove_codes(ids, all);
+  CHECK(map.size() == 0);
+  const std::int64_t unknown = 5;
+  CHECK(check::throws<UnknownLandmark>([&] { map.discard(std::span(&unknown, 1)); }, "landmark 5"));
+  return check::result();
+}
