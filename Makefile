@@ -1,7 +1,7 @@
 # The two commands for a fresh machine are `make demo` and `make test`. All of them make their own
 # virtual environments; PYTHON chooses the interpreter (3.10 or newer).
 PYTHON ?= python3
-SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*') \
+SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_core.pyi') \
            CMakeLists.txt pyproject.toml constraints.txt
 CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h')
 JOBS := $(shell nproc 2>/dev/null || echo 2)
@@ -30,9 +30,10 @@ test-cpp: .venv-test/installed
 	.venv-test/bin/ctest --test-dir build/core --output-on-failure
 
 check: .venv-check/installed
-	.venv-check/bin/ruff format --check python tests benchmarks examples
-	.venv-check/bin/ruff check python tests benchmarks examples
-	.venv-check/bin/mypy python tests
+	.venv-check/bin/ruff format --check
+	.venv-check/bin/ruff check
+	cp .venv-check/lib/python3*/site-packages/protomark/_core.pyi python/protomark/
+	.venv-check/bin/mypy
 	.venv-check/bin/clang-format --dry-run -Werror $(CPP)
 	.venv-check/bin/cmake -S core -B build/tidy -G Ninja \
 	  -DCMAKE_MAKE_PROGRAM=$(abspath .venv-check/bin/ninja) -DPROTOMARK_BUILD_TESTS=OFF \
@@ -40,8 +41,8 @@ check: .venv-check/installed
 	.venv-check/bin/clang-tidy --quiet -p build/tidy $(wildcard core/src/*.cpp)
 
 format: .venv-check/installed
-	.venv-check/bin/ruff format python tests benchmarks examples
-	.venv-check/bin/ruff check --fix python tests benchmarks examples
+	.venv-check/bin/ruff format
+	.venv-check/bin/ruff check --fix
 	.venv-check/bin/clang-format -i $(CPP)
 
 clean:

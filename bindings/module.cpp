@@ -428,16 +428,13 @@ void bind_sealed_map(nb::module_& m) {
   });
 }
 
-void bind_errors(nb::module_& m) {
-  static PyObject* file_error = PyErr_NewExceptionWithDoc(
-      "protomark.FileError", "A file that cannot be read or written, or is not what it should be.",
-      nb::make_tuple(nb::handle(PyExc_OSError), nb::handle(PyExc_ValueError)).ptr(), nullptr);
-  m.attr("FileError") = nb::borrow(file_error);
+void bind_errors() {
   nb::register_exception_translator([](const std::exception_ptr& p, void*) {
     try {
       std::rethrow_exception(p);
     } catch (const FileError& error) {
-      PyErr_SetString(file_error, error.what());
+      const nb::object type = nb::module_::import_("protomark.errors").attr("FileError");
+      PyErr_SetString(type.ptr(), error.what());
     } catch (const UnknownLandmark& error) {
       PyErr_SetString(PyExc_KeyError, error.what());
     }
@@ -451,7 +448,7 @@ NB_MODULE(_core, m) {
   using namespace protomark;
   using namespace protomark::python;
   m.doc() = "The C++ core of Protomark.";
-  bind_errors(m);
+  bind_errors();
   bind_encoder(m);
   bind_sealed_map(m);
   bind_open_map(m);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ def random_layers(
     """Integer layers whose sums spread over the whole range of the activation table."""
     rng = np.random.default_rng(seed)
     layers = []
-    for i, (inputs, outputs) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+    for i, (inputs, outputs) in enumerate(pairwise(widths)):
         last = i == len(widths) - 2
         spread = (0.5 if i == 0 else 128) * weight_limit * inputs**0.5
         layers.append(

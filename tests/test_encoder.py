@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import random_descriptors, random_layers, reference_encode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
+from conftest import random_descriptors, random_layers, reference_encode
 
 
 @settings(max_examples=40, deadline=None)
@@ -34,7 +34,9 @@ def test_codes_follow_their_definition(
     np.testing.assert_array_equal(encoder.encode(descriptors, threads=3), expected)
 
 
-@pytest.mark.parametrize("extreme", ["all ones", "all zeros", "largest weights", "smallest weights"])
+@pytest.mark.parametrize(
+    "extreme", ["all ones", "all zeros", "largest weights", "smallest weights"]
+)
 def test_codes_at_the_extremes(extreme: str) -> None:
     layers = random_layers([1024, 64, 64, 16])
     if "weights" in extreme:
@@ -70,7 +72,9 @@ def test_every_instruction_set_gives_the_same_bytes(tmp_path: Path) -> None:
     for isa in ("portable", ""):
         environment = {**os.environ, "PROTOMARK_ISA": isa}
         subprocess.run(
-            [sys.executable, "-c", script, str(tmp_path), isa or "best"], env=environment, check=True
+            [sys.executable, "-c", script, str(tmp_path), isa or "best"],
+            env=environment,
+            check=True,
         )
         results[isa] = dict(np.load(tmp_path / f"{isa or 'best'}.npz"))
     for name, expected in results["portable"].items():
@@ -113,7 +117,7 @@ def test_wrong_input_is_named(encoder: pm.Encoder) -> None:
     with pytest.raises(ValueError, match="descriptors have 7 bytes, encoder 'tiny' takes 8"):
         encoder.encode(np.zeros((3, 7), np.uint8))
     with pytest.raises(TypeError, match=r"uint8 array is needed, not float32 \(3, 8\)"):
-        encoder.encode(np.zeros((3, 8), np.float32))  # type: ignore[arg-type]
+        encoder.encode(np.zeros((3, 8), np.float32))
     with pytest.raises(TypeError, match=r"uint8 array is needed, not uint8 \(8,\)"):
         encoder.encode(np.zeros(8, np.uint8))
     with pytest.raises(ValueError, match="threads must be at least 1"):

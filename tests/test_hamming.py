@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import random_descriptors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
+from conftest import random_descriptors
 
 
 def reference(

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_descriptors, rounded
 
 import protomark as pm
+from conftest import random_descriptors, rounded
 
 
 @pytest.fixture
@@ -31,7 +31,9 @@ def test_open_map_round_trip(scene: pm.PrototypeMap, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.counts(ids), scene.counts(ids))
     np.testing.assert_array_equal(read.prototype(ids), scene.prototype(ids))
     np.testing.assert_array_equal(read.positions(ids), scene.positions(ids))
-    for a, b in zip(read.search(random_descriptors(9)), scene.search(random_descriptors(9)), strict=True):
+    for a, b in zip(
+        read.search(random_descriptors(9)), scene.search(random_descriptors(9)), strict=True
+    ):
         np.testing.assert_array_equal(a, b)
     read.add([1000], random_descriptors(1))
     read.remove([1000], random_descriptors(1))
@@ -52,7 +54,9 @@ def test_sealed_map_answers_like_the_open_one(scene: pm.PrototypeMap, tmp_path: 
         np.testing.assert_array_equal(m.prototype(ids), rounded(scene.prototype(ids)))
         np.testing.assert_allclose(m.positions(ids), scene.positions(ids), atol=1e-5)
         for kwargs in ({"k": 3}, {"k": 1, "ratio": 0.9}, {"k": 2, "max_distance": 200.0}):
-            for a, b in zip(m.search(queries, **kwargs), scene.search(queries, **kwargs), strict=True):
+            for a, b in zip(
+                m.search(queries, **kwargs), scene.search(queries, **kwargs), strict=True
+            ):
                 np.testing.assert_array_equal(a, b)
         with pytest.raises(KeyError, match="landmark 1 is not in the map"):
             m.counts([1])
@@ -105,7 +109,7 @@ def test_every_truncation_is_refused(encoder: pm.Encoder, tmp_path: Path) -> Non
     broken = tmp_path / "broken.pmk"
     for size in range(0, len(data), 37):
         broken.write_bytes(data[:size])
-        with pytest.raises(pm.FileError, match="broken.pmk: "):
+        with pytest.raises(pm.FileError, match=r"broken\.pmk: "):
             pm.open(broken)
 
 
@@ -121,9 +125,7 @@ def section_bytes(data: bytes) -> set[int]:
 
 
 @pytest.mark.parametrize("kind", ["model", "open", "sealed"])
-def test_every_flipped_byte_is_noticed(
-    kind: str, scene: pm.PrototypeMap, tmp_path: Path
-) -> None:
+def test_every_flipped_byte_is_noticed(kind: str, scene: pm.PrototypeMap, tmp_path: Path) -> None:
     path = tmp_path / "file"
     {"model": scene.encoder.save, "open": scene.save, "sealed": scene.seal}[kind](path)
     data = path.read_bytes()

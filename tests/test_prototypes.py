@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import random_descriptors, rounded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
+from conftest import random_descriptors, rounded
 
 
 class Reference:
@@ -248,14 +248,14 @@ def test_positions(encoder: pm.Encoder) -> None:
     scene = pm.PrototypeMap(encoder)
     scene.add([5, 6, 7], random_descriptors(3))
     assert np.isnan(scene.positions([5])).all()
-    scene.set_positions([7, 5], [[1e6, 2, 3], [4, 5, 6]])
+    scene.set_positions([7, 5], np.array([[1e6, 2, 3], [4, 5, 6]]))
     np.testing.assert_array_equal(scene.positions([5, 7]), [[4, 5, 6], [1e6, 2, 3]])
     scene.merge(6, 5)
     np.testing.assert_array_equal(scene.positions([6]), [[4, 5, 6]])
     scene.discard([6])
     np.testing.assert_array_equal(scene.positions([7]), [[1e6, 2, 3]])
     with pytest.raises(ValueError, match="position of landmark 7 is not finite"):
-        scene.set_positions([7], [[1, np.inf, 2]])
+        scene.set_positions([7], np.array([[1, np.inf, 2]]))
     with pytest.raises(TypeError, match=r"positions: a \(n, 3\) float64"):
         scene.set_positions([7], [[1, 2]])
 

@@ -1,18 +1,17 @@
 """Protomark: one small integer prototype per landmark instead of all its binary descriptors.
 
-    import protomark as pm
+import protomark as pm
 
-    encoder = pm.Encoder.load("freak")
-    scene = pm.PrototypeMap(encoder)
-    scene.add(landmark_ids, descriptors)
-    ids, distances = scene.search(new_descriptors, k=2)
+encoder = pm.Encoder.load("freak")
+scene = pm.PrototypeMap(encoder)
+scene.add(landmark_ids, descriptors)
+ids, distances = scene.search(new_descriptors, k=2)
 """
 
 from importlib.metadata import version as _version
 
 from protomark._core import (
     Encoder,
-    FileError,
     PrototypeMap,
     SealedMap,
     file_sections,
@@ -20,6 +19,7 @@ from protomark._core import (
     open,
     verify_file,
 )
+from protomark.errors import FileError
 
 __version__ = _version("protomark")
 

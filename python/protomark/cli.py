@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -84,6 +85,85 @@ def train(
         explain_interruption(stop, output)
         raise typer.Exit(130) from None
     print_summary(card, output)
+
+
+@app.command()
+def build(
+    tracks: Annotated[Path, typer.Argument(help="Tracks file that `protomark tracks` wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
+    encoder: Annotated[
+        str | None,
+        typer.Option(help="Name or file of the encoder; by default the descriptor's own."),
+    ] = None,
+    dim: Annotated[
+        int | None, typer.Option(help="Dimensions of a prototype; by default all.")
+    ] = None,
+    min_observations: Annotated[
+        int, typer.Option(help="Leave out landmarks with fewer observations.")
+    ] = 2,
+    sealed: Annotated[
+        bool, typer.Option("--sealed", help="Write a sealed map: smaller, and only answers.")
+    ] = False,
+    threads: Annotated[int, typer.Option(help="CPU threads.")] = 1,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the facts to this file.")
+    ] = None,
+) -> None:
+    """Build a map from a tracks file: one prototype a landmark, and its position."""
+    from protomark.build import build_file
+    from protomark.info import describe, show
+
+    build_file(tracks, output, encoder, dim, min_observations, sealed, threads)
+    facts = describe(output)
+    _write_json(json_file, facts)
+    show(facts)
+
+
+@app.command()
+def info(
+    file: Annotated[Path, typer.Argument(help="A map, an encoder or a tracks file.")],
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Check every checksum of a map or an encoder.")
+    ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the facts to this file.")
+    ] = None,
+) -> None:
+    """Say what a file holds."""
+    from protomark import verify_file
+    from protomark.info import describe, show
+
+    facts = describe(file)
+    if verify and facts["kind"] != "tracks":
+        verify_file(file)
+        facts["checksums"] = "all right"
+    _write_json(json_file, facts)
+    show(facts)
+
+
+def _write_json(path: Path | None, facts: dict[str, Any]) -> None:
+    if path is not None:
+        path.write_text(json.dumps(facts, indent=2) + "\n")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from protomark import __version__
+
+        typer.echo(f"protomark {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """One small integer prototype per landmark instead of all its binary descriptors."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The encoders that ship, each beside its card (a Markdown file that says data, licence, figures)."""
+"""The encoders that ship, each beside its card: data, licence, figures."""
 
 from __future__ import annotations
 

@@ -1,0 +1,121 @@
+"""What a file holds, at a glance: a map, an encoder or tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import protomark as pm
+from protomark.tracks import Tracks
+
+_BARS = "▁▂▃▄▅▆▇█"
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Facts about a file as JSON values; `kind` says what it is.
+
+    Raises:
+        OSError, ValueError: the file cannot be read, or is none of Protomark's.
+    """
+    if path.suffix == ".safetensors":
+        return _describe_tracks(path)
+    kinds = dict(pm.file_sections(path))
+    if "network" in kinds:
+        return _describe_encoder(path)
+    return _describe_map(path, kinds)
+
+
+def _describe_tracks(path: Path) -> dict[str, Any]:
+    tracks = Tracks.load(path)
+    observations = len(tracks.observations)
+    return {
+        "kind": "tracks",
+        "descriptor": tracks.descriptor,
+        "bits": tracks.bits,
+        "keyframes": len(tracks.keyframe_names),
+        "keypoints": len(tracks.keypoints),
+        "landmarks": len(tracks.landmark_ids),
+        "observations": observations,
+        "observations_per_landmark": observations / max(1, len(tracks.landmark_ids)),
+        "cameras": [camera.as_dict() for camera in tracks.cameras.values()],
+        "info": tracks.info,
+        "bytes": path.stat().st_size,
+    }
+
+
+def _encoder_facts(encoder: pm.Encoder) -> dict[str, Any]:
+    return {
+        "name": encoder.name,
+        "descriptor": encoder.descriptor,
+        "bits": encoder.bits,
+        "dims": encoder.dims,
+        "multiply_adds": encoder.multiply_adds,
+        "identity": encoder.identity,
+        "data": encoder.data,
+        "licence": encoder.licence,
+        **encoder.notes,
+    }
+
+
+def _describe_encoder(path: Path) -> dict[str, Any]:
+    encoder = pm.Encoder.load(path)
+    return {"kind": "encoder", **_encoder_facts(encoder), "bytes": path.stat().st_size}
+
+
+def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
+    scene = pm.open(path)
+    ids = scene.ids
+    counts = scene.counts(ids).astype(np.int64)
+    positions = scene.positions(ids)
+    placed = positions[~np.isnan(positions).any(axis=1)]
+    matching = scene.dim + 1 + (8 if "ids" in sections else 0)
+    return {
+        "kind": "sealed map" if isinstance(scene, pm.SealedMap) else "open map",
+        "landmarks": len(scene),
+        "dim": scene.dim,
+        "observations": int(counts.sum()),
+        "count_histogram": np.bincount(counts).tolist() if len(counts) else [],
+        "landmarks_with_position": len(placed),
+        "extent": [placed.min(0).tolist(), placed.max(0).tolist()] if len(placed) else None,
+        "bytes_per_landmark_for_matching": matching if isinstance(scene, pm.SealedMap) else None,
+        "bytes": path.stat().st_size,
+        "bytes_by_section": sections,
+        "encoder": _encoder_facts(scene.encoder),
+    }
+
+
+def _bars(histogram: list[int]) -> str:
+    """A histogram of counts 1, 2, ... as one line of bars, the tail folded into the last."""
+    shown = [*histogram[1:16], sum(histogram[16:])]
+    top = max(max(shown), 1)
+    return "".join(_BARS[int(v / top * (len(_BARS) - 1))] if v else " " for v in shown)
+
+
+def show(facts: dict[str, Any]) -> None:
+    """Print what `describe` returned."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from protomark.console import console
+
+    table = Table.grid(padding=(0, 2))
+    for key, value in facts.items():
+        if value is None:
+            continue
+        name = key.replace("_", " ")
+        if key == "count_histogram":
+            table.add_row("observations a landmark", f"1 {_bars(value)} 16 and more")
+        elif isinstance(value, dict):
+            for inner, v in value.items():
+                table.add_row(f"{name}: {inner.replace('_', ' ')}", escape(_text(v)))
+        else:
+            table.add_row(name, escape(_text(value)))
+    console.print(table)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return str(value)
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}"
