@@ -5,6 +5,7 @@ SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*
            CMakeLists.txt pyproject.toml constraints.txt
 CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h')
 JOBS := $(shell nproc 2>/dev/null || echo 2)
+cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 .PHONY: help demo test test-python test-cpp check format clean
@@ -23,11 +24,15 @@ test-python: .venv-test/installed
 	.venv-test/bin/python -m pytest
 
 test-cpp: .venv-test/installed
-	.venv-test/bin/cmake -S core -B build/core -G Ninja \
-	  -DCMAKE_MAKE_PROGRAM=$(abspath .venv-test/bin/ninja) -DPROTOMARK_BUILD_TESTS=ON \
-	  -DCMAKE_BUILD_TYPE=Release -DCMAKE_EXPORT_COMPILE_COMMANDS=ON > /dev/null
+	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON > /dev/null
 	.venv-test/bin/cmake --build build/core -j$(JOBS)
 	.venv-test/bin/ctest --test-dir build/core --output-on-failure
+	# The installed library, as another project finds it.
+	.venv-test/bin/cmake --install build/core --prefix build/prefix > /dev/null
+	$(call cmake,.venv-test) -S core/examples -B build/consumer \
+	  -DCMAKE_PREFIX_PATH=$(abspath build/prefix) > /dev/null
+	.venv-test/bin/cmake --build build/consumer
+	build/consumer/01_build_and_search python/protomark/models/freak.pme build
 
 check: .venv-check/installed
 	.venv-check/bin/ruff format --check
@@ -35,8 +40,7 @@ check: .venv-check/installed
 	cp .venv-check/lib/python3*/site-packages/protomark/_core.pyi python/protomark/
 	.venv-check/bin/mypy
 	.venv-check/bin/clang-format --dry-run -Werror $(CPP)
-	.venv-check/bin/cmake -S core -B build/tidy -G Ninja \
-	  -DCMAKE_MAKE_PROGRAM=$(abspath .venv-check/bin/ninja) -DPROTOMARK_BUILD_TESTS=OFF \
+	$(call cmake,.venv-check) -S core -B build/tidy -DPROTOMARK_BUILD_TESTS=OFF \
 	  -DCMAKE_EXPORT_COMPILE_COMMANDS=ON > /dev/null
 	.venv-check/bin/clang-tidy --quiet -p build/tidy $(wildcard core/src/*.cpp)
 
