@@ -1,0 +1,136 @@
+"""The command as users meet it: help, build, info, and errors in one sentence."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import protomark as pm
+from conftest import random_descriptors
+from protomark.build import build_map
+from protomark.tracks import Camera, Tracks
+
+
+def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "protomark.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture
+def tracks() -> Tracks:
+    """4 keyframes of 5 keypoints; landmark i is keypoint i, the last keypoint has none."""
+    rng = np.random.default_rng(0)
+    return Tracks(
+        descriptor="test",
+        cameras={1: Camera("SIMPLE_PINHOLE", 64, 48, (50.0, 32.0, 24.0))},
+        keyframe_names=[f"{i}.jpg" for i in range(4)],
+        keyframe_camera=np.ones(4, np.int32),
+        cam_from_world=np.tile(np.eye(3, 4), (4, 1, 1)),
+        offsets=np.arange(0, 21, 5),
+        keypoints=rng.uniform(0, 48, (20, 2)).astype(np.float32),
+        sizes=np.ones(20, np.float32),
+        angles=np.zeros(20, np.float32),
+        responses=np.ones(20, np.float32),
+        octaves=np.zeros(20, np.int32),
+        descriptors=random_descriptors(20),
+        landmark_of_keypoint=np.tile([0, 1, 2, 7, -1], 4),
+        landmark_ids=np.array([0, 1, 2, 7]),
+        landmark_positions=rng.normal(size=(4, 3)),
+    )
+
+
+@pytest.fixture
+def model(encoder: pm.Encoder, tmp_path: Path) -> Path:
+    encoder.save(tmp_path / "tiny.pme")
+    return tmp_path / "tiny.pme"
+
+
+def test_help_lists_the_commands() -> None:
+    done = protomark("--help")
+    assert done.returncode == 0
+    for command in ("demo", "tracks", "build", "info", "train", "evaluate"):
+        assert command in done.stdout
+        assert protomark(command, "--help").returncode == 0
+    assert protomark("--version").stdout.strip() == f"protomark {pm.__version__}"
+
+
+def test_starting_imports_nothing_heavy() -> None:
+    script = (
+        "import sys, protomark, protomark.cli\n"
+        "heavy = {'torch', 'cv2', 'pycolmap', 'matplotlib', 'poselib', 'safetensors'}\n"
+        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
+    tracks.save(tmp_path / "t.safetensors")
+    scene = tmp_path / "scene.pmk"
+    done = protomark(
+        "build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model, "--dim", 5
+    )
+    assert done.returncode == 0, done.stderr
+    built = pm.open(scene)
+    np.testing.assert_array_equal(built.ids, [0, 1, 2, 7])
+    np.testing.assert_array_equal(built.counts(built.ids), [4, 4, 4, 4])
+    np.testing.assert_array_equal(built.positions(built.ids), tracks.landmark_positions)
+    rows = tracks.landmark_of_keypoint == 7
+    codes = built.encoder.encode(tracks.descriptors[rows], dim=5)
+    np.testing.assert_array_equal(built.prototype([7])[0], codes.astype(np.float32).mean(0))
+
+    done = protomark("info", scene, "--verify", "--json", tmp_path / "facts.json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert (facts["kind"], facts["landmarks"], facts["observations"]) == ("open map", 4, 16)
+    assert facts["count_histogram"] == [0, 0, 0, 0, 4]
+    assert "open map" in done.stdout
+    assert protomark("info", model).returncode == 0
+    assert protomark("info", tmp_path / "t.safetensors").returncode == 0
+
+    done = protomark(
+        "build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model, "--sealed"
+    )
+    assert done.returncode == 0, done.stderr
+    assert isinstance(pm.open(scene), pm.SealedMap)
+
+
+def test_landmarks_seen_too_rarely_are_left_out(tracks: Tracks, encoder: pm.Encoder) -> None:
+    tracks.landmark_of_keypoint[5:] = np.where(
+        tracks.landmark_of_keypoint[5:] == 7, -1, tracks.landmark_of_keypoint[5:]
+    )
+    np.testing.assert_array_equal(build_map(tracks, encoder).ids, [0, 1, 2])
+    with pytest.raises(ValueError, match="no landmark has 5 observations"):
+        build_map(tracks, encoder, min_observations=5)
+
+
+def test_errors_are_one_sentence(tracks: Tracks, model: Path, tmp_path: Path) -> None:
+    tracks.descriptor = "other"
+    tracks.save(tmp_path / "t.safetensors")
+    (tmp_path / "text").write_text("no map")
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "t.safetensors").read_bytes()[:-9])
+    output = tmp_path / "scene.pmk"
+    calls = [
+        (["build", tmp_path / "t.safetensors", "-o", output, "--encoder", model], "is for test"),
+        (["build", tmp_path / "t.safetensors", "-o", output], "neither a model file nor"),
+        (["build", tmp_path / "none.safetensors", "-o", output], "no such tracks file"),
+        (["build", tmp_path / "cut.safetensors", "-o", output], "not a tracks file, or a broken"),
+        (["info", tmp_path / "text"], "not a Protomark file"),
+        (["info", tmp_path / "none"], "No such file"),
+    ]
+    for arguments, message in calls:
+        done = protomark(*arguments)
+        assert done.returncode == 1
+        assert done.stderr.startswith("error: ")
+        assert message in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert not output.exists()
