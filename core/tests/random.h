@@ -15,7 +15,8 @@ class Random {
  public:
   explicit Random(std::uint32_t seed) : engine_(seed) {}
   std::int64_t integer(std::int64_t low, std::int64_t high) {
-    return low + static_cast<std::int64_t>(engine_() % static_cast<std::uint64_t>(high - low + 1));
+    const auto range = static_cast<std::uint64_t>(high) - static_cast<std::uint64_t>(low) + 1;
+    return low + static_cast<std::int64_t>(engine_() % range);
   }
   template <typename T>
   std::vector<T> integers(std::size_t n, std::int64_t low, std::int64_t high) {
