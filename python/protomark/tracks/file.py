@@ -137,7 +137,11 @@ class Tracks:
                 )
         if sizes["b"] < 1:
             raise ValueError("tracks: descriptors have no bytes")
-        if self.offsets[0] != 0 or self.offsets[-1] != sizes["n"] or (np.diff(self.offsets) < 0).any():
+        if (
+            self.offsets[0] != 0
+            or self.offsets[-1] != sizes["n"]
+            or (np.diff(self.offsets) < 0).any()
+        ):
             raise ValueError("tracks: offsets do not run from 0 to the number of keypoints")
         if (np.diff(self.landmark_ids) <= 0).any():
             raise ValueError("tracks: landmark_ids are not strictly ascending")
@@ -145,7 +149,9 @@ class Tracks:
             raise ValueError("tracks: landmark_ids contains a negative id")
         seen = self.landmark_of_keypoint[self.landmark_of_keypoint != -1]
         if not np.isin(seen, self.landmark_ids).all():
-            raise ValueError("tracks: landmark_of_keypoint names a landmark that landmark_ids lacks")
+            raise ValueError(
+                "tracks: landmark_of_keypoint names a landmark that landmark_ids lacks"
+            )
         for name in ("cam_from_world", "keypoints", "landmark_positions"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"tracks: {name} contains NaN or infinity")

@@ -1,0 +1,198 @@
+"""Tracks straight from a COLMAP database and model that already hold binary descriptors."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.features import DESCRIPTORS, Features, descriptor_kind
+from protomark.tracks.file import Tracks
+
+
+@dataclass(frozen=True)
+class _Image:
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def digest_of(database: Path, model: Path) -> str:
+    """Digest of the content of the database and of the model's files.
+
+    Raises:
+        FileNotFoundError: the database is missing.
+    """
+    if not database.is_file():
+        raise FileNotFoundError(f"{database}: no such COLMAP database")
+    digest = hashlib.sha256()
+    for path in (database, *sorted(p for p in model.iterdir() if p.is_file())):
+        digest.update(path.name.encode())
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def from_database(database: Path, model_path: Path, descriptor: str, name: str = "") -> Tracks:
+    """Keypoints and descriptors of the database, landmarks of the model.
+
+    A landmark that the model saw twice in one image keeps the keypoint with the smaller
+    reprojection error; landmarks with fewer than two observations are left out.
+
+    Args:
+        database: COLMAP database (SQLite) whose descriptors are binary, as uint8 blobs.
+        model_path: folder of the sparse model with points, made from this database.
+        descriptor: name of the descriptor, for example "orb".
+        name: name of the sequence, for the file's provenance.
+
+    Raises:
+        FileNotFoundError: the database or the model is missing.
+        ValueError: they are broken, or do not fit together, or the descriptors are not binary.
+    """
+    from protomark.tracks.colmap import model_of, read_reconstruction
+
+    if not database.is_file():
+        raise FileNotFoundError(f"{database}: no such COLMAP database")
+    kind = descriptor_kind(descriptor)
+    reconstruction = read_reconstruction(model_path)
+    model = model_of(reconstruction, model_path)
+    if not reconstruction.points3D:
+        raise ValueError(
+            f"{model_path}: the model has no points, so the database's descriptors have no "
+            "landmarks; run protomark tracks without --database to make them from the images"
+        )
+    by_name = _read(database, kind.name, kind.bytes)
+    features, labels = [], []
+    ids = {point_id: row for row, point_id in enumerate(sorted(reconstruction.points3D))}
+    positions = np.array([reconstruction.points3D[i].xyz for i in sorted(ids)], np.float64)
+    for image_id, image_name in zip(model.image_ids, model.names, strict=True):
+        image = reconstruction.images[int(image_id)]
+        if image_name not in by_name:
+            raise ValueError(f"{database}: image {image_name} of the model is not in the database")
+        found = _features(by_name[image_name])
+        if len(found) != image.num_points2D():
+            raise ValueError(
+                f"{database}: image {image_name} has {len(found)} keypoints, but "
+                f"{image.num_points2D()} in the model; is this the model's database?"
+            )
+        label = np.full(len(found), -1, np.int64)
+        error = np.full(len(found), np.inf)
+        for row in image.get_observation_point2D_idxs():
+            point_id = image.points2D[row].point3D_id
+            label[row] = ids[point_id]
+            seen = image.project_point(reconstruction.points3D[point_id].xyz)
+            if seen is not None:
+                error[row] = float(np.linalg.norm(seen - found.keypoints[row]))
+        order = np.lexsort((error, label))
+        # label -1 comes first and repeats: setting it to -1 again changes nothing.
+        twice = order[1:][label[order[1:]] == label[order[:-1]]]
+        label[twice] = -1
+        features.append(found)
+        labels.append(label)
+    label = np.concatenate(labels)
+    count = np.bincount(label[label >= 0], minlength=len(positions))
+    keep = np.flatnonzero(count >= 2)
+    number = np.full(len(positions) + 1, -1, np.int64)
+    number[keep] = np.arange(len(keep))
+    tracks = Tracks(
+        descriptor=kind.name,
+        cameras=model.cameras,
+        keyframe_names=model.names,
+        keyframe_camera=model.camera_ids,
+        cam_from_world=model.cam_from_world,
+        offsets=np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64),
+        keypoints=np.concatenate([f.keypoints for f in features]),
+        sizes=np.concatenate([f.sizes for f in features]),
+        angles=np.concatenate([f.angles for f in features]),
+        responses=np.concatenate([f.responses for f in features]),
+        octaves=np.concatenate([f.octaves for f in features]),
+        descriptors=np.concatenate([f.descriptors for f in features]),
+        landmark_of_keypoint=number[label],
+        landmark_ids=np.arange(len(keep), dtype=np.int64),
+        landmark_positions=positions[keep],
+        info={
+            "sequence": name,
+            "settings": {"descriptor": kind.name, "database": True},
+            "input": digest_of(database, model_path),
+            "images_without_pose": model.unposed,
+            "poses_refined": False,
+        },
+    )
+    tracks.check()
+    return tracks
+
+
+def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
+    images = {}
+    try:
+        # Read-only, and never created: a database that is open elsewhere stays as it is.
+        connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
+        try:
+            rows = connection.execute(
+                "SELECT i.name, k.rows, k.cols, k.data, d.rows, d.cols, d.data FROM images i "
+                "LEFT JOIN keypoints k ON k.image_id = i.image_id "
+                "LEFT JOIN descriptors d ON d.image_id = i.image_id ORDER BY i.image_id"
+            )
+            for name, kr, kc, kd, dr, dc, dd in rows:
+                kr, kc, kd = kr or 0, kc or 2, kd or b""
+                dr, dc, dd = dr or 0, dc or width, dd or b""
+                if dr and dc != width:
+                    guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
+                    raise ValueError(
+                        f"{database}: image {name} has descriptors of {dc} bytes, {descriptor} has "
+                        f"{width}; name the right one with -d"
+                        + (f" ({' or '.join(guess)})" if guess else "")
+                    )
+                if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
+                    raise ValueError(
+                        f"{database}: image {name} has {kr} keypoints and {dr} descriptors that do "
+                        "not fit together, extract its features anew"
+                    )
+                images[name] = _Image(
+                    np.frombuffer(kd, "<f4").reshape(kr, kc),
+                    np.frombuffer(dd, np.uint8).reshape(dr, dc),
+                )
+        finally:
+            connection.close()
+    except sqlite3.Error as error:
+        raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
+    return images
+
+
+def _features(image: _Image) -> Features:
+    """Scale and angle as COLMAP keeps them: none, (scale, radians), or an affine shape."""
+    k = image.keypoints
+    n = len(k)
+    sizes, angles = np.ones(n, np.float32), np.full(n, -1, np.float32)
+    if k.shape[1] == 4:
+        sizes, turn = 2 * k[:, 2], np.degrees(k[:, 3])
+        angles = np.mod(turn, 360).astype(np.float32)
+    elif k.shape[1] >= 6:
+        sizes = 2 * np.sqrt(np.abs(k[:, 2] * k[:, 5] - k[:, 3] * k[:, 4]))
+        angles = np.mod(np.degrees(np.arctan2(k[:, 4], k[:, 2])), 360).astype(np.float32)
+    angles[angles >= 360] = 0
+    return Features(
+        np.ascontiguousarray(k[:, :2], np.float32),
+        np.asarray(sizes, np.float32),
+        np.asarray(angles, np.float32),
+        np.zeros(n, np.float32),
+        np.zeros(n, np.int32),
+        np.ascontiguousarray(image.descriptors),
+    )
+
+
+def is_done(path: Path, descriptor: str, digest: str) -> bool:
+    """Whether `path` holds the tracks of this very database and model."""
+    if not path.is_file():
+        return False
+    try:
+        info: dict[str, Any] = Tracks.load(path).info
+    except (ValueError, OSError):
+        return False
+    settings = {"descriptor": descriptor_kind(descriptor).name, "database": True}
+    return info.get("settings") == settings and info.get("input") == digest

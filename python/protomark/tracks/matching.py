@@ -1,0 +1,81 @@
+"""Matches between the descriptors of two keyframes, held against their known poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.geometry import epipolar_error, relative_pose
+
+
+@dataclass
+class View:
+    """What matching needs of one keyframe.
+
+    Attributes:
+        descriptors: (n, bits / 8) uint8.
+        rays: (n, 2) float64, undistorted x / z and y / z, NaN where undistortion failed.
+        pose: (3, 4) float64, cam_from_world.
+        focal: focal length in pixels.
+    """
+
+    descriptors: NDArray[np.uint8]
+    rays: NDArray[np.float64]
+    pose: NDArray[np.float64]
+    focal: float
+
+
+@dataclass
+class Matches:
+    """k matches between two keyframes.
+
+    Attributes:
+        rows: (k, 2) int64, keypoint of the first and of the second keyframe.
+        distances: (k,) int32, Hamming distance in bits.
+        errors: (k,) float64, epipolar (Sampson) error in pixels.
+    """
+
+    rows: NDArray[np.int64]
+    distances: NDArray[np.int32]
+    errors: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def where(self, keep: NDArray[np.bool_]) -> Matches:
+        """The matches for which `keep` (k,) is true."""
+        return Matches(self.rows[keep], self.distances[keep], self.errors[keep])
+
+
+def match(first: View, second: View, ratio: float, max_error: float) -> Matches:
+    """Mutual nearest neighbours that pass the ratio test and lie on each other's epipolar lines.
+
+    Args:
+        ratio: the nearest distance must be below this share of the second nearest; in (0, 1].
+        max_error: largest epipolar error in pixels.
+    """
+    import protomark as pm
+
+    empty = Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0))
+    if len(first.descriptors) < 2 or len(second.descriptors) < 2:
+        return empty
+    index, distance = pm.hamming_search(first.descriptors, second.descriptors, k=2)
+    rows = np.flatnonzero(distance[:, 0] < ratio * distance[:, 1])
+    target = index[rows, 0]
+    rotation, translation = relative_pose(first.pose, second.pose)
+    error = epipolar_error(rotation, translation, first.rays[rows], second.rays[target])
+    error *= 0.5 * (first.focal + second.focal)
+    near = error <= max_error  # NaN is not
+    rows, target, error = rows[near], target[near], error[near]
+    if not len(rows):
+        return empty
+    back, _ = pm.hamming_search(second.descriptors[target], first.descriptors, k=1)
+    mutual = back[:, 0] == rows
+    rows, target, error = rows[mutual], target[mutual], error[mutual]
+    return Matches(
+        np.column_stack([rows, target]).astype(np.int64),
+        distance[rows, 0].astype(np.int32),
+        error,
+    )

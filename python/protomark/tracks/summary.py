@@ -1,0 +1,60 @@
+"""Figures that describe tracks: how many, how long, how exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.file import Tracks
+
+
+def reprojection_errors(tracks: Tracks) -> NDArray[np.float64]:
+    """(n,) float64, pixels, of each observation in the order of `tracks.observations`."""
+    from protomark.tracks.colmap import project
+
+    rows = tracks.observations
+    keyframe = tracks.keyframe_of_keypoint[rows]
+    index = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
+    pose = tracks.cam_from_world[keyframe]
+    local = (
+        np.einsum("nij,nj->ni", pose[:, :, :3], tracks.landmark_positions[index]) + pose[:, :, 3]
+    )
+    pixels = np.zeros((len(rows), 2))
+    for camera_id, camera in tracks.cameras.items():
+        mine = tracks.keyframe_camera[keyframe] == camera_id
+        pixels[mine] = project(camera, local[mine])
+    errors: NDArray[np.float64] = np.linalg.norm(pixels - tracks.keypoints[rows], axis=1)
+    return errors
+
+
+def summarise(tracks: Tracks) -> dict[str, Any]:
+    """Counts, track lengths and reprojection error as JSON values."""
+    rows = tracks.observations
+    lengths = np.unique(tracks.landmark_of_keypoint[rows], return_counts=True)[1]
+    errors = reprojection_errors(tracks)
+    edges = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
+    upper = (*(e - 1 for e in edges[1:]), None)
+    histogram = {}
+    for low, high in zip(edges, upper, strict=True):
+        label = f"{low}+" if high is None else str(low) if low == high else f"{low}-{high}"
+        histogram[label] = int(
+            ((lengths >= low) & (lengths <= (high or lengths.max(initial=0)))).sum()
+        )
+    return {
+        "sequence": tracks.info.get("sequence", ""),
+        "descriptor": tracks.descriptor,
+        "bits": tracks.bits,
+        "keyframes": len(tracks.keyframe_names),
+        "keypoints": len(tracks.keypoints),
+        "landmarks": len(tracks.landmark_ids),
+        "observations": len(rows),
+        "track_length_mean": float(lengths.mean()) if len(lengths) else 0.0,
+        "track_length_median": float(np.median(lengths)) if len(lengths) else 0.0,
+        "track_length_max": int(lengths.max(initial=0)),
+        "track_length_histogram": histogram,
+        "reprojection_error_mean": float(errors.mean()) if len(errors) else 0.0,
+        "reprojection_error_median": float(np.median(errors)) if len(errors) else 0.0,
+        "poses_refined": bool(tracks.info.get("poses_refined", False)),
+    }

@@ -1,0 +1,212 @@
+"""Landmarks from matches and poses: COLMAP's triangulator, and its bundle adjustment."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.colmap import Model, focal_length, pycolmap, quiet
+from protomark.tracks.matching import Matches
+
+_SEED = 0
+# Enough to fix the six numbers of a pose many times over.
+_POINTS_PER_POSE = 200
+
+
+def triangulate(
+    model: Model,
+    keypoints: list[NDArray[np.float32]],
+    matches: dict[tuple[int, int], Matches],
+    max_error: float,
+    min_angle: float,
+    threads: int = 1,
+) -> Any:
+    """Join matches into landmarks under the poses of `model`.
+
+    Args:
+        model: cameras and m poses.
+        keypoints: m arrays (n, 2), pixels.
+        matches: (i, j) -> matches between keyframes i < j.
+        max_error: largest reprojection error in pixels.
+        min_angle: smallest angle between two rays of a landmark, degrees.
+
+    Returns:
+        pycolmap.Reconstruction whose image ids are 1 + index of the keyframe.
+    """
+    reconstruction = _posed(model, keypoints)
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.extract_colors = False
+    pipeline.min_num_matches = 1
+    pipeline.num_threads = threads
+    pipeline.random_seed = _SEED
+    pipeline.mapper.filter_max_reproj_error = max_error
+    pipeline.mapper.filter_min_tri_angle = min_angle
+    options = pipeline.triangulation
+    options.random_seed = _SEED
+    options.min_angle = min_angle
+    options.merge_max_reproj_error = options.complete_max_reproj_error = max_error
+    # The triangulator bounds angles, the user pixels; the widest-angled camera decides.
+    focal = min(focal_length(camera) for camera in model.cameras.values())
+    angle = float(np.degrees(np.arctan(1.5 * max_error / focal)))
+    options.create_max_angle_error = options.continue_max_angle_error = angle
+    options.re_max_angle_error = 2 * angle
+    # Cameras are given, not estimated: COLMAP must not refuse strong distortion as implausible.
+    for bounds in (pipeline, pipeline.mapper, options):
+        bounds.min_focal_length_ratio = 1e-12
+        bounds.max_focal_length_ratio = bounds.max_extra_param = 1e12
+    with quiet(), tempfile.TemporaryDirectory(prefix="protomark-") as folder:
+        database = Path(folder) / "matches.db"
+        _write_database(database, reconstruction, keypoints, matches)
+        return pycolmap.triangulate_points(
+            reconstruction, str(database), folder, folder, clear_points=True, options=pipeline
+        )
+
+
+def _posed(model: Model, keypoints: list[NDArray[np.float32]]) -> Any:
+    reconstruction = pycolmap.Reconstruction()
+    for camera_id, camera in model.cameras.items():
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera({**camera.as_dict(), "camera_id": camera_id})
+        )
+    for i, name in enumerate(model.names):
+        image = pycolmap.Image(
+            name=name,
+            camera_id=int(model.camera_ids[i]),
+            image_id=i + 1,
+            keypoints=np.asarray(keypoints[i], np.float64).reshape(-1, 2),
+        )
+        pose = pycolmap.Rigid3d(model.cam_from_world[i])
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    return reconstruction
+
+
+def _write_database(
+    path: Path,
+    reconstruction: Any,
+    keypoints: list[NDArray[np.float32]],
+    matches: dict[tuple[int, int], Matches],
+) -> None:
+    database = pycolmap.Database.open(str(path))
+    try:
+        with pycolmap.DatabaseTransaction(database):
+            for camera in reconstruction.cameras.values():
+                database.write_camera(camera, use_camera_id=True)
+            for rig in reconstruction.rigs.values():
+                database.write_rig(rig, use_rig_id=True)
+            for frame in reconstruction.frames.values():
+                database.write_frame(frame, use_frame_id=True)
+            for image_id, image in sorted(reconstruction.images.items()):
+                database.write_image(image, use_image_id=True)
+                database.write_keypoints(image_id, np.asarray(keypoints[image_id - 1], np.float32))
+            for (i, j), pair in matches.items():
+                if len(pair):
+                    geometry = pycolmap.TwoViewGeometry()
+                    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                    geometry.inlier_matches = pair.rows.astype(np.uint32)
+                    database.write_two_view_geometry(i + 1, j + 1, geometry)
+    finally:
+        database.close()
+
+
+def labels_of(
+    reconstruction: Any, keypoints: list[NDArray[np.float32]]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Index of each keypoint's landmark (n,), -1 where none, and the positions (l, 3).
+
+    Where one landmark has two keypoints of one keyframe, the one with the smaller reprojection
+    error keeps it.
+    """
+    offsets = np.concatenate([[0], np.cumsum([len(k) for k in keypoints])])
+    labels = np.full(offsets[-1], -1, np.int64)
+    positions = np.zeros((len(reconstruction.points3D), 3))
+    for index, point_id in enumerate(sorted(reconstruction.points3D)):
+        point = reconstruction.points3D[point_id]
+        positions[index] = point.xyz
+        best: dict[int, tuple[float, int]] = {}
+        for element in point.track.elements:
+            i, row = element.image_id, element.point2D_idx
+            if i in best:
+                seen = reconstruction.images[i].project_point(point.xyz)
+                error = [float(np.hypot(*(seen - keypoints[i - 1][r]))) for r in (row, best[i][1])]
+                if (error[1], best[i][1]) <= (error[0], row):
+                    continue
+            best[i] = (0.0, row)
+        for i, (_, row) in best.items():
+            labels[offsets[i - 1] + row] = index
+    return labels, positions
+
+
+def refine_poses(model: Model, reconstruction: Any, threads: int = 1) -> Model:
+    """Bundle adjustment of poses and points (not of cameras), robust against wrong matches.
+
+    The result stays in the world of `model`: scale, rotation and origin are those that bring the
+    refined cameras closest to the given ones. Points that poses do not need are deleted.
+    """
+    _thin(reconstruction)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = False
+    options.refine_principal_point = False
+    options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = 1.0
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = 30
+    options.ceres.solver_options.function_tolerance = 1e-4
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.images:
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment, which writes to the terminal.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    with quiet():
+        summary = adjuster.solve()
+    if not summary.is_solution_usable():
+        raise ValueError("bundle adjustment failed; try --refine-poses no")
+    poses = np.array(
+        [reconstruction.images[i + 1].cam_from_world().matrix() for i in range(len(model.names))]
+    )
+    return _aligned(replace(model, cam_from_world=poses), model)
+
+
+def _thin(reconstruction: Any) -> None:
+    """Keep the longest tracks, enough for every pose: time grows with each observation."""
+    points = sorted(
+        reconstruction.points3D.items(), key=lambda item: (-item[1].track.length(), item[0])
+    )
+    seen: dict[int, int] = {}
+    for point_id, point in points:
+        images = {element.image_id for element in point.track.elements}
+        if any(seen.get(i, 0) < _POINTS_PER_POSE for i in images):
+            for i in images:
+                seen[i] = seen.get(i, 0) + 1
+        else:
+            reconstruction.delete_point3D(point_id)
+
+
+def _aligned(source: Model, target: Model) -> Model:
+    """Source moved by the similarity that brings its cameras closest to those of target.
+
+    The rotation comes from the cameras' orientations, which also serves where their centres lie on
+    one line; scale and shift come from the centres.
+    """
+    turns = np.einsum(
+        "mji,mjk->ik", target.cam_from_world[:, :, :3], source.cam_from_world[:, :, :3]
+    )
+    u, _, vt = np.linalg.svd(turns)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    a = source.centers @ rotation.T
+    middle_a, middle_b = a.mean(0), target.centers.mean(0)
+    scale = float(
+        ((a - middle_a) * (target.centers - middle_b)).sum() / ((a - middle_a) ** 2).sum()
+    )
+    shift = middle_b - scale * middle_a
+    # x' = scale R x + shift, so cam_from_world' = [Rc R^T | scale tc - Rc R^T shift].
+    turned = source.cam_from_world[:, :, :3] @ rotation.T
+    moved = scale * source.cam_from_world[:, :, 3] - turned @ shift
+    return replace(source, cam_from_world=np.concatenate([turned, moved[:, :, None]], axis=2))
