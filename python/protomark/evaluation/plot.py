@@ -1,0 +1,130 @@
+"""Precision against bytes per landmark."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from protomark.evaluation.results import Summary
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+INK, MUTED, GRID, OURS = "#1f2430", "#6b7280", "#e5e7eb", "#0f766e"
+# Families that are lines of several sizes get a colour of their own, single methods are grey.
+_COLOURS = {"pca": "#b45309", "discriminant": "#7c3aed"}
+_OURS_COLOURS = (OURS, "#0369a1", "#4d7c0f", "#be123c")
+_SHORT = {
+    "unaggregated": "all descriptors",
+    "random": "random",
+    "first": "first seen",
+    "majority": "quantised mean",
+    "and": "bitwise AND",
+    "medoid": "medoid",
+    "mean": "mean of bits",
+    "pca": "PCA",
+    "discriminant": "discriminant",
+    "protomark": "Protomark",
+}
+
+
+def draw_precision(axes: Axes, rows: Sequence[Summary], title: str = "") -> None:
+    """Draw precision over bytes, log scale; methods of one family are joined by a line."""
+    families: dict[str, list[Summary]] = {}
+    for row in rows:
+        families.setdefault(row.family, []).append(row)
+    ours = [family for family in families if family.startswith("protomark")]
+    labels = []
+    for family, same in families.items():
+        same = sorted(same, key=lambda row: row.bytes_per_landmark)
+        own = family in ours
+        colour = (
+            _OURS_COLOURS[ours.index(family) % len(_OURS_COLOURS)]
+            if own
+            else _COLOURS.get(family.removesuffix("-float"), MUTED)
+        )
+        x = [row.bytes_per_landmark for row in same]
+        y = [row.precision for row in same]
+        axes.errorbar(
+            x,
+            y,
+            yerr=[row.spread or 0 for row in same],
+            color=colour,
+            marker="o",
+            markersize=7 if own else 5,
+            linewidth=2 if own else 1.2,
+            elinewidth=1,
+            zorder=3 if own else 2,
+        )
+        short = _SHORT.get(family, family.replace("protomark@", "Protomark "))
+        labels.append((x[-1], y[-1], short, colour, own))
+    _place(axes, labels)
+    axes.set_xscale("log", base=2)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    axes.set_xlabel("bytes per landmark (log)", color=INK)
+    axes.set_ylabel("precision", color=INK)
+    axes.set_title(title, loc="left", color=INK, fontsize=11, fontweight="bold")
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=MUTED, length=0)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(GRID)
+
+
+def save_plot(rows: Sequence[Summary], path: str | os.PathLike[str], title: str = "") -> None:
+    """Write the plot as PNG, SVG or PDF, by the ending of `path`.
+
+    Raises:
+        ValueError: the ending is another one.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    draw_precision(figure.add_subplot(), rows, title)
+    save_figure(figure, path)
+
+
+def save_figure(figure: object, path: str | os.PathLike[str]) -> None:
+    """Write a Matplotlib figure beside the target, then rename it over the target."""
+    from matplotlib.figure import Figure
+
+    assert isinstance(figure, Figure)
+    path = Path(path)
+    check_ending(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        figure.savefig(temporary, dpi=160, facecolor="white")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_ending(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError if the path does not end in .png, .svg or .pdf."""
+    if Path(path).suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise ValueError(f"{path}: a picture's name must end in .png, .svg or .pdf")
+
+
+def _place(axes: Axes, labels: list[tuple[float, float, str, str, bool]]) -> None:
+    """Name each family right of its last point, lower where names would overlap."""
+    bottom, top = axes.get_ylim()
+    room = 0.045 * (top - bottom)
+    placed: list[tuple[float, float]] = []
+    for x, y, text, colour, own in sorted(labels, key=lambda label: -label[1]):
+        height = y
+        for at, other in placed:
+            if height > other - room and 0.3 < x / at < 3:
+                height = other - room
+        placed.append((x, height))
+        axes.annotate(
+            text,
+            (1.15 * x, height),
+            color=colour,
+            fontsize=9,
+            fontweight="bold" if own else "normal",
+            va="center",
+        )

@@ -1,0 +1,229 @@
+"""Poses of whole query keyframes from matches with a map, and how far they are off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.file import Camera, Tracks
+
+# A pose is found if it is off by at most this share of the median scene depth, and this angle.
+DEPTH_SHARE = 0.01
+DEGREES = 2.0
+# This share of a frame's keypoints, those with the clearest matches, goes to RANSAC.
+ACCEPTED_SHARE = 0.25
+# Reprojection error of an inlier, and of a right match, as a share of the image's longer side.
+PIXEL_SHARE = 0.005
+MAX_ITERATIONS = 2000
+
+# Camera models that both COLMAP and PoseLib know.
+_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One query keyframe: all its keypoints, with and without landmark.
+
+    Attributes:
+        camera: its camera.
+        cam_from_world: (3, 4) float64, its true pose.
+        keypoints: (n, 2) float64, pixels.
+        descriptors: (n, bits / 8) uint8.
+        landmarks: (n,) int64, the true landmark of each keypoint, -1 where none is known.
+    """
+
+    camera: Camera
+    cam_from_world: NDArray[np.float64]
+    keypoints: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    landmarks: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, tracks: Tracks, keyframe: int) -> Frame:
+        """Keyframe number `keyframe` of some tracks."""
+        rows = tracks.keypoints_of(keyframe)
+        return cls(
+            camera=tracks.cameras[int(tracks.keyframe_camera[keyframe])],
+            cam_from_world=tracks.cam_from_world[keyframe],
+            keypoints=tracks.keypoints[rows].astype(np.float64),
+            descriptors=tracks.descriptors[rows],
+            landmarks=tracks.landmark_of_keypoint[rows],
+        )
+
+    @property
+    def tolerance(self) -> float:
+        """Pixels by which a right match may be off."""
+        return PIXEL_SHARE * max(self.camera.width, self.camera.height)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Accepted matches of one frame, the clearest first.
+
+    Attributes:
+        keypoints: (a,) int64, index of the keypoint in its frame.
+        landmarks: (a,) int64.
+    """
+
+    keypoints: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Localization:
+    """What came of localizing one frame.
+
+    Attributes:
+        cam_from_world: (3, 4) float64, or None where RANSAC found no pose.
+        position_error: distance of the camera centres, in world units, infinite without a pose.
+        angle_error: angle between the orientations in degrees, infinite without a pose.
+        inliers: (a,) bool, which of the accepted matches support the pose.
+    """
+
+    cam_from_world: NDArray[np.float64] | None
+    position_error: float
+    angle_error: float
+    inliers: NDArray[np.bool_]
+
+    def found(self, scene_depth: float) -> bool:
+        """Whether the pose is within `DEPTH_SHARE` of the depth and `DEGREES`."""
+        return self.position_error <= DEPTH_SHARE * scene_depth and self.angle_error <= DEGREES
+
+
+def accept(
+    landmarks: NDArray[np.int64],
+    distances: NDArray[np.float32],
+    share: float = ACCEPTED_SHARE,
+) -> Matches:
+    """The clearest matches of one frame.
+
+    Keypoints are ranked by the ratio of the distances to their two nearest landmarks, equal
+    ratios by distance, then by order. A landmark keeps its best keypoint only. The first `share`
+    of the frame's keypoints is accepted. A threshold on the ratio would favour some methods,
+    since ratios of Hamming and of Euclidean distances, and of few and of many dimensions,
+    spread differently; a share treats all alike.
+
+    Args:
+        landmarks: (n, 2) int64, two nearest landmarks, -1 where there is none.
+        distances: (n, 2) float32.
+        share: how many of the n keypoints are accepted at most.
+    """
+    nearest, second = distances[:, 0].astype(np.float64), distances[:, 1].astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where(second > 0, nearest / second, 1.0)
+    order = np.lexsort((nearest, ratio))
+    order = order[landmarks[order, 0] >= 0]
+    _, best = np.unique(landmarks[order, 0], return_index=True)
+    kept = order[np.sort(best)][: int(np.ceil(share * len(landmarks)))]
+    return Matches(kept, landmarks[kept, 0])
+
+
+def right(frame: Frame, matches: Matches, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(a,) bool: the landmark is the keypoint's own, or projects to within the tolerance.
+
+    Args:
+        frame: the frame, with its true pose.
+        matches: its accepted matches.
+        positions: (a, 3) float64, position of each match's landmark.
+    """
+    own = frame.landmarks[matches.keypoints] == matches.landmarks
+    pixels = project(frame.camera, frame.cam_from_world, positions)
+    off = np.linalg.norm(pixels - frame.keypoints[matches.keypoints], axis=1)
+    return own | (off <= frame.tolerance)
+
+
+def project(
+    camera: Camera, cam_from_world: NDArray[np.float64], positions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n, 3) world positions -> (n, 2) pixels, infinite for what lies behind the camera."""
+    import poselib
+
+    _check(camera)
+    points = positions @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    pixels = np.full((len(points), 2), np.inf)
+    front = points[:, 2] > 0
+    if front.any():
+        model = poselib.Camera(camera.model, list(camera.params), camera.width, camera.height)
+        pixels[front] = np.asarray(model.project(points[front, :2] / points[front, 2:]))
+    return pixels
+
+
+def localize(frame: Frame, matches: Matches, positions: NDArray[np.float64]) -> Localization:
+    """Absolute pose by PoseLib's RANSAC and refinement, held against the frame's true pose.
+
+    Args:
+        frame: the frame.
+        matches: its accepted matches, the clearest first.
+        positions: (a, 3) float64, position of each match's landmark.
+    """
+    import poselib
+
+    _check(frame.camera)
+    nothing = Localization(None, np.inf, np.inf, np.zeros(len(positions), dtype=bool))
+    if len(positions) < 4:
+        return nothing
+    # Tracks and PoseLib share COLMAP's pixels and camera parameters: nothing to shift.
+    pose, found = poselib.estimate_absolute_pose(
+        frame.keypoints[matches.keypoints],
+        positions,
+        frame.camera.as_dict(),
+        {
+            "max_reproj_error": frame.tolerance,
+            "max_iterations": MAX_ITERATIONS,
+            "min_iterations": 100,
+            "progressive_sampling": True,
+            "seed": 0,
+        },
+        {},
+    )
+    estimate = np.asarray(pose.Rt, dtype=np.float64)
+    if found["num_inliers"] < 4 or not np.isfinite(estimate).all():
+        return nothing
+    return Localization(
+        estimate,
+        *pose_error(estimate, frame.cam_from_world),
+        np.asarray(found["inliers"], dtype=bool),
+    )
+
+
+def pose_error(estimate: NDArray[np.float64], true: NDArray[np.float64]) -> tuple[float, float]:
+    """Distance of the camera centres in world units, and angle of the rotation in degrees."""
+    distance = np.linalg.norm(centre(estimate) - centre(true))
+    # From the distance of the matrices: exact for small angles, where arccos of the trace is not.
+    chord = np.linalg.norm(estimate[:, :3] - true[:, :3]) / np.sqrt(8)
+    return float(distance), float(np.degrees(2 * np.arcsin(min(chord, 1.0))))
+
+
+def centre(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(..., 3, 4) poses -> (..., 3) camera centres in the world."""
+    rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
+    return np.asarray(-np.einsum("...ji,...j->...i", rotation, translation))
+
+
+def scene_depth(tracks: Tracks) -> float:
+    """Median, over all observations, of the landmark's depth in front of the camera."""
+    rows = tracks.observations
+    where = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
+    poses = tracks.cam_from_world[tracks.keyframe_of_keypoint[rows]]
+    depths = (
+        np.einsum("nj,nj->n", poses[:, 2, :3], tracks.landmark_positions[where]) + poses[:, 2, 3]
+    )
+    return float(np.median(depths))
+
+
+def _check(camera: Camera) -> None:
+    if camera.model not in _MODELS:
+        raise ValueError(
+            f"camera model {camera.model} is not one that poses can be found for: undistort the "
+            f"images to one of {', '.join(_MODELS)}"
+        )

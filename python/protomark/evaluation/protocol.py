@@ -1,0 +1,90 @@
+"""The paper's protocol: which keyframes build the map, and which descriptors ask it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.file import Tracks
+
+SUPPORT_SHARE = 0.9
+MIN_OBSERVATIONS = 2
+MAX_QUERIES = 10_000
+
+
+@dataclass(frozen=True)
+class Split:
+    """Support and queries of one sequence at one seed.
+
+    Attributes:
+        seed: what the split was drawn with.
+        support_keyframes: (s,) int64, ascending indices of the keyframes that build the map.
+        query_keyframes: (m - s,) int64, ascending indices of the others.
+        support_rows: (o,) int64, ascending keypoint rows whose landmark is in the map.
+        query_rows: (q,) int64, ascending keypoint rows to ask for; each one's landmark is in
+            the map.
+    """
+
+    seed: int
+    support_keyframes: NDArray[np.int64]
+    query_keyframes: NDArray[np.int64]
+    support_rows: NDArray[np.int64]
+    query_rows: NDArray[np.int64]
+
+
+def split(
+    tracks: Tracks,
+    seed: int,
+    *,
+    support_share: float = SUPPORT_SHARE,
+    min_observations: int = MIN_OBSERVATIONS,
+    max_queries: int = MAX_QUERIES,
+) -> Split:
+    """Draw support and queries as in Komorowski and Trzcinski, section "Performance metric".
+
+    A random `support_share` of the keyframes is the support, rounded to the nearest number that
+    leaves at least one keyframe on either side. A landmark is in the map if the support observes
+    it at least `min_observations` times. Queries are up to `max_queries` observations of such
+    landmarks in the other keyframes, drawn at random.
+
+    The same tracks and seed give the same split on every platform.
+
+    Raises:
+        ValueError: there are fewer than two keyframes, or no landmark that both sides see.
+    """
+    keyframes = len(tracks.keyframe_names)
+    if keyframes < 2:
+        raise ValueError(
+            f"{keyframes} keyframe(s) cannot be split into support and queries: "
+            "at least 2 are needed"
+        )
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(keyframes)
+    # Not round(): it takes halves to the even neighbour, which is hard to explain in a protocol.
+    size = min(max(int(keyframes * support_share + 0.5), 1), keyframes - 1)
+    in_support = np.zeros(keyframes, dtype=bool)
+    in_support[order[:size]] = True
+
+    observations = tracks.observations
+    landmark = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[observations])
+    supported = in_support[tracks.keyframe_of_keypoint[observations]]
+    seen = np.bincount(landmark[supported], minlength=len(tracks.landmark_ids))
+    in_map = seen[landmark] >= min_observations
+
+    query_rows = observations[in_map & ~supported]
+    if not len(query_rows):
+        raise ValueError(
+            f"no query keyframe sees a landmark with {min_observations} support observations "
+            f"(seed {seed}): the tracks are too few or too short to be evaluated"
+        )
+    if len(query_rows) > max_queries:
+        query_rows = np.sort(rng.choice(query_rows, size=max_queries, replace=False))
+    return Split(
+        seed=seed,
+        support_keyframes=np.flatnonzero(in_support),
+        query_keyframes=np.flatnonzero(~in_support),
+        support_rows=observations[in_map & supported],
+        query_rows=query_rows,
+    )
