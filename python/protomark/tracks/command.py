@@ -134,6 +134,7 @@ def print_summary(summary: dict[str, Any], tracks: Tracks) -> None:
         f"{summary['landmarks']} landmarks, {summary['observations']} observations "
         f"({summary['track_length_mean']:.1f} a landmark)",
         highlight=False,
+        soft_wrap=True,
     )
     console.print(
         f"  reprojection error: mean {summary['reprojection_error_mean']:.2f} pixels, "

@@ -71,6 +71,8 @@ def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> 
     fewer than `min_length` observations or a widest angle below `min_angle` degrees. Landmarks are
     numbered by their first keypoint.
     """
+    if not len(scene.positions):
+        return
     scene.labels[~np.isfinite(scene.rays).all(1)] = -1
     for _ in range(2):
         rows = scene.observations()
@@ -109,6 +111,7 @@ def complete(
     """One pass over the keyframes: add observations, then merge landmarks, in place.
 
     Args:
+        scene: labelled keypoints; labels and positions change.
         partners: for each keyframe, the keyframes that see the same things.
         max_error: largest distance in pixels between projection and keypoint.
         max_distance: largest Hamming distance in bits to the nearest descriptor of the landmark.
@@ -178,10 +181,8 @@ def _candidates(
     camera = scene.model.cameras[int(scene.model.camera_ids[keyframe])]
     pose = scene.model.cam_from_world[keyframe]
     pixels = project(camera, scene.positions[landmarks] @ pose[:, :3].T + pose[:, 3])
-    inside = np.isfinite(pixels).all(1)
-    inside[inside] = (
-        (pixels[inside] >= 0) & (pixels[inside] <= (camera.width, camera.height))
-    ).all(1)
+    # NaN, behind the camera, is not inside.
+    inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
     landmarks, pixels = landmarks[inside], pixels[inside]
     a, b = within(pixels, scene.keypoints[own].astype(np.float64), radius)
     if not len(a):

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protomark.tracks.features import Extractor, Features, descriptor_kind, read_gray
 from protomark.tracks.file import Tracks
@@ -22,7 +21,7 @@ Progress = Callable[[str, int, int], None]
 
 # Matches are kept this far (pixels) from the epipolar line until it is known how good poses are.
 _ROUGH_ERROR = 16.0
-# Poses with a larger epipolar error (pixels, the median over pairs of each pair's median) are refined
+# Poses with a larger epipolar error (pixels, median over pairs of each pair's median) are refined
 # under `refine_poses="auto"`. Structure from motion shows 0.2 to 0.7, rough poses 1.3 and more.
 _ROUGH_POSES = 1.0
 _MIN_MATCHES = 15
@@ -41,7 +40,7 @@ class Settings:
         max_error: largest epipolar and reprojection error, pixels.
         min_angle: smallest angle between two rays of a landmark, degrees.
         min_length: fewest observations of a landmark.
-        refine_poses: "yes", "no", or "auto": where the matches say that poses are only roughly right.
+        refine_poses: "yes", "no", or "auto": where matches say that poses are only roughly right.
     """
 
     descriptor: str = "freak"
@@ -190,10 +189,7 @@ def extract(
     chosen = pairs.covisible_pairs(overlap, settings.partners)
     matches |= match_all([p for p in chosen if p not in matches], "match covisible")
     if not any(len(m) for m in matches.values()):
-        raise ValueError(
-            f"{source.name}: no two keyframes have matching keypoints; "
-            "do the images belong to this model?"
-        )
+        raise _nothing(source)
     error = _pose_error(matches)
     refine = settings.refine_poses == "yes" or (
         settings.refine_poses == "auto" and error > _ROUGH_POSES
@@ -207,7 +203,7 @@ def extract(
                 model, keypoints, near, limit, settings.min_angle, threads
             )
             if not reconstruction.points3D:
-                raise ValueError(f"{source.name}: no landmark could be triangulated")
+                raise _nothing(source)
             model = triangulation.refine_poses(model, reconstruction, threads)
             views = views_of(model)
             matches = {p: _with_errors(m, views[p[0]], views[p[1]]) for p, m in matches.items()}
@@ -218,6 +214,8 @@ def extract(
     reconstruction = triangulation.triangulate(
         model, keypoints, matches, settings.max_error, settings.min_angle, threads
     )
+    if not reconstruction.points3D:
+        raise _nothing(source)
     labels, positions = triangulation.labels_of(reconstruction, keypoints)
     progress("triangulate", 1, 1)
 
@@ -238,7 +236,7 @@ def extract(
     # A descriptor agrees with a landmark's if nearly all verified matches are no closer.
     distances = np.concatenate([m.distances for m in matches.values()])
     max_distance = int(np.percentile(distances, 99)) if len(distances) else 0
-    partners = [np.flatnonzero((overlap[i] > pairs.MIN_OVERLAP)) for i in range(len(views))]
+    partners = [np.flatnonzero(overlap[i] > pairs.MIN_OVERLAP) for i in range(len(views))]
     added = merged = 0
     for step in range(2):
         progress("complete", step, 2)
@@ -248,10 +246,7 @@ def extract(
     completion.clean(scene, settings.max_error, settings.min_angle, settings.min_length)
     progress("complete", 2, 2)
     if not len(scene.positions):
-        raise ValueError(
-            f"{source.name}: no landmark could be triangulated; "
-            "do images and poses belong together, and does the camera move?"
-        )
+        raise _nothing(source)
     info: dict[str, Any] = {
         "sequence": source.name,
         "settings": asdict(settings),
@@ -271,6 +266,13 @@ def extract(
         "software": _versions(),
     }
     return tracks_of(scene, features, settings.descriptor, info)
+
+
+def _nothing(source: Source) -> ValueError:
+    return ValueError(
+        f"{source.name}: no landmark could be triangulated; "
+        "do images and poses belong together, and does the camera move?"
+    )
 
 
 def tracks_of(

@@ -1,4 +1,4 @@
-"""Keypoints and binary descriptors of one image, with the detector each descriptor is paired with."""
+"""Keypoints and binary descriptors of one image, each descriptor with its usual detector."""
 
 from __future__ import annotations
 
@@ -100,18 +100,20 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: image is missing, though the model names it")
     data = np.fromfile(path, dtype=np.uint8)
-    # OpenCV fills the missing rows of a cut-off JPEG with grey and only warns.
-    if data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:].tobytes():
-        raise ValueError(
-            f"{path}: image is truncated (its JPEG end marker is missing), copy it anew"
-        )
+    # OpenCV fills the missing rows of a cut-off image with grey and only warns.
+    start, end = data[:4].tobytes(), data[-4096:].tobytes()
+    for magic, last in ((b"\xff\xd8", b"\xff\xd9"), (b"\x89PNG", b"IEND")):
+        if start.startswith(magic) and last not in end:
+            raise ValueError(
+                f"{path}: image is truncated (its end marker is missing), copy it anew"
+            )
     image = (
         cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
         if len(data)
         else None
     )
     if image is None:
-        raise ValueError(f"{path}: not a readable image, or a truncated one; copy it anew")
+        raise ValueError(f"{path}: not a readable image, or a truncated one; copy it")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -198,7 +200,7 @@ class Extractor:
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:
-    """Up to `limit` of the keypoints: in each cell of a grid the strongest first, none too close."""
+    """Up to `limit` keypoints: in each cell of a grid the strongest first, none too close."""
     if not found:
         return []
     xy = np.array([k.pt for k in found], np.float64)

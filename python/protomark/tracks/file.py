@@ -158,7 +158,8 @@ class Tracks:
         for i, camera in enumerate(self.keyframe_camera):
             if int(camera) not in self.cameras:
                 raise ValueError(
-                    f"tracks: keyframe {self.keyframe_names[i]} names camera {camera}, which is missing"
+                    f"tracks: keyframe {self.keyframe_names[i]} names camera {camera}, "
+                    "which is missing"
                 )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -208,7 +209,8 @@ class Tracks:
                     raise ValueError(f"{path}: a safetensors file, but not a Protomark tracks file")
                 if int(header["version"]) > VERSION:
                     raise ValueError(
-                        f"{path}: tracks version {header['version']}, this Protomark reads up to {VERSION}"
+                        f"{path}: tracks version {header['version']}, this Protomark reads up to "
+                        f"{VERSION}; update it"
                     )
                 missing = set(_ARRAYS) - set(file.keys())
                 if missing:

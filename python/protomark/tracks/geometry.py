@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def relative_pose(first: Array, second: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and translation (3,) that map the first camera's coordinates to the second's."""
+    """Rotation (3, 3) and translation (3,) from the first camera's coordinates to the second's."""
     rotation = second[:, :3] @ first[:, :3].T
     return rotation, second[:, 3] - rotation @ first[:, 3]
 
@@ -75,6 +75,7 @@ def refine_points(
         poses: (n, 3, 4) cam_from_world of each observation.
         seen: (n, 2) undistorted ray of each observation.
         focal: (n,) focal length of each observation, pixels.
+        iterations: most steps to take.
         huber: pixels from where an error counts linearly.
 
     Returns:
@@ -85,10 +86,10 @@ def refine_points(
     def cost(at: Array) -> tuple[Array, Array, Array, Array]:
         difference, depth = residuals(at[landmark], poses, seen)
         difference *= focal[:, None]
-        error = np.linalg.norm(difference, axis=1)
+        error: Array = np.linalg.norm(difference, axis=1)
         error = np.where(depth > 0, error, 1e6)
         robust = np.where(error < huber, 0.5 * error**2, huber * (error - 0.5 * huber))
-        return np.bincount(landmark, robust, count), difference, error, depth
+        return np.bincount(landmark, robust, count).astype(float), difference, error, depth
 
     best, difference, error, depth = cost(points)
     points = points.copy()

@@ -53,6 +53,8 @@ def match(first: View, second: View, ratio: float, max_error: float) -> Matches:
     """Mutual nearest neighbours that pass the ratio test and lie on each other's epipolar lines.
 
     Args:
+        first: keyframe whose keypoints look for a match.
+        second: keyframe in which they look.
         ratio: the nearest distance must be below this share of the second nearest; in (0, 1].
         max_error: largest epipolar error in pixels.
     """

@@ -34,6 +34,7 @@ def triangulate(
         matches: (i, j) -> matches between keyframes i < j.
         max_error: largest reprojection error in pixels.
         min_angle: smallest angle between two rays of a landmark, degrees.
+        threads: threads of the triangulator.
 
     Returns:
         pycolmap.Reconstruction whose image ids are 1 + index of the keyframe.

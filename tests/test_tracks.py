@@ -1,0 +1,171 @@
+"""Tracks of a rendered scene, whose landmarks must lie on the plane that was rendered."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from protomark.tracks import Tracks
+from protomark.tracks.extract import Settings, Source, extract, find_source, fingerprint, is_done
+from protomark.tracks.features import DESCRIPTORS
+from protomark.tracks.summary import reprojection_errors, summarise
+from tracks_scene import DISTORTED, PINHOLE, poses, write_model, write_sequence
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sequence(tmp_path_factory.mktemp("scene") / "plane")
+
+
+@pytest.fixture(scope="module")
+def orb(sequence: Path) -> Tracks:
+    return extract(find_source(sequence), Settings("orb", max_keypoints=600))
+
+
+def spread_on_plane(tracks: Tracks) -> np.ndarray:
+    """Distance of each observation from its landmark's mean, measured on the true plane z = 0."""
+    from protomark.tracks.colmap import rays
+
+    rows = tracks.observations
+    keyframe = tracks.keyframe_of_keypoint[rows]
+    pose = poses(len(tracks.keyframe_names))[keyframe]
+    ray = rays(tracks.cameras[1], tracks.keypoints[rows])
+    direction = np.einsum("nji,nj->ni", pose[:, :, :3], np.column_stack([ray, np.ones(len(ray))]))
+    center = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
+    hit = (center - direction * (center[:, 2] / direction[:, 2])[:, None])[:, :2]
+    label = tracks.landmark_of_keypoint[rows]
+    count = np.bincount(label)
+    mean = np.column_stack([np.bincount(label, hit[:, k]) / count for k in (0, 1)])
+    return np.linalg.norm(hit - mean[label], axis=1)
+
+
+def check_labels(tracks: Tracks) -> None:
+    """What holds for every tracks file."""
+    assert tracks.landmark_ids.tolist() == list(range(len(tracks.landmark_ids)))
+    rows = tracks.observations
+    pairs = np.column_stack([tracks.landmark_of_keypoint[rows], tracks.keyframe_of_keypoint[rows]])
+    assert len(np.unique(pairs, axis=0)) == len(pairs), "a landmark twice in one keyframe"
+    assert np.bincount(tracks.landmark_of_keypoint[rows]).min() >= 3
+    first = np.unique(tracks.landmark_of_keypoint[rows], return_index=True)[1]
+    assert (np.diff(first) > 0).all(), "landmarks are numbered by their first keypoint"
+
+
+@pytest.mark.parametrize("name", DESCRIPTORS)
+def test_every_descriptor_gives_landmarks_on_the_plane(sequence: Path, name: str) -> None:
+    tracks = extract(find_source(sequence), Settings(name, max_keypoints=400))
+    check_labels(tracks)
+    assert tracks.bits == DESCRIPTORS[name].bits
+    assert len(tracks.landmark_ids) > 50
+    assert np.median(np.abs(tracks.landmark_positions[:, 2])) < 0.01
+    # One pixel is 1/150 of a unit at the plane.
+    assert np.percentile(spread_on_plane(tracks), 99) < 3 / 150
+    assert reprojection_errors(tracks).max() < 3.2
+    assert np.diff(tracks.offsets).max() <= 400
+
+
+def test_strong_distortion(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "bent", DISTORTED, count=6)
+    tracks = extract(find_source(folder), Settings("orb", max_keypoints=500))
+    check_labels(tracks)
+    assert len(tracks.landmark_ids) > 50
+    assert np.median(np.abs(tracks.landmark_positions[:, 2])) < 0.01
+    assert np.percentile(spread_on_plane(tracks), 99) < 3 / 130
+
+
+def test_same_tracks_on_any_number_of_threads(sequence: Path, orb: Tracks) -> None:
+    again = extract(find_source(sequence), Settings("orb", max_keypoints=600), threads=2)
+    for name, value in vars(orb).items():
+        if isinstance(value, np.ndarray):
+            assert np.array_equal(value, getattr(again, name)), name
+    assert again.info == orb.info
+
+
+def test_keyframes_are_in_order_of_capture(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "long", count=11)
+    tracks = extract(find_source(folder), Settings("orb", max_keypoints=200))
+    assert tracks.keyframe_names == [f"img{i}.png" for i in range(1, 12)]
+
+
+def test_rough_poses_are_noticed_and_refined(sequence: Path, tmp_path: Path) -> None:
+    shutil.copytree(sequence / "images", tmp_path / "images")
+    rng = np.random.default_rng(0)
+    rough = poses(8)
+    for pose in rough:
+        turn = cv2.Rodrigues(rng.normal(0, 0.008, 3))[0]
+        pose[:] = turn @ pose
+    write_model(tmp_path / "sparse", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
+    source = find_source(tmp_path)
+    kept = extract(source, Settings("orb", max_keypoints=500, refine_poses="no"))
+    refined = extract(source, Settings("orb", max_keypoints=500))
+    assert not kept.info["poses_refined"]
+    assert refined.info["poses_refined"]
+    assert np.allclose(kept.cam_from_world, rough, atol=1e-12)
+    assert reprojection_errors(refined).mean() < 0.6 * reprojection_errors(kept).mean()
+    assert len(refined.observations) > 1.2 * len(kept.observations)
+    # The world stays the given one: same place and scale, and the plane is flat in it.
+    centers = [-p[:, :3].T @ p[:, 3] for p in refined.cam_from_world]
+    true = [-p[:, :3].T @ p[:, 3] for p in poses(8)]
+    assert np.linalg.norm(np.subtract(centers, true), axis=1).max() < 0.08
+    points = refined.landmark_positions - refined.landmark_positions.mean(0)
+    assert np.linalg.svd(points)[1][2] / np.sqrt(len(points)) < 0.03
+
+
+def test_exact_poses_are_kept(orb: Tracks) -> None:
+    assert not orb.info["poses_refined"]
+    assert np.allclose(orb.cam_from_world, poses(8), atol=1e-12)
+
+
+def test_completion_adds_observations_that_are_right(sequence: Path, orb: Tracks) -> None:
+    assert orb.info["observations_completed"] > 0
+    # Against a stricter matcher that leaves more to completion, the same points come out.
+    strict = extract(find_source(sequence), Settings("orb", max_keypoints=600, ratio=0.6))
+    assert strict.info["observations_completed"] > orb.info["observations_completed"]
+    assert np.percentile(spread_on_plane(strict), 99) < 3 / 150
+
+
+def test_few_landmarks_are_double(orb: Tracks) -> None:
+    xyz = orb.landmark_positions
+    near = np.linalg.norm(xyz[:, None] - xyz[None], axis=2) < 1 / 150
+    assert (near.sum(1) > 1).mean() < 0.05
+
+
+def test_file_round_trip(orb: Tracks, tmp_path: Path) -> None:
+    path = tmp_path / "plane.orb.safetensors"
+    orb.save(path)
+    back = Tracks.load(path)
+    for name in ("descriptors", "keypoints", "landmark_of_keypoint", "landmark_positions"):
+        assert np.array_equal(getattr(back, name), getattr(orb, name))
+    assert back.info == orb.info
+    assert back.cameras == orb.cameras
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_summary_counts_add_up(orb: Tracks) -> None:
+    summary = summarise(orb)
+    assert sum(summary["track_length_histogram"].values()) == summary["landmarks"]
+    mean = summary["observations"] / summary["landmarks"]
+    assert summary["track_length_mean"] == pytest.approx(mean)
+    assert summary["reprojection_error_mean"] == pytest.approx(reprojection_errors(orb).mean())
+
+
+def test_done_only_with_same_settings_and_input(
+    sequence: Path, orb: Tracks, tmp_path: Path
+) -> None:
+    path = tmp_path / "t.safetensors"
+    source, settings = find_source(sequence), Settings("orb", max_keypoints=600)
+    digest = fingerprint(source)
+    assert not is_done(path, settings, digest)
+    orb.save(path)
+    assert is_done(path, settings, digest)
+    assert not is_done(path, Settings("orb", max_keypoints=601), digest)
+    rough = poses(8)
+    rough[3, 0, 3] += 1e-6
+    write_model(tmp_path / "moved", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
+    moved = Source("plane", source.images, tmp_path / "moved")
+    assert not is_done(path, settings, fingerprint(moved))
+    path.write_bytes(path.read_bytes()[:-100])
+    assert not is_done(path, settings, digest)
