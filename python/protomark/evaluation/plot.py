@@ -11,6 +11,7 @@ from protomark.evaluation.results import Summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, MUTED, GRID, OURS = "#1f2430", "#6b7280", "#e5e7eb", "#0f766e"
 # Families that are lines of several sizes get a colour of their own, single methods are grey.
@@ -88,16 +89,22 @@ def save_plot(rows: Sequence[Summary], path: str | os.PathLike[str], title: str 
     save_figure(figure, path)
 
 
-def save_figure(figure: object, path: str | os.PathLike[str]) -> None:
-    """Write a Matplotlib figure beside the target, then rename it over the target."""
-    from matplotlib.figure import Figure
+def save_figure(
+    figure: Figure, path: str | os.PathLike[str], made_by: str = "protomark evaluate"
+) -> None:
+    """Write a figure beside the target, then rename it over the target.
 
-    assert isinstance(figure, Figure)
+    Args:
+        figure: the figure.
+        path: PNG, SVG or PDF, by its ending.
+        made_by: what the file says of its origin.
+    """
     path = Path(path)
     check_ending(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        figure.savefig(temporary, dpi=160, facecolor="white")
+        key = "Software" if path.suffix.lower() == ".png" else "Creator"
+        figure.savefig(temporary, dpi=160, facecolor="white", metadata={key: made_by})
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -110,21 +117,29 @@ def check_ending(path: str | os.PathLike[str]) -> None:
 
 
 def _place(axes: Axes, labels: list[tuple[float, float, str, str, bool]]) -> None:
-    """Name each family right of its last point, lower where names would overlap."""
+    """Name each family beside its last point: ours above it, others to the right of it.
+
+    Of names on the right that would overlap, one is lowered.
+    """
     bottom, top = axes.get_ylim()
     room = 0.045 * (top - bottom)
     placed: list[tuple[float, float]] = []
     for x, y, text, colour, own in sorted(labels, key=lambda label: -label[1]):
+        if own:
+            axes.annotate(
+                text,
+                (x, y),
+                xytext=(0, 9),
+                textcoords="offset points",
+                color=colour,
+                fontsize=10,
+                fontweight="bold",
+                ha="center",
+            )
+            continue
         height = y
         for at, other in placed:
             if height > other - room and 0.3 < x / at < 3:
                 height = other - room
         placed.append((x, height))
-        axes.annotate(
-            text,
-            (1.15 * x, height),
-            color=colour,
-            fontsize=9,
-            fontweight="bold" if own else "normal",
-            va="center",
-        )
+        axes.annotate(text, (1.13 * x, height), color=colour, fontsize=9, va="center")

@@ -15,7 +15,7 @@ from protomark.evaluation.methods.projection import (
     principal_components,
     projected_mean,
 )
-from protomark.evaluation.methods.prototypes import PrototypeMethod
+from protomark.evaluation.methods.prototypes import prototypes
 from protomark.evaluation.methods.single import first_seen, random_sample
 from protomark.evaluation.methods.unaggregated import unaggregated
 from protomark.evaluation.support import Moments, Support
@@ -156,6 +156,6 @@ def _discriminants(
 
 def _prototypes(encoder: pm.Encoder, dim: int, threads: int) -> Callable[[Support], Method]:
     def build(support: Support) -> Method:
-        return PrototypeMethod(support, encoder, dim, threads)
+        return prototypes(support, encoder, dim, threads)
 
     return build

@@ -15,14 +15,11 @@ if TYPE_CHECKING:
 
 
 class PrototypeMethod(Method):
-    """A `pm.PrototypeMap` of the support: k bytes and one for the count."""
+    """A map of prototypes, open or sealed: k bytes and one for the count."""
 
-    def __init__(self, support: Support, encoder: pm.Encoder, dim: int, threads: int = 1) -> None:
-        import protomark as pm
-
-        self.map = pm.PrototypeMap(encoder, dim=dim)
-        self.map.add(support.landmarks, support.descriptors, threads=threads)
-        self.bytes_per_landmark = dim + 1
+    def __init__(self, scene: pm.PrototypeMap | pm.SealedMap) -> None:
+        self.map = scene
+        self.bytes_per_landmark = scene.dim + 1
 
     def match(
         self, descriptors: NDArray[np.uint8], threads: int = 1
@@ -30,3 +27,14 @@ class PrototypeMethod(Method):
         """See `Method.match`."""
         ids, distances = self.map.search(descriptors, k=2, threads=threads)
         return ids, distances
+
+
+def prototypes(
+    support: Support, encoder: pm.Encoder, dim: int, threads: int = 1
+) -> PrototypeMethod:
+    """Eq. 1 of Komorowski and Trzcinski: the mean of the codes of each landmark's descriptors."""
+    import protomark as pm
+
+    scene = pm.PrototypeMap(encoder, dim=dim)
+    scene.add(support.landmarks, support.descriptors, threads=threads)
+    return PrototypeMethod(scene)
