@@ -1,0 +1,138 @@
+"""`protomark evaluate` as users meet it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import protomark as pm
+from evaluation_scene import ring_scene
+from protomark.evaluation.command import encoders_for, learn, sequence_name
+from protomark.evaluation.results import load_json
+
+
+def evaluate(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "protomark.cli", "evaluate", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture
+def tracks(tmp_path: Path) -> Path:
+    path = tmp_path / "ring.test.safetensors"
+    ring_scene().save(path)
+    return path
+
+
+@pytest.fixture
+def model(encoder: pm.Encoder, tmp_path: Path) -> Path:
+    encoder.save(tmp_path / "tiny.pme")
+    return tmp_path / "tiny.pme"
+
+
+def test_everything_at_once(tracks: Path, model: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.test.safetensors"
+    ring_scene(seed=1).save(other)
+    out = [tmp_path / "r.json", tmp_path / "r.md", tmp_path / "r.png"]
+    done = evaluate(
+        tracks, other, "--encoder", model, "--seeds", 2,
+        "--json", out[0], "--markdown", out[1], "--plot", out[2],
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for shown in ("ring, TEST: 20 keyframes", "Protomark, 12", "mean of 2 sequences"):
+        assert shown in done.stdout
+    results = load_json(out[0])
+    assert [r.sequence for r in results] == ["ring", "other"]
+    figures = {m.name: m for m in results[0].methods}
+    assert len(figures) == 15
+    assert all(len(m.precision) == 2 for m in figures.values())
+    # What is easy by making: little noise, and the mean takes most of it away.
+    assert figures["unaggregated"].summary().precision > 0.95
+    assert figures["majority"].summary().precision > figures["random"].summary().precision
+    assert figures["mean"].summary().pose_recall == 1
+    assert json.loads(out[0].read_text())["sequences"][0]["table"][0]["ratio"] == 1
+    assert out[1].read_text().count("#### ") == 3
+    assert out[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_without_an_encoder_the_others_are_compared(tracks: Path) -> None:
+    done = evaluate(tracks, "--seeds", 1, "--pose-frames", 0, "--methods", "medoid, pca")
+    assert done.returncode == 0
+    assert "no encoder ships for test with 64 bits" in done.stderr
+    assert "Medoid" in done.stdout
+    assert "Random" not in done.stdout
+
+
+def test_precision_is_the_same_in_every_run_and_on_any_threads(
+    tracks: Path, tmp_path: Path
+) -> None:
+    figures = []
+    for threads in (1, 2):
+        path = tmp_path / f"{threads}.json"
+        evaluate(tracks, "--seeds", 1, "--threads", threads, "--json", path)
+        figures.append(
+            [(m.name, m.precision, m.found, m.right) for m in load_json(path)[0].methods]
+        )
+    assert figures[0] == figures[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none.safetensors"], "none.safetensors: no such tracks file"),
+        (["TRACKS", "--methods", "median"], "there is no method 'median'"),
+        (["TRACKS", "--encoder", "none"], "none: neither a model file nor a bundled encoder"),
+        (["TRACKS", "--plot", "plot.txt"], "plot.txt: a picture's name must end in"),
+        (["TRACKS", "--json", "no/such/r.json"], "no/such: no such folder to write r.json to"),
+        (["TRACKS", "--json", "."], "is a folder: name a file"),
+        (["TRACKS", "--discriminant-from", "none"], "none: no such tracks file"),
+        (["MODEL"], "tiny.pme: not a tracks file"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    tracks: Path, model: Path, arguments: list[str], message: str
+) -> None:
+    names = {"TRACKS": tracks, "MODEL": model}
+    done = evaluate(*[names.get(a, a) for a in arguments])
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+def test_discriminants_can_be_learned_from_other_tracks(tracks: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.safetensors"
+    ring_scene(seed=1).save(other)
+    path = tmp_path / "r.json"
+    done = evaluate(
+        tracks, "--methods", "discriminant-8", "--seeds", 1,
+        "--discriminant-from", other, "--json", path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert load_json(path)[0].discriminant == "other.safetensors"
+
+    together = learn([tracks, other], ring_scene())
+    one = learn([tracks], ring_scene())
+    assert not np.array_equal(together.within, one.within)
+    with pytest.raises(ValueError, match="give tracks of the same descriptor"):
+        learn([other], ring_scene(bits=128))
+
+
+def test_encoders_fit_by_descriptor_and_bits(encoder: pm.Encoder) -> None:
+    assert encoders_for(ring_scene(), [encoder], given=True) == [encoder]
+    assert encoders_for(ring_scene(bits=128), [encoder], given=True) == []
+    # Of those that ship, the one that is named like the descriptor.
+    assert encoders_for(ring_scene(), [encoder], given=False) == []
+
+
+def test_sequence_names() -> None:
+    assert sequence_name(Path("a/toy.freak.safetensors")) == "toy"
+    assert sequence_name(Path(".hidden")) == ".hidden"

@@ -1,0 +1,198 @@
+"""Poses from matches, and what counts as right and found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluation_scene import CAMERA, looking_inwards, radial_pixels, ring_scene
+from protomark.evaluation import pose
+from protomark.evaluation.methods import choices, choose
+from protomark.evaluation.methods.unaggregated import unaggregated
+from protomark.evaluation.protocol import split
+from protomark.evaluation.run import Options, draw_frames, evaluate, positions_of
+from protomark.evaluation.support import Support
+
+
+def test_projection_is_colmaps() -> None:
+    camera_points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 5), (50, 3))
+    world = np.eye(3, 4)
+    assert pose.project(CAMERA, world, camera_points) == pytest.approx(
+        radial_pixels(camera_points), abs=1e-6
+    )
+    behind = camera_points * (1, 1, -1)
+    assert np.isinf(pose.project(CAMERA, world, behind)).all()
+
+
+@given(
+    angle=st.floats(0, 180),
+    axis=st.sampled_from(list(np.eye(3))),
+    shift=st.tuples(*[st.floats(-10, 10)] * 3),
+    turn=st.floats(-3, 3),
+)
+def test_pose_error(
+    angle: float, axis: np.ndarray, shift: tuple[float, float, float], turn: float
+) -> None:
+    true = looking_inwards(turn)
+    cross = np.cross(np.eye(3), axis)
+    radians = np.radians(angle)
+    rotation = np.eye(3) + np.sin(radians) * cross + (1 - np.cos(radians)) * cross @ cross
+    turned = rotation @ true[:, :3]
+    centre = -true[:, :3].T @ true[:, 3] + shift
+    estimate = np.concatenate([turned, (-turned @ centre)[:, None]], axis=1)
+    distance, degrees = pose.pose_error(estimate, true)
+    assert distance == pytest.approx(np.linalg.norm(shift), abs=1e-6)
+    assert degrees == pytest.approx(angle, abs=1e-5)
+
+
+def test_found_needs_both_place_and_direction() -> None:
+    inliers = np.ones(4, bool)
+    near, straight = 0.01 * 5, 2.0
+    assert pose.Localization(np.eye(3, 4), near, straight, inliers).found(5)
+    assert not pose.Localization(np.eye(3, 4), near + 1e-6, straight, inliers).found(5)
+    assert not pose.Localization(np.eye(3, 4), near, straight + 1e-6, inliers).found(5)
+    assert not pose.Localization(None, np.inf, np.inf, inliers).found(5)
+
+
+def test_acceptance_ranks_by_ratio_and_keeps_each_landmark_once() -> None:
+    landmarks = np.array([[7, 1], [7, 2], [3, 7], [-1, -1], [4, 3], [5, -1], [6, 1], [8, 1]])
+    distances = np.array(
+        [[4, 8], [1, 8], [3, 10], [np.inf, np.inf], [5, 5], [9, np.inf], [0, 0], [0, 7]],
+        dtype=np.float32,
+    )
+    every = pose.accept(landmarks, distances, share=1)
+    # Ratios: 0.5 (loses landmark 7), 0.125, 0.3, none, 1, 0 at distance 9, 1 (0 / 0), 0 at 0.
+    assert every.keypoints.tolist() == [7, 5, 1, 2, 6, 4]
+    assert every.landmarks.tolist() == [8, 5, 7, 3, 6, 4]
+    quarter = pose.accept(landmarks, distances)
+    assert quarter.keypoints.tolist() == [7, 5]
+    nothing = pose.accept(landmarks[:0], distances[:0])
+    assert len(nothing.keypoints) == 0
+
+
+def test_right_matches() -> None:
+    tracks = ring_scene()
+    frame = pose.Frame.of(tracks, 3)
+    own = np.flatnonzero(frame.landmarks >= 0)[:6]
+    landmarks = frame.landmarks[own].copy()
+    landmarks[3:] = np.roll(frame.landmarks[own], 1)[3:]
+    matches = pose.Matches(own, landmarks)
+    positions = positions_of(tracks, landmarks)
+    assert pose.right(frame, matches, positions).tolist() == [True] * 3 + [False] * 3
+    # The track is not known to the keypoint, but the landmark projects onto it.
+    unknown = replace(frame, landmarks=np.full_like(frame.landmarks, -1))
+    assert pose.right(unknown, matches, positions).tolist() == [True] * 3 + [False] * 3
+    # The tolerance is half a percent of 640 pixels.
+    off = replace(unknown, keypoints=frame.keypoints + np.array([0, 3.2 + 2.5]))
+    assert not pose.right(off, matches, positions).any()
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.6])
+def test_a_pose_is_found_among_wrong_matches(wrong: float) -> None:
+    tracks = ring_scene()
+    depth = pose.scene_depth(tracks)
+    rng = np.random.default_rng(0)
+    for keyframe in range(5):
+        frame = pose.Frame.of(tracks, keyframe)
+        keypoints = np.flatnonzero(frame.landmarks >= 0)
+        landmarks = frame.landmarks[keypoints].copy()
+        spoilt = rng.random(len(landmarks)) < wrong
+        landmarks[spoilt] = rng.permutation(landmarks[spoilt])
+        matches = pose.Matches(keypoints, landmarks)
+        found = pose.localize(frame, matches, positions_of(tracks, landmarks))
+        assert found.found(depth)
+        # Half a pixel of noise at 500 pixels focal length: a thousandth of the depth.
+        assert found.position_error < 0.005 * depth
+        assert found.inliers[~spoilt].mean() > 0.95
+
+
+def test_no_pose_without_enough_matches() -> None:
+    tracks = ring_scene()
+    frame = pose.Frame.of(tracks, 0)
+    three = np.flatnonzero(frame.landmarks >= 0)[:3]
+    matches = pose.Matches(three, frame.landmarks[three])
+    found = pose.localize(frame, matches, positions_of(tracks, matches.landmarks))
+    assert found.cam_from_world is None
+    assert not found.found(1e9)
+
+
+def test_no_pose_from_random_matches() -> None:
+    tracks = ring_scene()
+    rng = np.random.default_rng(0)
+    frame = pose.Frame.of(tracks, 0)
+    keypoints = np.arange(100)
+    landmarks = rng.permutation(400)[:100]
+    found = pose.localize(
+        frame, pose.Matches(keypoints, landmarks), positions_of(tracks, landmarks)
+    )
+    assert not found.found(pose.scene_depth(tracks))
+
+
+def test_scene_depth_against_every_observation() -> None:
+    tracks = ring_scene(keyframes=5)
+    depths = [
+        float(tracks.cam_from_world[i, 2, :3] @ tracks.landmark_positions[j])
+        + tracks.cam_from_world[i, 2, 3]
+        for i, j in zip(tracks.keyframe_of_keypoint, tracks.landmark_of_keypoint, strict=True)
+        if j >= 0
+    ]
+    assert pose.scene_depth(tracks) == pytest.approx(np.median(depths))
+
+
+def test_camera_models_that_no_pose_can_be_found_for_are_named() -> None:
+    tracks = ring_scene(keyframes=3)
+    tracks.cameras[1] = replace(CAMERA, model="FOV", params=(500.0, 500.0, 320.0, 240.0, 0.1))
+    chosen = choose(choices(), ["first"])
+    with pytest.raises(ValueError, match=r"camera model FOV.*undistort"):
+        evaluate(tracks, "ring", chosen, Options(seeds=[0]))
+
+
+def test_frames_are_whole_query_keyframes() -> None:
+    tracks = ring_scene(keyframes=40)
+    part = split(tracks, 0)
+    assert len(draw_frames(tracks, part, 100)) == len(part.query_keyframes) == 4
+    some = draw_frames(tracks, part, 2)
+    assert len(some) == 2
+    for frame in some:
+        index = next(
+            i
+            for i in part.query_keyframes
+            if (tracks.cam_from_world[i] == frame.cam_from_world).all()
+        )
+        assert len(frame.keypoints) == np.diff(tracks.offsets)[index]
+        assert (frame.landmarks == -1).sum() == 40
+
+
+def test_figures_of_a_method_against_one_query_at_a_time() -> None:
+    tracks = ring_scene(noise=0.25)
+    chosen = choose(choices(), ["unaggregated", "pca-8"])
+    result = evaluate(tracks, "ring", chosen, Options(seeds=[0], threads=2))
+    part = split(tracks, 0)
+    support = Support(
+        tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
+    )
+    method = unaggregated(support)
+    right = sum(
+        int(method.match(tracks.descriptors[row : row + 1])[0][0, 0])
+        == tracks.landmark_of_keypoint[row]
+        for row in part.query_rows
+    )
+    whole, small = result.methods
+    assert whole.precision == [right / len(part.query_rows)]
+    assert 0 < small.precision[0] < whole.precision[0] < 1
+
+    accepted = good = found = 0
+    for keyframe in part.query_keyframes:
+        frame = pose.Frame.of(tracks, int(keyframe))
+        matches = pose.accept(*method.match(frame.descriptors))
+        positions = positions_of(tracks, matches.landmarks)
+        accepted += len(matches.keypoints)
+        good += int(pose.right(frame, matches, positions).sum())
+        found += pose.localize(frame, matches, positions).found(result.scene_depth)
+    assert (whole.frames, whole.found) == (2, found)
+    assert (whole.accepted, whole.right) == (accepted, good)
+    assert found == 2
