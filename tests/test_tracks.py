@@ -144,6 +144,17 @@ def test_file_round_trip(orb: Tracks, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+def test_max_unlabelled_drops_only_keypoints_without_landmark(sequence: Path, orb: Tracks) -> None:
+    settings = Settings("orb", max_keypoints=600, max_unlabelled=7)
+    few = extract(find_source(sequence), settings)
+    assert np.array_equal(few.descriptors[few.observations], orb.descriptors[orb.observations])
+    for i in range(len(few.keyframe_names)):
+        rows, all_rows = few.keypoints_of(i), orb.keypoints_of(i)
+        strong = np.sort(orb.responses[all_rows][orb.landmark_of_keypoint[all_rows] < 0])[-7:]
+        kept = few.responses[rows][few.landmark_of_keypoint[rows] < 0]
+        assert np.array_equal(np.sort(kept), strong)
+
+
 def test_summary_counts_add_up(orb: Tracks) -> None:
     summary = summarise(orb)
     assert sum(summary["track_length_histogram"].values()) == summary["landmarks"]

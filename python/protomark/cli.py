@@ -74,6 +74,12 @@ def tracks(
             "are only roughly right."
         ),
     ] = "auto",
+    max_unlabelled: Annotated[
+        int | None,
+        typer.Option(
+            help="Keypoints without a landmark kept in a keyframe, the strongest (smaller files)."
+        ),
+    ] = None,
     threads: Annotated[
         int, typer.Option(help="CPU threads, 0 for one a core; the result is the same.")
     ] = 0,
@@ -103,6 +109,7 @@ def tracks(
             min_angle=min_angle,
             min_length=min_length,
             refine_poses=refine_poses,
+            max_unlabelled=max_unlabelled,
         )
         for name in dict.fromkeys(descriptors or ["freak"])
     ]

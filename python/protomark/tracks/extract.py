@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protomark.tracks.features import Extractor, Features, descriptor_kind, read_gray
 from protomark.tracks.file import Tracks
@@ -41,6 +42,9 @@ class Settings:
         min_angle: smallest angle between two rays of a landmark, degrees.
         min_length: fewest observations of a landmark.
         refine_poses: "yes", "no", or "auto": where matches say that poses are only roughly right.
+        max_unlabelled: keypoints without a landmark that a keyframe keeps, the strongest; None
+            keeps all. Fewer make smaller files, but a query frame then shows fewer of the
+            keypoints that match nothing.
     """
 
     descriptor: str = "freak"
@@ -51,6 +55,7 @@ class Settings:
     min_angle: float = 1.0
     min_length: int = 3
     refine_poses: str = "auto"
+    max_unlabelled: int | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)
@@ -61,6 +66,11 @@ class Settings:
             ("max_error", 0 < self.max_error <= _ROUGH_ERROR, f"in (0, {_ROUGH_ERROR:g}]"),
             ("min_angle", 0 <= self.min_angle < 90, "in [0, 90)"),
             ("min_length", self.min_length >= 2, "at least 2"),
+            (
+                "max_unlabelled",
+                self.max_unlabelled is None or self.max_unlabelled >= 0,
+                "at least 0",
+            ),
             ("refine_poses", self.refine_poses in ("auto", "yes", "no"), "auto, yes or no"),
         )
         for name, fine, want in checks:
@@ -131,7 +141,12 @@ def is_done(path: Path, settings: Settings, digest: str) -> bool:
         info = Tracks.load(path).info
     except (ValueError, OSError):
         return False
-    return info.get("settings") == asdict(settings) and info.get("input") == digest
+    try:
+        # Options that came after the file was made have their defaults.
+        made_with = Settings(**info.get("settings", {}))
+    except (TypeError, ValueError):
+        return False
+    return made_with == settings and info.get("input") == digest
 
 
 def extract(
@@ -265,7 +280,19 @@ def extract(
         "max_descriptor_distance": max_distance,
         "software": _versions(),
     }
-    return tracks_of(scene, features, settings.descriptor, info)
+    tracks = tracks_of(scene, features, settings.descriptor, info)
+    if settings.max_unlabelled is not None:
+        tracks = tracks.where(_labelled_or_strong(tracks, settings.max_unlabelled))
+    return tracks
+
+
+def _labelled_or_strong(tracks: Tracks, limit: int) -> NDArray[np.bool_]:
+    keep = tracks.landmark_of_keypoint >= 0
+    for i in range(len(tracks.keyframe_names)):
+        rows = np.arange(tracks.offsets[i], tracks.offsets[i + 1])
+        rows = rows[~keep[rows]]
+        keep[rows[np.argsort(-tracks.responses[rows], kind="stable")[:limit]]] = True
+    return keep
 
 
 def _nothing(source: Source) -> ValueError:

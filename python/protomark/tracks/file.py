@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +117,13 @@ class Tracks:
     def keypoints_of(self, keyframe: int) -> slice:
         """The rows of one keyframe's keypoints."""
         return slice(int(self.offsets[keyframe]), int(self.offsets[keyframe + 1]))
+
+    def where(self, keep: NDArray[np.bool_]) -> Tracks:
+        """The tracks with only the keypoints for which `keep` (n,) is true; landmarks stay."""
+        kept = np.bincount(self.keyframe_of_keypoint[keep], minlength=len(self.keyframe_names))
+        rows = {name: getattr(self, name)[keep] for name, (_, s) in _ARRAYS.items() if s[0] == "n"}
+        offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+        return replace(self, offsets=offsets, **rows)
 
     def check(self) -> None:
         """Raise ValueError, naming the array, if shapes, types or indices do not fit together."""
