@@ -18,6 +18,7 @@ from protomark.evaluation.methods.bitwise import bitwise_and, majority
 from protomark.evaluation.methods.hamming_map import HammingMap
 from protomark.evaluation.methods.medoid import medoid
 from protomark.evaluation.methods.projection import (
+    RIDGE,
     linear_discriminants,
     mean_of_bits,
     principal_components,
@@ -215,7 +216,7 @@ def test_principal_components_against_singular_vectors() -> None:
 def test_linear_discriminants_whiten_matches_and_separate_the_rest() -> None:
     moments = Support(*structured()).moments
     matrix = linear_discriminants(moments).truncated(8).matrix.astype(float)
-    ridge = 1e-3 * np.trace(moments.within) / 64 * np.eye(64)
+    ridge = RIDGE * np.trace(moments.within) / 64 * np.eye(64)
     assert matrix.T @ (moments.within + ridge) @ matrix == pytest.approx(np.eye(8), abs=1e-3)
     separated = matrix.T @ moments.total @ matrix
     ratios = np.diag(separated)

@@ -1,0 +1,117 @@
+"""Write the tables of docs/evaluation.md from what `protomark evaluate --json` measured.
+
+python benchmarks/evaluation_tables.py [RESULTS.json ...]
+
+Without arguments: from all benchmarks/results/evaluation.*.json. Exit code 1 if Protomark is not
+above PCA at equal bytes on every test sequence.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from protomark.evaluation.report import markdown
+from protomark.evaluation.results import SequenceResult, load_json, write_text
+
+ROOT = Path(__file__).parent.parent
+DOCUMENT = ROOT / "docs" / "evaluation.md"
+START, END = "<!-- tables: start -->", "<!-- tables: end -->"
+SPLITS = {
+    "train": ("hololens", "desk_rpy", "viking", "conch", "seneca"),
+    "validation": ("caliterra",),
+    "test": ("toy", "kitchen", "castle", "kitti07"),
+}
+COLUMNS = {
+    "unaggregated": "all",
+    "medoid": "medoid",
+    "majority": "majority",
+    "mean": "mean, float",
+    "pca-8": "PCA 8",
+    "discriminant-8": "discr. 8",
+    "protomark-8": "**ours 8**",
+    "pca-16": "PCA 16",
+    "discriminant-16": "discr. 16",
+    "protomark-16": "**ours 16**",
+    "pca-32": "PCA 32",
+    "discriminant-32": "discr. 32",
+    "protomark-32": "**ours 32**",
+}
+
+
+def split_of(sequence: str) -> str:
+    """Whether a sequence trained, validated or tests what ships."""
+    return next(name for name, members in SPLITS.items() if sequence in members)
+
+
+def overview(results: list[SequenceResult]) -> str:
+    """Precision of the main methods, a row a sequence."""
+    lines = [
+        "| sequence | split | " + " | ".join(COLUMNS.values()) + " |",
+        "|---|---|" + "---:|" * len(COLUMNS),
+    ]
+    for result in results:
+        rows = {row.name: row for row in result.rows()}
+        texts = []
+        for name in COLUMNS:
+            text = f"{rows[name].precision:.3f}" if name in rows else "–"
+            texts.append(f"**{text}**" if name.startswith("protomark") else text)
+        lines.append(
+            f"| {result.sequence} | {split_of(result.sequence)} | " + " | ".join(texts) + " |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def check(results: list[SequenceResult]) -> list[str]:
+    """Where Protomark is not above PCA at equal bytes, on test sequences."""
+    failures = []
+    for result in results:
+        rows = {row.name: row for row in result.rows()}
+        if split_of(result.sequence) != "test":
+            continue
+        for dim in (8, 16, 32):
+            ours, theirs = rows.get(f"protomark-{dim}"), rows[f"pca-{dim}"]
+            if ours is None or ours.precision <= theirs.precision:
+                mine = "none" if ours is None else f"{ours.precision:.3f}"
+                failures.append(
+                    f"{result.sequence} {result.descriptor} {dim}: {mine}, PCA {theirs.precision:.3f}"
+                )
+    return failures
+
+
+def main() -> int:
+    """Write the tables and say what the check found."""
+    paths = [Path(p) for p in sys.argv[1:]] or sorted(
+        (ROOT / "benchmarks" / "results").glob("evaluation.*.json")
+    )
+    if not paths:
+        print("no results: run `protomark evaluate ... --json` first", file=sys.stderr)
+        return 1
+    order = [name for members in SPLITS.values() for name in members]
+    results = sorted(
+        (result for path in paths for result in load_json(path)),
+        key=lambda result: (result.descriptor, order.index(result.sequence)),
+    )
+    parts = []
+    for descriptor in dict.fromkeys(result.descriptor for result in results):
+        same = [result for result in results if result.descriptor == descriptor]
+        parts.append(f"### {descriptor.upper()}\n\n{overview(same)}")
+    parts.append("### Every figure\n")
+    for split, members in SPLITS.items():
+        chosen = [result for result in results if result.sequence in members]
+        if chosen:
+            parts.append(f"**Split: {split}**\n\n{markdown(chosen)}")
+    before, rest = DOCUMENT.read_text(encoding="utf-8").split(START)
+    _, after = rest.split(END)
+    write_text(DOCUMENT, f"{before}{START}\n\n" + "\n".join(parts) + f"\n{END}{after}")
+
+    failures = check(results)
+    for failure in failures:
+        print(f"not above PCA: {failure}")
+    if not failures:
+        print("above PCA at equal bytes on every test sequence given")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
