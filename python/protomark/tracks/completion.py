@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from protomark.tracks.colmap import Model, project
 from protomark.tracks.geometry import group, refine_points, residuals, widest_angle
 
+# Landmarks this close (pixels) are one, though detection found two keypoints in some keyframe.
+SAME_POINT = 2.0
 _POPCOUNT = np.array([bin(i).count("1") for i in range(256)], np.uint8)
 
 
@@ -74,7 +76,7 @@ def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> 
     if not len(scene.positions):
         return
     scene.labels[~np.isfinite(scene.rays).all(1)] = -1
-    for _ in range(2):
+    for iterations in (5, 3):
         rows = scene.observations()
         scene.positions = refine_points(
             scene.positions,
@@ -82,6 +84,7 @@ def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> 
             scene.model.cam_from_world[scene.keyframe[rows]],
             scene.rays[rows],
             scene.focal[rows],
+            iterations,
         )
         scene.labels[rows[scene.errors(rows) > max_error]] = -1
     rows = scene.observations()
@@ -232,13 +235,18 @@ def within(
 
 
 def _merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
-    """Merge landmarks that were voted one, share no keyframe and fit one position."""
-    # Votes may be of landmarks that meanwhile gained an observation in the same keyframe.
+    """Merge landmarks that were voted one and fit one position.
+
+    Two landmarks that share a keyframe merge only if they lie within `SAME_POINT` pixels of each
+    other; in a shared keyframe the keypoint that fits better keeps the landmark.
+    """
     if not len(votes):
         return 0
     pairs, count = np.unique(votes, axis=0, return_counts=True)
     pairs = pairs[np.argsort(-count, kind="stable")]
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     rows = scene.observations()
+    close = _apart(scene, pairs, rows) <= SAME_POINT
     starts, lengths = group(scene.labels[rows])
     keyframes = {
         int(scene.labels[rows[s]]): set(scene.keyframe[rows[s : s + n]].tolist())
@@ -246,10 +254,10 @@ def _merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
     }
     used: set[int] = set()
     into = np.arange(len(scene.positions))
-    for keep, drop in pairs.tolist():
-        if keep in used or drop in used or keep == drop:
+    for (keep, drop), near in zip(pairs.tolist(), close.tolist(), strict=True):
+        if keep in used or drop in used:
             continue
-        if keyframes.get(keep, set()).isdisjoint(keyframes.get(drop, set())):
+        if near or keyframes.get(keep, set()).isdisjoint(keyframes.get(drop, set())):
             used.update((keep, drop))
             into[drop] = keep
     before = scene.labels[rows]
@@ -258,19 +266,38 @@ def _merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
     rows, before, after = rows[touched], before[touched], after[touched]
     if not len(rows):
         return 0
-    moved = refine_points(
-        scene.positions,
-        after,
-        scene.model.cam_from_world[scene.keyframe[rows]],
-        scene.rays[rows],
-        scene.focal[rows],
+    poses, seen = scene.model.cam_from_world[scene.keyframe[rows]], scene.rays[rows]
+    moved = refine_points(scene.positions, after, poses, seen, scene.focal[rows])
+    difference, depth = residuals(moved[after], poses, seen)
+    error = np.where(depth > 0, np.linalg.norm(difference, axis=1) * scene.focal[rows], np.inf)
+    # Of two keypoints in one keyframe the better one counts, the other loses its landmark.
+    order = np.lexsort((error, scene.keyframe[rows], after))
+    again = (np.diff(after[order], prepend=-1) == 0) & (
+        np.diff(scene.keyframe[rows[order]], prepend=-1) == 0
     )
-    difference, depth = residuals(
-        moved[after], scene.model.cam_from_world[scene.keyframe[rows]], scene.rays[rows]
-    )
-    error = np.linalg.norm(difference, axis=1) * scene.focal[rows]
-    bad = np.unique(after[(error > max_error) | (depth <= 0)])
+    spare = np.zeros(len(rows), bool)
+    spare[order[again]] = True
+    bad = np.unique(after[(error > max_error) & ~spare])
     fine = ~np.isin(after, bad)
-    scene.labels[rows[fine]] = after[fine]
+    scene.labels[rows[fine]] = np.where(spare[fine], -1, after[fine])
     scene.positions[after[fine]] = moved[after[fine]]
     return len(np.unique(before[fine][before[fine] != after[fine]]))
+
+
+def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Median distance (n,) in pixels between two landmarks, over the keyframes of the first."""
+    labels = scene.labels[rows]
+    start = np.searchsorted(labels, pairs[:, 0], "left")
+    length = np.searchsorted(labels, pairs[:, 0], "right") - start
+    pair = np.repeat(np.arange(len(pairs)), length)
+    at = rows[np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]]
+    poses = scene.model.cam_from_world[scene.keyframe[at]]
+    nothing = np.zeros((len(at), 2))
+    first, _ = residuals(scene.positions[pairs[pair, 0]], poses, nothing)
+    second, _ = residuals(scene.positions[pairs[pair, 1]], poses, nothing)
+    distance = np.linalg.norm(first - second, axis=1) * scene.focal[at]
+    order = np.lexsort((distance, pair))
+    out = np.full(len(pairs), np.inf)
+    has = length > 0
+    out[has] = distance[order[(np.cumsum(length) - length + length // 2)[has]]]
+    return out

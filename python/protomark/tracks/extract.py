@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -27,6 +28,9 @@ _ROUGH_ERROR = 16.0
 _ROUGH_POSES = 1.0
 _MIN_MATCHES = 15
 _REFINE_ERRORS = (12.0, 4.0)
+_PASSES = 3
+# Goes up whenever the same settings give other tracks, so that old files are made anew.
+_METHOD = 2
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,8 @@ def is_done(path: Path, settings: Settings, digest: str) -> bool:
         made_with = Settings(**info.get("settings", {}))
     except (TypeError, ValueError):
         return False
+    if info.get("method") != _METHOD:
+        return False
     return made_with == settings and info.get("input") == digest
 
 
@@ -253,17 +259,18 @@ def extract(
     max_distance = int(np.percentile(distances, 99)) if len(distances) else 0
     partners = [np.flatnonzero(overlap[i] > pairs.MIN_OVERLAP) for i in range(len(views))]
     added = merged = 0
-    for step in range(2):
-        progress("complete", step, 2)
+    for step in range(_PASSES):
+        progress("complete", step, _PASSES)
         more, joined = completion.complete(scene, partners, settings.max_error, max_distance)
         added, merged = added + more, merged + joined
         completion.clean(scene, settings.max_error, settings.min_angle, 2)
     completion.clean(scene, settings.max_error, settings.min_angle, settings.min_length)
-    progress("complete", 2, 2)
+    progress("complete", _PASSES, _PASSES)
     if not len(scene.positions):
         raise _nothing(source)
     info: dict[str, Any] = {
         "sequence": source.name,
+        "method": _METHOD,
         "settings": asdict(settings),
         "input": digest,
         "epipolar_error": round(error, 3),
@@ -334,7 +341,12 @@ def _detect(
 ) -> list[Features]:
     import cv2
 
+    # One extractor a thread: OpenCV's are costly to make and not to be shared.
+    local = threading.local()
+
     def one(index: int) -> Features:
+        if not hasattr(local, "extractor"):
+            local.extractor = Extractor(settings.descriptor, settings.max_keypoints)
         name = model.names[index]
         image = read_gray(source.images / name)
         camera = model.cameras[int(model.camera_ids[index])]
@@ -343,7 +355,8 @@ def _detect(
                 f"{source.images / name}: {image.shape[1]}x{image.shape[0]} pixels, but its camera "
                 f"in the model has {camera.width}x{camera.height}; use the images of this model"
             )
-        return Extractor(settings.descriptor, settings.max_keypoints)(image)
+        features: Features = local.extractor(image)
+        return features
 
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

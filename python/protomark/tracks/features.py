@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Two keypoints closer than this (pixels) are one place in the image, found twice: at two pyramid
-# levels, or at two corners of one edge. Both would become landmarks of the same 3D point.
-MIN_DISTANCE = 2.5
+# levels, or at two corners of one edge. Both would become landmarks that look alike and lie within
+# the error of each other, so that no one could say which of them a query should find.
+MIN_DISTANCE = 4.0
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[i
     xy = np.array([k.pt for k in found], np.float64)
     response = np.array([k.response for k in found], np.float64)
     order = np.lexsort(([k.octave for k in found], xy[:, 0], xy[:, 1], -response))
-    order = order[: 10 * limit]
+    order = order[: 5 * limit]
     order = order[_apart(xy[order], MIN_DISTANCE)]
     # About four keypoints a cell if all cells were equally rich.
     cell = max(1.0, float(np.sqrt(width * height / max(1.0, limit / 4))))

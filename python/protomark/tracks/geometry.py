@@ -81,51 +81,54 @@ def refine_points(
     Returns:
         (l, 3) positions; points whose error would grow stay where they are.
     """
-    count = len(points)
+    order = np.argsort(landmark, kind="stable")
+    poses, seen, focal = poses[order], seen[order], focal[order]
+    starts, lengths = group(landmark[order])
+    if not len(starts):
+        return points.copy()
+    present = landmark[order][starts]
+    # Only landmarks with observations from here on, one run of rows each.
+    at = points[present]
+    run = np.repeat(np.arange(len(present)), lengths)
 
-    def cost(at: Array) -> tuple[Array, Array, Array, Array]:
-        difference, depth = residuals(at[landmark], poses, seen)
-        difference *= focal[:, None]
-        error: Array = np.linalg.norm(difference, axis=1)
-        error = np.where(depth > 0, error, 1e6)
+    def cost(at: Array) -> tuple[Array, Array, Array, Array, Array]:
+        local = np.einsum("nij,nj->ni", poses[:, :, :3], at[run]) + poses[:, :, 3]
+        depth = local[:, 2]
+        local = local / np.where(depth > 0, depth, 1.0)[:, None]
+        difference = (local[:, :2] - seen) * focal[:, None]
+        error = np.where(depth > 0, np.hypot(difference[:, 0], difference[:, 1]), 1e6)
         robust = np.where(error < huber, 0.5 * error**2, huber * (error - 0.5 * huber))
-        return np.bincount(landmark, robust, count).astype(float), difference, error, depth
+        return np.add.reduceat(robust, starts), difference, error, depth, local
 
-    best, difference, error, depth = cost(points)
-    points = points.copy()
+    best, difference, error, depth, local = cost(at)
     for _ in range(iterations):
         weight = np.minimum(1.0, huber / np.maximum(error, 1e-12)) * (depth > 0)
-        local = np.einsum("nij,nj->ni", poses[:, :, :3], points[landmark]) + poses[:, :, 3]
-        z = np.where(depth > 0, depth, 1.0)
-        scale = (focal / z)[:, None]
-        rows = [
-            scale * (poses[:, k, :3] - (local[:, k] / z)[:, None] * poses[:, 2, :3]) for k in (0, 1)
-        ]
-        normal = np.empty((count, 3, 3))
-        right = np.empty((count, 3))
-        for i in range(3):
-            right[:, i] = np.bincount(
-                landmark,
-                weight * (rows[0][:, i] * difference[:, 0] + rows[1][:, i] * difference[:, 1]),
-                count,
-            )
-            for j in range(i, 3):
-                normal[:, i, j] = normal[:, j, i] = np.bincount(
-                    landmark,
-                    weight * (rows[0][:, i] * rows[0][:, j] + rows[1][:, i] * rows[1][:, j]),
-                    count,
-                )
+        scale = (focal / np.where(depth > 0, depth, 1.0))[:, None]
+        x, y = (scale * (poses[:, k, :3] - local[:, k, None] * poses[:, 2, :3]) for k in (0, 1))
+        products = [x[:, i] * x[:, j] + y[:, i] * y[:, j] for i in range(3) for j in range(i, 3)]
+        products += [x[:, i] * difference[:, 0] + y[:, i] * difference[:, 1] for i in range(3)]
+        sums = np.add.reduceat(np.stack(products, axis=1) * weight[:, None], starts, axis=0)
+        normal = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         trace = np.trace(normal, axis1=1, axis2=2)
-        normal += (1e-6 * trace + 1e-12)[:, None, None] * np.eye(3)
-        moved = points - np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-        moved = np.where(np.isfinite(moved), moved, points)
-        after, *_ = cost(moved)
-        better = after < best
-        if not better.any():
+        normal = normal + (1e-6 * trace + 1e-12)[:, None, None] * np.eye(3)
+        moved = at - np.linalg.solve(normal, sums[:, 6:, None])[:, :, 0]
+        moved = np.where(np.isfinite(moved), moved, at)
+        after = cost(moved)
+        better = after[0] < best
+        # Pixels squared: what moves less than this stays within a thousandth of a pixel.
+        if not (best - after[0] > 1e-6).any():
             break
-        points[better] = moved[better]
-        best, difference, error, depth = cost(points)
-    return points
+        at = np.where(better[:, None], moved, at)
+        best = np.where(better, after[0], best)
+        rows = better[run]
+        difference, local = (
+            np.where(rows[:, None], new, old)
+            for new, old in ((after[1], difference), (after[4], local))
+        )
+        error, depth = np.where(rows, after[2], error), np.where(rows, after[3], depth)
+    out = points.copy()
+    out[present] = at
+    return out
 
 
 def widest_angle(points: Array, landmark: NDArray[np.int64], centers: Array) -> Array:
