@@ -74,7 +74,8 @@ def check(results: list[SequenceResult]) -> list[str]:
             if ours is None or ours.precision <= theirs.precision:
                 mine = "none" if ours is None else f"{ours.precision:.3f}"
                 failures.append(
-                    f"{result.sequence} {result.descriptor} {dim}: {mine}, PCA {theirs.precision:.3f}"
+                    f"{result.sequence} {result.descriptor} {dim}: "
+                    f"{mine}, PCA {theirs.precision:.3f}"
                 )
     return failures
 

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
+from protomark import sample
+from protomark.build import check_descriptor
 from protomark.console import console, progress_bar
 from protomark.evaluation import pose
 from protomark.evaluation.methods import choices, choose
@@ -78,18 +80,6 @@ class DemoResult:
         return asdict(self)
 
 
-def sample_path() -> Path:
-    """The tracks file that ships.
-
-    Raises:
-        FileNotFoundError: the installation lacks it.
-    """
-    path = Path(__file__).parent / "sample" / "toy.freak.safetensors"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: the sample is missing, reinstall protomark")
-    return path
-
-
 def run_demo(
     output: Path,
     *,
@@ -107,8 +97,9 @@ def run_demo(
         FileExistsError: a file of the same name, but not of the demo's making, is in the way.
     """
     began = time.perf_counter()
-    tracks = Tracks.load(tracks_path or sample_path())
+    tracks = Tracks.load(tracks_path or sample.path())
     coder = pm.Encoder.load(encoder or tracks.descriptor)
+    check_descriptor(tracks, coder)
     _check_output(output)
     output.mkdir(parents=True, exist_ok=True)
 
@@ -208,9 +199,9 @@ def show(result: DemoResult) -> None:
         )
     console.print(table)
     console.print(
-        "Whole map: landmarks with position (12 bytes). Median error: of the camera position, as a "
-        "share of the median scene depth; found: within 1 % of it and 2 degrees. ms: matching and "
-        "RANSAC on one thread.",
+        "Whole map: landmarks with position (12 bytes), without what exists once, such as the "
+        "encoder. Median error: of the camera position, as a share of the median scene depth; "
+        "found: within 1 % of it and 2 degrees. ms: matching and RANSAC on one thread.",
         style="dim",
         highlight=False,
     )

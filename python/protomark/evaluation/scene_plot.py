@@ -98,16 +98,15 @@ def draw_scene(axes: Axes, picture: ScenePicture, title: str = "") -> None:
 def view_from_above(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 3, 4) poses -> (2, 3) axes of the ground plane, x along the widest spread of cameras.
 
-    Up is the mean of the images' up; for cameras that look down, rather the opposite of their
-    mean direction of view.
+    Up is the mean of the images' up. Where cameras mostly look one way, and move less along it
+    than along that up, they look down, and up is the opposite of their view.
     """
-    up = -poses[:, 1, :3].mean(axis=0)
-    ahead = poses[:, 2, :3].mean(axis=0)
-    if np.linalg.norm(ahead) > np.linalg.norm(up):
-        up = -ahead
-    up = up / (np.linalg.norm(up) or 1.0)
     centres = centre(poses)
     spread = centres - centres.mean(axis=0)
+    up, back = -poses[:, 1, :3].mean(axis=0), -poses[:, 2, :3].mean(axis=0)
+    if np.linalg.norm(back) > 0.7 and np.linalg.norm(spread @ back) < np.linalg.norm(spread @ up):
+        up = back
+    up = up / (np.linalg.norm(up) or 1.0)
     spread = spread - np.outer(spread @ up, up)
     # Without any spread the first right-singular vector is arbitrary, so take it off `up` again.
     across = np.linalg.svd(spread, full_matrices=False)[2][0]
