@@ -1,8 +1,8 @@
 """One small real map, so that everything runs after install.
 
 The tracks of the sequence "toy" (a toy on a textured table; github.com/sfmtool/sfmtool,
-Apache-2.0):
-FREAK keypoints and descriptors, poses and landmarks that `protomark tracks` computed; no image.
+Apache-2.0): FREAK keypoints and descriptors, poses and landmarks that `protomark tracks` computed;
+no image.
 """
 
 from __future__ import annotations
