@@ -117,7 +117,7 @@ def check_ending(path: str | os.PathLike[str]) -> None:
 
 
 def _place(axes: Axes, labels: list[tuple[float, float, str, str, bool]]) -> None:
-    """Name each family beside its last point: ours above it, others to the right of it.
+    """Name each family beside its last point: ours to the left, others to the right of it.
 
     Of names on the right that would overlap, one is lowered.
     """
@@ -129,12 +129,12 @@ def _place(axes: Axes, labels: list[tuple[float, float, str, str, bool]]) -> Non
             axes.annotate(
                 text,
                 (x, y),
-                xytext=(0, 9),
+                xytext=(-8, 4),
                 textcoords="offset points",
                 color=colour,
                 fontsize=10,
                 fontweight="bold",
-                ha="center",
+                ha="right",
             )
             continue
         height = y
