@@ -4,13 +4,14 @@ import json
 import sys
 
 import numpy as np
-import protomark as pm
 import pytest
+from typer.testing import CliRunner
+
+import protomark as pm
 from protomark.cli import app
 from protomark.tracks.file import Tracks
 from protomark.training.data import load_training
 from training_scene import scene
-from typer.testing import CliRunner
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
     result = run(
         files["a"], files["b"], "--validation", files["unseen"], "-o", out, "--dims", "4,8",
         "--steps", 60, "--batch", 200, "--threads", 1, "--licence", "Apache-2.0",
+        "--data-licence", "b=MIT",
         "--json", tmp_path / "mine.json",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -51,7 +53,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
     assert (encoder.name, encoder.descriptor, encoder.bits) == ("mine", "synthetic", 128)
     assert list(encoder.dims) == [4, 8]
     assert encoder.licence == "Apache-2.0"
-    assert encoder.data == "a (CC0-1.0); b (CC0-1.0)"
+    assert encoder.data == "a (CC0-1.0); b (MIT)"
     codes = encoder.encode(Tracks.load(files["unseen"]).descriptors)
     # Clamping is rare, and the codes use what 8 bits offer.
     assert (np.abs(codes.astype(int)) == 127).mean() < 0.01
@@ -69,7 +71,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
     assert (
         "protomark train a.synthetic.safetensors b.synthetic.safetensors --validation "
         "unseen.synthetic.safetensors -o mine.pme --dims 4,8 --steps 60 --batch 200 "
-        "--licence Apache-2.0"
+        "--licence Apache-2.0 --data-licence b=MIT"
     ) in card
     assert f"{validation['integer_precision']['8']:.4f}" in card
     assert str(tmp_path) not in card
@@ -108,6 +110,8 @@ def test_a_missing_file_is_named(files, tmp_path):
         (["--steps", "0"], "steps"),
         (["--device", "abacus"], "cpu or cuda"),
         (["--resume"], "without --resume"),
+        (["--data-licence", "MIT"], "NAME=LICENCE"),
+        (["--data-licence", "z=MIT"], "none of the sequences"),
         (["-o", "no/such/folder/x.pme"], "does not exist"),
         (["--report", "nowhere.safetensors"], "nowhere"),
     ],

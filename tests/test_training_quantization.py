@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
-import protomark as pm
 import pytest
 import torch
+
+import protomark as pm
 from protomark.training.network import (
     MAX_WEIGHT_BYTES,
     EncoderNetwork,

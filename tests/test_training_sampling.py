@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from protomark.training.sampling import BatchSampler, Views
 from training_scene import scene
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
 from protomark.training.network import embed
 from protomark.training.quantization import integer_forward
 from protomark.training.sampling import Views

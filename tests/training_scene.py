@@ -7,6 +7,7 @@ most variance (PCA) keeps the wrong ones, and an encoder that learns from tracks
 from __future__ import annotations
 
 import numpy as np
+
 from protomark.tracks.file import Camera, Tracks
 
 IDENTITY, NUISANCE = 10, 4

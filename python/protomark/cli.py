@@ -153,6 +153,10 @@ def train(
     ] = False,
     name: Annotated[str, typer.Option(help="Name of the encoder; the output's if empty.")] = "",
     licence: Annotated[str, typer.Option(help="Licence of the weights, for the model file.")] = "",
+    data_licence: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=LICENCE", help="Licence of a sequence; may be repeated."),
+    ] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
@@ -175,6 +179,10 @@ def train(
         parsed = tuple(int(d) for d in dims.split(","))
     except ValueError:
         raise ValueError(f"--dims {dims!r} is not a list of numbers such as 8,16,32") from None
+    for entry in data_licence or []:
+        if "=" not in entry:
+            raise ValueError(f"--data-licence {entry!r} is not of the form NAME=LICENCE")
+    data_licences = dict(entry.split("=", 1) for entry in data_licence or [])
     options = Options(dims=parsed, steps=steps, landmarks=batch, seed=seed)
     try:
         card = train_encoder(
@@ -186,6 +194,7 @@ def train(
             resume=resume,
             name=name,
             licence=licence,
+            data_licences=data_licences,
             device=device,
             threads=threads,
             json_path=json_file,

@@ -7,7 +7,7 @@ import os
 import platform
 import shlex
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -42,6 +42,7 @@ def train_encoder(
     resume: bool = False,
     name: str = "",
     licence: str = "",
+    data_licences: Mapping[str, str] | None = None,
     device: str = "cpu",
     threads: int = 0,
     json_path: Path | None = None,
@@ -59,6 +60,7 @@ def train_encoder(
         resume: continue from the checkpoint.
         name: of the encoder; the output's stem if empty.
         licence: of the weights.
+        data_licences: of the sequences, by name, for the card and the model file.
         device: "cpu" or "cuda".
         threads: for PyTorch on a CPU; 0 for one a core.
         json_path: where the figures go as JSON.
@@ -81,7 +83,7 @@ def train_encoder(
     for path in report:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such tracks file")
-    data = load_training(training, validation)
+    data = load_training(training, validation, licences=data_licences)
     half = has_fast_bfloat16(device)
     checkpoint = output.with_name(output.name + ".checkpoint")
     trainer = Trainer(data.views, data.trials, options, checkpoint, data.fingerprint, device, half)
@@ -90,7 +92,7 @@ def train_encoder(
     _run(trainer)
 
     encoder = pm.Encoder(
-        trainer.quantized.export(),
+        [{**layer} for layer in trainer.quantized.export()],
         dims=list(options.dims),
         name=name or output.stem,
         descriptor=data.descriptor,
@@ -116,7 +118,9 @@ def train_encoder(
         licence=licence,
         sources=data.sources,
         validation=data.validation_sources,
-        command=_command(data, training, report, output, options, name, licence, device),
+        command=_command(
+            data, training, report, output, options, name, licence, data_licences, device
+        ),
         seconds=trainer.seconds,
         machine=_machine(device, threads, half),
         steps=options.steps,
@@ -198,6 +202,7 @@ def _command(
     options: Options,
     name: str,
     licence: str,
+    data_licences: Mapping[str, str] | None,
     device: str,
 ) -> str:
     """The command that trains this encoder again, files by name only."""
@@ -216,6 +221,9 @@ def _command(
     for flag, value in (("--name", name), ("--licence", licence)):
         if value:
             words += [flag, value]
+    for source in [*data.sources, *data.validation_sources]:
+        if data_licences and source.name in data_licences:
+            words += ["--data-licence", f"{source.name}={source.licence}"]
     if device != "cpu":
         words += ["--device", device]
     return shlex.join(words)

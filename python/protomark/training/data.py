@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ class Source:
         name: file name up to its first dot.
         file: file name.
         keyframes, landmarks, observations: how many there are.
-        licence: from the tracks' `info`, "" if it does not say.
+        licence: what the user says of it, else what the tracks' `info` says, else "".
     """
 
     name: str
@@ -79,6 +79,7 @@ def load_training(
     validation: Sequence[Path],
     seeds: Sequence[int] = (0,),
     max_queries: int = 5_000,
+    licences: Mapping[str, str] | None = None,
 ) -> TrainingData:
     """Read and check training and validation tracks.
 
@@ -87,6 +88,7 @@ def load_training(
         validation: tracks files to pick the model by, none of them in `training`.
         seeds: one split of each validation sequence for each.
         max_queries: queries of one split.
+        licences: of the sequences, by name, for the card.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -102,6 +104,13 @@ def load_training(
         raise ValueError(
             f"{sorted(both)[0].name} is given for training and for validation; "
             "validate on a sequence that is not trained on"
+        )
+    licences = licences or {}
+    unknown = set(licences) - {sequence_name(p) for p in [*training, *validation]}
+    if unknown:
+        raise ValueError(
+            f"a licence is given for {min(unknown)}, which is none of the sequences; "
+            "a sequence's name is its file's name up to the first dot"
         )
     descriptor, bits = "", 0
     views: list[Views] = []
@@ -124,7 +133,7 @@ def load_training(
             )
         digest.update(tracks.descriptors.tobytes())
         digest.update(tracks.landmark_of_keypoint.tobytes())
-        sources.append(_source(tracks, path))
+        sources.append(_source(tracks, path, licences))
         if i < len(training):
             found = Views.from_tracks(tracks, sequence_name(path))
             if not (found.counts >= 3).any():
@@ -152,12 +161,13 @@ def load_training(
     )
 
 
-def _source(tracks: Tracks, path: Path) -> Source:
+def _source(tracks: Tracks, path: Path, licences: Mapping[str, str]) -> Source:
+    name = sequence_name(path)
     return Source(
-        sequence_name(path),
+        name,
         path.name,
         len(tracks.keyframe_names),
         len(np.unique(tracks.landmark_of_keypoint[tracks.observations])),
         len(tracks.observations),
-        str(tracks.info.get("licence", "")),
+        licences.get(name) or str(tracks.info.get("licence", "")),
     )
