@@ -141,7 +141,7 @@ def train(
     dims: Annotated[
         str, typer.Option(help="Code lengths that shall serve, ascending.")
     ] = "8,16,32",
-    steps: Annotated[int, typer.Option(help="Batches in all.")] = 10_000,
+    steps: Annotated[int, typer.Option(help="Batches in all.")] = 4000,
     batch: Annotated[int, typer.Option(help="Landmarks in a batch.")] = 1000,
     seed: Annotated[int, typer.Option(help="Of weights and batches.")] = 0,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",

@@ -1,7 +1,6 @@
 """The encoder as a floating-point network: fully connected layers with SELU in between.
 
-It is the paper's 'funnel': wide, wide, half as wide, then the embedding. Inputs are bits
-as -1 and +1, which keeps them centred for the self-normalising activation.
+Inputs are bits as -1 and +1, which keeps them centred for the self-normalising activation.
 """
 
 from __future__ import annotations
@@ -26,17 +25,16 @@ def weight_bytes(bits: int, hidden: Sequence[int], dim: int) -> int:
     return sum(a * b for a, b in pairwise(widths))
 
 
-def default_hidden(bits: int, dim: int) -> tuple[int, int]:
-    """Hidden widths for descriptors of `bits` bits: (h, h / 2), h the widest up to 512 that fits.
+def default_hidden(bits: int, dim: int) -> tuple[int, ...]:
+    """One hidden layer, the widest up to 512 units whose int8 weights fit `MAX_WEIGHT_BYTES`.
 
-    For 512 bits this is the paper's funnel after its first layer of b units, with one such layer
-    more than its three-layer network; longer descriptors get a smaller h so that the int8 weights
-    stay within `MAX_WEIGHT_BYTES`.
+    The paper's funnel (two hidden layers, the second half as wide) fits the training sequences
+    better and unseen ones worse; `docs/training.md` has the figures.
     """
     width = _WIDEST
-    while weight_bytes(bits, (width, width // 2), dim) > MAX_WEIGHT_BYTES:
+    while weight_bytes(bits, (width,), dim) > MAX_WEIGHT_BYTES:
         width -= 32
-    return width, width // 2
+    return (width,)
 
 
 def unpack_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:

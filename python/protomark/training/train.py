@@ -56,14 +56,14 @@ class Options:
 
     dims: tuple[int, ...] = (8, 16, 32)
     hidden: tuple[int, ...] | None = None
-    steps: int = 10_000
+    steps: int = 4000
     landmarks: int = 1000
     views: int = 9
     queries: int = 3
     balance: float = 0.5
-    noise: float = 0.0
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.0
+    noise: float = 0.03
+    learning_rate: float = 3e-3
+    weight_decay: float = 0.1
     clip: float = 1.0
     quantized_share: float = 0.25
     validate_every: int = 500
