@@ -1,0 +1,34 @@
+"""Build a map from observations, search it with a new frame, let it learn, save and seal it.
+
+Runs on the sample that ships: python examples/01_map_and_search.py
+"""
+
+import numpy as np
+
+import protomark as pm
+from protomark import sample
+
+tracks = sample.load()
+encoder = pm.Encoder.load("freak")
+
+# The last keyframe is the new frame, all others are the map.
+last = tracks.keypoints_of(len(tracks.keyframe_names) - 1)
+seen = np.flatnonzero(tracks.landmark_of_keypoint[: last.start] >= 0)
+
+scene = pm.PrototypeMap(encoder)
+scene.add(tracks.landmark_of_keypoint[seen], tracks.descriptors[seen])
+print(scene)
+
+# Nearest landmark of each keypoint, kept where it is clearly nearer than the second nearest.
+ids, distances = scene.search(tracks.descriptors[last], k=2, ratio=0.9)
+matched = np.flatnonzero(ids[:, 0] >= 0)
+truth = tracks.landmark_of_keypoint[last]
+right = ids[matched, 0] == truth[matched]
+print(f"{len(matched)} of {len(truth)} keypoints matched, {right.sum()} surely right")
+
+# The frame's right matches update their prototypes; the descriptors are not needed any more.
+scene.add(ids[matched, 0][right], tracks.descriptors[last][matched][right])
+
+scene.save("scene.pmk")
+sealed = scene.seal("scene.sealed.pmk")
+print(sealed, f"{sealed.dim + 1} bytes a landmark")
