@@ -11,23 +11,23 @@ from protomark import sample
 tracks = sample.load()
 encoder = pm.Encoder.load("freak")
 
-# The last keyframe is the new frame, all others are the map.
-last = tracks.keypoints_of(len(tracks.keyframe_names) - 1)
-seen = np.flatnonzero(tracks.landmark_of_keypoint[: last.start] >= 0)
+# One keyframe is the new frame, all others are the map.
+frame = tracks.keypoints_of(40)
+seen = np.setdiff1d(tracks.observations, np.arange(frame.start, frame.stop))
 
 scene = pm.PrototypeMap(encoder)
 scene.add(tracks.landmark_of_keypoint[seen], tracks.descriptors[seen])
 print(scene)
 
 # Nearest landmark of each keypoint, kept where it is clearly nearer than the second nearest.
-ids, distances = scene.search(tracks.descriptors[last], k=2, ratio=0.9)
+ids, distances = scene.search(tracks.descriptors[frame], k=2, ratio=0.9)
 matched = np.flatnonzero(ids[:, 0] >= 0)
-truth = tracks.landmark_of_keypoint[last]
+truth = tracks.landmark_of_keypoint[frame]
 right = ids[matched, 0] == truth[matched]
 print(f"{len(matched)} of {len(truth)} keypoints matched, {right.sum()} surely right")
 
 # The frame's right matches update their prototypes; the descriptors are not needed any more.
-scene.add(ids[matched, 0][right], tracks.descriptors[last][matched][right])
+scene.add(ids[matched, 0][right], tracks.descriptors[frame][matched][right])
 
 scene.save("scene.pmk")
 sealed = scene.seal("scene.sealed.pmk")
