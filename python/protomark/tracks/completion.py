@@ -8,62 +8,15 @@ that is measured with these labels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import Model, project
-from protomark.tracks.geometry import group, refine_points, residuals, widest_angle
+from protomark.tracks.colmap import project
+from protomark.tracks.geometry import refine_points, widest_angle
+from protomark.tracks.merging import merge
+from protomark.tracks.scene import Scene
 
-# Landmarks this close (pixels) are one, though detection found two keypoints in some keyframe.
-SAME_POINT = 2.0
 _POPCOUNT = np.array([bin(i).count("1") for i in range(256)], np.uint8)
-
-
-@dataclass
-class Scene:
-    """All keypoints of all keyframes, and their landmarks.
-
-    Attributes:
-        model: cameras and m poses.
-        offsets: (m + 1,) int64, rows of each keyframe.
-        keyframe: (n,) int64, keyframe of each keypoint.
-        keypoints: (n, 2) float32, pixels.
-        rays: (n, 2) float64, undistorted, NaN where that failed.
-        focal: (n,) float64, focal length in pixels.
-        descriptors: (n, bits / 8) uint8.
-        labels: (n,) int64, row in positions, -1 where none.
-        positions: (l, 3) float64.
-    """
-
-    model: Model
-    offsets: NDArray[np.int64]
-    keyframe: NDArray[np.int64]
-    keypoints: NDArray[np.float32]
-    rays: NDArray[np.float64]
-    focal: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
-    labels: NDArray[np.int64]
-    positions: NDArray[np.float64]
-
-    def observations(self) -> NDArray[np.int64]:
-        """Rows with a landmark, sorted by landmark, then by row."""
-        rows = np.flatnonzero(self.labels >= 0)
-        return rows[np.argsort(self.labels[rows], kind="stable")]
-
-    def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Reprojection error in pixels of observations, infinite behind the camera.
-
-        Measured in the undistorted image, scaled by the focal length.
-        """
-        difference, depth = residuals(
-            self.positions[self.labels[rows]],
-            self.model.cam_from_world[self.keyframe[rows]],
-            self.rays[rows],
-        )
-        error = np.linalg.norm(difference, axis=1) * self.focal[rows]
-        return np.where((depth > 0) & np.isfinite(error), error, np.inf)
 
 
 def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> None:
@@ -144,9 +97,7 @@ def complete(
         _, once = np.unique(label, return_index=True)
         scene.labels[chosen[once]] = label[once]
         added += len(once)
-    return added, _merge(
-        scene, np.concatenate(votes) if votes else np.zeros((0, 2), np.int64), max_error
-    )
+    return added, merge(scene, np.concatenate(votes), max_error)
 
 
 def _best(key: NDArray[np.int64], distance: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -232,72 +183,3 @@ def within(
     i, j = i[near], j[near]
     order = np.lexsort((j, i))
     return i[order], j[order]
-
-
-def _merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
-    """Merge landmarks that were voted one and fit one position.
-
-    Two landmarks that share a keyframe merge only if they lie within `SAME_POINT` pixels of each
-    other; in a shared keyframe the keypoint that fits better keeps the landmark.
-    """
-    if not len(votes):
-        return 0
-    pairs, count = np.unique(votes, axis=0, return_counts=True)
-    pairs = pairs[np.argsort(-count, kind="stable")]
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    rows = scene.observations()
-    close = _apart(scene, pairs, rows) <= SAME_POINT
-    starts, lengths = group(scene.labels[rows])
-    keyframes = {
-        int(scene.labels[rows[s]]): set(scene.keyframe[rows[s : s + n]].tolist())
-        for s, n in zip(starts, lengths, strict=True)
-    }
-    used: set[int] = set()
-    into = np.arange(len(scene.positions))
-    for (keep, drop), near in zip(pairs.tolist(), close.tolist(), strict=True):
-        if keep in used or drop in used:
-            continue
-        if near or keyframes.get(keep, set()).isdisjoint(keyframes.get(drop, set())):
-            used.update((keep, drop))
-            into[drop] = keep
-    before = scene.labels[rows]
-    after = into[before]
-    touched = np.isin(after, after[after != before])
-    rows, before, after = rows[touched], before[touched], after[touched]
-    if not len(rows):
-        return 0
-    poses, seen = scene.model.cam_from_world[scene.keyframe[rows]], scene.rays[rows]
-    moved = refine_points(scene.positions, after, poses, seen, scene.focal[rows])
-    difference, depth = residuals(moved[after], poses, seen)
-    error = np.where(depth > 0, np.linalg.norm(difference, axis=1) * scene.focal[rows], np.inf)
-    # Of two keypoints in one keyframe the better one counts, the other loses its landmark.
-    order = np.lexsort((error, scene.keyframe[rows], after))
-    again = (np.diff(after[order], prepend=-1) == 0) & (
-        np.diff(scene.keyframe[rows[order]], prepend=-1) == 0
-    )
-    spare = np.zeros(len(rows), bool)
-    spare[order[again]] = True
-    bad = np.unique(after[(error > max_error) & ~spare])
-    fine = ~np.isin(after, bad)
-    scene.labels[rows[fine]] = np.where(spare[fine], -1, after[fine])
-    scene.positions[after[fine]] = moved[after[fine]]
-    return len(np.unique(before[fine][before[fine] != after[fine]]))
-
-
-def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Median distance (n,) in pixels between two landmarks, over the keyframes of the first."""
-    labels = scene.labels[rows]
-    start = np.searchsorted(labels, pairs[:, 0], "left")
-    length = np.searchsorted(labels, pairs[:, 0], "right") - start
-    pair = np.repeat(np.arange(len(pairs)), length)
-    at = rows[np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]]
-    poses = scene.model.cam_from_world[scene.keyframe[at]]
-    nothing = np.zeros((len(at), 2))
-    first, _ = residuals(scene.positions[pairs[pair, 0]], poses, nothing)
-    second, _ = residuals(scene.positions[pairs[pair, 1]], poses, nothing)
-    distance = np.linalg.norm(first - second, axis=1) * scene.focal[at]
-    order = np.lexsort((distance, pair))
-    out = np.full(len(pairs), np.inf)
-    has = length > 0
-    out[has] = distance[order[(np.cumsum(length) - length + length // 2)[has]]]
-    return out

@@ -28,9 +28,11 @@ _ROUGH_ERROR = 16.0
 _ROUGH_POSES = 1.0
 _MIN_MATCHES = 15
 _REFINE_ERRORS = (12.0, 4.0)
+# Keypoints of an image, the strongest, that take part in refinement; more cost time, not error.
+_REFINE_KEYPOINTS = 700
 _PASSES = 3
 # Goes up whenever the same settings give other tracks, so that old files are made anew.
-_METHOD = 2
+_METHOD = 3
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ def extract(
     Args:
         source: images and model, see `find_source`.
         settings: how to make them.
-        threads: threads for detection, matching and bundle adjustment; the result is the same.
+        threads: threads for detection and matching; the result is the same.
         progress: called with each stage's name, steps done and steps in all.
 
     Raises:
@@ -175,6 +177,7 @@ def extract(
     """
     from protomark.tracks import colmap, completion, pairs, triangulation
     from protomark.tracks.matching import Matches, View, match
+    from protomark.tracks.scene import Scene
 
     digest = fingerprint(source)
     model = colmap.read_model(source.model)
@@ -219,13 +222,16 @@ def extract(
     if refine:
         for step, limit in enumerate(_REFINE_ERRORS):
             progress("refine poses", step, len(_REFINE_ERRORS))
-            near = {p: m.where(m.errors <= limit) for p, m in matches.items()}
+            near = {
+                p: m.where((m.errors <= limit) & (m.rows < _REFINE_KEYPOINTS).all(1))
+                for p, m in matches.items()
+            }
             reconstruction = triangulation.triangulate(
                 model, keypoints, near, limit, settings.min_angle, threads
             )
             if not reconstruction.points3D:
                 raise _nothing(source)
-            model = triangulation.refine_poses(model, reconstruction, threads)
+            model = triangulation.refine_poses(model, reconstruction)
             views = views_of(model)
             matches = {p: _with_errors(m, views[p[0]], views[p[1]]) for p, m in matches.items()}
         progress("refine poses", len(_REFINE_ERRORS), len(_REFINE_ERRORS))
@@ -242,7 +248,7 @@ def extract(
 
     counts = np.array([len(k) for k in keypoints])
     keyframe = np.repeat(np.arange(len(counts)), counts)
-    scene = completion.Scene(
+    scene = Scene(
         model=model,
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         keyframe=keyframe,

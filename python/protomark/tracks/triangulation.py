@@ -142,7 +142,7 @@ def labels_of(
     return labels, positions
 
 
-def refine_poses(model: Model, reconstruction: Any, threads: int = 1) -> Model:
+def refine_poses(model: Model, reconstruction: Any) -> Model:
     """Bundle adjustment of poses and points (not of cameras), robust against wrong matches.
 
     The result stays in the world of `model`: scale, rotation and origin are those that bring the
@@ -156,7 +156,8 @@ def refine_poses(model: Model, reconstruction: Any, threads: int = 1) -> Model:
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = 1.0
-    options.ceres.solver_options.num_threads = threads
+    # More threads add up in another order, and other labels could come out.
+    options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = 30
     options.ceres.solver_options.function_tolerance = 1e-4
     config = pycolmap.BundleAdjustmentConfig()

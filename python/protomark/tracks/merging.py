@@ -1,0 +1,127 @@
+"""Landmarks that are one: merged where votes, poses and keyframes agree."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.geometry import group, refine_points, residuals
+from protomark.tracks.scene import Scene
+
+# Landmarks this close (pixels) are one, though detection found two keypoints in some keyframe.
+SAME_POINT = 2.0
+# Share of observations of a merged landmark that may not fit; they lose it.
+_MISFITS = 0.1
+_ROUNDS = 8
+
+
+def merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
+    """Merge landmarks that were voted one and fit one position, in place.
+
+    Two landmarks merge if they lie within `max_error` pixels of each other, those that share a
+    keyframe only within `SAME_POINT`; in a shared keyframe the keypoint that fits better keeps the landmark. In each round a
+    landmark takes part in one merge, so that a chain of doubles becomes one over several rounds.
+
+    Args:
+        scene: labelled keypoints; labels and positions change.
+        votes: (v, 2) rows of positions, one pair for each time that two were found to be alike.
+        max_error: largest reprojection error in pixels.
+
+    Returns:
+        How many landmarks were merged into another.
+    """
+    merged = 0
+    for _ in range(_ROUNDS):
+        votes = np.sort(votes[votes[:, 0] != votes[:, 1]], axis=1)
+        if not len(votes):
+            break
+        into, refused = _round(scene, votes, max_error)
+        merged += int((into != np.arange(len(into))).sum())
+        tried = refused[votes[:, 0]] == votes[:, 1]
+        votes = into[votes[~tried]]
+        if not tried.any() and (into == np.arange(len(into))).all():
+            break
+    return merged
+
+
+def _round(
+    scene: Scene, votes: NDArray[np.int64], max_error: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Merge pairs that have no landmark in common.
+
+    Returns:
+        (l,) the landmark that each is now part of; and (l,) the landmark of a higher row with which
+        each was tried in vain, -1 where none.
+    """
+    pairs, count = np.unique(votes, axis=0, return_counts=True)
+    rows = scene.observations()
+    labels, keyframes = scene.labels[rows], scene.keyframe[rows]
+    apart = _apart(scene, pairs, rows)
+    near = apart <= SAME_POINT
+    eligible = near | ((apart <= max_error) & ~_share_keyframe(pairs, labels, keyframes))
+    order = np.lexsort((pairs[:, 1], pairs[:, 0], -count, ~near))
+    into = np.arange(len(scene.positions))
+    refused = np.full(len(into), -1)
+    used = np.zeros(len(into), bool)
+    for keep, drop in pairs[order][eligible[order]].tolist():
+        if not used[keep] and not used[drop]:
+            used[keep] = used[drop] = True
+            into[drop] = keep
+    after = into[labels]
+    touched = np.isin(after, after[after != labels])
+    rows, after, keyframes = rows[touched], after[touched], keyframes[touched]
+    if not len(rows):
+        return into, refused
+    poses, seen, focal = scene.model.cam_from_world[keyframes], scene.rays[rows], scene.focal[rows]
+    moved = refine_points(scene.positions, after, poses, seen, focal)
+    difference, depth = residuals(moved[after], poses, seen)
+    error = np.where(depth > 0, np.linalg.norm(difference, axis=1) * focal, np.inf)
+    # Of two keypoints in one keyframe the better one counts, the other loses its landmark.
+    order = np.lexsort((error, keyframes, after))
+    again = (np.diff(after[order], prepend=-1) == 0) & (np.diff(keyframes[order], prepend=-1) == 0)
+    spare = np.zeros(len(rows), bool)
+    spare[order[again]] = True
+    misfit = (error > max_error) & ~spare
+    total = np.bincount(after[~spare], minlength=len(into))
+    bad = np.bincount(after[misfit], minlength=len(into)) > _MISFITS * total
+    lost = np.flatnonzero(bad[into] & (into != np.arange(len(into))))
+    refused[into[lost]] = lost
+    into[lost] = lost
+    fine = ~bad[after]
+    scene.labels[rows[fine]] = np.where(spare[fine] | misfit[fine], -1, after[fine])
+    scene.positions[after[fine]] = moved[after[fine]]
+    return into, refused
+
+
+def _share_keyframe(
+    pairs: NDArray[np.int64], labels: NDArray[np.int64], keyframes: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Whether the two landmarks of each pair (n, 2) are seen together; labels ascending."""
+    starts, lengths = group(labels)
+    seen = {
+        int(labels[s]): frozenset(keyframes[s : s + n].tolist())
+        for s, n in zip(starts, lengths, strict=True)
+    }
+    nothing: frozenset[int] = frozenset()
+    return np.array(
+        [not seen.get(a, nothing).isdisjoint(seen.get(b, nothing)) for a, b in pairs.tolist()], bool
+    )
+
+
+def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Median distance (n,) in pixels between two landmarks, over the keyframes of the first."""
+    labels = scene.labels[rows]
+    start = np.searchsorted(labels, pairs[:, 0], "left")
+    length = np.searchsorted(labels, pairs[:, 0], "right") - start
+    pair = np.repeat(np.arange(len(pairs)), length)
+    at = rows[np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]]
+    poses = scene.model.cam_from_world[scene.keyframe[at]]
+    nothing = np.zeros((len(at), 2))
+    first, _ = residuals(scene.positions[pairs[pair, 0]], poses, nothing)
+    second, _ = residuals(scene.positions[pairs[pair, 1]], poses, nothing)
+    distance = np.linalg.norm(first - second, axis=1) * scene.focal[at]
+    order = np.lexsort((distance, pair))
+    out = np.full(len(pairs), np.inf)
+    has = length > 0
+    out[has] = distance[order[(np.cumsum(length) - length + length // 2)[has]]]
+    return out

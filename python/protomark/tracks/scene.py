@@ -1,0 +1,56 @@
+"""All keypoints of a sequence while their landmarks are being found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.colmap import Model
+from protomark.tracks.geometry import residuals
+
+
+@dataclass
+class Scene:
+    """All keypoints of all keyframes, and their landmarks.
+
+    Attributes:
+        model: cameras and m poses.
+        offsets: (m + 1,) int64, rows of each keyframe.
+        keyframe: (n,) int64, keyframe of each keypoint.
+        keypoints: (n, 2) float32, pixels.
+        rays: (n, 2) float64, undistorted, NaN where that failed.
+        focal: (n,) float64, focal length in pixels.
+        descriptors: (n, bits / 8) uint8.
+        labels: (n,) int64, row in positions, -1 where none.
+        positions: (l, 3) float64.
+    """
+
+    model: Model
+    offsets: NDArray[np.int64]
+    keyframe: NDArray[np.int64]
+    keypoints: NDArray[np.float32]
+    rays: NDArray[np.float64]
+    focal: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    labels: NDArray[np.int64]
+    positions: NDArray[np.float64]
+
+    def observations(self) -> NDArray[np.int64]:
+        """Rows with a landmark, sorted by landmark, then by row."""
+        rows = np.flatnonzero(self.labels >= 0)
+        return rows[np.argsort(self.labels[rows], kind="stable")]
+
+    def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Reprojection error in pixels of observations, infinite behind the camera.
+
+        Measured in the undistorted image, scaled by the focal length.
+        """
+        difference, depth = residuals(
+            self.positions[self.labels[rows]],
+            self.model.cam_from_world[self.keyframe[rows]],
+            self.rays[rows],
+        )
+        error = np.linalg.norm(difference, axis=1) * self.focal[rows]
+        return np.where((depth > 0) & np.isfinite(error), error, np.inf)
