@@ -23,10 +23,9 @@ def scene(*landmarks: tuple[NDArray[np.float64], list[int]]) -> Scene:
     positions = np.array([place for place, _ in landmarks])
     rays, _ = residuals(positions[labels], world[keyframe], np.zeros((len(rows), 2)))
     counts = np.bincount(keyframe, minlength=8)
+    names = [str(i) for i in range(8)]
     return Scene(
-        model=Model(
-            {1: PINHOLE}, [str(i) for i in range(8)], np.arange(8), np.ones(8, np.int32), world, []
-        ),
+        model=Model({1: PINHOLE}, names, np.arange(8), np.ones(8, np.int32), world, []),
         offsets=np.concatenate([[0], np.cumsum(counts)]),
         keyframe=keyframe,
         keypoints=(rays * 300 + (160, 120)).astype(np.float32),
@@ -54,7 +53,7 @@ def test_a_chain_of_doubles_becomes_one() -> None:
 
 
 def test_shared_keyframe_keeps_the_better_keypoint() -> None:
-    s = scene((ORIGIN, [0, 1, 2, 3, 4]), (right(1.5), [4, 5]))
+    s = scene((ORIGIN, [0, 1, 2, 4, 6, 7]), (right(1.5), [4, 5]))
     assert merge(s, np.array([[0, 1]]), 3.0) == 1
     four = s.labels[s.keyframe == 4]
     assert sorted(four.tolist()) == [-1, 0]

@@ -19,8 +19,9 @@ def merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
     """Merge landmarks that were voted one and fit one position, in place.
 
     Two landmarks merge if they lie within `max_error` pixels of each other, those that share a
-    keyframe only within `SAME_POINT`; in a shared keyframe the keypoint that fits better keeps the landmark. In each round a
-    landmark takes part in one merge, so that a chain of doubles becomes one over several rounds.
+    keyframe only within `SAME_POINT`; in a shared keyframe the keypoint that fits better keeps the
+    landmark. In each round a landmark takes part in one merge, so that a chain of doubles becomes
+    one over several rounds.
 
     Args:
         scene: labelled keypoints; labels and positions change.
