@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import protomark as pm
+from protomark import models
 from protomark.training.network import (
     MAX_WEIGHT_BYTES,
     EncoderNetwork,
@@ -77,6 +78,15 @@ def test_the_core_encodes_the_same_bytes(bits, dim, hidden, tmp_path):
     np.testing.assert_array_equal(encoder.encode(descriptors), expected)
     np.testing.assert_array_equal(loaded.encode(descriptors), expected)
     np.testing.assert_array_equal(loaded.encode(descriptors, dim=dim // 2), expected[:, : dim // 2])
+
+
+@pytest.mark.parametrize("name", models.names())
+def test_encoders_that_ship_encode_as_their_layers_say(name):
+    encoder = pm.Encoder.load(name)
+    descriptors = random_descriptors(3000, encoder.bits)
+    np.testing.assert_array_equal(
+        encoder.encode(descriptors), integer_forward(encoder.layers, descriptors)
+    )
 
 
 def test_integer_arithmetic_by_hand():
