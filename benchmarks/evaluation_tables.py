@@ -1,9 +1,9 @@
-"""Write the tables of docs/evaluation.md from what `protomark evaluate --json` measured.
+"""Write the tables of docs/evaluation.md and of the encoders' cards from an evaluation's JSON.
 
 python benchmarks/evaluation_tables.py [RESULTS.json ...]
 
-Without arguments: from all benchmarks/results/evaluation.*.json. Exit code 1 if Protomark is not
-above PCA at equal bytes on every test sequence.
+Without arguments: from all benchmarks/results/evaluation.*.json, which `protomark evaluate --json`
+wrote. Exit code 1 if Protomark is not above PCA at equal bytes on every test sequence.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from protomark.evaluation.results import SequenceResult, load_json, write_text
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = ROOT / "docs" / "evaluation.md"
+MODELS = ROOT / "python" / "protomark" / "models"
 START, END = "<!-- tables: start -->", "<!-- tables: end -->"
+DIMS = (8, 16, 32)
 SPLITS = {
     "train": ("hololens", "desk_rpy", "viking", "conch", "seneca"),
     "validation": ("caliterra",),
@@ -69,7 +71,7 @@ def check(results: list[SequenceResult]) -> list[str]:
         rows = {row.name: row for row in result.rows()}
         if split_of(result.sequence) != "test":
             continue
-        for dim in (8, 16, 32):
+        for dim in DIMS:
             ours, theirs = rows.get(f"protomark-{dim}"), rows[f"pca-{dim}"]
             if ours is None or ours.precision <= theirs.precision:
                 mine = "none" if ours is None else f"{ours.precision:.3f}"
@@ -78,6 +80,43 @@ def check(results: list[SequenceResult]) -> list[str]:
                     f"{mine}, PCA {theirs.precision:.3f}"
                 )
     return failures
+
+
+def card_table(results: list[SequenceResult]) -> str:
+    """What a card says of the test sequences; all results are of its descriptor."""
+    head = ["sequence", "unaggregated", "medoid", "majority"]
+    head += [f"{who}, {dim}" for dim in DIMS for who in ("ours", "PCA")]
+    lines = [
+        "## Test sequences",
+        "",
+        "Measured once training was over; nothing was chosen by them. Integer encoder and int8",
+        "prototypes, mean of three splits, as `protomark evaluate` measures. *PCA* is fitted on each",
+        "map's own support descriptors and stored in as many bytes.",
+        "",
+        "| " + " | ".join(head) + " |",
+        "|---|" + "---:|" * (len(head) - 1),
+    ]
+    ratios: dict[int, list[float]] = {dim: [] for dim in DIMS}
+    for result in results:
+        rows = {row.name: row for row in result.rows()}
+        names = ["unaggregated", "medoid", "majority"]
+        names += [f"{who}-{dim}" for dim in DIMS for who in ("protomark", "pca")]
+        figures = " | ".join(f"{rows[name].precision:.3f}" for name in names)
+        lines.append(f"| {result.sequence} | {figures} |")
+        for dim in DIMS:
+            ratios[dim].append(rows[f"protomark-{dim}"].ratio or 0.0)
+    means = ", ".join(f"{sum(r) / len(r):.3f} at {dim}" for dim, r in ratios.items())
+    return "\n".join([*lines, "", f"Mean ratio to unaggregated: {means}."]) + "\n"
+
+
+def replace_tables(document: Path, tables: str) -> None:
+    """Put the tables between the document's marks, or with marks at its end if it has none."""
+    text = document.read_text(encoding="utf-8")
+    if START not in text:
+        text = f"{text.rstrip()}\n\n{START}\n{END}\n"
+    before, rest = text.split(START)
+    _, after = rest.split(END)
+    write_text(document, f"{before}{START}\n\n{tables}\n{END}{after}")
 
 
 def main() -> int:
@@ -102,9 +141,12 @@ def main() -> int:
         chosen = [result for result in results if result.sequence in members]
         if chosen:
             parts.append(f"**Split: {split}**\n\n{markdown(chosen)}")
-    before, rest = DOCUMENT.read_text(encoding="utf-8").split(START)
-    _, after = rest.split(END)
-    write_text(DOCUMENT, f"{before}{START}\n\n" + "\n".join(parts) + f"\n{END}{after}")
+    replace_tables(DOCUMENT, "\n".join(parts))
+    tests = [result for result in results if result.sequence in SPLITS["test"]]
+    for descriptor in dict.fromkeys(result.descriptor for result in tests):
+        card = MODELS / f"{descriptor}.md"
+        if card.is_file():
+            replace_tables(card, card_table([r for r in tests if r.descriptor == descriptor]))
 
     failures = check(results)
     for failure in failures:

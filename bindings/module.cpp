@@ -480,7 +480,9 @@ Returns:
       "path"_a, nb::sig("def open(path: str | os.PathLike[str]) -> PrototypeMap | SealedMap"),
       "Open a map file: an open map is read, a sealed one mapped. Raises FileError.");
   m.def("file_sections", &file_sections, "path"_a,
+        nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");
   m.def("verify_file", &verify_file, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+        nb::sig("def verify_file(path: str | os.PathLike[str]) -> None"),
         "Check every checksum of a model or map file. Raises FileError.");
 }
