@@ -89,9 +89,9 @@ def card_table(results: list[SequenceResult]) -> str:
     lines = [
         "## Test sequences",
         "",
-        "Measured once training was over; nothing was chosen by them. Integer encoder and int8",
-        "prototypes, mean of three splits, as `protomark evaluate` measures. *PCA* is fitted on each",
-        "map's own support descriptors and stored in as many bytes.",
+        "Measured once training was over; nothing was chosen by them. Integer encoder, int8",
+        "prototypes, mean of three splits, as `protomark evaluate` measures. *PCA* is fitted on",
+        "each map's own support descriptors and stored in as many bytes.",
         "",
         "| " + " | ".join(head) + " |",
         "|---|" + "---:|" * (len(head) - 1),
