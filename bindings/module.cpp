@@ -234,7 +234,8 @@ Raises:
           R"(Load an encoder by the name of one that ships ("freak", "orb") or the path of a model file.
 
 Raises:
-    FileError: there is no such model, or the file is not one.)")
+    FileNotFoundError: there is no such model.
+    FileError: the file is not a model.)")
       .def("save", &Encoder::save, "path"_a,
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the model file, whole or not at all. Raises FileError.")
