@@ -11,8 +11,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from protomark.evaluation.plot import save_plot
 from protomark.evaluation.report import markdown
-from protomark.evaluation.results import SequenceResult, load_json, write_text
+from protomark.evaluation.results import SequenceResult, load_json, mean_rows, write_text
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = ROOT / "docs" / "evaluation.md"
@@ -136,6 +137,11 @@ def main() -> int:
     for descriptor in dict.fromkeys(result.descriptor for result in results):
         same = [result for result in results if result.descriptor == descriptor]
         parts.append(f"### {descriptor.upper()}\n\n{overview(same)}")
+        plotted = [result for result in same if split_of(result.sequence) == "test"]
+        if plotted:
+            title = f"{descriptor.upper()}: mean of {', '.join(r.sequence for r in plotted)}"
+            save_plot(mean_rows(plotted), DOCUMENT.parent / f"precision.{descriptor}.png", title)
+            parts.append(f"![{title}](precision.{descriptor}.png)\n")
     parts.append("### Every figure\n")
     for split, members in SPLITS.items():
         chosen = [result for result in results if result.sequence in members]
