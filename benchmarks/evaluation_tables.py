@@ -11,14 +11,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from documents import replace_tables
 from protomark.evaluation.plot import save_plot
 from protomark.evaluation.report import markdown
-from protomark.evaluation.results import SequenceResult, load_json, mean_rows, write_text
+from protomark.evaluation.results import SequenceResult, load_json, mean_rows
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = ROOT / "docs" / "evaluation.md"
 MODELS = ROOT / "python" / "protomark" / "models"
-START, END = "<!-- tables: start -->", "<!-- tables: end -->"
 DIMS = (8, 16, 32)
 SPLITS = {
     "train": ("hololens", "desk_rpy", "viking", "conch", "seneca"),
@@ -108,16 +108,6 @@ def card_table(results: list[SequenceResult]) -> str:
             ratios[dim].append(rows[f"protomark-{dim}"].ratio or 0.0)
     means = ", ".join(f"{sum(r) / len(r):.3f} at {dim}" for dim, r in ratios.items())
     return "\n".join([*lines, "", f"Mean ratio to unaggregated: {means}."]) + "\n"
-
-
-def replace_tables(document: Path, tables: str) -> None:
-    """Put the tables between the document's marks, or with marks at its end if it has none."""
-    text = document.read_text(encoding="utf-8")
-    if START not in text:
-        text = f"{text.rstrip()}\n\n{START}\n{END}\n"
-    before, rest = text.split(START)
-    _, after = rest.split(END)
-    write_text(document, f"{before}{START}\n\n{tables}\n{END}{after}")
 
 
 def main() -> int:
