@@ -227,7 +227,7 @@ def extract(
                 for p, m in matches.items()
             }
             reconstruction = triangulation.triangulate(
-                model, keypoints, near, limit, settings.min_angle, threads
+                model, keypoints, near, limit, settings.min_angle
             )
             if not reconstruction.points3D:
                 raise _nothing(source)
@@ -239,7 +239,7 @@ def extract(
     matches = {p: m.where(m.errors <= settings.max_error) for p, m in matches.items()}
     progress("triangulate", 0, 1)
     reconstruction = triangulation.triangulate(
-        model, keypoints, matches, settings.max_error, settings.min_angle, threads
+        model, keypoints, matches, settings.max_error, settings.min_angle
     )
     if not reconstruction.points3D:
         raise _nothing(source)

@@ -24,7 +24,6 @@ def triangulate(
     matches: dict[tuple[int, int], Matches],
     max_error: float,
     min_angle: float,
-    threads: int = 1,
 ) -> Any:
     """Join matches into landmarks under the poses of `model`.
 
@@ -34,7 +33,6 @@ def triangulate(
         matches: (i, j) -> matches between keyframes i < j.
         max_error: largest reprojection error in pixels.
         min_angle: smallest angle between two rays of a landmark, degrees.
-        threads: threads of the triangulator.
 
     Returns:
         pycolmap.Reconstruction whose image ids are 1 + index of the keyframe.
@@ -43,7 +41,8 @@ def triangulate(
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.extract_colors = False
     pipeline.min_num_matches = 1
-    pipeline.num_threads = threads
+    # More threads add up in another order, and other labels come out.
+    pipeline.num_threads = 1
     pipeline.random_seed = _SEED
     pipeline.mapper.filter_max_reproj_error = max_error
     pipeline.mapper.filter_min_tri_angle = min_angle
@@ -156,7 +155,6 @@ def refine_poses(model: Model, reconstruction: Any) -> Model:
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = 1.0
-    # More threads add up in another order, and other labels could come out.
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = 30
     options.ceres.solver_options.function_tolerance = 1e-4
