@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protomark.evaluation.results import write_text
+from protomark.files import write_text
 
 START, END = "<!-- tables: start -->", "<!-- tables: end -->"
 

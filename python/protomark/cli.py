@@ -353,7 +353,9 @@ def evaluate(
 
 def _write_json(path: Path | None, facts: dict[str, Any]) -> None:
     if path is not None:
-        path.write_text(json.dumps(facts, indent=2) + "\n")
+        from protomark.files import write_text
+
+        write_text(path, json.dumps(facts, indent=2) + "\n")
 
 
 def _print_version(wanted: bool) -> None:

@@ -11,9 +11,10 @@ from protomark.console import console, progress_bar, progress_console
 from protomark.evaluation.methods import choices, choose
 from protomark.evaluation.plot import check_ending, save_plot
 from protomark.evaluation.report import caption, markdown, rich_table
-from protomark.evaluation.results import SequenceResult, mean_rows, save_json, write_text
+from protomark.evaluation.results import SequenceResult, mean_rows, save_json
 from protomark.evaluation.run import Options, evaluate
 from protomark.evaluation.support import Moments, Support
+from protomark.files import write_text
 from protomark.tracks.file import Tracks
 
 if TYPE_CHECKING:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from protomark.files import write_text
 
 FORMAT = "protomark-evaluation"
 VERSION = 1
@@ -175,20 +176,6 @@ def load_json(path: str | os.PathLike[str]) -> list[SequenceResult]:
         raise FileNotFoundError(f"{path}: no such results file") from None
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: broken results file ({error!r})") from None
-
-
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file beside the target, then rename it over the target."""
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def _sequence(entry: dict[str, Any]) -> SequenceResult:

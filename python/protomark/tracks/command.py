@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from protomark.console import console, progress_bar, progress_console
+from protomark.files import write_text
 from protomark.tracks.extract import Progress, Settings, extract, find_source, fingerprint, is_done
 from protomark.tracks.file import Tracks
 from protomark.tracks.summary import summarise
@@ -77,7 +78,7 @@ def make_tracks(
             summaries.append(summary)
             print_summary(summary, tracks)
     if json_path is not None:
-        json_path.write_text(json.dumps(summaries, indent=2) + "\n")
+        write_text(json_path, json.dumps(summaries, indent=2) + "\n")
     return summaries
 
 

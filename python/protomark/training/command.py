@@ -6,7 +6,6 @@ import json
 import os
 import platform
 import shlex
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 
 from protomark.console import console, progress_bar, progress_console
+from protomark.files import write_text
 from protomark.tracks.file import Tracks
 from protomark.training.card import Card, Figures, describe_data
 from protomark.training.data import TrainingData, load_training, load_trials, sequence_name
@@ -128,9 +128,9 @@ def train_encoder(
         figures=figures,
         history=[(p.step, p.loss, p.mean_precision) for p in trainer.history],
     )
-    _write(output.with_suffix(".md"), card.markdown())
+    write_text(output.with_suffix(".md"), card.markdown())
     if json_path is not None:
-        _write(json_path, json.dumps(asdict(card), indent=1) + "\n")
+        write_text(json_path, json.dumps(asdict(card), indent=1) + "\n")
     checkpoint.unlink(missing_ok=True)
     return card
 
@@ -237,19 +237,6 @@ def _machine(device: str, threads: int, half: bool) -> str:
     if device.startswith("cuda"):
         return f"{torch.cuda.get_device_name(device)}, {arithmetic}"
     return f"{platform.machine()}, {threads} thread{'s' if threads != 1 else ''}, {arithmetic}"
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    handle, temporary = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def print_summary(card: Card, output: Path) -> None:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-import os
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from protomark.files import replacing
 from protomark.training.loss import PrototypeLoss
 from protomark.training.network import EncoderNetwork, embed, to_signs
 from protomark.training.quantization import QuantizedNetwork
@@ -295,15 +294,8 @@ class Trainer:
             "best_step": self.best_step,
             "best_state": self.best_state,
         }
-        path = self.checkpoint
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                torch.save(state, file)
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+        with replacing(self.checkpoint) as file:
+            torch.save(state, file)
 
     def resume(self) -> None:
         """Continue from the checkpoint.
