@@ -56,32 +56,37 @@ nb::tuple hamming(nb::object queries, nb::object database, std::size_t k,
   return nb::make_tuple(ids.release(), distances.release());
 }
 
+// Makes room for the answer and lets `run` fill it without the GIL.
+template <typename Run>
+nb::tuple answer(std::size_t queries, std::size_t k, const Run& run) {
+  NewMatrix<std::int64_t> ids(queries, k);
+  NewMatrix<float> distances(queries, k);
+  {
+    const nb::gil_scoped_release release;
+    run(ids.view(), distances.view());
+  }
+  return nb::make_tuple(ids.release(), distances.release());
+}
+
 // Open and sealed maps search alike.
 template <typename Map>
 nb::tuple search(const Map& map, nb::object queries, std::size_t k,
                  std::optional<float> max_distance, std::optional<float> ratio, int threads) {
   const auto q = descriptors(queries);
-  NewMatrix<std::int64_t> ids(q.shape(0), k);
-  NewMatrix<float> distances(q.shape(0), k);
-  {
-    const nb::gil_scoped_release release;
-    map.search(view(q), search_options(max_distance, ratio, threads), ids.view(), distances.view());
-  }
-  return nb::make_tuple(ids.release(), distances.release());
+  const SearchOptions options = search_options(max_distance, ratio, threads);
+  return answer(q.shape(0), k, [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+    map.search(view(q), options, ids, distances);
+  });
 }
 
 template <typename Map>
 nb::tuple search_codes(const Map& map, nb::object queries, std::size_t k,
                        std::optional<float> max_distance, std::optional<float> ratio, int threads) {
   const auto q = codes(queries);
-  NewMatrix<std::int64_t> ids(q.shape(0), k);
-  NewMatrix<float> distances(q.shape(0), k);
-  {
-    const nb::gil_scoped_release release;
-    map.search_codes(view(q), search_options(max_distance, ratio, threads), ids.view(),
-                     distances.view());
-  }
-  return nb::make_tuple(ids.release(), distances.release());
+  const SearchOptions options = search_options(max_distance, ratio, threads);
+  return answer(q.shape(0), k, [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+    map.search_codes(view(q), options, ids, distances);
+  });
 }
 
 template <typename Map>
