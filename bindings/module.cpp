@@ -117,7 +117,8 @@ void bind_reading(nb::class_<Map>& map) {
       .def("prototype", &prototype<Map>, "landmark_ids"_a,
            nb::sig("def prototype(self, landmark_ids: ArrayLike) -> NDArray[numpy.float32]"),
            "Mean codes (Komorowski and Trzcinski, Eq. 1), (n, dim) float32, in code units; a "
-           "sealed map gives them rounded. Raises KeyError for an id that is not in the map.")
+           "sealed map gives them rounded, to one of 16 levels where its code_bits is 4. Raises "
+           "KeyError for an id that is not in the map.")
       .def(
           "positions",
           [](const Map& m, nb::object ids) {
@@ -408,13 +409,23 @@ Raises:
            "Write the map, whole or not at all. Raises FileError.")
       .def(
           "seal",
-          [](const PrototypeMap& self, const Path& path) {
+          [](const PrototypeMap& self, const Path& path, int bits) {
             const nb::gil_scoped_release release;
-            self.seal(path);
+            self.seal(path, bits);
             return SealedMap(path);
           },
-          "path"_a, nb::sig("def seal(self, path: str | os.PathLike[str]) -> SealedMap"),
-          "Write a sealed map, whole or not at all, and open it. Raises FileError.")
+          "path"_a, "bits"_a = 8,
+          nb::sig("def seal(self, path: str | os.PathLike[str], bits: int = 8) -> SealedMap"),
+          R"(Write a sealed map, whole or not at all, and open it.
+
+Args:
+    path: the file to write.
+    bits: bits of a prototype's number. With 8 the sealed map gives the same answers; with 4 numbers
+        are rounded to the 16 levels that fit this map best, and take half the bytes.
+
+Raises:
+    FileError: the file cannot be written.
+    ValueError: bits is neither 8 nor 4.)")
       .def("__repr__", [](const PrototypeMap& self) {
         return "<protomark.PrototypeMap: " + std::to_string(self.size()) + " landmarks, " +
                std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
@@ -423,14 +434,17 @@ Raises:
 }
 
 void bind_sealed_map(nb::module_& m) {
-  nb::class_<SealedMap> map(
-      m, "SealedMap",
-      "A map that only answers, mapped from its file: dim + 1 bytes a landmark, and its position.");
+  nb::class_<SealedMap> map(m, "SealedMap",
+                            "A map that only answers, mapped from its file: dim * code_bits / 8 + "
+                            "1 bytes a landmark, and its position.");
   bind_reading(map);
+  map.def_prop_ro("code_bits", &SealedMap::code_bits,
+                  "Bits of a prototype's number: 8, or 4 where the map was sealed so.");
   map.def("__repr__", [](const SealedMap& self) {
     return "<protomark.SealedMap: " + std::to_string(self.size()) + " landmarks, " +
-           std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
-           "'>";
+           std::to_string(self.dim()) + " dimensions" +
+           (self.code_bits() == 8 ? "" : " of 4 bits") + ", encoder '" +
+           self.encoder()->info().name + "'>";
   });
 }
 

@@ -102,6 +102,25 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert isinstance(pm.open(scene), pm.SealedMap)
+    assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "21"
+
+    build = ["build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model]
+    done = protomark(*build, "--sealed", "--code-bits", 4, "--json", tmp_path / "facts.json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    # The ids are 0, 1, 2 and 7, so they are kept: 12 dimensions, a count and 8 bytes.
+    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 6 + 1 + 8)
+    assert row(done.stdout, "code bits").split()[-1] == "4"
+    done = protomark(*build, "--code-bits", 4)
+    assert (done.returncode, done.stderr.strip()) == (
+        1,
+        "error: --code-bits 4 is for sealed maps: add --sealed",
+    )
+
+
+def row(output: str, name: str) -> str:
+    """The line of the facts that begins with a name."""
+    return next(line for line in output.splitlines() if line.startswith(name))
 
 
 def test_landmarks_seen_too_rarely_are_left_out(tracks: Tracks, encoder: pm.Encoder) -> None:

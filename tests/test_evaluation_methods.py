@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import random_descriptors
+from conftest import random_descriptors, random_layers
 from evaluation_scene import observations
 from protomark.evaluation.methods import choices, choose
 from protomark.evaluation.methods.bitwise import bitwise_and, majority
@@ -255,6 +256,32 @@ def test_prototypes_are_the_cores_map(encoder: pm.Encoder) -> None:
     expected_ids, expected_distances = scene.search(queries)
     assert np.array_equal(ids, expected_ids)
     assert np.array_equal(distances, expected_distances)
+
+
+def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
+    coder = pm.Encoder(
+        random_layers([64, 40, 32]), [8, 16, 32], name="w", descriptor="test", scale=0.02
+    )
+    landmarks, descriptors = structured()
+    support = Support(landmarks, descriptors)
+    listed = choices([coder])
+    chosen = choose(listed, ["protomark-4bit"])
+    assert [c.name for c in chosen] == ["protomark-16x4", "protomark-32x4"]
+    assert [c.name for c in choose(listed, None)][-2:] == [c.name for c in chosen]
+    assert chosen[1].label == "Protomark, 32 x 4 bits"
+    queries = random_descriptors(30)
+    for choice, dim in zip(chosen, (16, 32), strict=True):
+        scene = pm.PrototypeMap(coder, dim=dim)
+        scene.add(landmarks, descriptors)
+        built = choice.build(support)
+        assert built.bytes_per_landmark == dim // 2 + 1
+        expected = scene.seal(tmp_path / "s.pmk", bits=4).search(queries)
+        for a, b in zip(built.match(queries), expected, strict=True):
+            assert np.array_equal(a, b)
+        # Rounding to 16 levels shows.
+        assert not np.array_equal(expected[1], scene.search(queries)[1])
+    several = [c.name for c in choices([coder, coder]) if c.family == "protomark-4bit@w"]
+    assert several[0] == "protomark-16x4@w"
 
 
 def test_choosing_methods(encoder: pm.Encoder) -> None:

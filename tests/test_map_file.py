@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -124,10 +125,15 @@ def section_bytes(data: bytes) -> set[int]:
     return covered
 
 
-@pytest.mark.parametrize("kind", ["model", "open", "sealed"])
+@pytest.mark.parametrize("kind", ["model", "open", "sealed", "sealed with 4 bits"])
 def test_every_flipped_byte_is_noticed(kind: str, scene: pm.PrototypeMap, tmp_path: Path) -> None:
     path = tmp_path / "file"
-    {"model": scene.encoder.save, "open": scene.save, "sealed": scene.seal}[kind](path)
+    {
+        "model": scene.encoder.save,
+        "open": scene.save,
+        "sealed": scene.seal,
+        "sealed with 4 bits": partial(scene.seal, bits=4),
+    }[kind](path)
     data = path.read_bytes()
     covered = section_bytes(data)
     rng = np.random.default_rng(5)

@@ -21,7 +21,7 @@ static_assert(std::endian::native == std::endian::little,
               "the file format is little-endian; a big-endian machine needs byte swaps here");
 
 constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
-constexpr std::uint32_t kVersion = 1;
+constexpr std::uint32_t kNewestVersion = 2;
 constexpr std::size_t kAlignment = 64;
 constexpr std::uint32_t kMaxSections = 64;
 
@@ -152,7 +152,7 @@ void ContainerWriter::emit(const std::function<void(Bytes)>& sink) const {
   }
   Header header{};
   std::memcpy(header.magic, kMagic, sizeof(kMagic));
-  header.version = kVersion;
+  header.version = version_;
   header.kind = static_cast<std::uint32_t>(kind_);
   header.file_size = offset;
   header.sections = static_cast<std::uint32_t>(sections_.size());
@@ -199,9 +199,9 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   }
   Header header;
   std::memcpy(&header, file_.data(), sizeof(header));
-  if (header.version != kVersion) {
-    fail("format version " + std::to_string(header.version) + ", this Protomark reads version " +
-         std::to_string(kVersion));
+  if (header.version < 1 || header.version > kNewestVersion) {
+    fail("format version " + std::to_string(header.version) +
+         ", this Protomark reads versions 1 to " + std::to_string(kNewestVersion));
   }
   if (header.sections > kMaxSections) fail("its header is broken");
   const std::size_t table_size = header.sections * sizeof(Entry);

@@ -31,7 +31,10 @@ using Bytes = std::span<const std::byte>;
 // Sections in memory that belong to somebody else, to be written as one file.
 class ContainerWriter {
  public:
-  explicit ContainerWriter(FileKind kind) : kind_(kind) {}
+  // `version` is the oldest format that has all that the file holds (docs/format.md), so that a
+  // reader which knows less refuses it, and older ones go on reading everything else.
+  explicit ContainerWriter(FileKind kind, std::uint32_t version = 1)
+      : kind_(kind), version_(version) {}
 
   // `bytes` must stay alive until the file is written.
   void add(std::string name, Bytes bytes);
@@ -51,6 +54,7 @@ class ContainerWriter {
   void emit(const std::function<void(Bytes)>& sink) const;
 
   FileKind kind_;
+  std::uint32_t version_;
   std::vector<Section> sections_;
 };
 

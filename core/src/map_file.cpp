@@ -8,6 +8,7 @@
 #include "container.h"
 #include "map_sections.h"
 #include "protomark/error.h"
+#include "quantize4.h"
 
 namespace protomark {
 
@@ -36,11 +37,21 @@ struct SealedMap::Content {
     encoder = read_encoder(file);
     shape = read_shape(file, *encoder);
     const std::size_t n = shape.landmarks;
-    prototypes = map<std::int8_t>(section::kPrototypes, packed_size(n, shape.dim));
+    if (file.map_if_there(section::kLevels)) {
+      code_bits = 4;
+      const int half_step = read_levels(file);
+      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(n, shape.dim)), n,
+                     shape.dim, half_step};
+      check_padding();
+    } else {
+      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(n, shape.dim)), n,
+                    shape.dim};
+    }
     counts = map<std::uint8_t>(section::kCounts, n);
     if (const auto bytes = file.read_if_there(section::kIds)) {
       ids = map<std::int64_t>(section::kIds, n);
       check_ids(file, {ids, n});
+      prototypes.ids = prototypes4.ids = ids;
     }
     if (file.map_if_there(section::kPositions)) {
       positions = map<std::array<float, 3>>(section::kPositions, n);
@@ -69,11 +80,36 @@ struct SealedMap::Content {
     return static_cast<std::size_t>(found - ids);
   }
 
+  // That of the last block, where the padding of rows is; padding elsewhere is never looked at.
+  void check_padding() const {
+    const std::size_t n = shape.landmarks, dim = shape.dim;
+    const std::size_t padded_dim = (dim + 7) / 8 * 8;
+    const std::size_t first = n == 0 ? 0 : (n - 1) / kPackedRows * kPackedRows;
+    const std::size_t end = n == 0 ? 0 : first + kPackedRows;
+    for (std::size_t row = first; row < end; ++row) {
+      for (std::size_t d = row < n ? dim : 0; d < padded_dim; ++d) {
+        if (value4(row, d) != 0) file.fail("the padding of its prototypes is not zero");
+      }
+    }
+  }
+
+  std::uint8_t value4(std::size_t row, std::size_t d) const {
+    const std::uint8_t byte = prototypes4.data[packed4_index(row, d, shape.dim)];
+    return static_cast<std::uint8_t>(packed4_high(d) ? byte >> 4 : byte & 15);
+  }
+
+  int prototype(std::size_t row, std::size_t d) const {
+    if (code_bits == 4) return level4(value4(row, d), prototypes4.half_step);
+    return prototypes.data[packed_index(row, d, shape.dim)];
+  }
+
   MappedFile mapped;
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
-  const std::int8_t* prototypes = nullptr;
+  int code_bits = 8;
+  PackedPrototypes prototypes;    // where it is 8
+  PackedPrototypes4 prototypes4;  // where it is 4
   const std::uint8_t* counts = nullptr;
   const std::int64_t* ids = nullptr;
   const std::array<float, 3>* positions = nullptr;
@@ -87,6 +123,7 @@ SealedMap::SealedMap(SealedMap&&) noexcept = default;
 const std::shared_ptr<const Encoder>& SealedMap::encoder() const { return content_->encoder; }
 std::size_t SealedMap::dim() const { return content_->shape.dim; }
 std::size_t SealedMap::size() const { return content_->shape.landmarks; }
+int SealedMap::code_bits() const { return content_->code_bits; }
 
 std::vector<std::int64_t> SealedMap::ids() const {
   std::vector<std::int64_t> result(size());
@@ -112,7 +149,7 @@ void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<f
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
     const std::size_t row = content_->at(landmarks[i]);
     for (std::size_t d = 0; d < dim(); ++d) {
-      means.row(i)[d] = content_->prototypes[packed_index(row, d, dim())];
+      means.row(i)[d] = static_cast<float>(content_->prototype(row, d));
     }
   }
 }
@@ -141,8 +178,11 @@ void SealedMap::search(Descriptors queries, const SearchOptions& options,
 
 void SealedMap::search_codes(Codes queries, const SearchOptions& options,
                              MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
-  protomark::search({content_->prototypes, size(), dim(), content_->ids}, queries, options, ids,
-                    distances);
+  if (content_->code_bits == 4) {
+    protomark::search(content_->prototypes4, queries, options, ids, distances);
+  } else {
+    protomark::search(content_->prototypes, queries, options, ids, distances);
+  }
 }
 
 }  // namespace protomark

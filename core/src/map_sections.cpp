@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <string>
 
 namespace protomark {
 
@@ -30,6 +31,29 @@ MapShape read_shape(const ContainerReader& file, const Encoder& encoder) {
     file.fail("its origin is not finite");
   }
   return shape;
+}
+
+std::vector<std::byte> write_levels(int half_step) {
+  SectionWriter out;
+  out.value(std::uint32_t{4});
+  out.value(static_cast<std::uint32_t>(half_step));
+  return out.take();
+}
+
+int read_levels(const ContainerReader& file) {
+  SectionReader in(file, section::kLevels);
+  const auto bits = in.value<std::uint32_t>();
+  const auto half_step = in.value<std::uint32_t>();
+  in.finish();
+  if (bits != 4) {
+    file.fail("its prototypes have " + std::to_string(bits) +
+              " bits a number, this Protomark reads 8 and 4");
+  }
+  if (half_step < 1 || half_step > kMaxHalfStep) {
+    file.fail("the half-step of its prototypes is " + std::to_string(half_step) + ", not 1 to " +
+              std::to_string(kMaxHalfStep));
+  }
+  return static_cast<int>(half_step);
 }
 
 std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {

@@ -17,7 +17,8 @@ inline constexpr char kShape[] = "shape";        // MapShape
 inline constexpr char kIds[] = "ids";            // int64, ascending; sealed: absent for 0 ... n - 1
 inline constexpr char kCounts[] = "counts";      // uint8
 inline constexpr char kSums[] = "sums";          // open: int16, n x dim
-inline constexpr char kPrototypes[] = "protos";  // sealed: int8, packed (protomark/search.h)
+inline constexpr char kPrototypes[] = "protos";  // sealed: packed (protomark/search.h)
+inline constexpr char kLevels[] = "levels";      // sealed, 4 bits a number: u32 4, u32 half-step
 inline constexpr char kPositions[] = "position";  // open: 3 x float64; sealed: 3 x float32
 }  // namespace section
 
@@ -30,6 +31,9 @@ struct MapShape {
 std::vector<std::byte> write_shape(const MapShape& shape);
 MapShape read_shape(const ContainerReader& file, const Encoder& encoder);
 std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
+// What 4-bit prototypes stand for.
+std::vector<std::byte> write_levels(int half_step);
+int read_levels(const ContainerReader& file);
 // Throws FileError unless ids are ascending and not negative.
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
 // The middle of the positions that are there.

@@ -14,6 +14,7 @@
 #include "id_index.h"
 #include "map_sections.h"
 #include "protomark/error.h"
+#include "quantize4.h"
 
 namespace protomark {
 namespace {
@@ -170,6 +171,41 @@ struct PrototypeMap::Store {
     std::sort(rows.begin(), rows.end(),
               [&](std::uint32_t a, std::uint32_t b) { return ids[a] < ids[b]; });
     return rows;
+  }
+
+  // Of the numbers of the rounded prototypes.
+  Occurrences occurrences() const {
+    Occurrences result{};
+    for (std::size_t row = 0; row < ids.size(); ++row) {
+      for (std::size_t d = 0; d < dim; ++d) {
+        ++result[static_cast<std::size_t>(packed[packed_index(row, d, dim)] + 128)];
+      }
+    }
+    return result;
+  }
+
+  // Rounded prototypes of some rows, as PackedPrototypes has them ...
+  std::vector<std::uint8_t> pack8(std::span<const std::uint32_t> rows) const {
+    std::vector<std::uint8_t> result(packed_size(rows.size(), dim), 0);
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      for (std::size_t d = 0; d < dim; ++d) {
+        result[packed_index(i, d, dim)] =
+            static_cast<std::uint8_t>(packed[packed_index(rows[i], d, dim)]);
+      }
+    }
+    return result;
+  }
+
+  // ... and as PackedPrototypes4.
+  std::vector<std::uint8_t> pack4(std::span<const std::uint32_t> rows, int half_step) const {
+    std::vector<std::uint8_t> result(packed4_size(rows.size(), dim), 0);
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      for (std::size_t d = 0; d < dim; ++d) {
+        const std::uint8_t u = quantize4(packed[packed_index(rows[i], d, dim)], half_step);
+        result[packed4_index(i, d, dim)] |= static_cast<std::uint8_t>(packed4_high(d) ? u << 4 : u);
+      }
+    }
+    return result;
   }
 };
 
@@ -458,20 +494,23 @@ PrototypeMap PrototypeMap::load(const std::filesystem::path& path) {
   return map;
 }
 
-void PrototypeMap::seal(const std::filesystem::path& path) const {
+void PrototypeMap::seal(const std::filesystem::path& path, int bits) const {
+  if (bits != 8 && bits != 4) {
+    throw std::invalid_argument("prototypes are sealed with 8 or 4 bits a number, not " +
+                                std::to_string(bits));
+  }
   const std::shared_lock lock(store_->mutex);
   const auto rows = store_->rows_by_id();
   const std::size_t n = rows.size();
   std::vector<std::int64_t> ids(n);
   std::vector<std::uint8_t> counts(n);
-  std::vector<std::int8_t> packed(packed_size(n, dim_), 0);
   for (std::size_t i = 0; i < n; ++i) {
     ids[i] = store_->ids[rows[i]];
     counts[i] = store_->counts[rows[i]];
-    for (std::size_t d = 0; d < dim_; ++d) {
-      packed[packed_index(i, d, dim_)] = store_->packed[packed_index(rows[i], d, dim_)];
-    }
   }
+  const int half_step = bits == 4 ? best_half_step(store_->occurrences()) : 0;
+  const std::vector<std::uint8_t> packed =
+      bits == 4 ? store_->pack4(rows, half_step) : store_->pack8(rows);
   MapShape shape{n, dim_, {}};
   std::vector<std::array<float, 3>> positions;
   if (!std::all_of(store_->positions.begin(), store_->positions.end(), is_nowhere)) {
@@ -485,11 +524,12 @@ void PrototypeMap::seal(const std::filesystem::path& path) const {
   }
   const bool implicit_ids = n == 0 || (ids.front() == 0 && ids.back() == std::int64_t(n) - 1);
 
-  ContainerWriter file(FileKind::sealed_map);
+  ContainerWriter file(FileKind::sealed_map, bits == 4 ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape(shape));
   if (!implicit_ids) file.add(section::kIds, std::as_bytes(std::span(ids)));
   file.add(section::kCounts, std::as_bytes(std::span(counts)));
+  if (bits == 4) file.add(section::kLevels, write_levels(half_step));
   file.add(section::kPrototypes, std::as_bytes(std::span(packed)));
   if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
   file.write(path);

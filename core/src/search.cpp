@@ -21,15 +21,14 @@ constexpr std::size_t kChunkRows = kChunkBlocks * kPackedRows;
 // Squared distances reach 256 * 254^2 < 2^24, which float holds exactly; this is beyond all.
 constexpr std::int32_t kNoLimit = 1 << 25;
 
-void check(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
+void check(std::size_t dim, Codes queries, const SearchOptions& options,
            const MatrixView<std::int64_t>& ids, const MatrixView<float>& distances) {
-  if (queries.columns != prototypes.dim) {
+  if (queries.columns != dim) {
     throw std::invalid_argument("queries have " + std::to_string(queries.columns) +
-                                " dimensions, prototypes " + std::to_string(prototypes.dim));
+                                " dimensions, prototypes " + std::to_string(dim));
   }
-  if (prototypes.dim == 0 || prototypes.dim > 256) {
-    throw std::invalid_argument("a code has 1 to 256 dimensions, not " +
-                                std::to_string(prototypes.dim));
+  if (dim == 0 || dim > 256) {
+    throw std::invalid_argument("a code has 1 to 256 dimensions, not " + std::to_string(dim));
   }
   if (ids.columns == 0) throw std::invalid_argument("k must be at least 1");
   if (ids.rows != queries.rows || distances.rows != queries.rows ||
@@ -60,11 +59,13 @@ bool distinct(std::int32_t nearest, std::int32_t second, float ratio) {
   return static_cast<double>(nearest) < static_cast<double>(ratio) * ratio * second;
 }
 
-}  // namespace
-
-void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
-            MatrixView<std::int64_t> ids, MatrixView<float> distances) {
-  check(prototypes, queries, options, ids, distances);
+// What is searched: either kind of packed prototypes, and chunk(block, blocks, room), which gives
+// int8 codes of some blocks, packed as in PackedPrototypes. It may put them into `room`.
+template <typename Prototypes, typename Chunk>
+void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queries,
+                   const SearchOptions& options, MatrixView<std::int64_t> ids,
+                   MatrixView<float> distances) {
+  check(prototypes.dim, queries, options, ids, distances);
   const std::size_t dim = packed_dim(prototypes.dim);
   const std::size_t all_blocks = (prototypes.rows + kPackedRows - 1) / kPackedRows;
   const std::size_t k = ids.columns;
@@ -89,12 +90,13 @@ void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptio
 
     // The kernels leave out the query's own norm, which does not change the order; it is added
     // where distances are given back.
+    std::vector<std::int8_t> room;
     std::vector<std::int32_t> offsets(kChunkRows);
     std::vector<std::uint32_t> hit_rows(kChunkRows);
     std::vector<std::int32_t> hit_distances(kChunkRows);
     for (std::size_t block = 0; block < all_blocks; block += kChunkBlocks) {
       const std::size_t blocks = std::min(kChunkBlocks, all_blocks - block);
-      const std::int8_t* packed = prototypes.data + block * kPackedRows * dim;
+      const std::int8_t* packed = chunk(block, blocks, room);
       kernel.code_offsets(packed, blocks, dim, offsets.data());
       for (std::size_t q = 0; q < n; ++q) {
         const std::size_t found =
@@ -126,6 +128,35 @@ void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptio
       }
     }
   });
+}
+
+}  // namespace
+
+void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
+            MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+  const std::size_t block_size = packed_size(kPackedRows, prototypes.dim);
+  const auto chunk = [&](std::size_t block, std::size_t, std::vector<std::int8_t>&) {
+    return prototypes.data + block * block_size;
+  };
+  search_chunks(prototypes, chunk, queries, options, ids, distances);
+}
+
+// A chunk is unpacked once for all queries, into the cache that it would stay in anyway: memory is
+// read at 4 bits a number, and the scan is that of int8.
+void search(const PackedPrototypes4& prototypes, Codes queries, const SearchOptions& options,
+            MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+  if (prototypes.half_step < 1 || prototypes.half_step > kMaxHalfStep) {
+    throw std::invalid_argument("a half-step is 1 to " + std::to_string(kMaxHalfStep) + ", not " +
+                                std::to_string(prototypes.half_step));
+  }
+  const std::size_t block_size = packed4_size(kPackedRows, prototypes.dim);
+  const auto chunk = [&](std::size_t block, std::size_t blocks, std::vector<std::int8_t>& room) {
+    room.resize(packed_size(kChunkRows, prototypes.dim));
+    kernels::active().code_unpack4(prototypes.data + block * block_size, blocks, prototypes.dim,
+                                   prototypes.half_step, room.data());
+    return static_cast<const std::int8_t*>(room.data());
+  };
+  search_chunks(prototypes, chunk, queries, options, ids, distances);
 }
 
 }  // namespace protomark

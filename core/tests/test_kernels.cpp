@@ -53,6 +53,29 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
   }
 }
 
+// Not a multiple of a vector's length, and garbage where the padding is.
+void compare_unpack4(const Kernels& set, test::Random& random, std::size_t dim,
+                     std::size_t blocks) {
+  const std::size_t stride = (dim + 3) / 4 * 4;
+  const auto packed = random.integers<std::uint8_t>(blocks * 16 * ((dim + 7) / 8 * 4), 0, 255);
+  for (int half_step = 1; half_step <= 8; ++half_step) {
+    // One more block, which must stay as it is.
+    std::vector<std::int8_t> expected((blocks + 1) * 16 * stride, 99), codes = expected;
+    for (std::size_t row = 0; row < 16 * blocks; ++row) {
+      const std::size_t block = row / 16, lane = row % 16;
+      for (std::size_t d = 0; d < stride; ++d) {
+        const std::uint8_t byte =
+            packed[block * 16 * ((dim + 7) / 8 * 4) + d / 8 * 64 + lane * 4 + d % 4];
+        const int u = d % 8 < 4 ? byte % 16 : byte / 16;
+        expected[block * 16 * stride + d / 4 * 64 + lane * 4 + d % 4] =
+            static_cast<std::int8_t>(d < dim ? half_step * (2 * u - 15) : 0);
+      }
+    }
+    set.code_unpack4(packed.data(), blocks, dim, half_step, codes.data());
+    CHECK(codes == expected);
+  }
+}
+
 void compare_hamming(const Kernels& set, test::Random& random, std::size_t words,
                      std::size_t blocks, int style) {
   auto packed = random.integers<std::uint64_t>(8 * words * blocks, 0, INT64_MAX);
@@ -94,6 +117,8 @@ int main() {
       for (const std::size_t dim : {4, 12, 32, 256}) {
         for (const std::size_t blocks : {0, 1, 5}) compare_codes(*set, random, dim, blocks, style);
       }
+      for (std::size_t dim = 1; dim <= 33; ++dim) compare_unpack4(*set, random, dim, 3);
+      for (const std::size_t blocks : {0, 1}) compare_unpack4(*set, random, 256, blocks);
       for (const std::size_t words : {1, 4, 8, 16}) {
         for (const std::size_t blocks : {0, 1, 9}) {
           compare_hamming(*set, random, words, blocks, style);

@@ -2,6 +2,8 @@
 
 #include <unistd.h>
 
+#include <algorithm>
+#include <cmath>
 #include <fstream>
 
 #include "check.h"
@@ -10,6 +12,52 @@
 
 using namespace protomark;
 namespace fs = std::filesystem;
+
+namespace {
+
+// A map of 4 bits answers as one of the numbers that it gives back, and those are the levels
+// nearest to the rounded means.
+void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path) {
+  map.seal(path, 4);
+  verify_file(path);
+  const SealedMap mapped(path);
+  CHECK(mapped.code_bits() == 4);
+  CHECK(mapped.ids() == map.ids());
+  const auto ids = map.ids();
+  const std::size_t n = ids.size(), dim = map.dim();
+  CHECK(mapped.counts(ids) == map.counts(ids));
+  std::vector<float> means(n * dim), levels(n * dim);
+  map.prototypes(ids, {means.data(), n, dim});
+  mapped.prototypes(ids, {levels.data(), n, dim});
+  const float half_step = std::abs(*std::min_element(
+      levels.begin(), levels.end(), [](float a, float b) { return std::abs(a) < std::abs(b); }));
+  for (std::size_t i = 0; i < n * dim; ++i) {
+    const float rounded = std::round(means[i]);
+    for (int u = 0; u < 16; ++u) {
+      const float level = half_step * static_cast<float>(2 * u - 15);
+      CHECK(std::abs(rounded - levels[i]) <= std::abs(rounded - level));
+    }
+  }
+
+  PrototypeMap expanded(map.encoder());
+  std::vector<std::int8_t> codes(levels.begin(), levels.end());
+  expanded.add_codes(ids, {codes.data(), n, dim});
+  for (const std::size_t k : {1, 3}) {
+    SearchOptions options;
+    options.threads = 2;
+    if (k == 1) options.ratio = 0.9f;
+    std::vector<std::int64_t> a(k * queries.rows), b(a.size());
+    std::vector<float> distance_a(a.size()), distance_b(a.size());
+    expanded.search_codes(queries, options, {a.data(), queries.rows, k},
+                          {distance_a.data(), queries.rows, k});
+    mapped.search_codes(queries, options, {b.data(), queries.rows, k},
+                        {distance_b.data(), queries.rows, k});
+    CHECK(a == b && distance_a == distance_b);
+  }
+  CHECK(check::throws<std::invalid_argument>([&] { map.seal(path, 5); }, "8 or 4 bits"));
+}
+
+}  // namespace
 
 int main() {
   const fs::path folder =
@@ -36,6 +84,7 @@ int main() {
   const SealedMap mapped(sealed);
   CHECK(read.ids() == map.ids());
   CHECK(mapped.ids() == map.ids());
+  CHECK(mapped.code_bits() == 8);
   CHECK(mapped.positions(std::span(ids).first(1))[0] == here);
 
   std::vector<std::int64_t> found(3 * n), found_read(3 * n), found_mapped(3 * n);
@@ -46,6 +95,9 @@ int main() {
   mapped.search_codes(queries, {}, {found_mapped.data(), n, 3}, {distance_mapped.data(), n, 3});
   CHECK(found == found_read && distance == distance_read);
   CHECK(found == found_mapped && distance == distance_mapped);
+
+  test_four_bits(map, queries, folder / "map.4.pmk");
+  CHECK(SealedMap(folder / "map.4.pmk").positions(std::span(ids).first(1))[0] == here);
 
   std::ofstream(folder / "text.pmk") << "no map";
   CHECK(check::throws<FileError>([&] { map_kind(folder / "text.pmk"); }, "not a Protomark file"));

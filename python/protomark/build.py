@@ -63,14 +63,24 @@ def build_file(
     min_observations: int,
     seal: bool,
     threads: int,
+    code_bits: int = 8,
 ) -> PrototypeMap:
-    """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor."""
+    """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor.
+
+    Raises:
+        ValueError: as `build_map`; or `code_bits`, those of a sealed map, is neither 8 nor 4, or is
+            4 where none is sealed.
+    """
+    if code_bits not in (8, 4):
+        raise ValueError(f"--code-bits {code_bits}: a sealed map has 8 or 4 bits a number")
+    if code_bits != 8 and not seal:
+        raise ValueError(f"--code-bits {code_bits} is for sealed maps: add --sealed")
     loaded = Tracks.load(tracks)
     scene = build_map(
         loaded, Encoder.load(encoder or loaded.descriptor), dim, min_observations, threads
     )
     if seal:
-        scene.seal(output)
+        scene.seal(output, bits=code_bits)
     else:
         scene.save(output)
     return scene

@@ -222,6 +222,9 @@ def build(
     sealed: Annotated[
         bool, typer.Option("--sealed", help="Write a sealed map: smaller, and only answers.")
     ] = False,
+    code_bits: Annotated[
+        int, typer.Option(help="Bits of a sealed prototype's number: 8, or 4 for half the bytes.")
+    ] = 8,
     threads: Annotated[int, typer.Option(help="CPU threads.")] = 1,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the facts to this file.")
@@ -231,7 +234,7 @@ def build(
     from protomark.build import build_file
     from protomark.info import describe, show
 
-    build_file(tracks, output, encoder, dim, min_observations, sealed, threads)
+    build_file(tracks, output, encoder, dim, min_observations, sealed, threads, code_bits)
     facts = describe(output)
     _write_json(json_file, facts)
     show(facts)

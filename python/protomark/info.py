@@ -70,16 +70,18 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     counts = scene.counts(ids).astype(np.int64)
     positions = scene.positions(ids)
     placed = positions[~np.isnan(positions).any(axis=1)]
-    matching = scene.dim + 1 + (8 if "ids" in sections else 0)
+    code_bits = scene.code_bits if isinstance(scene, pm.SealedMap) else None
+    matching = (scene.dim * (code_bits or 8) + 7) // 8 + 1 + (8 if "ids" in sections else 0)
     return {
-        "kind": "sealed map" if isinstance(scene, pm.SealedMap) else "open map",
+        "kind": "open map" if code_bits is None else "sealed map",
         "landmarks": len(scene),
         "dim": scene.dim,
+        "code_bits": code_bits,
         "observations": int(counts.sum()),
         "count_histogram": np.bincount(counts).tolist() if len(counts) else [],
         "landmarks_with_position": len(placed),
         "extent": [placed.min(0).tolist(), placed.max(0).tolist()] if len(placed) else None,
-        "bytes_per_landmark_for_matching": matching if isinstance(scene, pm.SealedMap) else None,
+        "bytes_per_landmark_for_matching": None if code_bits is None else matching,
         "bytes": path.stat().st_size,
         "bytes_by_section": sections,
         "encoder": _encoder_facts(scene.encoder),

@@ -29,8 +29,8 @@ std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesy
 void verify_file(const std::filesystem::path& path);
 
 // A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, landmarks to
-// one of 16), 8 more where ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads
-// are safe from any thread.
+// one of 16), with 4 bits a number dim / 2 + 1 (dimensions padded to a multiple of 8), 8 more where
+// ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads are safe from any thread.
 class SealedMap {
  public:
   // Throws FileError. The large sections are not read; verify_file checks them.
@@ -41,9 +41,12 @@ class SealedMap {
   const std::shared_ptr<const Encoder>& encoder() const;
   std::size_t dim() const;
   std::size_t size() const;
+  // Bits of a prototype's number: 8, or 4 where it was sealed so.
+  int code_bits() const;
   std::vector<std::int64_t> ids() const;
 
-  // Throw UnknownLandmark. Prototypes are the rounded ones. Positions are 32-bit, relative to the
+  // Throw UnknownLandmark. Prototypes are the rounded ones; with 4 bits, the levels nearest to
+  // these. Positions are 32-bit, relative to the
   // middle of the map; NaN where there is none.
   std::vector<std::uint8_t> counts(std::span<const std::int64_t> landmarks) const;
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;

@@ -81,8 +81,10 @@ class PrototypeMap {
   // all. Throws FileError.
   void save(const std::filesystem::path& path) const;
   static PrototypeMap load(const std::filesystem::path& path);
-  // Writes a sealed map (protomark/map_file.h). Throws FileError.
-  void seal(const std::filesystem::path& path) const;
+  // Writes a sealed map (protomark/map_file.h) whose prototypes have 8 or 4 bits a number. With 8
+  // it gives the same answers; with 4 numbers are rounded to 16 levels that fit this map best,
+  // which takes half the bytes. Throws FileError, and std::invalid_argument for other `bits`.
+  void seal(const std::filesystem::path& path, int bits = 8) const;
 
  private:
   struct Store;

@@ -33,6 +33,32 @@ constexpr std::size_t packed_index(std::size_t row, std::size_t d, std::size_t d
          row % kPackedRows * 4 + d % 4;
 }
 
+// Prototypes of 4 bits a number, as a sealed map may store them: u, 0 to 15, stands for
+// half_step * (2 u - 15). Blocks of 16 landmarks; within a block, for every 8 dimensions, 16
+// landmarks x 4 bytes, of which byte j holds dimension j in its low bits and dimension 4 + j in its
+// high ones. The last block and the last dimensions are padded with zeros. Value d of row r stands
+// at packed4_index(r, d, dim), in the high bits where packed4_high(d).
+struct PackedPrototypes4 {
+  const std::uint8_t* data = nullptr;
+  std::size_t rows = 0;
+  std::size_t dim = 0;
+  int half_step = 1;                  // 1 to kMaxHalfStep
+  const std::int64_t* ids = nullptr;  // as in PackedPrototypes
+};
+
+inline constexpr int kMaxHalfStep = 8;  // 15 * 8 is the last multiple of 15 that int8 holds
+
+constexpr std::size_t packed4_size(std::size_t rows, std::size_t dim) {
+  return (rows + kPackedRows - 1) / kPackedRows * kPackedRows * ((dim + 7) / 8 * 4);
+}
+
+constexpr std::size_t packed4_index(std::size_t row, std::size_t d, std::size_t dim) {
+  return row / kPackedRows * kPackedRows * ((dim + 7) / 8 * 4) + d / 8 * 4 * kPackedRows +
+         row % kPackedRows * 4 + d % 4;
+}
+
+constexpr bool packed4_high(std::size_t d) { return d % 8 >= 4; }
+
 struct SearchOptions {
   // Neighbours further away than this (Euclidean, in code units) are not reported.
   std::optional<float> max_distance;
@@ -48,6 +74,8 @@ struct SearchOptions {
 // float nearest to the root of the integer squared distance. Where there is no neighbour the id is
 // -1 and the distance infinite. Throws std::invalid_argument where shapes or options do not fit.
 void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
+            MatrixView<std::int64_t> ids, MatrixView<float> distances);
+void search(const PackedPrototypes4& prototypes, Codes queries, const SearchOptions& options,
             MatrixView<std::int64_t> ids, MatrixView<float> distances);
 
 }  // namespace protomark

@@ -57,6 +57,32 @@ void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim
   }
 }
 
+void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int half_step,
+                  std::int8_t* codes) {
+  // The shuffle looks bytes up in each 16 of a register: the same 16 levels four times.
+  std::int8_t table[64];
+  for (int i = 0; i < 64; ++i) table[i] = static_cast<std::int8_t>(half_step * (2 * (i % 16) - 15));
+  const __m512i levels = _mm512_loadu_si512(table);
+  const __m512i low = _mm512_set1_epi8(15);
+  // Which of 4 dimensions are there, for the last 4 of them.
+  const std::size_t last = dim % 4 == 0 ? 4 : dim % 4;
+  const __mmask64 tail = 0x1111111111111111u * ((1u << last) - 1);
+  for (std::size_t b = 0; b < blocks; ++b) {
+    for (std::size_t d = 0; d < dim; d += 8, packed += 64) {
+      const __m512i bytes = _mm512_loadu_si512(packed);
+      const __mmask64 first = d + 4 < dim ? ~__mmask64{0} : tail;
+      _mm512_storeu_si512(codes,
+                          _mm512_maskz_shuffle_epi8(first, levels, _mm512_and_si512(bytes, low)));
+      codes += 64;
+      if (d + 4 >= dim) continue;
+      const __mmask64 second = d + 8 < dim ? ~__mmask64{0} : tail;
+      const __m512i high = _mm512_and_si512(_mm512_srli_epi16(bytes, 4), low);
+      _mm512_storeu_si512(codes, _mm512_maskz_shuffle_epi8(second, levels, high));
+      codes += 64;
+    }
+  }
+}
+
 std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
                       std::size_t dim, const std::int32_t* offsets, std::int32_t limit, Hits hits) {
   const __m512i limits = _mm512_set1_epi32(limit);
@@ -109,6 +135,6 @@ std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed
 
 }  // namespace
 
-const Kernels avx512 = {"avx512", dense, code_offsets, code_scan, hamming_scan};
+const Kernels avx512 = {"avx512", dense, code_offsets, code_unpack4, code_scan, hamming_scan};
 
 }  // namespace protomark::kernels

@@ -42,6 +42,13 @@ struct Kernels {
   void (*code_offsets)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
                        std::int32_t* offsets);
 
+  // 4-bit numbers u as codes half_step * (2 u - 15), packed as code_scan takes them, `dim` rounded
+  // up to a multiple of 4 with zeros, whatever `packed` holds there. They are packed in blocks of
+  // 16 rows: for every 8 dimensions, 16 rows x 4 bytes; byte j holds dimension j in its low four
+  // bits, 4 + j in its high ones. `half_step` is 1 to 8.
+  void (*code_unpack4)(const std::uint8_t* packed, std::size_t blocks, std::size_t dim,
+                       int half_step, std::int8_t* codes);
+
   // All rows with offsets[row] - 2 * (q + 128) . p <= limit, in ascending order, with that value;
   // `query` is q + 128, unsigned. Returns how many were written to `hits`.
   std::size_t (*code_scan)(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,

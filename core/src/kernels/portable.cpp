@@ -39,6 +39,22 @@ void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim
   }
 }
 
+void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int half_step,
+                  std::int8_t* codes) {
+  std::int8_t levels[16];
+  for (int u = 0; u < 16; ++u) levels[u] = static_cast<std::int8_t>(half_step * (2 * u - 15));
+  for (std::size_t b = 0; b < blocks; ++b) {
+    for (std::size_t d = 0; d < dim; d += 4, codes += 4 * kCodeRows) {
+      const int shift = d % 8 == 0 ? 0 : 4;
+      for (std::size_t i = 0; i < 4 * kCodeRows; ++i) {
+        codes[i] = d + i % 4 < dim ? levels[packed[i] >> shift & 15] : std::int8_t{0};
+      }
+      // Both halves of the bytes were read, or there is no second half.
+      if (shift == 4 || d + 4 >= dim) packed += 4 * kCodeRows;
+    }
+  }
+}
+
 std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
                       std::size_t dim, const std::int32_t* offsets, std::int32_t limit, Hits hits) {
   std::size_t found = 0;
@@ -97,6 +113,6 @@ std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed
 
 }  // namespace
 
-const Kernels portable = {"portable", dense, code_offsets, code_scan, hamming_scan};
+const Kernels portable = {"portable", dense, code_offsets, code_unpack4, code_scan, hamming_scan};
 
 }  // namespace protomark::kernels

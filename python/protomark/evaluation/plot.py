@@ -28,6 +28,7 @@ _SHORT = {
     "pca": "PCA",
     "discriminant": "discriminant",
     "protomark": "Protomark",
+    "protomark-4bit": "Protomark, 4 bits",
 }
 
 
@@ -59,7 +60,8 @@ def draw_precision(axes: Axes, rows: Sequence[Summary], title: str = "") -> None
             elinewidth=1,
             zorder=3 if own else 2,
         )
-        short = _SHORT.get(family, family.replace("protomark@", "Protomark "))
+        kind, _, encoder = family.partition("@")
+        short = f"{_SHORT.get(kind, kind)} {encoder}".rstrip()
         labels.append((x[-1], y[-1], short, colour, own))
     _place(axes, labels)
     axes.set_xscale("log", base=2)

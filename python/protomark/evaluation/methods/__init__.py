@@ -23,6 +23,8 @@ from protomark.evaluation.support import Moments, Support
 if TYPE_CHECKING:
     import protomark as pm
 
+# Codes of at least so many dimensions are compared at 4 bits a number too.
+MIN_4_BIT_DIM = 16
 PROJECTED_DIMS = (8, 16, 32)
 
 
@@ -111,6 +113,17 @@ def choices(
                     _prototypes(encoder, dim, threads),
                 )
             )
+        for dim in sorted(encoder.dims):
+            if dim < MIN_4_BIT_DIM:
+                continue
+            listed.append(
+                MethodChoice(
+                    f"protomark-{dim}x4{tail}",
+                    f"Protomark, {dim} x 4 bits{mark}",
+                    f"protomark-4bit{tail}",
+                    _prototypes(encoder, dim, threads, bits=4),
+                )
+            )
     return listed
 
 
@@ -154,8 +167,10 @@ def _discriminants(
     return build
 
 
-def _prototypes(encoder: pm.Encoder, dim: int, threads: int) -> Callable[[Support], Method]:
+def _prototypes(
+    encoder: pm.Encoder, dim: int, threads: int, bits: int = 8
+) -> Callable[[Support], Method]:
     def build(support: Support) -> Method:
-        return prototypes(support, encoder, dim, threads)
+        return prototypes(support, encoder, dim, threads, bits)
 
     return build

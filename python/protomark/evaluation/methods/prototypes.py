@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,11 +17,15 @@ if TYPE_CHECKING:
 
 
 class PrototypeMethod(Method):
-    """A map of prototypes, open or sealed: k bytes and one for the count."""
+    """A map of prototypes, open or sealed: k int8 or 4-bit numbers, and one byte for the count."""
 
     def __init__(self, scene: pm.PrototypeMap | pm.SealedMap) -> None:
         self.map = scene
-        self.bytes_per_landmark = scene.dim + 1
+        import protomark as pm
+
+        # An open map searches the int8 prototypes that a sealed one would hold.
+        bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
+        self.bytes_per_landmark = (scene.dim * bits + 7) // 8 + 1
 
     def match(
         self, descriptors: NDArray[np.uint8], threads: int = 1
@@ -30,11 +36,23 @@ class PrototypeMethod(Method):
 
 
 def prototypes(
-    support: Support, encoder: pm.Encoder, dim: int, threads: int = 1
+    support: Support, encoder: pm.Encoder, dim: int, threads: int = 1, bits: int = 8
 ) -> PrototypeMethod:
-    """Eq. 1 of Komorowski and Trzcinski: the mean of the codes of each landmark's descriptors."""
+    """Eq. 1 of Komorowski and Trzcinski: the mean of the codes of each landmark's descriptors.
+
+    Args:
+        support: the observations.
+        encoder: an encoder for their descriptor.
+        dim: dimensions of a prototype, one of `encoder.dims`.
+        threads: threads to encode on.
+        bits: 8 or 4 bits a number, as a map is sealed.
+    """
     import protomark as pm
 
     scene = pm.PrototypeMap(encoder, dim=dim)
     scene.add(support.landmarks, support.descriptors, threads=threads)
-    return PrototypeMethod(scene)
+    if bits == 8:
+        return PrototypeMethod(scene)
+    with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
+        # The map stays mapped when its file is gone.
+        return PrototypeMethod(scene.seal(Path(folder) / "scene.sealed.pmk", bits=bits))

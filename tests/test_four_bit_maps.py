@@ -1,0 +1,319 @@
+"""Sealed maps of 4 bits a number, against what docs/format.md says, in NumPy."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zlib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import protomark as pm
+from conftest import random_descriptors, random_layers, rounded
+from protomark.build import build_file
+
+Section = tuple[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sealed")
+
+
+@pytest.fixture(scope="module")
+def coder() -> pm.Encoder:
+    """Dims around the 8 dimensions that are packed together, and beyond."""
+    dims = [1, 3, 4, 5, 7, 8, 9, 12, 16, 21]
+    return pm.Encoder(random_layers([64, 40, 21]), dims, name="t", descriptor="test", scale=0.02)
+
+
+def filled(coder: pm.Encoder, dim: int, n: int, limit: int, seed: int) -> pm.PrototypeMap:
+    """A map whose prototypes reach up to `limit`."""
+    rng = np.random.default_rng(seed)
+    scene = pm.PrototypeMap(coder, dim=dim)
+    ids = rng.choice(1000, n, replace=False)
+    for _ in range(2):
+        scene.add_codes(ids, rng.integers(-limit, limit + 1, (n, dim)).astype(np.int8))
+    return scene
+
+
+def levels(half_step: int) -> NDArray[np.int64]:
+    return half_step * (2 * np.arange(16) - 15)
+
+
+@cache
+def nearest_levels(half_step: int) -> NDArray[np.int64]:
+    """Of each value from -128: of two levels the one away from zero, for zero the one above."""
+    return np.array(
+        [
+            min(levels(half_step).tolist(), key=lambda level: (abs(level - v), -abs(level), -level))
+            for v in range(-128, 128)
+        ]
+    )
+
+
+def quantized(prototypes: NDArray[np.int64], half_step: int) -> NDArray[np.int64]:
+    return nearest_levels(half_step)[prototypes + 128]
+
+
+def best_half_step(prototypes: NDArray[np.int64]) -> int:
+    errors = [((prototypes - quantized(prototypes, a)) ** 2).sum() for a in range(1, 9)]
+    return 1 + int(np.argmin(errors))
+
+
+def sections(data: bytes) -> list[Section]:
+    found = []
+    for i in range(int.from_bytes(data[24:28], "little")):
+        entry = data[64 + 32 * i : 96 + 32 * i]
+        begin, size = (int.from_bytes(entry[a : a + 8], "little") for a in (8, 16))
+        found.append((entry[:8].rstrip(b"\0").decode(), data[begin : begin + size]))
+    return found
+
+
+def container(parts: list[Section], version: int = 2) -> bytes:
+    """A sealed map of these sections whose checksums are right."""
+    table, body = b"", b""
+    offset = -(-(64 + 32 * len(parts)) // 64) * 64
+    start = offset
+    for name, content in parts:
+        table += name.encode().ljust(8, b"\0") + offset.to_bytes(8, "little")
+        table += len(content).to_bytes(8, "little")
+        table += zlib.crc32(content).to_bytes(4, "little") + bytes(4)
+        body += content.ljust(-(-len(content) // 64) * 64, b"\0")
+        offset = start + len(body)
+    head = b"PROTOMRK" + version.to_bytes(4, "little") + (3).to_bytes(4, "little")
+    head += offset.to_bytes(8, "little") + len(parts).to_bytes(4, "little")
+    crc = zlib.crc32(head + bytes(36) + table)
+    return (head + crc.to_bytes(4, "little") + bytes(32) + table).ljust(start, b"\0") + body
+
+
+def read_levels(path: Path, n: int, k: int) -> NDArray[np.int64]:
+    """Prototypes of a file, by docs/format.md."""
+    found = dict(sections(path.read_bytes()))
+    bits, half_step = np.frombuffer(found["levels"], "<u4").astype(int)
+    assert bits == 4
+    k8, n16 = -(-k // 8) * 8, -(-n // 16) * 16
+    b = np.frombuffer(found["protos"], np.uint8).reshape(n16 // 16, k8 // 8, 16, 4)
+    u = np.concatenate([b & 15, b >> 4], axis=3).transpose(0, 2, 1, 3).reshape(n16, k8)
+    assert not u[n:].any()
+    assert not u[:, k:].any()
+    return levels(half_step)[u[:n, :k]]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    n=st.integers(0, 40),
+    k=st.integers(1, 4),
+    dim=st.sampled_from([1, 3, 4, 5, 7, 8, 9, 12, 16, 21]),
+    limit=st.integers(0, 127),
+    max_distance=st.none() | st.floats(0, 300),
+    ratio=st.none() | st.floats(0.25, 1),
+    threads=st.integers(1, 3),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_levels_and_search_equal_the_definition(
+    n: int,
+    k: int,
+    dim: int,
+    limit: int,
+    max_distance: float | None,
+    ratio: float | None,
+    threads: int,
+    seed: int,
+    coder: pm.Encoder,
+    folder: Path,
+) -> None:
+    scene = filled(coder, dim, n, limit, seed)
+    sealed = scene.seal(folder / "s.pmk", bits=4)
+    pm.verify_file(folder / "s.pmk")
+    means = rounded(scene.prototype(scene.ids))
+    expected = quantized(means, best_half_step(means))
+    np.testing.assert_array_equal(read_levels(folder / "s.pmk", n, dim), expected)
+    np.testing.assert_array_equal(sealed.prototype(scene.ids), expected)
+    np.testing.assert_array_equal(sealed.ids, scene.ids)
+    np.testing.assert_array_equal(sealed.counts(scene.ids), scene.counts(scene.ids))
+    assert (len(sealed), sealed.dim, sealed.code_bits) == (n, dim, 4)
+
+    queries = np.random.default_rng(seed).integers(-128, 128, (35, dim)).astype(np.int8)
+    ids, distances = sealed.search_codes(
+        queries, k=k, max_distance=max_distance, ratio=ratio, threads=threads
+    )
+    for q, query in enumerate(queries.astype(np.int64)):
+        squared = ((expected - query) ** 2).sum(1)
+        order = np.argsort(squared, kind="stable")
+        keep = True
+        if ratio is not None and len(order) > 1:
+            r = float(np.float32(ratio))
+            keep = float(squared[order[0]]) < r * r * float(squared[order[1]])
+        furthest = np.inf if max_distance is None else float(np.float32(max_distance)) ** 2
+        best = [(scene.ids[o], squared[o]) for o in order[:k] if keep and squared[o] <= furthest]
+        best += [(-1, np.inf)] * (k - len(best))
+        np.testing.assert_array_equal(ids[q], [i for i, _ in best])
+        np.testing.assert_array_equal(
+            distances[q], np.sqrt(np.array([s for _, s in best], np.float32))
+        )
+
+
+def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
+    """A map larger than the chunks that the search works in; it opens as it was sealed."""
+    scene = pm.PrototypeMap(coder, dim=21)
+    rng = np.random.default_rng(0)
+    scene.add_codes(np.arange(3000), rng.integers(-127, 128, (3000, 21)).astype(np.int8))
+    scene.set_positions([5], np.array([[1.0, 2.0, 3.0]]))
+    scene.seal(folder / "large.pmk", bits=4)
+    sealed = pm.open(folder / "large.pmk")
+    assert isinstance(sealed, pm.SealedMap)
+    assert "21 dimensions of 4 bits" in repr(sealed)
+    np.testing.assert_array_equal(sealed.positions([5]), [[1, 2, 3]])
+    prototypes = sealed.prototype(np.arange(3000)).astype(np.int64)
+    descriptors = random_descriptors(50)
+    codes = coder.encode(descriptors).astype(np.int64)
+    squared = ((codes[:, None] - prototypes[None]) ** 2).sum(-1)
+    expected = np.argsort(squared, axis=1, kind="stable")[:, :3]
+    np.testing.assert_array_equal(sealed.search(descriptors, k=3)[0], expected)
+
+
+def test_bytes_a_landmark(coder: pm.Encoder, folder: Path) -> None:
+    scene = pm.PrototypeMap(coder, dim=16)
+    scene.add(np.arange(1600), random_descriptors(1600))
+    scene.seal(folder / "a.pmk", bits=4)
+    sizes = dict(pm.file_sections(folder / "a.pmk"))
+    assert set(sizes) == {"encoder", "shape", "counts", "levels", "protos"}
+    assert sizes["counts"] + sizes["protos"] == 1600 * (16 // 2 + 1)
+
+
+def test_8_bits_are_the_default_and_as_ever(coder: pm.Encoder, folder: Path) -> None:
+    scene = filled(coder, 12, 30, 100, 0)
+    assert scene.seal(folder / "a.pmk").code_bits == 8
+    scene.seal(folder / "b.pmk", bits=8)
+    data = (folder / "a.pmk").read_bytes()
+    assert data == (folder / "b.pmk").read_bytes()
+    assert data[8:12] == (1).to_bytes(4, "little")
+    assert [name for name, _ in sections(data)] == ["encoder", "shape", "ids", "counts", "protos"]
+    scene.seal(folder / "c.pmk", bits=4)
+    assert (folder / "c.pmk").read_bytes()[8:12] == (2).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize("bits", [-4, 0, 1, 5, 16])
+def test_other_bits_are_refused(bits: int, coder: pm.Encoder, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=f"with 8 or 4 bits a number, not {bits}"):
+        pm.PrototypeMap(coder).seal(tmp_path / "s.pmk", bits=bits)
+    assert not (tmp_path / "s.pmk").exists()
+
+
+def words(*values: int) -> bytes:
+    return np.array(values, "<u4").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("section", "content", "message"),
+    [
+        ("levels", words(4, 0), "half-step of its prototypes is 0, not 1 to 8"),
+        ("levels", words(4, 9), "half-step of its prototypes is 9, not 1 to 8"),
+        ("levels", words(4, 2**32 - 1), "half-step of its prototypes is 4294967295"),
+        ("levels", words(2, 1), "its prototypes have 2 bits a number"),
+        ("levels", words(4), "section 'levels' is shorter than it should be"),
+        ("levels", words(4, 1, 0), "section 'levels' is longer than it should be"),
+        ("levels", None, "section 'protos' has the wrong size"),
+        ("protos", bytes(64), "section 'protos' has the wrong size"),
+        ("protos", b"", "section 'protos' has the wrong size"),
+        ("protos", None, "it lacks the section 'protos'"),
+        ("counts", bytes(1), "section 'counts' has the wrong size"),
+    ],
+)
+def test_hostile_sections_are_refused(
+    section: str, content: bytes | None, message: str, coder: pm.Encoder, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.pmk"
+    filled(coder, 9, 20, 100, 0).seal(path, bits=4)
+    parts = sections(path.read_bytes())
+    assert container(parts) == path.read_bytes()
+    changed = [(name, content if name == section else old) for name, old in parts]
+    path.write_bytes(container([(n, c) for n, c in changed if c is not None]))
+    with pytest.raises(pm.FileError, match=message):
+        pm.open(path)
+
+
+def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
+    """Of 9 dimensions 7 are padding, of 20 landmarks 12: never read, refused in the last block."""
+    path = tmp_path / "s.pmk"
+    sealed = filled(coder, 9, 20, 100, 0).seal(path, bits=4)
+    queries = np.random.default_rng(1).integers(-127, 128, (20, 9)).astype(np.int8)
+    expected = sealed.search_codes(queries)
+    parts = dict(sections(path.read_bytes()))
+    protos = np.frombuffer(parts["protos"], np.uint8).reshape(2, 2, 16, 4).copy()
+
+    def write(changed: NDArray[np.uint8]) -> None:
+        path.unlink()
+        path.write_bytes(container([*{**parts, "protos": changed.tobytes()}.items()]))
+
+    first = protos.copy()
+    first[0, 1, :, 0] |= 0xF0
+    first[0, 1, :, 1:] = 0xFF
+    write(first)
+    for a, b in zip(pm.open(path).search_codes(queries), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for place in ((1, 0, 4, 0), (1, 1, 15, 3), (1, 1, 0, 1)):
+        for nibble in (0x01, 0x10):
+            last = protos.copy()
+            last[place] |= nibble
+            write(last)
+            with pytest.raises(pm.FileError, match="padding of its prototypes is not zero"):
+                pm.open(path)
+    last = protos.copy()
+    last[1, 1, 0, 0] |= 0x10
+    write(last)
+    with pytest.raises(pm.FileError, match="padding of its prototypes is not zero"):
+        pm.open(path)
+
+
+def test_later_formats_are_refused(coder: pm.Encoder, tmp_path: Path) -> None:
+    path = tmp_path / "s.pmk"
+    filled(coder, 9, 20, 100, 0).seal(path, bits=4)
+    path.write_bytes(container(sections(path.read_bytes()), version=3))
+    with pytest.raises(pm.FileError, match="format version 3, this Protomark reads versions 1 to"):
+        pm.open(path)
+
+
+def test_plain_code_gives_the_same_file_and_answers(coder: pm.Encoder, tmp_path: Path) -> None:
+    """The instruction set is chosen when a process starts: another process, with the plain one."""
+    open_path, path = tmp_path / "o.pmk", tmp_path / "s.pmk"
+    scene = filled(coder, 21, 900, 60, 3)
+    scene.save(open_path)
+    sealed = scene.seal(path, bits=4)
+    descriptors = random_descriptors(70)
+    script = (
+        "import sys, numpy as np, protomark as pm\n"
+        "sealed = pm.open(sys.argv[1]).seal(sys.argv[2], bits=4)\n"
+        "ids, distances = sealed.search(np.load(sys.argv[3]), k=5)\n"
+        "np.savez(sys.argv[4], ids=ids, distances=distances)\n"
+    )
+    np.save(tmp_path / "d.npy", descriptors)
+    files = [open_path, tmp_path / "p.pmk", tmp_path / "d.npy", tmp_path / "r.npz"]
+    subprocess.run(
+        [sys.executable, "-c", script, *map(str, files)],
+        env={**os.environ, "PROTOMARK_ISA": "portable"},
+        check=True,
+    )
+    assert files[1].read_bytes() == path.read_bytes()
+    answers: Any = np.load(files[3])
+    ids, distances = sealed.search(descriptors, k=5)
+    np.testing.assert_array_equal(answers["ids"], ids)
+    np.testing.assert_array_equal(answers["distances"], distances)
+
+
+@pytest.mark.parametrize(
+    ("seal", "bits", "message"),
+    [(False, 4, "is for sealed maps: add --sealed"), (True, 6, "has 8 or 4 bits a number")],
+)
+def test_build_says_what_is_wrong(seal: bool, bits: int, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        build_file(tmp_path / "t", tmp_path / "s.pmk", None, None, 2, seal, 1, bits)
