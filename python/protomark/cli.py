@@ -128,19 +128,30 @@ def tracks(
 
 @app.command()
 def train(
-    tracks: Annotated[list[Path], typer.Argument(help="Tracks files to learn from.")],
-    validation: Annotated[
-        list[Path],
-        typer.Option("--validation", help="Tracks file that picks the model; may be repeated."),
+    tracks: Annotated[
+        list[Path], typer.Argument(help="Tracks files to learn from, one a sequence.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.pme).")],
+    validation: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--validation",
+            help="Tracks file that picks the model; may be repeated. By default the last of TRACKS "
+            "is not learned from but picks.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Model file to write; by default DESCRIPTOR.pme, if not there."
+        ),
+    ] = None,
     report: Annotated[
         list[Path] | None,
         typer.Option("--report", help="Tracks file to measure the result on; may be repeated."),
     ] = None,
     dims: Annotated[
         str, typer.Option(help="Code lengths that shall serve, ascending.")
-    ] = "8,16,32",
+    ] = "8,16,24,32,48,64",
     steps: Annotated[int, typer.Option(help="Batches in all.")] = 4000,
     batch: Annotated[int, typer.Option(help="Landmarks in a batch.")] = 1000,
     seed: Annotated[int, typer.Option(help="Of weights and batches.")] = 0,
@@ -163,8 +174,9 @@ def train(
 ) -> None:
     """Train an encoder on tracks, and write it with its card (needs PyTorch).
 
-    Works for any binary descriptor of 64 to 1024 bits. Ctrl-C leaves a checkpoint beside the
-    output, and the same command with --resume continues.
+    Works for any binary descriptor of 64 to 1024 bits: `protomark train my-tracks/*`. Beside the
+    model come its card (.md) and a picture of the training (.png) that is drawn anew at each
+    validation. Ctrl-C leaves a checkpoint, and the same command with --resume continues.
     """
     try:
         import torch  # noqa: F401
@@ -172,7 +184,13 @@ def train(
         raise ModuleNotFoundError(
             "training needs PyTorch, which is not installed: pip install protomark[train]"
         ) from None
-    from protomark.training.command import explain_interruption, print_summary, train_encoder
+    from protomark.training.command import (
+        default_output,
+        explain_interruption,
+        print_summary,
+        train_encoder,
+    )
+    from protomark.training.data import hold_out
     from protomark.training.train import Interrupted, Options
 
     try:
@@ -184,10 +202,12 @@ def train(
             raise ValueError(f"--data-licence {entry!r} is not of the form NAME=LICENCE")
     data_licences = dict(entry.split("=", 1) for entry in data_licence or [])
     options = Options(dims=parsed, steps=steps, landmarks=batch, seed=seed)
+    learned, picking = hold_out(tracks, validation or [])
+    output = output or default_output(learned[0], resume)
     try:
         card = train_encoder(
-            tracks,
-            validation,
+            learned,
+            picking,
             output,
             options,
             report=report or [],
@@ -352,6 +372,85 @@ def evaluate(
         discriminant_from=discriminant_from or [],
     )
     command.write(results, json_file, markdown_file, plot_file)
+
+
+@app.command()
+def reproduce(
+    data: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[DATA]...",
+            help="Tracks files, folders of them, or folders of sequences with images/ and "
+            "sparse/, whose tracks are made first. By default the sequences in data, ../data or "
+            "../shared/data.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for the report and all that is kept."),
+    ] = Path("reproduction"),
+    scale: Annotated[
+        str,
+        typer.Option(
+            help="small: minutes, on the sequences whose tracks are quickly made; medium: all "
+            "sequences, short trainings; full: trained until the validation loss stagnates, hours."
+        ),
+    ] = "small",
+    descriptor: Annotated[
+        str, typer.Option("--descriptor", "-d", help="Descriptor; the paper's is freak.")
+    ] = "freak",
+    train: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Sequence to train on; may be repeated."),
+    ] = None,
+    validation: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Sequence to pick networks on; may be repeated."),
+    ] = None,
+    test: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Sequence to measure on; may be repeated."),
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option(min=0, help="Trainings at a time, 0 for as many as cores allow.")
+    ] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads of one training.")] = 1,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file too.")
+    ] = None,
+) -> None:
+    """Run the paper's whole evaluation again and report it beside the paper's numbers.
+
+    Trains 'fat' and 'funnel' networks of 2 to 5 layers as triplet and as prototypical networks,
+    compares prototypes of 8 to 64 dimensions and the other methods of the paper's table, and
+    writes report.md with its figures (needs PyTorch). Finished trainings are kept: after Ctrl-C
+    the same command goes on. Sequences of other names than the project's own need --train,
+    --validation and --test. docs/reproduction.md says more.
+    """
+    try:
+        import torch  # noqa: F401
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "reproduce trains networks with PyTorch, which is not installed: "
+            "pip install protomark[train]"
+        ) from None
+    from protomark.evaluation.threads import available_threads
+    from protomark.reproduce import command
+    from protomark.reproduce.scale import find_scale
+
+    settings = command.Settings(
+        scale=find_scale(scale),
+        descriptor=descriptor,
+        jobs=jobs or max(available_threads() // threads, 1),
+        threads=threads,
+        given={"training": train or [], "validation": validation or [], "test": test or []},
+    )
+    try:
+        results = command.reproduce(data or [], output, settings, json_file)
+    except KeyboardInterrupt:
+        command.explain_interruption(output)
+        raise typer.Exit(130) from None
+    command.print_summary(results, output)
 
 
 def _write_json(path: Path | None, facts: dict[str, Any]) -> None:

@@ -1,0 +1,1 @@
+"""The paper's whole evaluation, run again on other sequences (`protomark reproduce`)."""
