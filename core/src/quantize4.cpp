@@ -20,10 +20,10 @@ int best_half_step(const Occurrences& occurrences) {
   auto least = std::numeric_limits<std::uint64_t>::max();
   for (int half_step = 1; half_step <= kMaxHalfStep; ++half_step) {
     std::uint64_t error = 0;
-    for (int value = -128; value < 128; ++value) {
+    for (std::size_t i = 0; i < occurrences.size(); ++i) {
+      const int value = static_cast<int>(i) - 128;
       const int difference = value - level4(quantize4(value, half_step), half_step);
-      error += static_cast<std::uint64_t>(difference * difference) *
-               occurrences[static_cast<std::size_t>(value + 128)];
+      error += static_cast<std::uint64_t>(difference * difference) * occurrences[i];
     }
     if (error < least) {
       least = error;

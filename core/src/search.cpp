@@ -59,6 +59,12 @@ bool distinct(std::int32_t nearest, std::int32_t second, float ratio) {
   return static_cast<double>(nearest) < static_cast<double>(ratio) * ratio * second;
 }
 
+// Codes of 16 landmarks x 4 dimensions. Aligned: a scan whose loads cross cache lines takes a
+// quarter longer.
+struct alignas(64) Vector {
+  std::int8_t codes[64];
+};
+
 // What is searched: either kind of packed prototypes, and chunk(block, blocks, room), which gives
 // int8 codes of some blocks, packed as in PackedPrototypes. It may put them into `room`.
 template <typename Prototypes, typename Chunk>
@@ -90,7 +96,7 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
 
     // The kernels leave out the query's own norm, which does not change the order; it is added
     // where distances are given back.
-    std::vector<std::int8_t> room;
+    std::vector<Vector> room;
     std::vector<std::int32_t> offsets(kChunkRows);
     std::vector<std::uint32_t> hit_rows(kChunkRows);
     std::vector<std::int32_t> hit_distances(kChunkRows);
@@ -135,7 +141,7 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
 void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
             MatrixView<std::int64_t> ids, MatrixView<float> distances) {
   const std::size_t block_size = packed_size(kPackedRows, prototypes.dim);
-  const auto chunk = [&](std::size_t block, std::size_t, std::vector<std::int8_t>&) {
+  const auto chunk = [&](std::size_t block, std::size_t, std::vector<Vector>&) {
     return prototypes.data + block * block_size;
   };
   search_chunks(prototypes, chunk, queries, options, ids, distances);
@@ -150,11 +156,12 @@ void search(const PackedPrototypes4& prototypes, Codes queries, const SearchOpti
                                 std::to_string(prototypes.half_step));
   }
   const std::size_t block_size = packed4_size(kPackedRows, prototypes.dim);
-  const auto chunk = [&](std::size_t block, std::size_t blocks, std::vector<std::int8_t>& room) {
-    room.resize(packed_size(kChunkRows, prototypes.dim));
+  const auto chunk = [&](std::size_t block, std::size_t blocks, std::vector<Vector>& room) {
+    room.resize(packed_size(kChunkRows, prototypes.dim) / sizeof(Vector));
+    auto* codes = reinterpret_cast<std::int8_t*>(room.data());
     kernels::active().code_unpack4(prototypes.data + block * block_size, blocks, prototypes.dim,
-                                   prototypes.half_step, room.data());
-    return static_cast<const std::int8_t*>(room.data());
+                                   prototypes.half_step, codes);
+    return static_cast<const std::int8_t*>(codes);
   };
   search_chunks(prototypes, chunk, queries, options, ids, distances);
 }

@@ -28,7 +28,7 @@ _SHORT = {
     "pca": "PCA",
     "discriminant": "discriminant",
     "protomark": "Protomark",
-    "protomark-4bit": "Protomark, 4 bits",
+    "protomark-4bit": "Protomark x4",
 }
 
 
