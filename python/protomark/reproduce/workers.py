@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
@@ -147,6 +148,11 @@ class Trainings:
                 for future in done:
                     yield waiting.pop(future), future.result()
                 show(shares[:])
+        except BrokenProcessPool:
+            raise OSError(
+                "a training process ended of itself, perhaps for lack of memory; what is finished "
+                "is kept: run the same command with --jobs 1"
+            ) from None
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
