@@ -47,7 +47,9 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
         "--json", tmp_path / "mine.json",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.json", "mine.md", "mine.pme"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "mine.json", "mine.md", "mine.pme", "mine.png",
+    ]  # fmt: skip
 
     encoder = pm.Encoder.load(out)
     assert (encoder.name, encoder.descriptor, encoder.bits) == ("mine", "synthetic", 128)
@@ -67,6 +69,10 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
         validation["float_precision"]["8"], abs=0.03
     )
     assert figures["bytes"] == out.stat().st_size
+    # One binary descriptor a landmark is far above chance (1 in 1200) and below all of them.
+    for one in ("medoid", "majority"):
+        assert 0.02 < validation[one] < validation["unaggregated"]
+    assert 1 < figures["encode_ns"] < 1e6
     card = (tmp_path / "mine.md").read_text()
     assert (
         "protomark train a.synthetic.safetensors b.synthetic.safetensors --validation "
@@ -74,6 +80,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
         "--licence Apache-2.0 --data-licence b=MIT"
     ) in card
     assert f"{validation['integer_precision']['8']:.4f}" in card
+    assert "![loss and validation precision](mine.png)" in card
     assert str(tmp_path) not in card
 
 
@@ -128,3 +135,27 @@ def test_without_torch_it_says_what_to_install(files, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     result = run(files["a"], "--validation", files["unseen"], "-o", tmp_path / "x.pme")
     assert "pip install protomark[train]" in str(result.exception)
+
+
+def test_without_options_the_last_file_picks_and_the_descriptor_names_the_model(
+    files, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    words = [files["a"], files["b"], files["unseen"], "--steps", 20, "--batch", 100]
+    words += ["--dims", "4,8", "--threads", 1]
+    result = run(*words)
+    assert result.exit_code == 0, result.output
+    card = (tmp_path / "synthetic.md").read_text()
+    assert "| unseen | validation |" in card
+    assert "| b | training |" in card
+    before = (tmp_path / "synthetic.pme").read_bytes()
+    again = run(*words)
+    assert isinstance(again.exception, FileExistsError)
+    assert "synthetic.pme exists and is kept" in str(again.exception)
+    assert (tmp_path / "synthetic.pme").read_bytes() == before
+
+
+def test_one_file_cannot_do_both(files):
+    result = run(files["a"])
+    assert isinstance(result.exception, ValueError)
+    assert "cannot both train and pick" in str(result.exception)

@@ -18,6 +18,8 @@ class Figures:
         role: "validation" or "report".
         seeds: how many splits.
         unaggregated: of the raw descriptors on the same queries.
+        medoid: of one descriptor a landmark, the one closest to its others.
+        majority: of the quantised mean, each bit as most of the landmark's descriptors have it.
         float_precision: of the float network, by dimension.
         integer_precision: of the integer encoder with int8 prototypes, by dimension.
     """
@@ -26,6 +28,8 @@ class Figures:
     role: str
     seeds: int
     unaggregated: float
+    medoid: float
+    majority: float
     float_precision: dict[int, float]
     integer_precision: dict[int, float]
 
@@ -41,6 +45,7 @@ class Card:
         widths: units of each layer, input and output included.
         dims: prefixes that may be used alone.
         bytes: size of the model file.
+        encode_ns: nanoseconds to encode one descriptor on one thread.
         licence: of the weights.
         sources: training sequences.
         validation: validation sequences.
@@ -51,6 +56,7 @@ class Card:
         best_step: the one whose weights were kept.
         figures: precision, by sequence.
         history: (step, loss, mean validation precision) of each validation.
+        curve: file name of the picture of the training, beside the card, or "".
     """
 
     name: str
@@ -59,6 +65,7 @@ class Card:
     widths: list[int]
     dims: list[int]
     bytes: int
+    encode_ns: float
     licence: str
     sources: list[Source]
     validation: list[Source]
@@ -69,6 +76,7 @@ class Card:
     best_step: int
     figures: list[Figures]
     history: list[tuple[int, float, float]] = field(default_factory=list)
+    curve: str = ""
 
     @property
     def multiply_adds(self) -> int:
@@ -86,6 +94,7 @@ class Card:
             "",
             f"- network: {'-'.join(map(str, self.widths))}, SELU, int8 weights; "
             f"{self.multiply_adds:,} multiply-adds a descriptor",
+            f"- encode: {self.encode_ns:,.0f} ns a descriptor on one thread of this machine",
             f"- file: {self.bytes:,} bytes",
             f"- licence: {self.licence or 'none stated'}",
             f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "
@@ -113,21 +122,25 @@ class Card:
             "## Precision",
             "",
             "Share of queries whose nearest prototype is their own landmark's: 90 % of the "
-            "keyframes build the map, the others ask. *Float* is the network before rounding, "
-            "*integer* the encoder in this file with int8 prototypes, *unaggregated* all raw "
-            "descriptors on the same queries.",
+            "keyframes build the map, the others ask; mean of the splits. *Unaggregated*: all raw "
+            "descriptors of the landmarks; *medoid*, *majority*: one binary descriptor a landmark; "
+            "*float*: the network before rounding, *integer*: the encoder in this file with int8 "
+            "prototypes.",
             "",
-            "| sequence | splits | unaggregated | dim | bytes a landmark | float | integer "
-            "| ratio to unaggregated |",
-            "|---|---|---|---|---|---|---|---|",
+            "| sequence | splits | unaggregated | medoid | majority | dim | bytes a landmark "
+            "| float | integer | ratio to unaggregated |",
+            "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
         ]
         for f in self.figures:
             for d in self.dims:
                 lines.append(
-                    f"| {f.sequence} ({f.role}) | {f.seeds} | {f.unaggregated:.4f} | {d} | {d + 1} "
+                    f"| {f.sequence} ({f.role}) | {f.seeds} | {f.unaggregated:.4f} "
+                    f"| {f.medoid:.4f} | {f.majority:.4f} | {d} | {d + 1} "
                     f"| {f.float_precision[d]:.4f} | {f.integer_precision[d]:.4f} "
                     f"| {f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f} |"
                 )
+        if self.curve:
+            lines += ["", "## Training", "", f"![loss and validation precision]({self.curve})"]
         return "\n".join(lines) + "\n"
 
 

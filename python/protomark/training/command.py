@@ -6,17 +6,23 @@ import json
 import os
 import platform
 import shlex
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from protomark.console import console, progress_bar, progress_console
+from protomark.evaluation.methods.bitwise import majority
+from protomark.evaluation.methods.medoid import medoid
+from protomark.evaluation.support import Support
 from protomark.files import write_text
 from protomark.tracks.file import Tracks
 from protomark.training.card import Card, Figures, describe_data
+from protomark.training.curve import save_curve, sparkline
 from protomark.training.data import TrainingData, load_training, load_trials, sequence_name
 from protomark.training.network import embed
 from protomark.training.train import (
@@ -28,6 +34,9 @@ from protomark.training.train import (
     keep_freed_memory,
 )
 from protomark.training.validation import Trial, precision
+
+if TYPE_CHECKING:
+    import protomark as pm
 
 REPORT_SEEDS = (0, 1, 2)
 
@@ -89,7 +98,8 @@ def train_encoder(
     trainer = Trainer(data.views, data.trials, options, checkpoint, data.fingerprint, device, half)
     if resume:
         trainer.resume()
-    _run(trainer)
+    curve = output.with_suffix(".png")
+    _run(trainer, curve, name or output.stem)
 
     encoder = pm.Encoder(
         [{**layer} for layer in trainer.quantized.export()],
@@ -115,6 +125,7 @@ def train_encoder(
         widths=[data.bits, *trainer.network.hidden, options.dims[-1]],
         dims=list(options.dims),
         bytes=output.stat().st_size,
+        encode_ns=encode_cost(encoder),
         licence=licence,
         sources=data.sources,
         validation=data.validation_sources,
@@ -127,6 +138,7 @@ def train_encoder(
         best_step=trainer.best_step,
         figures=figures,
         history=[(p.step, p.loss, p.mean_precision) for p in trainer.history],
+        curve=curve.name,
     )
     write_text(output.with_suffix(".md"), card.markdown())
     if json_path is not None:
@@ -135,8 +147,21 @@ def train_encoder(
     return card
 
 
-def _run(trainer: Trainer) -> None:
-    """Train behind a progress bar; each validation leaves a line."""
+def default_output(tracks: Path, resume: bool = False) -> Path:
+    """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
+
+    Raises:
+        FileExistsError: it is there already, and would be overwritten.
+    """
+    output = Path(f"{Tracks.load(tracks).descriptor}.pme")
+    if output.exists() and not resume:
+        raise FileExistsError(f"{output} exists and is kept; name another file with -o")
+    return output
+
+
+def _run(trainer: Trainer, curve: Path, name: str) -> None:
+    """Train behind a progress bar; each validation leaves a line and draws `curve` anew."""
+    losses: list[float] = []
     with progress_bar() as bar:
         task = bar.add_task("training", total=trainer.options.steps, completed=trainer.step)
         mean = 0.0
@@ -144,9 +169,16 @@ def _run(trainer: Trainer) -> None:
         def step(done: int, loss: float, progress: Progress | None) -> None:
             nonlocal mean
             mean = 0.98 * mean + 0.02 * loss if mean else loss
-            bar.update(task, completed=done, description=f"loss {mean:.3f}")
+            if done % 20 == 0:
+                losses.append(mean)
+            found = [p.mean_precision for p in trainer.history]
+            text = f"loss {mean:.3f} {sparkline(losses, 12)}"
+            if found:
+                text += f" precision {found[-1]:.3f} {sparkline(found, 8)}"
+            bar.update(task, completed=done, description=text)
             if progress is not None:
                 bar.console.print(_line(progress), highlight=False)
+                save_curve(trainer.history, curve, name)
 
         trainer.run(step)
 
@@ -158,33 +190,55 @@ def _line(p: Progress) -> str:
 
 
 def _measure(
-    trainer: Trainer, encoder: object, path: Path, role: str, device: str, threads: int
+    trainer: Trainer, encoder: pm.Encoder, path: Path, role: str, device: str, threads: int
 ) -> Figures:
-    import protomark as pm
-
-    assert isinstance(encoder, pm.Encoder)
     dims = trainer.options.dims
     trials = load_trials(Tracks.load(path), path, REPORT_SEEDS)
     floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
     whole = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
+    binary = [
+        _binary_precision(t, seed, threads) for t, seed in zip(trials, REPORT_SEEDS, strict=True)
+    ]
     return Figures(
         sequence_name(path),
         role,
         len(trials),
         float(np.mean([unaggregated_precision(t, threads) for t in trials])),
+        float(np.mean([b["medoid"] for b in binary])),
+        float(np.mean([b["majority"] for b in binary])),
         {d: float(np.mean([p[d] for p in floats])) for d in dims},
         {d: float(np.mean([p[d] for p in whole])) for d in dims},
     )
+
+
+def _binary_precision(trial: Trial, seed: int, threads: int) -> dict[str, float]:
+    """Precision of maps with one binary descriptor a landmark."""
+    support = Support(trial.landmarks, trial.support, seed)
+    found = {}
+    for name, method in (("medoid", medoid(support)), ("majority", majority(support))):
+        nearest, _ = method.match(trial.queries, threads=threads)
+        found[name] = float((nearest[:, 0] == trial.targets).mean())
+    return found
+
+
+def encode_cost(encoder: pm.Encoder) -> float:
+    """Nanoseconds to encode one descriptor on one thread, the best of five rounds of 20,000."""
+    rng = np.random.default_rng(0)
+    descriptors = rng.integers(0, 256, (20_000, encoder.bits // 8), np.uint8)
+    seconds = []
+    for _ in range(5):
+        began = time.perf_counter()
+        encoder.encode(descriptors, threads=1)
+        seconds.append(time.perf_counter() - began)
+    return 1e9 * min(seconds) / len(descriptors)
 
 
 def unaggregated_precision(trial: Trial, threads: int = 1) -> float:
     """Share of queries whose nearest raw descriptor is one of their own landmark's."""
     import protomark as pm
 
-    counts = np.diff(np.append(trial.starts, len(trial.support)))
-    landmarks = np.repeat(np.arange(len(trial.starts)), counts)
     found, _ = pm.hamming_search(trial.queries, trial.support, k=1, threads=threads)
-    return float((landmarks[found[:, 0]] == trial.targets).mean())
+    return float((trial.landmarks[found[:, 0]] == trial.targets).mean())
 
 
 def _check_device(device: str) -> None:

@@ -67,6 +67,22 @@ def sequence_name(path: Path) -> str:
     return path.name.split(".")[0]
 
 
+def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """The files to learn from and those that pick: the last one, if none is named for it.
+
+    Raises:
+        ValueError: a single file would have to do both.
+    """
+    if validation:
+        return list(training), list(validation)
+    if len(training) < 2:
+        raise ValueError(
+            f"{training[0]}: one tracks file cannot both train and pick the model; give another "
+            "sequence with --validation"
+        )
+    return list(training[:-1]), [training[-1]]
+
+
 def load_trials(
     tracks: Tracks, path: Path, seeds: Sequence[int], max_queries: int = 10_000
 ) -> list[Trial]:

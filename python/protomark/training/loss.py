@@ -30,13 +30,20 @@ class PrototypeLoss(nn.Module):
         self.dims = tuple(dims)
         self.log_temperature = nn.Parameter(torch.tensor([math.log(d / 4) for d in self.dims]))
 
-    def forward(self, embeddings: Tensor, landmarks: Tensor, queries: Tensor) -> Tensor:
+    def forward(
+        self,
+        embeddings: Tensor,
+        landmarks: Tensor,
+        queries: Tensor,
+        dims: Sequence[int] | None = None,
+    ) -> Tensor:
         """Loss of one batch.
 
         Args:
             embeddings: (n, k) float, one row a view.
             landmarks: (n,) int64, landmark of each row, numbered 0..m-1, each with a view.
             queries: (q,) int64, rows to classify; their landmarks have at least 2 views.
+            dims: the prefixes that count this time, some of `self.dims`; None for all.
 
         Returns:
             Scalar: mean over prefixes and queries.
@@ -54,6 +61,8 @@ class PrototypeLoss(nn.Module):
         losses = []
         column = target[:, None]
         for d, log_temperature in zip(self.dims, self.log_temperature, strict=True):
+            if dims is not None and d not in dims:
+                continue
             # |q - p|^2 without |q|^2, which is the same for all prototypes and cancels.
             q, p, o = query[:, :d], prototype[:, :d], own[:, :d]
             inverse = torch.exp(-log_temperature)

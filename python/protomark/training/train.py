@@ -29,7 +29,7 @@ from protomark.training.quantization import QuantizedNetwork
 from protomark.training.sampling import BatchSampler, Views
 from protomark.training.validation import Trial, mean_precision
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Options:
         seed: of weights and batches.
     """
 
-    dims: tuple[int, ...] = (8, 16, 32)
+    dims: tuple[int, ...] = (8, 16, 24, 32, 48, 64)
     hidden: tuple[int, ...] | None = None
     steps: int = 4000
     landmarks: int = 1000
@@ -86,6 +86,15 @@ class Options:
     def quantized_from(self) -> int:
         """First step with quantisation in the loop."""
         return self.steps - max(round(self.steps * self.quantized_share), 1)
+
+    def trained_dims(self, step: int) -> tuple[int, ...]:
+        """The prefixes in the loss of a step: with more than three, every other one in turn.
+
+        The loss costs as much as the network, for each prefix; neighbours train each other.
+        """
+        if len(self.dims) <= 3:
+            return self.dims
+        return tuple(d for i, d in enumerate(reversed(self.dims)) if (i + step) % 2 == 0)
 
     def rate(self, step: int) -> float:
         """Learning rate of a step."""
@@ -237,6 +246,7 @@ class Trainer:
             embeddings,
             torch.from_numpy(batch.landmarks).to(self.device),
             torch.from_numpy(batch.queries).to(self.device),
+            options.trained_dims(self.step),
         )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -32,6 +32,12 @@ class Trial:
     queries: NDArray[np.uint8]
     targets: NDArray[np.int64]
 
+    @property
+    def landmarks(self) -> NDArray[np.int64]:
+        """(n,) int64, landmark of each row of `support`."""
+        counts = np.diff(np.append(self.starts, len(self.support)))
+        return np.repeat(np.arange(len(self.starts)), counts)
+
     @classmethod
     def from_tracks(
         cls, tracks: Tracks, name: str, seed: int = 0, max_queries: int = 10_000
