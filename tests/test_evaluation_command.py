@@ -52,7 +52,7 @@ def test_everything_at_once(tracks: Path, model: Path, tmp_path: Path) -> None:
     results = load_json(out[0])
     assert [r.sequence for r in results] == ["ring", "other"]
     figures = {m.name: m for m in results[0].methods}
-    assert len(figures) == 15
+    assert len(figures) == 17
     assert all(len(m.precision) == 2 for m in figures.values())
     # What is easy by making: little noise, and the mean takes most of it away.
     assert figures["unaggregated"].summary().precision > 0.95

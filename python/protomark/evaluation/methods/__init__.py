@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Codes of at least so many dimensions are compared at 4 bits a number too.
 MIN_4_BIT_DIM = 16
-PROJECTED_DIMS = (8, 16, 32)
+PROJECTED_DIMS = (8, 16, 32, 64)
 
 
 @dataclass(frozen=True)
