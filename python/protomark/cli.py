@@ -379,7 +379,7 @@ def reproduce(
     data: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="DATA...",
+            metavar="DATA",
             help="Tracks files, folders of them, or folders of sequences with images/ and "
             "sparse/, whose tracks are made first. By default the sequences in data, ../data or "
             "../shared/data.",
