@@ -16,7 +16,7 @@ from torch import Tensor, nn
 MAX_WEIGHT_BYTES = 600_000
 """An encoder that ships is at most this large; one int8 weight is one byte."""
 
-_WIDEST = 512
+_WIDEST = 768
 
 
 def weight_bytes(bits: int, hidden: Sequence[int], dim: int) -> int:
@@ -26,7 +26,7 @@ def weight_bytes(bits: int, hidden: Sequence[int], dim: int) -> int:
 
 
 def default_hidden(bits: int, dim: int) -> tuple[int, ...]:
-    """One hidden layer, the widest up to 512 units whose int8 weights fit `MAX_WEIGHT_BYTES`.
+    """One hidden layer, the widest up to 768 units whose int8 weights fit `MAX_WEIGHT_BYTES`.
 
     The paper's funnel (two hidden layers, the second half as wide) fits the training sequences
     better and unseen ones worse; `docs/training.md` has the figures.

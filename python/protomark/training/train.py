@@ -61,7 +61,7 @@ class Options:
     queries: int = 3
     balance: float = 0.5
     noise: float = 0.03
-    learning_rate: float = 3e-3
+    learning_rate: float = 5e-3
     weight_decay: float = 0.1
     clip: float = 1.0
     quantized_share: float = 0.25
