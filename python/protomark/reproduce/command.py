@@ -133,7 +133,7 @@ def reproduce(
         write_text(json_path, text)
     write_text(output / "report.md", markdown(results))
     progress_console.print(
-        f"{trainings.made} trainings made, the others were kept; "
+        f"{trainings.made} trainings made, {len(seconds) - trainings.made} were there; "
         f"{(time.perf_counter() - begin) / 60:.1f} minutes in all",
         highlight=False,
     )
