@@ -20,6 +20,7 @@ from protomark._core import (
     verify_file,
 )
 from protomark.errors import FileError
+from protomark.upright import upright_descriptors
 
 __version__ = _version("protomark")
 
@@ -32,5 +33,6 @@ __all__ = [
     "file_sections",
     "hamming_search",
     "open",
+    "upright_descriptors",
     "verify_file",
 ]

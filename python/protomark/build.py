@@ -8,6 +8,7 @@ import numpy as np
 
 from protomark import Encoder, PrototypeMap
 from protomark.tracks import Tracks
+from protomark.upright import upright_tracks
 
 
 def build_map(
@@ -64,8 +65,11 @@ def build_file(
     seal: bool,
     threads: int,
     code_bits: int = 8,
+    upright: bool = False,
 ) -> PrototypeMap:
     """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor.
+
+    With `upright` angles and sizes of the keypoints go in, too (`protomark.upright`).
 
     Raises:
         ValueError: as `build_map`; or `code_bits`, those of a sealed map, is neither 8 nor 4, or is
@@ -76,6 +80,8 @@ def build_file(
     if code_bits != 8 and not seal:
         raise ValueError(f"--code-bits {code_bits} is for sealed maps: add --sealed")
     loaded = Tracks.load(tracks)
+    if upright:
+        loaded = upright_tracks(loaded)
     scene = build_map(
         loaded, Encoder.load(encoder or loaded.descriptor), dim, min_observations, threads
     )

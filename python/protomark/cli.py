@@ -155,6 +155,12 @@ def train(
     steps: Annotated[int, typer.Option(help="Batches in all.")] = 4000,
     batch: Annotated[int, typer.Option(help="Landmarks in a batch.")] = 1000,
     seed: Annotated[int, typer.Option(help="Of weights and batches.")] = 0,
+    upright: Annotated[
+        bool,
+        typer.Option(
+            "--upright", help="For cameras that do not roll: learn from angles and sizes, too."
+        ),
+    ] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     threads: Annotated[
         int, typer.Option(help="CPU threads, 0 for one a core; take 1 on a busy machine.")
@@ -203,7 +209,7 @@ def train(
     data_licences = dict(entry.split("=", 1) for entry in data_licence or [])
     options = Options(dims=parsed, steps=steps, landmarks=batch, seed=seed)
     learned, picking = hold_out(tracks, validation or [])
-    output = output or default_output(learned[0], resume)
+    output = output or default_output(learned[0], resume, upright)
     try:
         card = train_encoder(
             learned,
@@ -212,6 +218,7 @@ def train(
             options,
             report=report or [],
             resume=resume,
+            upright=upright,
             name=name,
             licence=licence,
             data_licences=data_licences,
@@ -245,6 +252,13 @@ def build(
     code_bits: Annotated[
         int, typer.Option(help="Bits of a sealed prototype's number: 8, or 4 for half the bytes.")
     ] = 8,
+    upright: Annotated[
+        bool,
+        typer.Option(
+            "--upright",
+            help="For cameras that do not roll: encode the keypoints' angles and sizes, too.",
+        ),
+    ] = False,
     threads: Annotated[int, typer.Option(help="CPU threads.")] = 1,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the facts to this file.")
@@ -254,7 +268,7 @@ def build(
     from protomark.build import build_file
     from protomark.info import describe, show
 
-    build_file(tracks, output, encoder, dim, min_observations, sealed, threads, code_bits)
+    build_file(tracks, output, encoder, dim, min_observations, sealed, threads, code_bits, upright)
     facts = describe(output)
     _write_json(json_file, facts)
     show(facts)
@@ -319,6 +333,14 @@ def evaluate(
             help="Name or file of an encoder; may be repeated. By default the descriptor's own."
         ),
     ] = None,
+    upright: Annotated[
+        bool,
+        typer.Option(
+            "--upright",
+            help="Give Protomark the keypoints' angles and sizes, too (encoders such as "
+            "freak-upright); all other methods get the plain descriptors.",
+        ),
+    ] = False,
     methods: Annotated[
         str,
         typer.Option(
@@ -370,6 +392,7 @@ def evaluate(
         encoders=encoder or [],
         methods=[name.strip() for name in methods.split(",") if name.strip()],
         discriminant_from=discriminant_from or [],
+        upright=upright,
     )
     command.write(results, json_file, markdown_file, plot_file)
 

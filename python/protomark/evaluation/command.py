@@ -16,6 +16,7 @@ from protomark.evaluation.run import Options, evaluate
 from protomark.evaluation.support import Moments, Support
 from protomark.files import write_text
 from protomark.tracks.file import Tracks
+from protomark.upright import upright_tracks
 
 if TYPE_CHECKING:
     import protomark as pm
@@ -28,6 +29,7 @@ def evaluate_files(
     encoders: Sequence[str] = (),
     methods: Sequence[str] = (),
     discriminant_from: Sequence[Path] = (),
+    upright: bool = False,
 ) -> list[SequenceResult]:
     """Evaluate tracks files one after the other, printing each table as soon as it is there.
 
@@ -39,6 +41,7 @@ def evaluate_files(
         methods: names of methods, or of families of methods; none given: the default ones.
         discriminant_from: tracks files to learn the linear discriminants from; none given: from
             each sequence's own support.
+        upright: give Protomark's own methods descriptors with angles and sizes.
 
     Raises:
         FileNotFoundError, ValueError: a file is missing, broken, or does not fit the others.
@@ -51,7 +54,8 @@ def evaluate_files(
     results = []
     for path in paths:
         tracks = Tracks.load(path)
-        fitting = encoders_for(tracks, loaded, given=bool(encoders))
+        longer = upright_tracks(tracks) if upright else tracks
+        fitting = encoders_for(longer, loaded, given=bool(encoders))
         kind = (tracks.descriptor, tracks.bits)
         if kind not in learned:
             learned[kind] = learn(discriminant_from, tracks) if discriminant_from else None
@@ -63,6 +67,7 @@ def evaluate_files(
                 name,
                 chosen,
                 options,
+                own=longer,
                 discriminant=", ".join(p.name for p in discriminant_from) or "support",
                 advance=advance,
             )

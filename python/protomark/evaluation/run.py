@@ -43,6 +43,7 @@ def evaluate(
     methods: Sequence[MethodChoice],
     options: Options,
     *,
+    own: Tracks | None = None,
     discriminant: str = "support",
     advance: Callable[[str], None] = lambda _: None,
 ) -> SequenceResult:
@@ -53,31 +54,40 @@ def evaluate(
         sequence: its name, for the tables.
         methods: what to compare.
         options: seeds, frames and threads.
+        own: the same sequence with the descriptors that Protomark's own methods take, if others
+            than those of `tracks`.
         discriminant: what the linear discriminants are learned from, for the record.
         advance: called with the method's label before each method at each seed.
     """
+    own = own or tracks
     results = [MethodResult(choice.name, choice.label, choice.family) for choice in methods]
     sizes = []
     depth = pose.scene_depth(tracks)
     for seed in options.seeds:
         part = split(tracks, seed)
-        support = Support(
-            tracks.landmark_of_keypoint[part.support_rows],
-            tracks.descriptors[part.support_rows],
-            seed,
-        )
-        frames = draw_frames(tracks, part, options.pose_frames)
+        # The same keypoints either way; only the bytes of their descriptors may differ.
+        supports = {
+            id(source): Support(
+                tracks.landmark_of_keypoint[part.support_rows],
+                source.descriptors[part.support_rows],
+                seed,
+            )
+            for source in (tracks, own)
+        }
+        frames = {id(t): draw_frames(t, part, options.pose_frames) for t in (tracks, own)}
+        support = supports[id(tracks)]
         sizes.append((len(support.ids), len(part.support_rows), len(part.query_rows)))
         for choice, result in zip(methods, results, strict=True):
             advance(choice.label)
+            source = own if choice.is_own else tracks
             began = time.perf_counter()
             # Small matrices: more BLAS threads cost more in waiting than they bring.
             with one_blas_thread():
-                method = choice.build(support)
+                method = choice.build(supports[id(source)])
             result.build_s.append(time.perf_counter() - began)
             result.bytes_per_landmark.append(method.bytes_per_landmark)
-            measure_precision(tracks, part, method, options.threads, result)
-            measure_poses(tracks, frames, depth, method, options.threads, result)
+            measure_precision(source, part, method, options.threads, result)
+            measure_poses(source, frames[id(source)], depth, method, options.threads, result)
     landmarks, observations, queries = np.mean(sizes, axis=0)
     return SequenceResult(
         sequence=sequence,

@@ -23,7 +23,13 @@ from protomark.files import write_text
 from protomark.tracks.file import Tracks
 from protomark.training.card import Card, Figures, describe_data
 from protomark.training.curve import save_curve, sparkline
-from protomark.training.data import TrainingData, load_training, load_trials, sequence_name
+from protomark.training.data import (
+    TrainingData,
+    load_training,
+    load_trials,
+    read_tracks,
+    sequence_name,
+)
 from protomark.training.network import embed
 from protomark.training.train import (
     Interrupted,
@@ -49,6 +55,7 @@ def train_encoder(
     *,
     report: Sequence[Path] = (),
     resume: bool = False,
+    upright: bool = False,
     name: str = "",
     licence: str = "",
     data_licences: Mapping[str, str] | None = None,
@@ -67,6 +74,7 @@ def train_encoder(
         options: what decides the weights.
         report: tracks files on which the finished encoder is measured, and nothing else.
         resume: continue from the checkpoint.
+        upright: add angles and sizes of the keypoints to the descriptors.
         name: of the encoder; the output's stem if empty.
         licence: of the weights.
         data_licences: of the sequences, by name, for the card and the model file.
@@ -92,7 +100,7 @@ def train_encoder(
     for path in report:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such tracks file")
-    data = load_training(training, validation, licences=data_licences)
+    data = load_training(training, validation, licences=data_licences, upright=upright)
     half = has_fast_bfloat16(device)
     checkpoint = output.with_name(output.name + ".checkpoint")
     trainer = Trainer(data.views, data.trials, options, checkpoint, data.fingerprint, device, half)
@@ -116,7 +124,7 @@ def train_encoder(
         files = [(p, "validation") for p in validation] + [(p, "report") for p in report]
         task = bar.add_task("measuring", total=len(files))
         for path, role in files:
-            figures.append(_measure(trainer, encoder, path, role, device, threads))
+            figures.append(_measure(trainer, encoder, path, role, upright, device, threads))
             bar.advance(task)
     card = Card(
         name=encoder.name,
@@ -130,7 +138,15 @@ def train_encoder(
         sources=data.sources,
         validation=data.validation_sources,
         command=_command(
-            data, training, report, output, options, name, licence, data_licences, device
+            data,
+            report,
+            output,
+            options,
+            upright,
+            name,
+            licence,
+            data_licences,
+            device,
         ),
         seconds=trainer.seconds,
         machine=_machine(device, threads, half),
@@ -147,13 +163,13 @@ def train_encoder(
     return card
 
 
-def default_output(tracks: Path, resume: bool = False) -> Path:
+def default_output(tracks: Path, resume: bool = False, upright: bool = False) -> Path:
     """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
 
     Raises:
         FileExistsError: it is there already, and would be overwritten.
     """
-    output = Path(f"{Tracks.load(tracks).descriptor}.pme")
+    output = Path(f"{read_tracks(tracks, upright).descriptor}.pme")
     if output.exists() and not resume:
         raise FileExistsError(f"{output} exists and is kept; name another file with -o")
     return output
@@ -190,20 +206,27 @@ def _line(p: Progress) -> str:
 
 
 def _measure(
-    trainer: Trainer, encoder: pm.Encoder, path: Path, role: str, device: str, threads: int
+    trainer: Trainer,
+    encoder: pm.Encoder,
+    path: Path,
+    role: str,
+    upright: bool,
+    device: str,
+    threads: int,
 ) -> Figures:
     dims = trainer.options.dims
-    trials = load_trials(Tracks.load(path), path, REPORT_SEEDS)
+    trials = load_trials(read_tracks(path, upright), path, REPORT_SEEDS)
+    plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if upright else trials
     floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
     whole = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
     binary = [
-        _binary_precision(t, seed, threads) for t, seed in zip(trials, REPORT_SEEDS, strict=True)
+        _binary_precision(t, seed, threads) for t, seed in zip(plain, REPORT_SEEDS, strict=True)
     ]
     return Figures(
         sequence_name(path),
         role,
         len(trials),
-        float(np.mean([unaggregated_precision(t, threads) for t in trials])),
+        float(np.mean([unaggregated_precision(t, threads) for t in plain])),
         float(np.mean([b["medoid"] for b in binary])),
         float(np.mean([b["majority"] for b in binary])),
         {d: float(np.mean([p[d] for p in floats])) for d in dims},
@@ -250,10 +273,10 @@ def _check_device(device: str) -> None:
 
 def _command(
     data: TrainingData,
-    training: Sequence[Path],
     report: Sequence[Path],
     output: Path,
     options: Options,
+    upright: bool,
     name: str,
     licence: str,
     data_licences: Mapping[str, str] | None,
@@ -266,6 +289,8 @@ def _command(
     for path in report:
         words += ["--report", path.name]
     words += ["-o", output.name]
+    if upright:
+        words.append("--upright")
     default = Options()
     if options.dims != default.dims:
         words += ["--dims", ",".join(map(str, options.dims))]

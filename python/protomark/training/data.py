@@ -13,6 +13,7 @@ from protomark.console import track
 from protomark.tracks.file import Tracks
 from protomark.training.sampling import Views
 from protomark.training.validation import Trial
+from protomark.upright import upright_tracks
 
 MIN_BITS = 64
 MAX_BITS = 1024
@@ -67,6 +68,12 @@ def sequence_name(path: Path) -> str:
     return path.name.split(".")[0]
 
 
+def read_tracks(path: Path, upright: bool) -> Tracks:
+    """A tracks file, with longer descriptors if `upright` (`protomark.upright`)."""
+    tracks = Tracks.load(path)
+    return upright_tracks(tracks) if upright else tracks
+
+
 def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """The files to learn from and those that pick: the last one, if none is named for it.
 
@@ -96,6 +103,7 @@ def load_training(
     seeds: Sequence[int] = (0,),
     max_queries: int = 5_000,
     licences: Mapping[str, str] | None = None,
+    upright: bool = False,
 ) -> TrainingData:
     """Read and check training and validation tracks.
 
@@ -105,6 +113,7 @@ def load_training(
         seeds: one split of each validation sequence for each.
         max_queries: queries of one split.
         licences: of the sequences, by name, for the card.
+        upright: add angles and sizes of the keypoints to the descriptors.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -134,7 +143,7 @@ def load_training(
     sources: list[Source] = []
     digest = hashlib.sha256()
     for i, path in enumerate(track([*training, *validation], "reading tracks")):
-        tracks = Tracks.load(path)
+        tracks = read_tracks(path, upright)
         if not views and not trials:
             descriptor, bits = tracks.descriptor, tracks.bits
             if not MIN_BITS <= bits <= MAX_BITS:

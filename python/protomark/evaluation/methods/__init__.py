@@ -46,6 +46,11 @@ class MethodChoice:
     build: Callable[[Support], Method]
     default: bool = True
 
+    @property
+    def is_own(self) -> bool:
+        """Whether it is one of Protomark's, which take an encoder's descriptors."""
+        return self.family.startswith("protomark")
+
 
 def choices(
     encoders: Sequence[pm.Encoder] = (),
