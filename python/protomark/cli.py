@@ -80,6 +80,13 @@ def tracks(
             help="Keypoints without a landmark kept in a keyframe, the strongest (smaller files)."
         ),
     ] = None,
+    variants: Annotated[
+        int,
+        typer.Option(
+            help="Also write FOLDER.DESCRIPTOR.varied.safetensors, to train on: with this many "
+            "copies of each image, warped and with other light, blur and noise."
+        ),
+    ] = 0,
     threads: Annotated[
         int, typer.Option(help="CPU threads, 0 for one a core; the result is the same.")
     ] = 0,
@@ -120,6 +127,7 @@ def tracks(
         images=images,
         model=model,
         database=database,
+        variants=variants,
         force=force,
         threads=threads if threads > 0 else os.cpu_count() or 1,
         json_path=json_file,

@@ -52,8 +52,14 @@ def split(
     The same tracks and seed give the same split on every platform.
 
     Raises:
-        ValueError: there are fewer than two keyframes, or no landmark that both sides see.
+        ValueError: the tracks hold variants (`tracks.variants`), there are fewer than two
+            keyframes, or no landmark that both sides see.
     """
+    if tracks.info.get("variants"):
+        raise ValueError(
+            "these tracks hold varied copies of each keyframe, which are to learn from only; "
+            "give the plain tracks"
+        )
     keyframes = len(tracks.keyframe_names)
     if keyframes < 2:
         raise ValueError(

@@ -13,6 +13,7 @@ from protomark.files import write_text
 from protomark.tracks.extract import Progress, Settings, extract, find_source, fingerprint, is_done
 from protomark.tracks.file import Tracks
 from protomark.tracks.summary import summarise
+from protomark.tracks.variants import METHOD, add_variants
 
 _BAR = 30
 
@@ -25,6 +26,7 @@ def make_tracks(
     images: Path | None = None,
     model: Path | None = None,
     database: Path | None = None,
+    variants: int = 0,
     force: bool = False,
     threads: int = 1,
     json_path: Path | None = None,
@@ -34,6 +36,10 @@ def make_tracks(
     Returns:
         One summary for each file, see `protomark.tracks.summary.summarise`.
     """
+    if variants < 0:
+        raise ValueError(f"--variants {variants}: give the number of copies, 0 for none")
+    if variants and database:
+        raise ValueError("--variants needs the images, and --database does not read them")
     if len(folders) > 1 and (images or model or database):
         raise ValueError("--images, --model and --database go with one FOLDER, give one at a time")
     names = [folder.resolve().name for folder in folders]
@@ -77,9 +83,47 @@ def make_tracks(
             }
             summaries.append(summary)
             print_summary(summary, tracks)
+            if variants:
+                folder_of_images = find_source(folder, images, model).images
+                _make_variants(tracks, folder_of_images, variants, target, force, threads)
     if json_path is not None:
         write_text(json_path, json.dumps(summaries, indent=2) + "\n")
     return summaries
+
+
+def variants_path(target: Path) -> Path:
+    """Where the tracks with varied copies go: toy.freak.varied.safetensors."""
+    return target.with_name(f"{target.stem}.varied.safetensors")
+
+
+def _make_variants(
+    tracks: Tracks, images: Path, count: int, target: Path, force: bool, threads: int
+) -> None:
+    output = variants_path(target)
+    want: dict[str, Any] = {"variants": count, "variants_method": METHOD}
+    want |= {key: tracks.info.get(key) for key in ("method", "settings", "input")}
+    if output.is_file() and not force:
+        try:
+            info = Tracks.load(output).info
+        except (ValueError, OSError):
+            info = {}
+        if all(info.get(key) == value for key, value in want.items()):
+            progress_console.print(f"{output}: is there already; skipped", highlight=False)
+            return
+    total = len(tracks.keyframe_names)
+    varied = _with_bar(
+        target.name.split(".")[0],
+        lambda progress: add_variants(
+            tracks, images, count, threads, lambda done: progress("vary", done, total)
+        ),
+    )
+    varied.save(output)
+    added = len(varied.keypoints) - len(tracks.observations)
+    console.print(
+        f"[bold]{output}[/]\n  {count} varied copies of each keyframe, {added} more observations",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _from_images(

@@ -1,0 +1,184 @@
+"""Varied copies of keyframes, for training: each image warped, its light changed, detected anew.
+
+A keypoint found in a copy belongs to the landmark whose keypoint in the original it falls on, so
+that an encoder sees what detection, blur, noise, exposure, compression, rotation and scale do to a
+descriptor. Places and angles are those in the original image, so that poses and cameras stay true.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.features import Extractor, Features, read_gray
+from protomark.tracks.file import Tracks
+
+METHOD = 1
+"""Goes up whenever the same tracks give other variants."""
+_NEAR = 2.0  # pixels between a keypoint of the copy and that of the original
+_SIZES = 1.5  # largest ratio of their sizes
+
+
+def vary(
+    image: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.float64], float, float]:
+    """A randomly warped and re-exposed copy of an image.
+
+    Args:
+        image: (height, width) uint8.
+        rng: where all random numbers come from.
+
+    Returns:
+        The copy, of the same shape; the homography (3, 3) from the image's pixels to the copy's
+        (first pixel centre at 0, 0); its scale at the middle; its rotation in degrees, clockwise.
+    """
+    import cv2
+
+    height, width = image.shape
+    angle, scale = rng.normal(0, 20), float(np.exp(rng.normal(0, 0.2)))
+    c, s = scale * np.cos(np.radians(angle)), scale * np.sin(np.radians(angle))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    bend = np.eye(3)
+    bend[0, 1] = rng.normal(0, 0.1)
+    bend[2, :2] = rng.normal(0, 0.08, 2) / width
+    middle = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
+    homography = np.linalg.inv(middle) @ turn @ bend @ middle
+    warped = cv2.warpPerspective(image, homography, (width, height), borderMode=cv2.BORDER_REFLECT)
+    light = np.clip(warped.astype(np.float32) / 255, 1e-3, 1) ** np.exp(rng.normal(0, 0.25))
+    light = (light - 0.5) * np.exp(rng.normal(0, 0.2)) + 0.5 + rng.normal(0, 0.05)
+    if rng.random() < 0.5:
+        light = cv2.GaussianBlur(light, (0, 0), rng.uniform(0.3, 1.3))
+    light = light + rng.normal(0, rng.uniform(0, 0.03), light.shape)
+    copy = np.clip(255 * light, 0, 255).astype(np.uint8)
+    if rng.random() < 0.7:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 95))]
+        decoded = cv2.imdecode(cv2.imencode(".jpg", copy, quality)[1], cv2.IMREAD_GRAYSCALE)
+        copy = np.asarray(decoded, np.uint8)
+    return copy, homography, scale, float(angle)
+
+
+def add_variants(
+    tracks: Tracks,
+    images: Path,
+    count: int,
+    threads: int = 1,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Tracks:
+    """The observations of `tracks` and those in `count` varied copies of each keyframe.
+
+    Copies are keyframes of their own, named image#1, image#2, ..., with the original's pose.
+    Keypoints without a landmark are left out. The same tracks give the same result on any number
+    of threads.
+
+    Args:
+        tracks: what `extract` made.
+        images: folder of the images that the keyframes name.
+        count: copies of each keyframe, at least 1.
+        threads: keyframes worked on at a time.
+        progress: called with the number of keyframes done.
+
+    Raises:
+        FileNotFoundError: an image is missing.
+        ValueError: `count` is below 1, an image is broken, or the tracks have variants already.
+    """
+    if count < 1:
+        raise ValueError(f"variants is {count}, it must be at least 1")
+    if tracks.info.get("variants"):
+        raise ValueError("these tracks have variants already; add them to plain tracks")
+    plain = tracks.where(tracks.landmark_of_keypoint >= 0)
+    settings = tracks.info.get("settings", {})
+    own = threading.local()
+
+    def copies(index: int) -> list[tuple[Features, NDArray[np.int64]]]:
+        if not hasattr(own, "extractor"):
+            own.extractor = Extractor(tracks.descriptor, int(settings.get("max_keypoints", 2000)))
+        image = read_gray(images / tracks.keyframe_names[index])
+        rows = plain.keypoints_of(index)
+        seen = (plain.keypoints[rows], plain.sizes[rows], plain.landmark_of_keypoint[rows])
+        return [
+            _copy(image, np.random.default_rng([index, k]), own.extractor, *seen)
+            for k in range(count)
+        ]
+
+    found: list[list[tuple[Features, NDArray[np.int64]]]] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for done, one in enumerate(pool.map(copies, range(len(tracks.keyframe_names))), 1):
+            found.append(one)
+            progress(done)
+    flat = [(i, k, *one[k]) for i, one in enumerate(found) for k in range(count)]
+    keyframes = np.array([i for i, *_ in flat])
+    ends = int(plain.offsets[-1]) + np.cumsum([len(f) for _, _, f, _ in flat])
+
+    def joined(name: str) -> Any:
+        return np.concatenate([getattr(plain, name), *(getattr(f, name) for _, _, f, _ in flat)])
+
+    arrays = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
+    values: dict[str, Any] = {name: joined(name) for name in arrays}
+    return replace(
+        plain,
+        **values,
+        keyframe_names=[
+            *plain.keyframe_names,
+            *(f"{plain.keyframe_names[i]}#{k + 1}" for i, k, *_ in flat),
+        ],
+        keyframe_camera=np.concatenate([plain.keyframe_camera, plain.keyframe_camera[keyframes]]),
+        cam_from_world=np.concatenate([plain.cam_from_world, plain.cam_from_world[keyframes]]),
+        offsets=np.concatenate([plain.offsets, ends]).astype(np.int64),
+        landmark_of_keypoint=np.concatenate(
+            [plain.landmark_of_keypoint, *(labels for *_, labels in flat)]
+        ),
+        info={**tracks.info, "variants": count, "variants_method": METHOD},
+    )
+
+
+def _copy(
+    image: NDArray[np.uint8],
+    rng: np.random.Generator,
+    extractor: Extractor,
+    keypoints: NDArray[np.float32],
+    sizes: NDArray[np.float32],
+    landmarks: NDArray[np.int64],
+) -> tuple[Features, NDArray[np.int64]]:
+    """Features of a copy that fall on a keypoint of the original, there, and their landmarks."""
+    copy, homography, scale, angle = vary(image, rng)
+    features = extractor(copy)
+    if not len(features) or not len(keypoints):
+        return _where(features, np.zeros(len(features), bool)), np.zeros(0, np.int64)
+    # OpenCV's pixels start at the first centre, COLMAP's half a pixel before.
+    there = np.column_stack([features.keypoints - 0.5, np.ones(len(features))])
+    back = there @ np.linalg.inv(homography).T
+    xy = back[:, :2] / back[:, 2:] + 0.5
+    distances = ((xy[:, None] - keypoints[None]) ** 2).sum(2)
+    nearest = distances.argmin(1)
+    gap = distances[np.arange(len(xy)), nearest]
+    ratio = features.sizes / scale / sizes[nearest]
+    fits = (gap < _NEAR**2) & (ratio < _SIZES) & (ratio > 1 / _SIZES)
+    # A keypoint of the original takes the closest one that fits.
+    order = np.lexsort((gap, ~fits, nearest))
+    first = np.zeros(len(xy), bool)
+    first[order[np.flatnonzero(np.diff(nearest[order], prepend=-1))]] = True
+    keep = fits & first
+    features.keypoints[:] = xy
+    features.sizes /= np.float32(scale)
+    known = features.angles >= 0
+    features.angles[known] = np.mod(features.angles[known] - np.float32(angle), 360)
+    features.angles[features.angles >= 360] = 0
+    return _where(features, keep), landmarks[nearest[keep]]
+
+
+def _where(features: Features, keep: NDArray[np.bool_]) -> Features:
+    return Features(
+        features.keypoints[keep],
+        features.sizes[keep],
+        features.angles[keep],
+        features.responses[keep],
+        features.octaves[keep],
+        features.descriptors[keep],
+    )
