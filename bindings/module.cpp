@@ -97,28 +97,47 @@ nb::object prototype(const Map& map, nb::object landmark_ids) {
   return means.release();
 }
 
+// Counts in as small a type as they fit.
+nb::object counts(const std::vector<std::uint32_t>& values, bool one_byte) {
+  if (!one_byte) return new_vector(values);
+  return new_vector(std::vector<std::uint8_t>(values.begin(), values.end()));
+}
+
+// Vectors of one length as the rows of an array.
+nb::object stacked(const std::vector<std::vector<float>>& rows, std::size_t columns) {
+  NewMatrix<float> result(rows.size(), columns);
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    std::copy(rows[i].begin(), rows[i].end(), result.view().row(i));
+  }
+  return result.release();
+}
+
+// ", 3 prototypes" where there are more than landmarks.
+template <typename Map>
+std::string describe_prototypes(const Map& map) {
+  if (map.prototype_count() == map.size()) return "";
+  return ", " + std::to_string(map.prototype_count()) + " prototypes";
+}
+
 // What open and sealed maps have in common.
 template <typename Map>
 void bind_reading(nb::class_<Map>& map) {
   map.def("__len__", &Map::size)
       .def_prop_ro("encoder", &Map::encoder, "The encoder of this map.")
       .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
+      .def_prop_ro("prototype_count", &Map::prototype_count,
+                   "Number of prototypes: one a landmark, or one for each of its looks.")
       .def_prop_ro(
           "ids", [](const Map& m) { return new_vector(m.ids()); },
           nb::sig("def ids(self) -> NDArray[numpy.int64]"),
           "All landmark ids, ascending, (n,) int64.")
       .def(
-          "counts",
-          [](const Map& m, nb::object ids) { return new_vector(m.counts(view(landmarks(ids)))); },
-          "landmark_ids"_a,
-          nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8]"),
-          "Number of observations in each prototype, (n,) uint8. Raises KeyError for an id that is "
-          "not in the map.")
-      .def("prototype", &prototype<Map>, "landmark_ids"_a,
-           nb::sig("def prototype(self, landmark_ids: ArrayLike) -> NDArray[numpy.float32]"),
-           "Mean codes (Komorowski and Trzcinski, Eq. 1), (n, dim) float32, in code units; a "
-           "sealed map gives them rounded, to one of 16 levels where its code_bits is 4. Raises "
-           "KeyError for an id that is not in the map.")
+          "prototype", &prototype<Map>, "landmark_ids"_a,
+          nb::sig("def prototype(self, landmark_ids: ArrayLike) -> NDArray[numpy.float32]"),
+          "Mean codes (Komorowski and Trzcinski, Eq. 1), (n, dim) float32, in code units, over all "
+          "looks; a sealed map gives them rounded, to one of 16 levels where its code_bits is 4, "
+          "and of a landmark with several looks their plain mean. Raises KeyError for an id that "
+          "is not in the map.")
       .def(
           "positions",
           [](const Map& m, nb::object ids) {
@@ -310,18 +329,65 @@ Returns:
 void bind_open_map(nb::module_& m) {
   nb::class_<PrototypeMap> map(
       m, "PrototypeMap",
-      "An open map: one prototype a landmark, kept as an exact integer sum of codes, so that it "
-      "follows every change without rounding.");
+      "An open map: one prototype a landmark, or one for each of its looks, kept as an exact "
+      "integer sum of codes, so that it follows every change without rounding.");
   map.def(
       "__init__",
-      [](PrototypeMap* self, std::shared_ptr<Encoder> encoder, std::optional<std::size_t> dim) {
+      [](PrototypeMap* self, std::shared_ptr<Encoder> encoder, std::optional<std::size_t> dim,
+         std::size_t look_bits) {
         if (dim == 0) throw nb::value_error("dim must be at least 1");
-        new (self) PrototypeMap(std::move(encoder), dim.value_or(0));
+        new (self) PrototypeMap(std::move(encoder), dim.value_or(0), look_bits);
       },
-      "encoder"_a, "dim"_a = nb::none(),
-      nb::sig("def __init__(self, encoder: Encoder, dim: int | None = None) -> None"),
-      "An empty map whose prototypes have `dim` dimensions, one of encoder.dims; None: all.");
+      "encoder"_a, "dim"_a = nb::none(), "look_bits"_a = 0,
+      nb::sig("def __init__(self, encoder: Encoder, dim: int | None = None, look_bits: int = 0) -> "
+              "None"),
+      R"(An empty map.
+
+Args:
+    encoder: makes codes of descriptors.
+    dim: dimensions of a prototype, one of encoder.dims; None: all.
+    look_bits: observations of a landmark whose codes differ in the sign of any of their first
+        look_bits numbers are different looks of it, and each look has a prototype of its own. 0 to
+        16 and at most dim; 0: one prototype a landmark.
+
+Raises:
+    ValueError: dim or look_bits is none of these.)");
   bind_reading(map);
+  map.def_prop_ro("look_bits", &PrototypeMap::look_bits,
+                  "Signs that tell the looks of a landmark apart; 0: it has one prototype.")
+      .def(
+          "counts",
+          [](const PrototypeMap& m, nb::object ids) {
+            return counts(m.counts(view(landmarks(ids))), m.look_bits() == 0);
+          },
+          "landmark_ids"_a,
+          nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8] | "
+                  "NDArray[numpy.uint32]"),
+          "Number of observations of each landmark, (n,) uint8; uint32, over all looks, where "
+          "look_bits is not 0. Raises KeyError for an id that is not in the map.")
+      .def(
+          "looks",
+          [](const PrototypeMap& m, std::int64_t id) {
+            std::vector<std::vector<float>> means;
+            for (Look& look : m.looks(id)) means.push_back(std::move(look.mean));
+            return stacked(means, m.dim());
+          },
+          "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
+          "Mean codes of the looks of one landmark, (r, dim) float32, in code units; r is 1 where "
+          "look_bits is 0. Raises KeyError for an id that is not in the map.")
+      .def(
+          "look_counts",
+          [](const PrototypeMap& m, std::int64_t id) {
+            std::vector<std::uint8_t> result;
+            for (const Look& look : m.looks(id)) {
+              result.push_back(static_cast<std::uint8_t>(look.count));
+            }
+            return new_vector(std::move(result));
+          },
+          "landmark_id"_a,
+          nb::sig("def look_counts(self, landmark_id: int) -> NDArray[numpy.uint8]"),
+          "Number of observations of each of these looks, (r,) uint8. Raises KeyError for an id "
+          "that is not in the map.");
 
   const auto change = [](auto method) {
     return [method](PrototypeMap& self, nb::object ids, nb::object array, int threads) {
@@ -389,8 +455,8 @@ Raises:
           "landmark_ids"_a, nb::sig("def discard(self, landmark_ids: ArrayLike) -> None"),
           "Forget landmarks. Raises KeyError for an unknown id.")
       .def("update", &PrototypeMap::update, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
-           "Join another map of the same encoder and dim: landmarks that both have are summed, the "
-           "rest taken over. Raises ValueError where encoder or dim differ.")
+           "Join another map of the same encoder, dim and look_bits: landmarks that both have are "
+           "summed, the rest taken over. Raises ValueError where one of these differs.")
       .def(
           "set_positions",
           [](PrototypeMap& self, nb::object ids, nb::object positions) {
@@ -409,40 +475,62 @@ Raises:
            "Write the map, whole or not at all. Raises FileError.")
       .def(
           "seal",
-          [](const PrototypeMap& self, const Path& path, int bits) {
+          [](const PrototypeMap& self, const Path& path, int bits,
+             std::optional<double> prototypes) {
             const nb::gil_scoped_release release;
-            self.seal(path, bits);
+            self.seal(path, bits, prototypes);
             return SealedMap(path);
           },
-          "path"_a, "bits"_a = 8,
-          nb::sig("def seal(self, path: str | os.PathLike[str], bits: int = 8) -> SealedMap"),
+          "path"_a, "bits"_a = 8, "prototypes"_a = nb::none(),
+          nb::sig("def seal(self, path: str | os.PathLike[str], bits: int = 8, prototypes: float | "
+                  "None = None) -> SealedMap"),
           R"(Write a sealed map, whole or not at all, and open it.
 
 Args:
     path: the file to write.
     bits: bits of a prototype's number. With 8 the sealed map gives the same answers; with 4 numbers
         are rounded to the 16 levels that fit this map best, and take half the bytes.
+    prototypes: the largest number of prototypes that a landmark has on average, at least 1. Looks
+        of a landmark are joined, over the whole map those first whose joining adds least to the
+        squared distances of observations to their prototypes (Ward's criterion), until it fits.
+        None: every look is kept (of one landmark at most 255).
 
 Raises:
     FileError: the file cannot be written.
-    ValueError: bits is neither 8 nor 4.)")
+    ValueError: bits is neither 8 nor 4, or prototypes is below 1.)")
       .def("__repr__", [](const PrototypeMap& self) {
-        return "<protomark.PrototypeMap: " + std::to_string(self.size()) + " landmarks, " +
-               std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
-               "'>";
+        return "<protomark.PrototypeMap: " + std::to_string(self.size()) + " landmarks" +
+               describe_prototypes(self) + ", " + std::to_string(self.dim()) +
+               " dimensions, encoder '" + self.encoder()->info().name + "'>";
       });
 }
 
 void bind_sealed_map(nb::module_& m) {
   nb::class_<SealedMap> map(m, "SealedMap",
                             "A map that only answers, mapped from its file: dim * code_bits / 8 + "
-                            "1 bytes a landmark, and its position.");
+                            "1 bytes a landmark, and its position. Where landmarks have several "
+                            "prototypes, dim * code_bits / 8 bytes each, and 2 a landmark.");
   bind_reading(map);
+  map.def(
+         "counts",
+         [](const SealedMap& m, nb::object ids) {
+           return counts(m.counts(view(landmarks(ids))), true);
+         },
+         "landmark_ids"_a,
+         nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8]"),
+         "Number of observations of each landmark, at most 255, (n,) uint8. Raises KeyError for an "
+         "id that is not in the map.")
+      .def(
+          "looks",
+          [](const SealedMap& m, std::int64_t id) { return stacked(m.looks(id), m.dim()); },
+          "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
+          "Prototypes of one landmark, (r, dim) float32, in code units. Raises KeyError for an id "
+          "that is not in the map.");
   map.def_prop_ro("code_bits", &SealedMap::code_bits,
                   "Bits of a prototype's number: 8, or 4 where the map was sealed so.");
   map.def("__repr__", [](const SealedMap& self) {
-    return "<protomark.SealedMap: " + std::to_string(self.size()) + " landmarks, " +
-           std::to_string(self.dim()) + " dimensions" +
+    return "<protomark.SealedMap: " + std::to_string(self.size()) + " landmarks" +
+           describe_prototypes(self) + ", " + std::to_string(self.dim()) + " dimensions" +
            (self.code_bits() == 8 ? "" : " of 4 bits") + ", encoder '" +
            self.encoder()->info().name + "'>";
   });

@@ -65,3 +65,10 @@ def layers() -> list[dict[str, Any]]:
 def encoder(layers: list[dict[str, Any]]) -> pm.Encoder:
     """64 bits to 12 dimensions, prefix of 5: no length is a multiple of a vector's."""
     return pm.Encoder(layers, [5, 12], name="tiny", descriptor="test", scale=0.02)
+
+
+def balanced_encoder() -> pm.Encoder:
+    """64 bits to 12 dimensions, of which each is as often above zero as below."""
+    layers = random_layers([64, 12])
+    layers[0]["bias"] = (-layers[0]["weights"].sum(axis=1, dtype=np.int64) // 2).astype(np.int32)
+    return pm.Encoder(layers, [5, 12], name="balanced", descriptor="test", scale=0.02)

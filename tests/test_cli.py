@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from conftest import random_descriptors
+from conftest import balanced_encoder, random_descriptors
 from protomark.build import build_map
 from protomark.tracks import Camera, Tracks
 
@@ -116,6 +116,31 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
         1,
         "error: --code-bits 4 is for sealed maps: add --sealed",
     )
+
+    balanced_encoder().save(model)
+    done = protomark(*build, "--look-bits", 12, "--json", tmp_path / "facts.json")
+    assert done.returncode == 0, done.stderr
+    opened = pm.open(scene)
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert (facts["look_bits"], facts["prototypes"]) == (12, opened.prototype_count)
+    assert opened.prototype_count == 16
+    looks = ["--look-bits", 12, "--sealed", "--prototypes", 1.5]
+    done = protomark(*build, *looks, "--json", tmp_path / "facts.json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert (facts["prototypes"], facts["prototypes_per_landmark"]) == (6, 1.5)
+    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 12 + 2 + 8
+    assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
+    for options, message in (
+        (["--prototypes", 2], "is for sealed maps: add --sealed"),
+        (["--prototypes", 2, "--sealed"], "is for landmarks with looks: add --look-bits 10"),
+        (["--prototypes", 0.5, *looks[:3]], "--prototypes 0.5: a landmark has at least 1"),
+        (["--look-bits", 13], "look_bits must be 0 to 12, not 13"),
+        (["--look-bits", -1], "Invalid value for '--look-bits'"),
+    ):
+        done = protomark(*build, *options)
+        assert done.returncode in (1, 2)
+        assert message in done.stderr
 
 
 def row(output: str, name: str) -> str:

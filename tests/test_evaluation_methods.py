@@ -267,7 +267,8 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
     listed = choices([coder])
     chosen = choose(listed, ["protomark-4bit"])
     assert [c.name for c in chosen] == ["protomark-16x4", "protomark-32x4"]
-    assert [c.name for c in choose(listed, None)][-2:] == [c.name for c in chosen]
+    names = [c.name for c in choose(listed, None)]
+    assert names[-4:-2] == [c.name for c in chosen]
     assert chosen[1].label == "Protomark, 32 x 4 bits"
     queries = random_descriptors(30)
     for choice, dim in zip(chosen, (16, 32), strict=True):
@@ -282,6 +283,32 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
         assert not np.array_equal(expected[1], scene.search(queries)[1])
     several = [c.name for c in choices([coder, coder]) if c.family == "protomark-4bit@w"]
     assert several[0] == "protomark-16x4@w"
+
+
+def test_looks_are_a_sealed_map_of_looks_in_the_bytes_of_one_prototype(tmp_path: Path) -> None:
+    coder = pm.Encoder(
+        random_layers([64, 40, 32]), [8, 16, 32], name="w", descriptor="test", scale=0.02
+    )
+    landmarks, descriptors = structured()
+    support = Support(landmarks, descriptors)
+    chosen = choose(choices([coder]), ["protomark-looks"])
+    assert [c.name for c in chosen] == ["looks-16x4", "looks-32x4"]
+    assert chosen[1].label == "Protomark, 32 x 4 bits, looks"
+    queries = random_descriptors(30)
+    for choice, dim in zip(chosen, (16, 32), strict=True):
+        scene = pm.PrototypeMap(coder, dim=dim, look_bits=10)
+        scene.add(landmarks, descriptors)
+        sealed = scene.seal(tmp_path / "s.pmk", bits=4, prototypes=(dim - 1) / (dim / 2))
+        built = choice.build(support)
+        # What the file really holds; 300 landmarks and their prototypes fill no block of 16.
+        held = sealed.prototype_count * dim / 2 + 2 * 300
+        assert built.bytes_per_landmark == pytest.approx(held / 300)
+        assert dim < built.bytes_per_landmark <= dim + 1
+        sizes = dict(pm.file_sections(tmp_path / "s.pmk"))
+        assert 0 <= sum(sizes[n] for n in ("counts", "rows", "protos")) - held < 16 * dim / 2
+        for a, b in zip(built.match(queries), sealed.search(queries), strict=True):
+            assert np.array_equal(a, b)
+    assert "looks-16x4@w" in [c.name for c in choices([coder, coder])]
 
 
 def test_choosing_methods(encoder: pm.Encoder) -> None:

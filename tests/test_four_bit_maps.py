@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import zlib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,8 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from conftest import random_descriptors, random_layers, rounded
+from map_container import container, sections
 from protomark.build import build_file
-
-Section = tuple[str, bytes]
 
 
 @pytest.fixture(scope="module")
@@ -67,32 +65,6 @@ def quantized(prototypes: NDArray[np.int64], half_step: int) -> NDArray[np.int64
 def best_half_step(prototypes: NDArray[np.int64]) -> int:
     errors = [((prototypes - quantized(prototypes, a)) ** 2).sum() for a in range(1, 9)]
     return 1 + int(np.argmin(errors))
-
-
-def sections(data: bytes) -> list[Section]:
-    found = []
-    for i in range(int.from_bytes(data[24:28], "little")):
-        entry = data[64 + 32 * i : 96 + 32 * i]
-        begin, size = (int.from_bytes(entry[a : a + 8], "little") for a in (8, 16))
-        found.append((entry[:8].rstrip(b"\0").decode(), data[begin : begin + size]))
-    return found
-
-
-def container(parts: list[Section], version: int = 2) -> bytes:
-    """A sealed map of these sections whose checksums are right."""
-    table, body = b"", b""
-    offset = -(-(64 + 32 * len(parts)) // 64) * 64
-    start = offset
-    for name, content in parts:
-        table += name.encode().ljust(8, b"\0") + offset.to_bytes(8, "little")
-        table += len(content).to_bytes(8, "little")
-        table += zlib.crc32(content).to_bytes(4, "little") + bytes(4)
-        body += content.ljust(-(-len(content) // 64) * 64, b"\0")
-        offset = start + len(body)
-    head = b"PROTOMRK" + version.to_bytes(4, "little") + (3).to_bytes(4, "little")
-    head += offset.to_bytes(8, "little") + len(parts).to_bytes(4, "little")
-    crc = zlib.crc32(head + bytes(36) + table)
-    return (head + crc.to_bytes(4, "little") + bytes(32) + table).ljust(start, b"\0") + body
 
 
 def read_levels(path: Path, n: int, k: int) -> NDArray[np.int64]:

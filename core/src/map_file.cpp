@@ -37,16 +37,19 @@ struct SealedMap::Content {
     encoder = read_encoder(file);
     shape = read_shape(file, *encoder);
     const std::size_t n = shape.landmarks;
+    rows = n;
+    if (const auto bytes = file.read_if_there(section::kRows)) read_rows();
     if (file.map_if_there(section::kLevels)) {
       code_bits = 4;
       const int half_step = read_levels(file);
-      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(n, shape.dim)), n,
+      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(rows, shape.dim)), rows,
                      shape.dim, half_step};
       check_padding();
     } else {
-      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(n, shape.dim)), n,
+      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(rows, shape.dim)), rows,
                     shape.dim};
     }
+    prototypes.landmarks.rows_of = prototypes4.landmarks.rows_of = rows_of;
     counts = map<std::uint8_t>(section::kCounts, n);
     if (const auto bytes = file.read_if_there(section::kIds)) {
       ids = map<std::int64_t>(section::kIds, n);
@@ -80,9 +83,28 @@ struct SealedMap::Content {
     return static_cast<std::size_t>(found - ids);
   }
 
+  void read_rows() {
+    const std::size_t n = shape.landmarks;
+    rows_of = map<std::uint8_t>(section::kRows, n);
+    rows = count_rows(file, std::span(rows_of, n));
+    std::uint32_t row = 0;
+    for (std::size_t i = 0; i < n; ++i) {
+      if (i % kFirstRowsStep == 0) first_rows.push_back(row);
+      row += rows_of[i];
+    }
+  }
+
+  // The rows of landmark i: the first one and the one behind the last.
+  std::pair<std::size_t, std::size_t> rows_at(std::size_t i) const {
+    if (rows_of == nullptr) return {i, i + 1};
+    std::size_t first = first_rows[i / kFirstRowsStep];
+    for (std::size_t j = i / kFirstRowsStep * kFirstRowsStep; j < i; ++j) first += rows_of[j];
+    return {first, first + rows_of[i]};
+  }
+
   // That of the last block, where the padding of rows is; padding elsewhere is never looked at.
   void check_padding() const {
-    const std::size_t n = shape.landmarks, dim = shape.dim;
+    const std::size_t n = rows, dim = shape.dim;
     const std::size_t padded_dim = (dim + 7) / 8 * 8;
     const std::size_t first = n == 0 ? 0 : (n - 1) / kPackedRows * kPackedRows;
     const std::size_t end = n == 0 ? 0 : first + kPackedRows;
@@ -103,10 +125,16 @@ struct SealedMap::Content {
     return prototypes.data[packed_index(row, d, shape.dim)];
   }
 
+  // Landmarks whose first rows are remembered: every one of these.
+  static constexpr std::size_t kFirstRowsStep = 64;
+
   MappedFile mapped;
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
+  std::size_t rows = 0;                   // prototypes
+  const std::uint8_t* rows_of = nullptr;  // of each landmark; nullptr: each has one
+  std::vector<std::uint32_t> first_rows;
   int code_bits = 8;
   PackedPrototypes prototypes;    // where it is 8
   PackedPrototypes4 prototypes4;  // where it is 4
@@ -123,6 +151,7 @@ SealedMap::SealedMap(SealedMap&&) noexcept = default;
 const std::shared_ptr<const Encoder>& SealedMap::encoder() const { return content_->encoder; }
 std::size_t SealedMap::dim() const { return content_->shape.dim; }
 std::size_t SealedMap::size() const { return content_->shape.landmarks; }
+std::size_t SealedMap::prototype_count() const { return content_->rows; }
 int SealedMap::code_bits() const { return content_->code_bits; }
 
 std::vector<std::int64_t> SealedMap::ids() const {
@@ -135,8 +164,8 @@ std::vector<std::int64_t> SealedMap::ids() const {
   return result;
 }
 
-std::vector<std::uint8_t> SealedMap::counts(std::span<const std::int64_t> landmarks) const {
-  std::vector<std::uint8_t> result;
+std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmarks) const {
+  std::vector<std::uint32_t> result;
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) result.push_back(content_->counts[content_->at(id)]);
   return result;
@@ -147,11 +176,25 @@ void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<f
     throw std::invalid_argument("means must be landmarks x dim");
   }
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const std::size_t row = content_->at(landmarks[i]);
+    const auto [first, end] = content_->rows_at(content_->at(landmarks[i]));
     for (std::size_t d = 0; d < dim(); ++d) {
-      means.row(i)[d] = static_cast<float>(content_->prototype(row, d));
+      int sum = 0;
+      for (std::size_t row = first; row < end; ++row) sum += content_->prototype(row, d);
+      means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(end - first);
     }
   }
+}
+
+std::vector<std::vector<float>> SealedMap::looks(std::int64_t landmark) const {
+  const auto [first, end] = content_->rows_at(content_->at(landmark));
+  std::vector<std::vector<float>> result;
+  for (std::size_t row = first; row < end; ++row) {
+    std::vector<float>& look = result.emplace_back(dim());
+    for (std::size_t d = 0; d < dim(); ++d) {
+      look[d] = static_cast<float>(content_->prototype(row, d));
+    }
+  }
+  return result;
 }
 
 std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmarks) const {

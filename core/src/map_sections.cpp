@@ -61,6 +61,25 @@ std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {
       Encoder::parse(file.read(section::kEncoder), file.name() + ": encoder"));
 }
 
+std::vector<std::byte> write_look_bits(std::size_t look_bits) {
+  SectionWriter out;
+  out.value(static_cast<std::uint32_t>(look_bits));
+  return out.take();
+}
+
+std::size_t read_look_bits(const ContainerReader& file, std::size_t dim) {
+  if (!file.map_if_there(section::kLookBits)) return 0;
+  SectionReader in(file, section::kLookBits);
+  const auto look_bits = in.value<std::uint32_t>();
+  in.finish();
+  const std::size_t most = std::min(PrototypeMap::kMaxLookBits, dim);
+  if (look_bits == 0 || look_bits > most) {
+    file.fail("its looks have " + std::to_string(look_bits) + " bits, not 1 to " +
+              std::to_string(most));
+  }
+  return look_bits;
+}
+
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {
   if (!ids.empty() && ids.front() < 0) file.fail("it has a negative landmark id");
   for (std::size_t i = 1; i < ids.size(); ++i) {

@@ -12,13 +12,17 @@
 namespace protomark {
 
 namespace section {
-inline constexpr char kEncoder[] = "encoder";    // a whole model file
-inline constexpr char kShape[] = "shape";        // MapShape
-inline constexpr char kIds[] = "ids";            // int64, ascending; sealed: absent for 0 ... n - 1
-inline constexpr char kCounts[] = "counts";      // uint8
-inline constexpr char kSums[] = "sums";          // open: int16, n x dim
-inline constexpr char kPrototypes[] = "protos";  // sealed: packed (protomark/search.h)
-inline constexpr char kLevels[] = "levels";      // sealed, 4 bits a number: u32 4, u32 half-step
+inline constexpr char kEncoder[] = "encoder";  // a whole model file
+inline constexpr char kShape[] = "shape";      // MapShape
+inline constexpr char kIds[] = "ids";          // int64, ascending; sealed: absent for 0 ... n - 1
+inline constexpr char kCounts[] = "counts";    // uint8; open: of rows; sealed: of landmarks
+// Where landmarks have several prototypes, rows of each: open uint32, sealed uint8.
+inline constexpr char kRows[] = "rows";
+inline constexpr char kLookBits[] = "lookbits";   // open, where not 0: u32
+inline constexpr char kLooks[] = "looks";         // open: uint16, of each row
+inline constexpr char kSums[] = "sums";           // open: int16, rows x dim
+inline constexpr char kPrototypes[] = "protos";   // sealed: packed (protomark/search.h)
+inline constexpr char kLevels[] = "levels";       // sealed, 4 bits a number: u32 4, u32 half-step
 inline constexpr char kPositions[] = "position";  // open: 3 x float64; sealed: 3 x float32
 }  // namespace section
 
@@ -34,10 +38,26 @@ std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
 // What 4-bit prototypes stand for.
 std::vector<std::byte> write_levels(int half_step);
 int read_levels(const ContainerReader& file);
+// Signs that tell looks apart; 0 where the file says nothing of them.
+std::vector<std::byte> write_look_bits(std::size_t look_bits);
+std::size_t read_look_bits(const ContainerReader& file, std::size_t dim);
 // Throws FileError unless ids are ascending and not negative.
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
 // The middle of the positions that are there.
 Position middle(std::span<const Position> positions);
+
+// The sum of the numbers of rows of all landmarks. Throws FileError where a landmark has none, or
+// where these are more than a map can hold.
+template <typename T>
+std::size_t count_rows(const ContainerReader& file, std::span<const T> rows_of) {
+  std::uint64_t total = 0;
+  for (const T n : rows_of) {
+    if (n == 0) file.fail("it has a landmark without prototypes");
+    total += n;
+    if (total > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
+  }
+  return total;
+}
 
 // A section of exactly n values.
 template <typename T>

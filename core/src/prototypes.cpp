@@ -3,37 +3,22 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
-#include <limits>
+#include <functional>
 #include <mutex>
-#include <numeric>
 #include <stdexcept>
 #include <string>
 #include <unordered_map>
 
 #include "container.h"
-#include "id_index.h"
 #include "map_sections.h"
 #include "protomark/error.h"
-#include "quantize4.h"
+#include "prototype_store.h"
 
 namespace protomark {
 namespace {
 
-constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-constexpr Position kNowhere = {kNaN, kNaN, kNaN};
-
 // Descriptors that are encoded and added at a time, to bound the memory for their codes.
 constexpr std::size_t kEncodeChunk = 1 << 16;
-
-bool is_nowhere(const Position& p) {
-  return std::isnan(p[0]) && std::isnan(p[1]) && std::isnan(p[2]);
-}
-
-// The mean rounded to the nearest integer, halves away from zero.
-std::int8_t rounded_mean(int sum, int n) {
-  const int magnitude = (2 * std::abs(sum) + n) / (2 * n);
-  return static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
-}
 
 void check_pairs(std::size_t landmarks, std::size_t rows, const char* what) {
   if (landmarks != rows) {
@@ -53,6 +38,10 @@ void check_codes(Codes codes, std::size_t dim) {
   }
 }
 
+float mean(std::int64_t sum, std::int64_t n) {
+  return static_cast<float>(static_cast<double>(sum) / static_cast<double>(n));
+}
+
 void check_new_ids(std::span<const std::int64_t> landmarks) {
   for (const std::int64_t id : landmarks) {
     if (id < 0) throw std::invalid_argument("landmark id " + std::to_string(id) + " is negative");
@@ -61,155 +50,8 @@ void check_new_ids(std::span<const std::int64_t> landmarks) {
 
 }  // namespace
 
-// Landmarks in the order they came, unsorted; row r of every array is one landmark.
-struct PrototypeMap::Store {
-  explicit Store(std::size_t dim) : dim(dim) {}
-
-  std::size_t dim;
-  std::vector<std::int64_t> ids;
-  std::vector<std::int16_t> sums;  // rows x dim
-  std::vector<std::uint8_t> counts;
-  std::vector<std::int8_t> packed;  // rounded means, see PackedPrototypes
-  std::vector<Position> positions;  // empty while no landmark has one
-  IdIndex index;
-  mutable std::shared_mutex mutex;
-
-  std::int16_t* sum(std::uint32_t row) { return &sums[row * dim]; }
-  const std::int16_t* sum(std::uint32_t row) const { return &sums[row * dim]; }
-
-  std::uint32_t find(std::int64_t id) const { return index.find(ids, id); }
-
-  std::uint32_t at(std::int64_t id) const {
-    const std::uint32_t row = find(id);
-    if (row == IdIndex::kNone) throw UnknownLandmark(id);
-    return row;
-  }
-
-  std::uint32_t find_or_create(std::int64_t id) {
-    const std::uint32_t found = find(id);
-    if (found != IdIndex::kNone) return found;
-    if (ids.size() >= IdIndex::kNone) throw std::length_error("a map holds under 2^32 landmarks");
-    const auto row = static_cast<std::uint32_t>(ids.size());
-    ids.push_back(id);
-    sums.resize(sums.size() + dim, 0);
-    counts.push_back(0);
-    packed.resize(packed_size(ids.size(), dim), 0);
-    if (!positions.empty()) positions.push_back(kNowhere);
-    index.insert(ids, row);
-    return row;
-  }
-
-  // The last row takes the place of the one that goes.
-  void erase(std::int64_t id) {
-    const std::uint32_t row = at(id);
-    const auto last = static_cast<std::uint32_t>(ids.size() - 1);
-    index.erase(ids, id);
-    if (row != last) {
-      index.move(ids, ids[last], row);
-      ids[row] = ids[last];
-      std::copy_n(sum(last), dim, sum(row));
-      counts[row] = counts[last];
-      if (!positions.empty()) positions[row] = positions[last];
-      refresh(row);
-    }
-    for (std::size_t d = 0; d < dim; ++d) packed[packed_index(last, d, dim)] = 0;
-    ids.pop_back();
-    sums.resize(sums.size() - dim);
-    counts.pop_back();
-    if (!positions.empty()) positions.pop_back();
-    packed.resize(packed_size(ids.size(), dim));
-  }
-
-  void refresh(std::uint32_t row) {
-    for (std::size_t d = 0; d < dim; ++d) {
-      packed[packed_index(row, d, dim)] = rounded_mean(sum(row)[d], counts[row]);
-    }
-  }
-
-  // Eq. 2.
-  void add(std::int64_t id, const std::int8_t* code) {
-    const std::uint32_t row = find_or_create(id);
-    std::int16_t* s = sum(row);
-    if (counts[row] == kMaxCount) {
-      for (std::size_t d = 0; d < dim; ++d) s[d] = static_cast<std::int16_t>(s[d] / 2);
-      counts[row] /= 2;
-    }
-    for (std::size_t d = 0; d < dim; ++d) s[d] = static_cast<std::int16_t>(s[d] + code[d]);
-    ++counts[row];
-  }
-
-  // Sums of both, halved until the count fits.
-  void join(std::uint32_t row, const std::int16_t* other, int other_count) {
-    int n = counts[row] + other_count;
-    const int halvings = n > kMaxCount ? 1 : 0;  // 255 + 255 needs one at most
-    std::int16_t* s = sum(row);
-    for (std::size_t d = 0; d < dim; ++d) {
-      const int total = s[d] + other[d];
-      s[d] = static_cast<std::int16_t>(halvings != 0 ? total / 2 : total);
-    }
-    counts[row] = static_cast<std::uint8_t>(n >> halvings);
-    refresh(row);
-  }
-
-  void set_position(std::uint32_t row, const Position& position) {
-    if (positions.empty()) {
-      if (is_nowhere(position)) return;
-      positions.assign(ids.size(), kNowhere);
-    }
-    positions[row] = position;
-  }
-
-  Position position(std::uint32_t row) const {
-    return positions.empty() ? kNowhere : positions[row];
-  }
-
-  PackedPrototypes view() const { return {packed.data(), ids.size(), dim, ids.data()}; }
-
-  std::vector<std::uint32_t> rows_by_id() const {
-    std::vector<std::uint32_t> rows(ids.size());
-    std::iota(rows.begin(), rows.end(), 0u);
-    std::sort(rows.begin(), rows.end(),
-              [&](std::uint32_t a, std::uint32_t b) { return ids[a] < ids[b]; });
-    return rows;
-  }
-
-  // Of the numbers of the rounded prototypes.
-  Occurrences occurrences() const {
-    Occurrences result{};
-    for (std::size_t row = 0; row < ids.size(); ++row) {
-      for (std::size_t d = 0; d < dim; ++d) {
-        ++result[static_cast<std::size_t>(packed[packed_index(row, d, dim)] + 128)];
-      }
-    }
-    return result;
-  }
-
-  // Rounded prototypes of some rows, as PackedPrototypes has them ...
-  std::vector<std::uint8_t> pack8(std::span<const std::uint32_t> rows) const {
-    std::vector<std::uint8_t> result(packed_size(rows.size(), dim), 0);
-    for (std::size_t i = 0; i < rows.size(); ++i) {
-      for (std::size_t d = 0; d < dim; ++d) {
-        result[packed_index(i, d, dim)] =
-            static_cast<std::uint8_t>(packed[packed_index(rows[i], d, dim)]);
-      }
-    }
-    return result;
-  }
-
-  // ... and as PackedPrototypes4.
-  std::vector<std::uint8_t> pack4(std::span<const std::uint32_t> rows, int half_step) const {
-    std::vector<std::uint8_t> result(packed4_size(rows.size(), dim), 0);
-    for (std::size_t i = 0; i < rows.size(); ++i) {
-      for (std::size_t d = 0; d < dim; ++d) {
-        const std::uint8_t u = quantize4(packed[packed_index(rows[i], d, dim)], half_step);
-        result[packed4_index(i, d, dim)] |= static_cast<std::uint8_t>(packed4_high(d) ? u << 4 : u);
-      }
-    }
-    return result;
-  }
-};
-
-PrototypeMap::PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t dim)
+PrototypeMap::PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t dim,
+                           std::size_t look_bits)
     : encoder_(std::move(encoder)), dim_(dim) {
   if (encoder_ == nullptr) throw std::invalid_argument("a map needs an encoder");
   if (dim_ == 0) dim_ = encoder_->dim();
@@ -218,7 +60,12 @@ PrototypeMap::PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t d
     throw std::invalid_argument("encoder '" + encoder_->info().name + "' has no codes of " +
                                 std::to_string(dim_) + " dimensions");
   }
-  store_ = std::make_unique<Store>(dim_);
+  const std::size_t most = std::min(kMaxLookBits, dim_);
+  if (look_bits > most) {
+    throw std::invalid_argument("look_bits must be 0 to " + std::to_string(most) + ", not " +
+                                std::to_string(look_bits));
+  }
+  store_ = std::make_unique<Store>(dim_, look_bits);
 }
 
 PrototypeMap::PrototypeMap(PrototypeMap&& other) noexcept = default;
@@ -226,12 +73,19 @@ PrototypeMap::~PrototypeMap() = default;
 
 std::size_t PrototypeMap::size() const {
   const std::shared_lock lock(store_->mutex);
-  return store_->ids.size();
+  return store_->landmarks();
 }
+
+std::size_t PrototypeMap::prototype_count() const {
+  const std::shared_lock lock(store_->mutex);
+  return store_->rows();
+}
+
+std::size_t PrototypeMap::look_bits() const { return store_->look_bits(); }
 
 std::vector<std::int64_t> PrototypeMap::ids() const {
   const std::shared_lock lock(store_->mutex);
-  std::vector<std::int64_t> result = store_->ids;
+  std::vector<std::int64_t> result = store_->ids();
   std::sort(result.begin(), result.end());
   return result;
 }
@@ -255,8 +109,13 @@ void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes code
   check_codes(codes, dim_);
   check_new_ids(landmarks);
   const std::unique_lock lock(store_->mutex);
-  for (std::size_t i = 0; i < landmarks.size(); ++i) store_->add(landmarks[i], codes.row(i));
-  for (const std::int64_t id : landmarks) store_->refresh(store_->at(id));
+  std::vector<std::uint32_t> rows;
+  rows.reserve(landmarks.size());
+  for (std::size_t i = 0; i < landmarks.size(); ++i) {
+    rows.push_back(store_->find_or_create_row(landmarks[i], store_->look_of(codes.row(i))));
+    store_->add(rows.back(), codes.row(i));
+  }
+  for (const std::uint32_t row : rows) store_->refresh(row);
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors descriptors,
@@ -272,48 +131,54 @@ void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes c
   check_codes(codes, dim_);
   const std::unique_lock lock(store_->mutex);
 
-  // What is to be taken from each landmark, added up first so that all can be checked before any
+  // What is to be taken from each row, added up first so that all can be checked before any
   // changes.
   struct Part {
     std::vector<int> sum;
     int count = 0;
   };
-  std::unordered_map<std::int64_t, Part> parts;
+  std::unordered_map<std::uint32_t, Part> parts;
+  const auto never_added = [](std::int64_t id) {
+    return std::invalid_argument("descriptors to be removed from landmark " + std::to_string(id) +
+                                 " were never added to it");
+  };
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    store_->at(landmarks[i]);
-    Part& part = parts[landmarks[i]];
+    const std::uint32_t row =
+        store_->find_row(store_->at(landmarks[i]), store_->look_of(codes.row(i)));
+    if (row == Store::kNone) throw never_added(landmarks[i]);
+    Part& part = parts[row];
     part.sum.resize(dim_, 0);
     for (std::size_t d = 0; d < dim_; ++d) part.sum[d] += codes.row(i)[d];
     ++part.count;
   }
-  for (const auto& [id, part] : parts) {
-    const std::uint32_t row = store_->at(id);
-    const int left = store_->counts[row] - part.count;
-    const std::string landmark = "landmark " + std::to_string(id);
+  for (const auto& [row, part] : parts) {
+    const int left = store_->count(row) - part.count;
+    const std::int64_t id = store_->ids()[store_->landmark_of(row)];
     if (left < 0) {
-      throw std::invalid_argument(landmark + " has " + std::to_string(store_->counts[row]) +
-                                  " observations, " + std::to_string(part.count) +
-                                  " cannot be removed");
+      throw std::invalid_argument("landmark " + std::to_string(id) + " has " +
+                                  std::to_string(store_->count(row)) + " observations" +
+                                  (look_bits() == 0 ? "" : " of one look") + ", " +
+                                  std::to_string(part.count) + " cannot be removed");
     }
     for (std::size_t d = 0; d < dim_; ++d) {
-      if (std::abs(store_->sum(row)[d] - part.sum[d]) > 127 * left) {
-        throw std::invalid_argument("descriptors to be removed from " + landmark +
-                                    " were never added to it");
-      }
+      if (std::abs(store_->sum(row)[d] - part.sum[d]) > 127 * left) throw never_added(id);
     }
   }
-  for (const auto& [id, part] : parts) {
-    const std::uint32_t row = store_->at(id);
-    if (store_->counts[row] == part.count) {
-      store_->erase(id);
+  std::vector<std::uint32_t> empty;
+  for (const auto& [row, part] : parts) {
+    if (store_->count(row) == part.count) {
+      empty.push_back(row);
       continue;
     }
     for (std::size_t d = 0; d < dim_; ++d) {
       store_->sum(row)[d] = static_cast<std::int16_t>(store_->sum(row)[d] - part.sum[d]);
     }
-    store_->counts[row] = static_cast<std::uint8_t>(store_->counts[row] - part.count);
+    store_->set_count(row, store_->count(row) - part.count);
     store_->refresh(row);
   }
+  // From the last one on, so that none of them takes the place of another.
+  std::sort(empty.begin(), empty.end(), std::greater<>());
+  for (const std::uint32_t row : empty) store_->erase_row(row);
 }
 
 void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source) {
@@ -335,10 +200,16 @@ void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std
     gone[source[i]] = true;
   }
   for (std::size_t i = 0; i < into.size(); ++i) {
-    const std::uint32_t row = store_->at(into[i]);
     const std::uint32_t other = store_->at(source[i]);
-    store_->join(row, store_->sum(other), store_->counts[other]);
-    if (is_nowhere(store_->position(row))) store_->set_position(row, store_->position(other));
+    for (std::uint32_t from = store_->first_row(other); from != Store::kNone;
+         from = store_->next_row(from)) {
+      const std::uint32_t row = store_->find_or_create_row(into[i], store_->look(from));
+      store_->join(row, store_->sum(from), store_->count(from));
+    }
+    const std::uint32_t landmark = store_->at(into[i]);
+    if (is_nowhere(store_->position(landmark))) {
+      store_->set_position(landmark, store_->position(other));
+    }
     store_->erase(source[i]);
   }
 }
@@ -360,12 +231,20 @@ void PrototypeMap::update(const PrototypeMap& other) {
                                 other.encoder_->info().name + "' with " +
                                 std::to_string(other.dim_));
   }
+  if (other.look_bits() != look_bits()) {
+    throw std::invalid_argument("maps of " + std::to_string(look_bits()) + " and " +
+                                std::to_string(other.look_bits()) +
+                                " look bits cannot be joined: build both with the same");
+  }
   const std::scoped_lock lock(store_->mutex, other.store_->mutex);
   const Store& from = *other.store_;
-  for (std::uint32_t i = 0; i < from.ids.size(); ++i) {
-    const std::uint32_t row = store_->find_or_create(from.ids[i]);
-    store_->join(row, from.sum(i), from.counts[i]);
-    if (is_nowhere(store_->position(row))) store_->set_position(row, from.position(i));
+  for (std::uint32_t i = 0; i < from.rows(); ++i) {
+    const std::int64_t id = from.ids()[from.landmark_of(i)];
+    store_->join(store_->find_or_create_row(id, from.look(i)), from.sum(i), from.count(i));
+  }
+  for (std::uint32_t i = 0; i < from.landmarks(); ++i) {
+    const std::uint32_t landmark = store_->at(from.ids()[i]);
+    if (is_nowhere(store_->position(landmark))) store_->set_position(landmark, from.position(i));
   }
 }
 
@@ -395,11 +274,11 @@ std::vector<Position> PrototypeMap::positions(std::span<const std::int64_t> land
   return result;
 }
 
-std::vector<std::uint8_t> PrototypeMap::counts(std::span<const std::int64_t> landmarks) const {
+std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> landmarks) const {
   const std::shared_lock lock(store_->mutex);
-  std::vector<std::uint8_t> result;
+  std::vector<std::uint32_t> result;
   result.reserve(landmarks.size());
-  for (const std::int64_t id : landmarks) result.push_back(store_->counts[store_->at(id)]);
+  for (const std::int64_t id : landmarks) result.push_back(store_->observations(store_->at(id)));
   return result;
 }
 
@@ -409,13 +288,28 @@ void PrototypeMap::prototypes(std::span<const std::int64_t> landmarks,
     throw std::invalid_argument("means must be landmarks x dim");
   }
   const std::shared_lock lock(store_->mutex);
+  std::vector<std::int64_t> sum(dim_);
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const std::uint32_t row = store_->at(landmarks[i]);
-    for (std::size_t d = 0; d < dim_; ++d) {
-      means.row(i)[d] =
-          static_cast<float>(store_->sum(row)[d]) / static_cast<float>(store_->counts[row]);
+    std::fill(sum.begin(), sum.end(), 0);
+    std::int64_t n = 0;
+    for (std::uint32_t row = store_->first_row(store_->at(landmarks[i])); row != Store::kNone;
+         row = store_->next_row(row)) {
+      for (std::size_t d = 0; d < dim_; ++d) sum[d] += store_->sum(row)[d];
+      n += store_->count(row);
     }
+    for (std::size_t d = 0; d < dim_; ++d) means.row(i)[d] = mean(sum[d], n);
   }
+}
+
+std::vector<Look> PrototypeMap::looks(std::int64_t landmark) const {
+  const std::shared_lock lock(store_->mutex);
+  std::vector<Look> result;
+  for (const std::uint32_t row : store_->sorted_rows(store_->at(landmark))) {
+    Look look{std::vector<float>(dim_), store_->count(row)};
+    for (std::size_t d = 0; d < dim_; ++d) look.mean[d] = mean(store_->sum(row)[d], look.count);
+    result.push_back(std::move(look));
+  }
+  return result;
 }
 
 void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
@@ -433,25 +327,40 @@ void PrototypeMap::search_codes(Codes queries, const SearchOptions& options,
 
 void PrototypeMap::save(const std::filesystem::path& path) const {
   const std::shared_lock lock(store_->mutex);
-  const auto rows = store_->rows_by_id();
-  const std::size_t n = rows.size();
-  std::vector<std::int64_t> ids(n);
-  std::vector<std::uint8_t> counts(n);
-  std::vector<std::int16_t> sums(n * dim_);
-  std::vector<Position> positions(store_->positions.empty() ? 0 : n);
-  for (std::size_t i = 0; i < n; ++i) {
-    ids[i] = store_->ids[rows[i]];
-    counts[i] = store_->counts[rows[i]];
-    std::copy_n(store_->sum(rows[i]), dim_, &sums[i * dim_]);
-    if (!positions.empty()) positions[i] = store_->positions[rows[i]];
+  const auto landmarks = store_->sorted_landmarks();
+  const std::size_t n = landmarks.size(), m = store_->rows();
+  const bool with_looks = look_bits() != 0;
+  std::vector<std::int64_t> ids;
+  std::vector<std::uint32_t> rows_of;
+  std::vector<Position> positions;
+  ids.reserve(n);
+  for (const std::uint32_t landmark : landmarks) {
+    ids.push_back(store_->ids()[landmark]);
+    if (!store_->positions().empty()) positions.push_back(store_->position(landmark));
+    if (with_looks) rows_of.push_back(static_cast<std::uint32_t>(store_->rows_of(landmark)));
   }
   // A map whose positions were all taken away equals one that never had any.
   if (std::all_of(positions.begin(), positions.end(), is_nowhere)) positions.clear();
+  std::vector<std::uint16_t> looks;
+  std::vector<std::uint8_t> counts;
+  std::vector<std::int16_t> sums;
+  counts.reserve(m);
+  sums.reserve(m * dim_);
+  for (const std::uint32_t row : store_->sorted_rows()) {
+    if (with_looks) looks.push_back(store_->look(row));
+    counts.push_back(store_->count(row));
+    sums.insert(sums.end(), store_->sum(row), store_->sum(row) + dim_);
+  }
 
-  ContainerWriter file(FileKind::open_map);
+  ContainerWriter file(FileKind::open_map, with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
   file.add(section::kIds, std::as_bytes(std::span(ids)));
+  if (with_looks) {
+    file.add(section::kLookBits, write_look_bits(look_bits()));
+    file.add(section::kRows, std::as_bytes(std::span(rows_of)));
+    file.add(section::kLooks, std::as_bytes(std::span(looks)));
+  }
   file.add(section::kCounts, std::as_bytes(std::span(counts)));
   file.add(section::kSums, std::as_bytes(std::span(sums)));
   if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
@@ -464,75 +373,57 @@ PrototypeMap PrototypeMap::load(const std::filesystem::path& path) {
   file.expect(FileKind::open_map);
   auto encoder = read_encoder(file);
   const MapShape shape = read_shape(file, *encoder);
-  const std::size_t n = shape.landmarks;
-
-  PrototypeMap map(std::move(encoder), shape.dim);
-  Store& store = *map.store_;
-  store.ids = read_section<std::int64_t>(file, section::kIds, n);
-  store.counts = read_section<std::uint8_t>(file, section::kCounts, n);
-  store.sums = read_section<std::int16_t>(file, section::kSums, n * shape.dim);
+  const std::size_t n = shape.landmarks, dim = shape.dim;
+  const std::size_t look_bits = read_look_bits(file, dim);
+  const auto ids = read_section<std::int64_t>(file, section::kIds, n);
+  check_ids(file, ids);
+  std::vector<std::uint32_t> rows_of;
+  std::size_t m = n;
+  if (look_bits != 0) {
+    rows_of = read_section<std::uint32_t>(file, section::kRows, n);
+    m = count_rows(file, std::span<const std::uint32_t>(rows_of));
+  }
+  std::vector<std::uint16_t> looks;
+  if (look_bits != 0) looks = read_section<std::uint16_t>(file, section::kLooks, m);
+  const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
+  const auto sums = read_section<std::int16_t>(file, section::kSums, m * dim);
+  std::vector<Position> positions;
   if (file.map_if_there(section::kPositions)) {
-    store.positions = read_section<Position>(file, section::kPositions, n);
+    positions = read_section<Position>(file, section::kPositions, n);
   }
-  check_ids(file, store.ids);
-  store.packed.resize(packed_size(n, shape.dim), 0);
-  for (std::uint32_t row = 0; row < n; ++row) {
-    const int count = store.counts[row];
-    const std::int16_t* sum = store.sum(row);
-    if (count == 0 ||
-        std::any_of(sum, sum + shape.dim, [&](int s) { return std::abs(s) > 127 * count; })) {
-      file.fail("landmark " + std::to_string(store.ids[row]) + " has an impossible prototype");
+
+  PrototypeMap map(std::move(encoder), dim, look_bits);
+  Store& store = *map.store_;
+  store.reserve(n, m);
+  for (std::size_t i = 0, next = 0; i < n; ++i) {
+    const std::uint32_t landmark = store.create_landmark(ids[i]);
+    const std::size_t end = next + (look_bits != 0 ? rows_of[i] : 1);
+    for (const std::size_t first = next; next < end; ++next) {
+      const int count = counts[next];
+      const std::int16_t* sum = &sums[next * dim];
+      if (count == 0 ||
+          std::any_of(sum, sum + dim, [&](int s) { return std::abs(s) > 127 * count; })) {
+        file.fail("landmark " + std::to_string(ids[i]) + " has an impossible prototype");
+      }
+      if (look_bits != 0 &&
+          (looks[next] >> look_bits != 0 || (next > first && looks[next] <= looks[next - 1]))) {
+        file.fail("the looks of landmark " + std::to_string(ids[i]) + " do not ascend");
+      }
+      const std::uint32_t row = store.create_row(landmark, look_bits != 0 ? looks[next] : 0);
+      std::copy_n(sum, dim, store.sum(row));
+      store.set_count(row, count);
+      store.refresh(row);
     }
-    const Position position = store.position(row);
-    if (!is_nowhere(position) &&
-        !(std::isfinite(position[0]) && std::isfinite(position[1]) && std::isfinite(position[2]))) {
-      file.fail("landmark " + std::to_string(store.ids[row]) + " has no finite position");
+    if (positions.empty()) continue;
+    const Position& p = positions[i];
+    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
+    if (!finite && !is_nowhere(p)) {
+      file.fail("landmark " + std::to_string(ids[i]) + " has no finite position");
     }
-    store.refresh(row);
-    store.index.insert(store.ids, row);
   }
+  // After the landmarks, so that room for positions is made once.
+  for (std::uint32_t i = 0; i < positions.size(); ++i) store.set_position(i, positions[i]);
   return map;
-}
-
-void PrototypeMap::seal(const std::filesystem::path& path, int bits) const {
-  if (bits != 8 && bits != 4) {
-    throw std::invalid_argument("prototypes are sealed with 8 or 4 bits a number, not " +
-                                std::to_string(bits));
-  }
-  const std::shared_lock lock(store_->mutex);
-  const auto rows = store_->rows_by_id();
-  const std::size_t n = rows.size();
-  std::vector<std::int64_t> ids(n);
-  std::vector<std::uint8_t> counts(n);
-  for (std::size_t i = 0; i < n; ++i) {
-    ids[i] = store_->ids[rows[i]];
-    counts[i] = store_->counts[rows[i]];
-  }
-  const int half_step = bits == 4 ? best_half_step(store_->occurrences()) : 0;
-  const std::vector<std::uint8_t> packed =
-      bits == 4 ? store_->pack4(rows, half_step) : store_->pack8(rows);
-  MapShape shape{n, dim_, {}};
-  std::vector<std::array<float, 3>> positions;
-  if (!std::all_of(store_->positions.begin(), store_->positions.end(), is_nowhere)) {
-    shape.origin = middle(store_->positions);
-    for (const std::uint32_t row : rows) {
-      const Position& p = store_->positions[row];
-      positions.push_back({static_cast<float>(p[0] - shape.origin[0]),
-                           static_cast<float>(p[1] - shape.origin[1]),
-                           static_cast<float>(p[2] - shape.origin[2])});
-    }
-  }
-  const bool implicit_ids = n == 0 || (ids.front() == 0 && ids.back() == std::int64_t(n) - 1);
-
-  ContainerWriter file(FileKind::sealed_map, bits == 4 ? 2 : 1);
-  file.add(section::kEncoder, encoder_->serialize());
-  file.add(section::kShape, write_shape(shape));
-  if (!implicit_ids) file.add(section::kIds, std::as_bytes(std::span(ids)));
-  file.add(section::kCounts, std::as_bytes(std::span(counts)));
-  if (bits == 4) file.add(section::kLevels, write_levels(half_step));
-  file.add(section::kPrototypes, std::as_bytes(std::span(packed)));
-  if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
-  file.write(path);
 }
 
 }  // namespace protomark

@@ -59,6 +59,38 @@ bool distinct(std::int32_t nearest, std::int32_t second, float ratio) {
   return static_cast<double>(nearest) < static_cast<double>(ratio) * ratio * second;
 }
 
+// The landmarks of a map's rows, chunk after chunk from the first row.
+class RowLandmarkCursor {
+ public:
+  RowLandmarkCursor(const RowLandmarks& landmarks, std::size_t rows)
+      : landmarks_(landmarks), end_(rows) {}
+
+  // Those of the next rows, up to kChunkRows; nullptr where a row is a landmark.
+  const std::uint32_t* next() {
+    const std::size_t first = row_;
+    row_ = std::min(end_, row_ + kChunkRows);
+    if (landmarks_.of_row != nullptr) return landmarks_.of_row + first;
+    if (landmarks_.rows_of == nullptr) return nullptr;
+    room_.resize(kChunkRows);
+    for (std::size_t i = 0; i < row_ - first; ++i) {
+      room_[i] = landmark_;
+      if (++used_ == landmarks_.rows_of[landmark_]) {
+        ++landmark_;
+        used_ = 0;
+      }
+    }
+    return room_.data();
+  }
+
+ private:
+  RowLandmarks landmarks_;
+  std::size_t end_;
+  std::size_t row_ = 0;
+  std::uint32_t landmark_ = 0;
+  int used_ = 0;  // rows of landmark_ that were given
+  std::vector<std::uint32_t> room_;
+};
+
 // Codes of 16 landmarks x 4 dimensions. Aligned: a scan whose loads cross cache lines takes a
 // quarter longer.
 struct alignas(64) Vector {
@@ -100,10 +132,16 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
     std::vector<std::int32_t> offsets(kChunkRows);
     std::vector<std::uint32_t> hit_rows(kChunkRows);
     std::vector<std::int32_t> hit_distances(kChunkRows);
+    RowLandmarkCursor cursor(prototypes.landmarks, prototypes.rows);
+    const auto id = [&](std::size_t landmark) {
+      return prototypes.ids != nullptr ? prototypes.ids[landmark]
+                                       : static_cast<std::int64_t>(landmark);
+    };
     for (std::size_t block = 0; block < all_blocks; block += kChunkBlocks) {
       const std::size_t blocks = std::min(kChunkBlocks, all_blocks - block);
       const std::int8_t* packed = chunk(block, blocks, room);
       kernel.code_offsets(packed, blocks, dim, offsets.data());
+      const std::uint32_t* landmarks = cursor.next();
       for (std::size_t q = 0; q < n; ++q) {
         const std::size_t found =
             kernel.code_scan(&unsigned_queries[q * dim], packed, blocks, dim, offsets.data(),
@@ -111,9 +149,11 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
         for (std::size_t i = 0; i < found; ++i) {
           const std::size_t row = block * kPackedRows + hit_rows[i];
           if (row >= prototypes.rows) continue;
-          best[q].offer(hit_distances[i], prototypes.ids != nullptr
-                                              ? prototypes.ids[row]
-                                              : static_cast<std::int64_t>(row));
+          if (landmarks == nullptr) {
+            best[q].offer(hit_distances[i], id(row));
+          } else {
+            best[q].offer_distinct(hit_distances[i], id(landmarks[hit_rows[i]]));
+          }
         }
       }
     }

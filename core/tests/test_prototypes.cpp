@@ -24,7 +24,7 @@ int main() {
   // Eq. 1, one landmark at a time.
   for (const std::int64_t id : map.ids()) {
     std::vector<int> sum(dim, 0);
-    int count = 0;
+    unsigned count = 0;
     for (std::size_t i = 0; i < n; ++i) {
       if (ids[i] != id) continue;
       ++count;

@@ -17,8 +17,9 @@ def build_map(
     dim: int | None = None,
     min_observations: int = 2,
     threads: int = 1,
+    look_bits: int = 0,
 ) -> PrototypeMap:
-    """An open map with the prototype and position of every landmark of `tracks`.
+    """An open map with the prototypes and position of every landmark of `tracks`.
 
     Args:
         tracks: the observations.
@@ -26,9 +27,11 @@ def build_map(
         dim: dimensions of a prototype, one of `encoder.dims`; None: all.
         min_observations: landmarks with fewer are left out.
         threads: threads to encode on.
+        look_bits: signs of a code that tell the looks of a landmark apart; 0: it has one prototype.
 
     Raises:
-        ValueError: the encoder is for another descriptor, or no landmark is left.
+        ValueError: the encoder is for another descriptor, no landmark is left, or dim or look_bits
+            does not fit the encoder.
     """
     check_descriptor(tracks, encoder)
     rows = tracks.observations
@@ -39,7 +42,7 @@ def build_map(
         raise ValueError(
             f"no landmark has {min_observations} observations: there is no map to build"
         )
-    scene = PrototypeMap(encoder, dim)
+    scene = PrototypeMap(encoder, dim, look_bits)
     scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
     ids = known[counts >= min_observations]
     scene.set_positions(ids, tracks.landmark_positions[np.searchsorted(tracks.landmark_ids, ids)])
@@ -66,6 +69,8 @@ def build_file(
     threads: int,
     code_bits: int = 8,
     upright: bool = False,
+    look_bits: int = 0,
+    prototypes: float | None = None,
 ) -> PrototypeMap:
     """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor.
 
@@ -73,20 +78,35 @@ def build_file(
 
     Raises:
         ValueError: as `build_map`; or `code_bits`, those of a sealed map, is neither 8 nor 4, or is
-            4 where none is sealed.
+            4 where none is sealed; or `prototypes`, a sealed map's largest mean number of them a
+            landmark, is below 1, or given where no map is sealed or landmarks have no looks.
     """
     if code_bits not in (8, 4):
         raise ValueError(f"--code-bits {code_bits}: a sealed map has 8 or 4 bits a number")
     if code_bits != 8 and not seal:
         raise ValueError(f"--code-bits {code_bits} is for sealed maps: add --sealed")
+    if prototypes is not None:
+        if not prototypes >= 1:
+            raise ValueError(f"--prototypes {prototypes:g}: a landmark has at least 1")
+        if not seal:
+            raise ValueError(f"--prototypes {prototypes:g} is for sealed maps: add --sealed")
+        if look_bits == 0:
+            raise ValueError(
+                f"--prototypes {prototypes:g} is for landmarks with looks: add --look-bits 10"
+            )
     loaded = Tracks.load(tracks)
     if upright:
         loaded = upright_tracks(loaded)
     scene = build_map(
-        loaded, Encoder.load(encoder or loaded.descriptor), dim, min_observations, threads
+        loaded,
+        Encoder.load(encoder or loaded.descriptor),
+        dim,
+        min_observations,
+        threads,
+        look_bits,
     )
     if seal:
-        scene.seal(output, bits=code_bits)
+        scene.seal(output, bits=code_bits, prototypes=prototypes)
     else:
         scene.save(output)
     return scene

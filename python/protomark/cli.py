@@ -260,6 +260,22 @@ def build(
     code_bits: Annotated[
         int, typer.Option(help="Bits of a sealed prototype's number: 8, or 4 for half the bytes.")
     ] = 8,
+    look_bits: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Signs of a code that tell several looks of a landmark apart, each with a "
+            "prototype of its own: more precise, more bytes. 0 to 16, 0 for one prototype a "
+            "landmark.",
+        ),
+    ] = 0,
+    prototypes: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest number of prototypes that a landmark of a sealed map has on average: "
+            "looks are joined until it fits. By default all are kept."
+        ),
+    ] = None,
     upright: Annotated[
         bool,
         typer.Option(
@@ -272,11 +288,23 @@ def build(
         Path | None, typer.Option("--json", help="Write the facts to this file.")
     ] = None,
 ) -> None:
-    """Build a map from a tracks file: one prototype a landmark, and its position."""
+    """Build a map from a tracks file: prototypes of each landmark, and its position."""
     from protomark.build import build_file
     from protomark.info import describe, show
 
-    build_file(tracks, output, encoder, dim, min_observations, sealed, threads, code_bits, upright)
+    build_file(
+        tracks,
+        output,
+        encoder,
+        dim,
+        min_observations,
+        sealed,
+        threads,
+        code_bits=code_bits,
+        upright=upright,
+        look_bits=look_bits,
+        prototypes=prototypes,
+    )
     facts = describe(output)
     _write_json(json_file, facts)
     show(facts)

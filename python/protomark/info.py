@@ -64,6 +64,19 @@ def _describe_encoder(path: Path) -> dict[str, Any]:
     return {"kind": "encoder", **_encoder_facts(encoder), "bytes": path.stat().st_size}
 
 
+def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
+    """Bytes a landmark that matching needs of a sealed map: prototypes and count, ids left out.
+
+    An open map counts as if it were sealed as it is, with 8 bits a number.
+    """
+    bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
+    prototype = (scene.dim * bits + 7) // 8
+    if scene.prototype_count == len(scene):
+        return prototype + 1
+    # One more byte says how many prototypes a landmark has.
+    return prototype * scene.prototype_count / len(scene) + 2
+
+
 def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     scene = pm.open(path)
     ids = scene.ids
@@ -71,14 +84,19 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     positions = scene.positions(ids)
     placed = positions[~np.isnan(positions).any(axis=1)]
     code_bits = scene.code_bits if isinstance(scene, pm.SealedMap) else None
-    matching = (scene.dim * (code_bits or 8) + 7) // 8 + 1 + (8 if "ids" in sections else 0)
+    matching = matching_bytes(scene) + (8 if "ids" in sections else 0)
+    look_bits = scene.look_bits if isinstance(scene, pm.PrototypeMap) else 0
+    looks = look_bits > 0 or scene.prototype_count != len(scene)
     return {
         "kind": "open map" if code_bits is None else "sealed map",
         "landmarks": len(scene),
+        "prototypes": scene.prototype_count if looks else None,
+        "prototypes_per_landmark": scene.prototype_count / max(1, len(scene)) if looks else None,
+        "look_bits": look_bits or None,
         "dim": scene.dim,
         "code_bits": code_bits,
         "observations": int(counts.sum()),
-        "count_histogram": np.bincount(counts).tolist() if len(counts) else [],
+        "count_histogram": np.bincount(np.minimum(counts, 255)).tolist() if len(counts) else [],
         "landmarks_with_position": len(placed),
         "extent": [placed.min(0).tolist(), placed.max(0).tolist()] if len(placed) else None,
         "bytes_per_landmark_for_matching": None if code_bits is None else matching,

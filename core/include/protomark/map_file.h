@@ -28,9 +28,11 @@ std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesy
 // Checks every checksum of a model or map file. Throws FileError.
 void verify_file(const std::filesystem::path& path);
 
-// A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, landmarks to
-// one of 16), with 4 bits a number dim / 2 + 1 (dimensions padded to a multiple of 8), 8 more where
-// ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads are safe from any thread.
+// A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, prototypes to
+// one of 16), with 4 bits a number dim / 2 + 1 (dimensions padded to a multiple of 8). Where
+// landmarks have several prototypes these take dim or dim / 2 bytes each, and a landmark 2 more. 8
+// more where ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads are safe from
+// any thread.
 class SealedMap {
  public:
   // Throws FileError. The large sections are not read; verify_file checks them.
@@ -40,16 +42,21 @@ class SealedMap {
 
   const std::shared_ptr<const Encoder>& encoder() const;
   std::size_t dim() const;
+  // Landmarks.
   std::size_t size() const;
+  // One a landmark, or several where looks are told apart.
+  std::size_t prototype_count() const;
   // Bits of a prototype's number: 8, or 4 where it was sealed so.
   int code_bits() const;
   std::vector<std::int64_t> ids() const;
 
-  // Throw UnknownLandmark. Prototypes are the rounded ones; with 4 bits, the levels nearest to
-  // these. Positions are 32-bit, relative to the
-  // middle of the map; NaN where there is none.
-  std::vector<std::uint8_t> counts(std::span<const std::int64_t> landmarks) const;
+  // Throw UnknownLandmark. Counts are at most 255. Prototypes are the rounded ones; with 4 bits,
+  // the levels nearest to these. Of a landmark with several they are the mean, each counting alike.
+  // Positions are 32-bit, relative to the middle of the map; NaN where there is none.
+  std::vector<std::uint32_t> counts(std::span<const std::int64_t> landmarks) const;
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
+  // The prototypes of one landmark.
+  std::vector<std::vector<float>> looks(std::int64_t landmark) const;
   std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
 
   void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,

@@ -1,4 +1,5 @@
-// The open map: one prototype a landmark, exact under any history of changes.
+// The open map: one prototype a landmark, or one for each of its looks, exact under any history of
+// changes.
 #pragma once
 
 #include <array>
@@ -6,7 +7,7 @@
 #include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <shared_mutex>
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -18,9 +19,20 @@ namespace protomark {
 
 using Position = std::array<double, 3>;
 
+// Some of a landmark's observations, which look alike: their mean in code units, and their number.
+struct Look {
+  std::vector<float> mean;
+  int count;
+};
+
 // A landmark is kept as the integer sum of its codes and their number n, so that its prototype, the
 // mean (Komorowski and Trzcinski, Eq. 1), follows every change without rounding: observations may
 // come in any order and in any batches (Eq. 2), be taken back, and landmarks be joined.
+//
+// A landmark may also have several *looks*: the signs of the first `look_bits` numbers of a code
+// say which one an observation belongs to, and each look that occurs keeps a sum and a count of its
+// own. That depends on the observation alone, so all of the above holds for each look. A landmark
+// is then as far away as the nearest of its looks.
 //
 // n goes to 255. Before one more is added, sum and n are halved (toward zero), so that an old
 // landmark forgets slowly; from then on its observations cannot be taken back exactly.
@@ -32,15 +44,22 @@ using Position = std::array<double, 3>;
 class PrototypeMap {
  public:
   static constexpr int kMaxCount = 255;
+  static constexpr std::size_t kMaxLookBits = 16;
 
-  // Codes have `dim` dimensions, one of the encoder's; 0: all of them.
-  explicit PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t dim = 0);
+  // Codes have `dim` dimensions, one of the encoder's; 0: all of them. `look_bits`
+  // is 0 (one prototype a landmark) to 16 and at most dim.
+  explicit PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t dim = 0,
+                        std::size_t look_bits = 0);
 
   PrototypeMap(PrototypeMap&& other) noexcept;
 
   const std::shared_ptr<const Encoder>& encoder() const { return encoder_; }
   std::size_t dim() const { return dim_; }
+  std::size_t look_bits() const;
+  // Landmarks.
   std::size_t size() const;
+  // One for each look of each landmark.
+  std::size_t prototype_count() const;
   // Ascending.
   std::vector<std::int64_t> ids() const;
 
@@ -54,22 +73,25 @@ class PrototypeMap {
   void add_codes(std::span<const std::int64_t> landmarks, Codes codes);
   void remove_codes(std::span<const std::int64_t> landmarks, Codes codes);
 
-  // Joins landmark source[i] to into[i], in this order; the sources leave the map. A landmark keeps
-  // its position, or takes the source's where it has none.
+  // Joins landmark source[i] to into[i], look by look, in this order; the sources leave the map. A
+  // landmark keeps its position, or takes the source's where it has none.
   void merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source);
   // Forgets landmarks.
   void discard(std::span<const std::int64_t> landmarks);
-  // Joins another map of the same encoder and dim: landmarks of both are summed, the rest taken
-  // over.
+  // Joins another map of the same encoder, dim and look_bits: landmarks of both are summed, the
+  // rest taken over.
   void update(const PrototypeMap& other);
 
   // World coordinates. Finite; NaN in all three takes a position away.
   void set_positions(std::span<const std::int64_t> landmarks, std::span<const Position> positions);
   // NaN where there is none.
   std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
-  std::vector<std::uint8_t> counts(std::span<const std::int64_t> landmarks) const;
-  // Means, (landmarks x dim), in code units.
+  // Observations of each landmark, over all its looks.
+  std::vector<std::uint32_t> counts(std::span<const std::int64_t> landmarks) const;
+  // Means over all looks, (landmarks x dim), in code units.
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
+  // The looks of one landmark, by ascending sign bits.
+  std::vector<Look> looks(std::int64_t landmark) const;
 
   // See protomark/search.h.
   void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
@@ -83,8 +105,13 @@ class PrototypeMap {
   static PrototypeMap load(const std::filesystem::path& path);
   // Writes a sealed map (protomark/map_file.h) whose prototypes have 8 or 4 bits a number. With 8
   // it gives the same answers; with 4 numbers are rounded to 16 levels that fit this map best,
-  // which takes half the bytes. Throws FileError, and std::invalid_argument for other `bits`.
-  void seal(const std::filesystem::path& path, int bits = 8) const;
+  // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
+  // average over the map, at least 1: looks of a landmark are joined, those first whose joining
+  // adds least to the squared distances of all observations to their prototypes (Ward's criterion),
+  // until the map fits. One landmark keeps at most 255 looks. Throws FileError, and
+  // std::invalid_argument for other `bits` and `prototypes`.
+  void seal(const std::filesystem::path& path, int bits = 8,
+            std::optional<double> prototypes = std::nullopt) const;
 
  private:
   struct Store;

@@ -10,14 +10,22 @@
 
 namespace protomark {
 
-// Prototypes as search reads them and as a sealed map stores them: blocks of 16 landmarks; within a
-// block, for every 4 dimensions, 16 landmarks x 4 values. The last block and the last dimensions
-// are padded with zeros. Value d of row r stands at packed_index(r, d, dim).
+// Which landmark each row is of, where landmarks may have several; at most one of these is set.
+struct RowLandmarks {
+  const std::uint32_t* of_row = nullptr;  // number of the landmark of each row
+  // Number of rows of each landmark, at least 1; a landmark's rows follow each other.
+  const std::uint8_t* rows_of = nullptr;
+};
+
+// Prototypes as search reads them and as a sealed map stores them: blocks of 16 rows; within a
+// block, for every 4 dimensions, 16 rows x 4 values. The last block and the last dimensions are
+// padded with zeros. Value d of row r stands at packed_index(r, d, dim).
 struct PackedPrototypes {
   const std::int8_t* data = nullptr;
   std::size_t rows = 0;
   std::size_t dim = 0;
-  const std::int64_t* ids = nullptr;  // landmark of each row; nullptr: the row's number
+  const std::int64_t* ids = nullptr;  // of each landmark; nullptr: its number
+  RowLandmarks landmarks = {};        // neither is set: a row is a landmark
 };
 
 inline constexpr std::size_t kPackedRows = 16;
@@ -34,8 +42,8 @@ constexpr std::size_t packed_index(std::size_t row, std::size_t d, std::size_t d
 }
 
 // Prototypes of 4 bits a number, as a sealed map may store them: u, 0 to 15, stands for
-// half_step * (2 u - 15). Blocks of 16 landmarks; within a block, for every 8 dimensions, 16
-// landmarks x 4 bytes, of which byte j holds dimension j in its low bits and dimension 4 + j in its
+// half_step * (2 u - 15). Blocks of 16 rows; within a block, for every 8 dimensions, 16 rows x 4
+// bytes, of which byte j holds dimension j in its low bits and dimension 4 + j in its
 // high ones. The last block and the last dimensions are padded with zeros. Value d of row r stands
 // at packed4_index(r, d, dim), in the high bits where packed4_high(d).
 struct PackedPrototypes4 {
@@ -44,6 +52,7 @@ struct PackedPrototypes4 {
   std::size_t dim = 0;
   int half_step = 1;                  // 1 to kMaxHalfStep
   const std::int64_t* ids = nullptr;  // as in PackedPrototypes
+  RowLandmarks landmarks = {};
 };
 
 inline constexpr int kMaxHalfStep = 8;  // 15 * 8 is the last multiple of 15 that int8 holds
@@ -68,7 +77,8 @@ struct SearchOptions {
   int threads = 1;
 };
 
-// The k nearest prototypes of each query code, nearest first, ties to the smaller landmark id.
+// The k nearest landmarks of each query code, nearest first, ties to the smaller id. A landmark is
+// as far away as the nearest of its prototypes.
 //
 // ids and distances are (queries x k), k = ids.columns. Distances are Euclidean, in code units: the
 // float nearest to the root of the integer squared distance. Where there is no neighbour the id is

@@ -29,6 +29,7 @@ _SHORT = {
     "discriminant": "discriminant",
     "protomark": "Protomark",
     "protomark-4bit": "Protomark x4",
+    "protomark-looks": "Protomark looks",
 }
 
 

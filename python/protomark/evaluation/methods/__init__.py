@@ -15,7 +15,7 @@ from protomark.evaluation.methods.projection import (
     principal_components,
     projected_mean,
 )
-from protomark.evaluation.methods.prototypes import prototypes
+from protomark.evaluation.methods.prototypes import looks, prototypes
 from protomark.evaluation.methods.single import first_seen, random_sample
 from protomark.evaluation.methods.unaggregated import unaggregated
 from protomark.evaluation.support import Moments, Support
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 # Codes of at least so many dimensions are compared at 4 bits a number too.
 MIN_4_BIT_DIM = 16
+# Dimensions of 4 bits at which several looks are compared, in as many bytes as at 8 bits one takes.
+LOOKS_DIMS = (16, 32, 64)
+LOOK_BITS = 10
 PROJECTED_DIMS = (8, 16, 32, 64)
 
 
@@ -129,6 +132,15 @@ def choices(
                     _prototypes(encoder, dim, threads, bits=4),
                 )
             )
+        for dim in sorted(set(encoder.dims) & set(LOOKS_DIMS)):
+            listed.append(
+                MethodChoice(
+                    f"looks-{dim}x4{tail}",
+                    f"Protomark, {dim} x 4 bits, looks{mark}",
+                    f"protomark-looks{tail}",
+                    _looks(encoder, dim, threads),
+                )
+            )
     return listed
 
 
@@ -177,5 +189,12 @@ def _prototypes(
 ) -> Callable[[Support], Method]:
     def build(support: Support) -> Method:
         return prototypes(support, encoder, dim, threads, bits)
+
+    return build
+
+
+def _looks(encoder: pm.Encoder, dim: int, threads: int) -> Callable[[Support], Method]:
+    def build(support: Support) -> Method:
+        return looks(support, encoder, dim, LOOK_BITS, dim + 1, threads)
 
     return build

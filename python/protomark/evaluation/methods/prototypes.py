@@ -17,15 +17,18 @@ if TYPE_CHECKING:
 
 
 class PrototypeMethod(Method):
-    """A map of prototypes, open or sealed: k int8 or 4-bit numbers, and one byte for the count."""
+    """A map of prototypes, open or sealed.
+
+    A prototype has k int8 or 4-bit numbers. A landmark has one byte for the count, and where
+    landmarks have several prototypes one more that says how many.
+    """
 
     def __init__(self, scene: pm.PrototypeMap | pm.SealedMap) -> None:
-        self.map = scene
-        import protomark as pm
+        from protomark.info import matching_bytes
 
+        self.map = scene
         # An open map searches the int8 prototypes that a sealed one would hold.
-        bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
-        self.bytes_per_landmark = (scene.dim * bits + 7) // 8 + 1
+        self.bytes_per_landmark = matching_bytes(scene)
 
     def match(
         self, descriptors: NDArray[np.uint8], threads: int = 1
@@ -56,3 +59,32 @@ def prototypes(
     with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
         # The map stays mapped when its file is gone.
         return PrototypeMethod(scene.seal(Path(folder) / "scene.sealed.pmk", bits=bits))
+
+
+def looks(
+    support: Support,
+    encoder: pm.Encoder,
+    dim: int,
+    look_bits: int,
+    most_bytes: float,
+    threads: int = 1,
+) -> PrototypeMethod:
+    """A prototype of 4 bits a number for each look of a landmark, in a number of bytes.
+
+    Args:
+        support: the observations.
+        encoder: an encoder for their descriptor.
+        dim: dimensions of a prototype, an even one of `encoder.dims`.
+        look_bits: signs of a code that tell looks apart.
+        most_bytes: bytes that a landmark takes on average, at most.
+        threads: threads to encode on.
+    """
+    import protomark as pm
+
+    scene = pm.PrototypeMap(encoder, dim=dim, look_bits=look_bits)
+    scene.add(support.landmarks, support.descriptors, threads=threads)
+    # dim / 2 bytes a prototype; one for the count, one for the number of prototypes.
+    mean_prototypes = (most_bytes - 2) / (dim / 2)
+    with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
+        path = Path(folder) / "scene.sealed.pmk"
+        return PrototypeMethod(scene.seal(path, bits=4, prototypes=mean_prototypes))
