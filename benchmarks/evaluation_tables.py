@@ -39,16 +39,16 @@ COLUMNS = {
     "protomark-16x4": "**16 x 4 bits**",
     "protomark-32x4": "**32 x 4 bits**",
     "protomark-64x4": "**64 x 4 bits**",
-    "looks-16x4": "**looks, 17 B**",
-    "looks-32x4": "**looks, 33 B**",
-    "looks-64x4": "**looks, 65 B**",
+    "looks-17": "**looks, 17 B**",
+    "looks-33": "**looks, 33 B**",
+    "looks-65": "**looks, 65 B**",
 }
 # Bytes a landmark -> what is kept in them: int8, 4 bits, 4 bits and several looks.
 BUDGETS = {
     9: ("protomark-8", "protomark-16x4", None),
-    17: ("protomark-16", "protomark-32x4", "looks-16x4"),
-    33: ("protomark-32", "protomark-64x4", "looks-32x4"),
-    65: ("protomark-64", None, "looks-64x4"),
+    17: ("protomark-16", "protomark-32x4", "looks-17"),
+    33: ("protomark-32", "protomark-64x4", "looks-33"),
+    65: ("protomark-64", None, "looks-65"),
 }
 TARGETS = {9: None, 17: 0.95, 33: 1.0, 65: 1.03}
 PAPER = {65: 0.849}  # Komorowski and Trzcinski, 16 float32 numbers and the count: 0.676 of 0.796

@@ -14,9 +14,9 @@ from protomark import sample
 from protomark.build import check_descriptor
 from protomark.console import console, progress_bar
 from protomark.evaluation import pose
-from protomark.evaluation.methods import choices, choose
+from protomark.evaluation.methods import LOOK_BITS, LOOKS_DIMS, choices, choose
 from protomark.evaluation.methods.method import Method
-from protomark.evaluation.methods.prototypes import PrototypeMethod
+from protomark.evaluation.methods.prototypes import PrototypeMethod, prototypes_in
 from protomark.evaluation.plot import draw_precision, save_figure
 from protomark.evaluation.protocol import Split, split
 from protomark.evaluation.results import Summary
@@ -27,11 +27,14 @@ from protomark.evaluation.threads import one_blas_thread
 from protomark.tracks.file import Tracks
 
 PICTURE, OPEN_MAP, SEALED_MAP = "protomark_demo.png", "toy.pmk", "toy.sealed.pmk"
-BASELINES = ("unaggregated", "random", "majority", "medoid", "mean", "pca-8", "pca-16", "pca-32")
+BASELINES = ("unaggregated", "random", "majority", "medoid", "mean", "pca-16", "pca-32", "pca-64")
+OURS = ("protomark-16", "protomark-32", "protomark-64", "protomark-32x4", "looks-33")
 # Written into the picture, so that a later run knows its own.
 _MADE_BY = "protomark demo"
 # A position as a sealed map keeps it.
 _POSITION_BYTES = 12
+# Bytes a landmark of the map that is sealed.
+_SIZE = 33
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,13 @@ class DemoResult:
     """All rows, and the files that were written with their sizes in bytes.
 
     Attributes:
+        shown: name of the row that the sealed map and the picture are of.
         encoder_bytes: how many of the sealed map's bytes are its encoder.
         seconds: from start to end.
     """
 
     rows: list[DemoRow]
+    shown: str
     folder: str
     files: dict[str, int]
     encoder_bytes: int
@@ -108,7 +113,7 @@ def run_demo(
         tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
     )
     frames = [pose.Frame.of(tracks, int(keyframe)) for keyframe in part.query_keyframes]
-    sealed, files = _write_maps(tracks, part, coder, output)
+    sealed, shown, files = _write_maps(tracks, part, coder, output)
 
     console.print(
         f"[bold]{tracks.info.get('sequence', 'toy')}[/]: {len(part.support_keyframes)} keyframes "
@@ -117,7 +122,9 @@ def run_demo(
         "localized in it.",
         highlight=False,
     )
-    compared = choose(choices([coder]), [*BASELINES, "protomark"])
+    listed = choices([coder])
+    ours_here = [name for name in OURS if name in {choice.name for choice in listed}]
+    compared = choose(listed, [*BASELINES, *ours_here, shown])
     rows, depth = [], pose.scene_depth(tracks)
     ours: list[pose.Localization] = []
     matched: list[NDArray[np.float64]] = []
@@ -125,7 +132,7 @@ def run_demo(
         task = progress.add_task("", total=len(compared))
         for choice in compared:
             progress.update(task, description=choice.label)
-            is_sealed = choice.name == f"protomark-{coder.dim}"
+            is_sealed = choice.name == shown
             method = PrototypeMethod(sealed) if is_sealed else choice.build(support)
             answers, _ = method.match(tracks.descriptors[part.query_rows])
             right = answers[:, 0] == tracks.landmark_of_keypoint[part.query_rows]
@@ -163,10 +170,11 @@ def run_demo(
             true=tracks.cam_from_world[part.query_keyframes],
             estimated=[one.cam_from_world for one in ours],
         )
-        _draw(rows, scene, output / PICTURE)
+        _draw(rows, next(r for r in rows if r.name == shown), scene, output / PICTURE)
     encoder_bytes = dict(pm.file_sections(output / SEALED_MAP))["encoder"]
     files[PICTURE] = (output / PICTURE).stat().st_size
-    return DemoResult(rows, str(output), files, encoder_bytes, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return DemoResult(rows, shown, str(output), files, encoder_bytes, seconds)
 
 
 def show(result: DemoResult) -> None:
@@ -195,7 +203,7 @@ def show(result: DemoResult) -> None:
             f"{row.found} of {row.frames}",
             f"{100 * row.median_error:.2f}%",
             f"{row.ms_per_frame:.0f}",
-            style="bold green" if row.family == "protomark" else "",
+            style="bold green" if row.family.startswith("protomark") else "",
         )
     console.print(table)
     console.print(
@@ -211,10 +219,7 @@ def show(result: DemoResult) -> None:
 
     rows = {row.name: row for row in result.rows}
     whole = rows["unaggregated"]
-    ours = max(
-        (row for row in result.rows if row.family == "protomark"),
-        key=lambda row: row.bytes_per_landmark,
-    )
+    ours = rows[result.shown]
     console.print(
         f"[bold]What it means:[/] {ours.bytes_per_landmark:.0f} bytes a landmark in place of "
         f"{whole.bytes_per_landmark:.0f} keep {100 * ours.precision / whole.precision:.0f} % of "
@@ -249,27 +254,37 @@ def _localize(
 
 def _write_maps(
     tracks: Tracks, part: Split, encoder: pm.Encoder, output: Path
-) -> tuple[pm.PrototypeMap | pm.SealedMap, dict[str, int]]:
-    """Build the map of the support, save and seal it, and open the sealed file again."""
-    scene = pm.PrototypeMap(encoder)
+) -> tuple[pm.PrototypeMap | pm.SealedMap, str, dict[str, int]]:
+    """Build the map of the support, save and seal it, and open the sealed file again.
+
+    Where the encoder has the dimensions for it the map keeps several looks, in 33 bytes a landmark,
+    else one int8 prototype. Also returns the name of the method that this is.
+    """
+    dim = LOOKS_DIMS[_SIZE]
+    several = dim in encoder.dims
+    if several:
+        scene = pm.PrototypeMap(encoder, dim=dim, look_bits=LOOK_BITS)
+    else:
+        scene = pm.PrototypeMap(encoder)
     scene.add(tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows])
     scene.set_positions(scene.ids, positions_of(tracks, scene.ids))
     scene.save(output / OPEN_MAP)
-    scene.seal(output / SEALED_MAP)
+    if several:
+        scene.seal(output / SEALED_MAP, bits=4, prototypes=prototypes_in(_SIZE, dim))
+    else:
+        scene.seal(output / SEALED_MAP)
+    shown = f"looks-{_SIZE}" if several else f"protomark-{encoder.dim}"
     sizes = {name: (output / name).stat().st_size for name in (OPEN_MAP, SEALED_MAP)}
-    return pm.open(output / SEALED_MAP), sizes
+    return pm.open(output / SEALED_MAP), shown, sizes
 
 
-def _draw(rows: list[DemoRow], scene: ScenePicture, path: Path) -> None:
+def _draw(rows: list[DemoRow], ours: DemoRow, scene: ScenePicture, path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08, wspace=0.04)
     figure = Figure(figsize=(13, 6.2), layout=layout)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
-    ours = max(
-        (row for row in rows if row.family == "protomark"), key=lambda row: row.bytes_per_landmark
-    )
     draw_scene(
         left,
         scene,

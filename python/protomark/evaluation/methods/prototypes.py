@@ -61,6 +61,14 @@ def prototypes(
         return PrototypeMethod(scene.seal(Path(folder) / "scene.sealed.pmk", bits=bits))
 
 
+def prototypes_in(size: float, dim: int) -> float:
+    """How many 4-bit prototypes of `dim` numbers a landmark has in `size` bytes.
+
+    dim / 2 bytes a prototype; one for the count, one for the number of prototypes.
+    """
+    return (size - 2) / (dim / 2)
+
+
 def looks(
     support: Support,
     encoder: pm.Encoder,
@@ -83,8 +91,7 @@ def looks(
 
     scene = pm.PrototypeMap(encoder, dim=dim, look_bits=look_bits)
     scene.add(support.landmarks, support.descriptors, threads=threads)
-    # dim / 2 bytes a prototype; one for the count, one for the number of prototypes.
-    mean_prototypes = (most_bytes - 2) / (dim / 2)
+    mean_prototypes = prototypes_in(most_bytes, dim)
     with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
         path = Path(folder) / "scene.sealed.pmk"
         return PrototypeMethod(scene.seal(path, bits=4, prototypes=mean_prototypes))
