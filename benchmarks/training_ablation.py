@@ -1,11 +1,11 @@
 """What each part of the training recipe brings: data, objective, capacity, length.
 
-python benchmarks/training_ablation.py TRACKS... -o FOLDER [--steps 400] [--seeds 1] [--only NAME]
+python benchmarks/training_ablation.py TRACKS... -o FOLDER [--steps 300] [--seeds 1] [--only NAME]
 
-TRACKS are the FREAK (or other) tracks of hololens, desk_rpy, viking, conch, seneca and caliterra.
-Trained on desk_rpy, viking, conch and seneca, measured on hololens and caliterra, which are no test
-sequences. A finished variant is kept in FOLDER and not trained again. Writes the table and the
-figures of docs/training.md.
+TRACKS are the FREAK (or other) tracks of hololens, caliterra, and, plain and varied, of desk_rpy,
+viking, conch and seneca. Trained on the latter four, measured on hololens and caliterra, which are
+no test sequences. A finished variant is kept in FOLDER and not trained again. Writes the table and
+the figure of docs/training.md.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from protomark.training.network import default_hidden, embed
 from protomark.training.sampling import Views
 from protomark.training.train import Options, Trainer, has_fast_bfloat16, keep_freed_memory
 from protomark.training.validation import Trial, precision
+from protomark.upright import upright_tracks
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "training.md"
 LEARNED = ("desk_rpy", "viking", "conch", "seneca")
@@ -42,18 +43,22 @@ QUERIES = 5000
 
 @dataclass(frozen=True)
 class Variant:
-    """One change of the recipe: options that differ, and the sequences learned from."""
+    """One change of the recipe: options that differ, and what is learned from."""
 
     name: str
     group: str
     options: dict[str, object] = field(default_factory=dict)
     sequences: tuple[str, ...] = LEARNED
+    varied: bool = True
+    upright: bool = False
 
 
 VARIANTS = (
     Variant("the recipe", ""),
     Variant("1 sequence", "data", sequences=LEARNED[:1]),
     Variant("2 sequences", "data", sequences=LEARNED[:2]),
+    Variant("no varied copies", "", varied=False),
+    Variant("angle and size as inputs (upright)", "", varied=False, upright=True),
     Variant("no bit noise", "data", {"noise": 0.0}),
     Variant("2 views in the support", "objective", {"views": 3, "queries": 3}),
     Variant("batches of 300 landmarks", "objective", {"landmarks": 300}),
@@ -89,8 +94,13 @@ def run(
     assert isinstance(share, float)
     many = round(steps * share)
     options = replace(Options(steps=many, validate_every=many, seed=seed), **changes)  # type: ignore[arg-type]
-    views = [Views.from_tracks(tracks[name], name) for name in variant.sequences]
-    trials = [Trial.from_tracks(tracks[name], name, 0, QUERIES) for name in MEASURED]
+    learned = [tracks[name + ".varied" * variant.varied] for name in variant.sequences]
+    measured = [tracks[name] for name in MEASURED]
+    plain = [Trial.from_tracks(t, n, 0, QUERIES) for n, t in zip(MEASURED, measured, strict=True)]
+    if variant.upright:
+        learned, measured = [[upright_tracks(t) for t in each] for each in (learned, measured)]
+    views = [Views.from_tracks(t, n) for n, t in zip(variant.sequences, learned, strict=True)]
+    trials = [Trial.from_tracks(t, n, 0, QUERIES) for n, t in zip(MEASURED, measured, strict=True)]
     trainer = Trainer(views, trials[:1], options, half=has_fast_bfloat16("cpu"))
     trainer.run(step)  # type: ignore[arg-type]
     bits, dims = trainer.network.bits, [d for d in DIMS if d in options.dims]
@@ -110,10 +120,10 @@ def run(
         descriptor=tracks[MEASURED[0]].descriptor,
         scale=float(trainer.quantized.scale),
     )
-    for trial in trials:
+    for trial, raw in zip(trials, plain, strict=True):
         codes = embed(trainer.quantized, np.concatenate([trial.support, trial.queries]))
         found[trial.name] = {
-            "unaggregated": unaggregated_precision(trial),
+            "unaggregated": unaggregated_precision(raw),
             "prototypes": precision(trial, encoder.encode, dims),
             "codes kept": kept_codes_precision(trial, codes),
         }
@@ -183,15 +193,18 @@ def main() -> None:
     )
     parser.add_argument("tracks", nargs="+", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--only", action="append", help="train only this variant; may be repeated")
     asked = parser.parse_args()
     keep_freed_memory()
     torch.set_num_threads(1)
     asked.output.mkdir(parents=True, exist_ok=True)
-    tracks = {sequence_name(p): Tracks.load(p) for p in asked.tracks}
-    missing = {*LEARNED, *MEASURED} - set(tracks)
+    tracks = {}
+    for path in asked.tracks:
+        loaded = Tracks.load(path)
+        tracks[sequence_name(path) + ".varied" * bool(loaded.info.get("variants"))] = loaded
+    missing = {*LEARNED, *MEASURED, *(f"{name}.varied" for name in LEARNED)} - set(tracks)
     if missing:
         parser.error(f"no tracks of {', '.join(sorted(missing))}")
     results: dict[str, dict[str, dict]] = {}  # type: ignore[type-arg]
