@@ -7,6 +7,7 @@ import numpy as np
 
 import protomark as pm
 from protomark import sample
+from protomark.info import matching_bytes
 
 tracks = sample.load()
 encoder = pm.Encoder.load("freak")
@@ -15,7 +16,8 @@ encoder = pm.Encoder.load("freak")
 frame = tracks.keypoints_of(40)
 seen = np.setdiff1d(tracks.observations, np.arange(frame.start, frame.stop))
 
-scene = pm.PrototypeMap(encoder)
+# 48 of the encoder's 64 numbers; what looks different in 10 signs of a code is kept apart.
+scene = pm.PrototypeMap(encoder, dim=48, look_bits=10)
 scene.add(tracks.landmark_of_keypoint[seen], tracks.descriptors[seen])
 print(scene)
 
@@ -30,5 +32,6 @@ print(f"{len(matched)} of {len(truth)} keypoints matched, {right.sum()} surely r
 scene.add(ids[matched, 0][right], tracks.descriptors[frame][matched][right])
 
 scene.save("scene.pmk")
-sealed = scene.seal("scene.sealed.pmk")
-print(sealed, f"{sealed.dim + 1} bytes a landmark")
+# 4 bits a number, looks joined until a landmark has 1.29 prototypes on average.
+sealed = scene.seal("scene.sealed.pmk", bits=4, prototypes=1.29)
+print(sealed, f"{matching_bytes(sealed):.0f} bytes a landmark")
