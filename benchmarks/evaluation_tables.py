@@ -3,7 +3,8 @@
 python benchmarks/evaluation_tables.py [RESULTS.json ...]
 
 Without arguments: from all benchmarks/results/evaluation.*.json, which `protomark evaluate --json`
-wrote. Exit code 1 if Protomark is not above PCA at equal bytes on every test sequence.
+wrote. Methods of one sequence may come from several files; of the same method the last file
+counts. Exit code 1 if Protomark is not above PCA at equal bytes on every test sequence.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import sys
 from pathlib import Path
 
 from documents import replace_tables
+from protomark.evaluation.methods import choices
 from protomark.evaluation.plot import save_plot
 from protomark.evaluation.report import markdown
 from protomark.evaluation.results import SequenceResult, load_json, mean_rows
@@ -76,6 +78,26 @@ def overview(results: list[SequenceResult]) -> str:
             f"| {result.sequence} | {split_of(result.sequence)} | " + " | ".join(texts) + " |"
         )
     return "\n".join(lines) + "\n"
+
+
+def joined(results: list[SequenceResult]) -> list[SequenceResult]:
+    """One result a descriptor and sequence, with all methods that were measured on its queries."""
+    families = [choice.family for choice in choices()]
+    families += ["protomark", "protomark-4bit", "protomark-looks"]
+    whole: dict[tuple[str, str], SequenceResult] = {}
+    for result in results:
+        first = whole.setdefault((result.descriptor, result.sequence), result)
+        if (first.queries, first.seeds) != (result.queries, result.seeds):
+            raise ValueError(
+                f"{result.sequence}, {result.descriptor}: measured on other queries in another "
+                "file; evaluate both on the same tracks and seeds"
+            )
+        methods = {method.name: method for method in [*first.methods, *result.methods]}
+        first.methods = sorted(
+            methods.values(),
+            key=lambda m: (families.index(m.family), m.bytes_per_landmark[0]),
+        )
+    return list(whole.values())
 
 
 def check(results: list[SequenceResult]) -> list[str]:
@@ -166,7 +188,7 @@ def main() -> int:
         return 1
     order = [name for members in SPLITS.values() for name in members]
     results = sorted(
-        (result for path in paths for result in load_json(path)),
+        joined([result for path in paths for result in load_json(path)]),
         key=lambda result: (result.descriptor, order.index(result.sequence)),
     )
     parts = []

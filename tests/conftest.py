@@ -7,9 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from numpy.typing import NDArray
 
 import protomark as pm
+
+# A busy machine is no failure of a property.
+settings.register_profile("protomark", deadline=None)
+settings.load_profile("protomark")
 
 
 def random_layers(
