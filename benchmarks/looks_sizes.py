@@ -1,4 +1,4 @@
-"""Which dimensions are the most precise in a number of bytes, when a landmark may have several looks.
+"""Which dimensions are the most precise in a number of bytes, when landmarks have several looks.
 
 python benchmarks/looks_sizes.py TRACKS [--look-bits 8 10 12]
 
