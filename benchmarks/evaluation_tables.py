@@ -9,14 +9,19 @@ counts. Exit code 1 if Protomark is not above PCA at equal bytes on every test s
 
 from __future__ import annotations
 
+import platform
+import re
 import sys
 from pathlib import Path
 
+import protomark as pm
 from documents import replace_tables
+from protomark.evaluation.encode_cost import encode_nanoseconds
 from protomark.evaluation.methods import choices
 from protomark.evaluation.plot import save_plot
 from protomark.evaluation.report import markdown
 from protomark.evaluation.results import SequenceResult, load_json, mean_rows
+from protomark.files import write_text
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = ROOT / "docs" / "evaluation.md"
@@ -178,6 +183,14 @@ def ratios(results: list[SequenceResult]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _measure_encoding(card: Path) -> None:
+    """Put the cost of encoding, measured now, into a card."""
+    cost = encode_nanoseconds(pm.Encoder.load(card.with_suffix(".pme")))
+    text = card.read_text(encoding="utf-8")
+    line = f"- encode: {cost:,.0f} ns a descriptor on one thread of {platform.machine()}\n"
+    write_text(card, re.sub(r"- encode: .*\n", line, text))
+
+
 def main() -> int:
     """Write the tables and say what the check found."""
     paths = [Path(p) for p in sys.argv[1:]] or sorted(
@@ -211,6 +224,7 @@ def main() -> int:
     for descriptor in dict.fromkeys(result.descriptor for result in tests):
         card = MODELS / f"{descriptor}.md"
         if card.is_file():
+            _measure_encoding(card)
             replace_tables(card, card_table([r for r in tests if r.descriptor == descriptor]))
 
     failures = check(results)

@@ -6,7 +6,6 @@ import json
 import os
 import platform
 import shlex
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 
 from protomark.console import console, progress_bar, progress_console
+from protomark.evaluation.encode_cost import encode_nanoseconds
 from protomark.evaluation.methods.bitwise import majority
 from protomark.evaluation.methods.medoid import medoid
 from protomark.evaluation.support import Support
@@ -133,7 +133,7 @@ def train_encoder(
         widths=[data.bits, *trainer.network.hidden, options.dims[-1]],
         dims=list(options.dims),
         bytes=output.stat().st_size,
-        encode_ns=encode_cost(encoder),
+        encode_ns=encode_nanoseconds(encoder),
         licence=licence,
         sources=data.sources,
         validation=data.validation_sources,
@@ -242,18 +242,6 @@ def _binary_precision(trial: Trial, seed: int, threads: int) -> dict[str, float]
         nearest, _ = method.match(trial.queries, threads=threads)
         found[name] = float((nearest[:, 0] == trial.targets).mean())
     return found
-
-
-def encode_cost(encoder: pm.Encoder) -> float:
-    """Nanoseconds to encode one descriptor on one thread, the best of five rounds of 20,000."""
-    rng = np.random.default_rng(0)
-    descriptors = rng.integers(0, 256, (20_000, encoder.bits // 8), np.uint8)
-    seconds = []
-    for _ in range(5):
-        began = time.perf_counter()
-        encoder.encode(descriptors, threads=1)
-        seconds.append(time.perf_counter() - began)
-    return 1e9 * min(seconds) / len(descriptors)
 
 
 def unaggregated_precision(trial: Trial, threads: int = 1) -> float:
