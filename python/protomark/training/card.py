@@ -95,7 +95,8 @@ class Card:
             "",
             f"- network: {'-'.join(map(str, self.widths))}, SELU, int8 weights; "
             f"{self.multiply_adds:,} multiply-adds a descriptor",
-            f"- encode: {self.encode_ns:,.0f} ns a descriptor on one thread of {platform.machine()}",
+            f"- encode: {self.encode_ns:,.0f} ns a descriptor on one thread of "
+            f"{platform.machine()}",
             f"- file: {self.bytes:,} bytes",
             f"- licence: {self.licence or 'none stated'}",
             f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "
