@@ -4,7 +4,8 @@ python benchmarks/evaluation_tables.py [RESULTS.json ...]
 
 Without arguments: from all benchmarks/results/evaluation.*.json, which `protomark evaluate --json`
 wrote. Methods of one sequence may come from several files; of the same method the last file
-counts. Exit code 1 if Protomark is not above PCA at equal bytes on every test sequence.
+counts. Exit code 1 if on some test sequence nothing that Protomark keeps in as many bytes is above
+the mean of int8 principal components; says too where its int8 prototypes alone are not.
 """
 
 from __future__ import annotations
@@ -105,24 +106,24 @@ def joined(results: list[SequenceResult]) -> list[SequenceResult]:
     return list(whole.values())
 
 
-def check(results: list[SequenceResult]) -> list[str]:
-    """Where Protomark is not above PCA at equal bytes, on test sequences."""
-    failures = []
+def check(results: list[SequenceResult]) -> tuple[list[str], list[str]]:
+    """Where PCA is not beaten on test sequences: by all of ours, and by int8 prototypes alone."""
+    failures, notes = [], []
     for result in results:
-        rows = {row.name: row for row in result.rows()}
+        rows = {row.name: row.precision for row in result.rows()}
         if split_of(result.sequence) != "test":
             continue
         for dim in DIMS:
-            ours, theirs = rows.get(f"protomark-{dim}"), rows.get(f"pca-{dim}")
+            theirs = rows.get(f"pca-{dim}")
             if theirs is None:
                 continue
-            if ours is None or ours.precision <= theirs.precision:
-                mine = "none" if ours is None else f"{ours.precision:.3f}"
-                failures.append(
-                    f"{result.sequence} {result.descriptor} {dim}: "
-                    f"{mine}, PCA {theirs.precision:.3f}"
-                )
-    return failures
+            kept = [rows[name] for name in BUDGETS[dim + 1] if name in rows]
+            where = f"{result.sequence} {result.descriptor}, {dim + 1} bytes: PCA {theirs:.3f}"
+            if max(kept, default=0.0) <= theirs:
+                failures.append(where)
+            elif rows.get(f"protomark-{dim}", 0.0) <= theirs:
+                notes.append(f"{where}, int8 prototypes {rows.get(f'protomark-{dim}', 0.0):.3f}")
+    return failures, notes
 
 
 def card_table(results: list[SequenceResult]) -> str:
@@ -191,6 +192,30 @@ def _measure_encoding(card: Path) -> None:
     write_text(card, re.sub(r"- encode: .*\n", line, text))
 
 
+def upright_table(plain: list[SequenceResult], upright: list[SequenceResult]) -> str:
+    """Precision without and with the keypoints' angles and sizes, a row a sequence."""
+    names = ["protomark-32", "protomark-32x4", "looks-17", "looks-33", "looks-65"]
+    lines = [
+        "Plain, and with angle and size of the keypoint:",
+        "",
+        "| sequence | all descriptors | "
+        + " | ".join(f"{COLUMNS[name].strip('*')}: plain, upright" for name in names)
+        + " |",
+        "|---|---:|" + "---:|" * len(names),
+    ]
+    others = {result.sequence: result for result in upright}
+    for result in plain:
+        if result.sequence not in others:
+            continue
+        rows = {row.name: row.precision for row in result.rows()}
+        more = {row.name: row.precision for row in others[result.sequence].rows()}
+        cells = [f"{rows[name]:.3f}, {more[name]:.3f}" for name in names]
+        lines.append(
+            f"| {result.sequence} | {rows['unaggregated']:.3f} | " + " | ".join(cells) + " |"
+        )
+    return "\n".join(lines) + "\n"
+
+
 def main() -> int:
     """Write the tables and say what the check found."""
     paths = [Path(p) for p in sys.argv[1:]] or sorted(
@@ -214,6 +239,10 @@ def main() -> int:
             title = f"{descriptor.upper()}: mean of {', '.join(r.sequence for r in plotted)}"
             save_plot(mean_rows(plotted), DOCUMENT.parent / f"precision.{descriptor}.png", title)
             parts.append(f"![{title}](precision.{descriptor}.png)\n")
+        upright = ROOT / "benchmarks" / "results" / f"upright.{descriptor}.json"
+        if upright.is_file():
+            parts.append(f"#### Cameras that do not roll: `{descriptor}-upright`\n")
+            parts.append(upright_table(same, load_json(upright)))
     parts.append("### Every figure\n")
     for split, members in SPLITS.items():
         chosen = [result for result in results if result.sequence in members]
@@ -227,7 +256,9 @@ def main() -> int:
             _measure_encoding(card)
             replace_tables(card, card_table([r for r in tests if r.descriptor == descriptor]))
 
-    failures = check(results)
+    failures, notes = check(results)
+    for note in notes:
+        print(f"int8 alone is not above PCA: {note}")
     for failure in failures:
         print(f"not above PCA: {failure}")
     if not failures:
