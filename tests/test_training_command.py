@@ -104,6 +104,17 @@ def test_data_that_cannot_be_trained_on(files, training, validation, message):
         load_training([files[n] for n in training], [files[n] for n in validation])
 
 
+def test_varied_copies_of_the_validation_sequence_are_not_trained_on(tmp_path):
+    tracks = scene(seed=1)
+    tracks.info["input"] = "digest of the images"
+    plain, varied = tmp_path / "yard.x.safetensors", tmp_path / "yard.x.varied.safetensors"
+    tracks.save(plain)
+    tracks.info["variants"] = 1
+    tracks.save(varied)
+    with pytest.raises(ValueError, match=r"yard\.x\.safetensors and yard\.x\.varied.*same images"):
+        load_training([varied], [plain])
+
+
 def test_a_missing_file_is_named(files, tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         load_training([files["a"], tmp_path / "nowhere"], [files["unseen"]])
@@ -121,12 +132,18 @@ def test_a_missing_file_is_named(files, tmp_path):
         (["--data-licence", "z=MIT"], "none of the sequences"),
         (["-o", "no/such/folder/x.pme"], "does not exist"),
         (["--report", "nowhere.safetensors"], "nowhere"),
+        (["--report", "{longer}"], "report on tracks of the same descriptor"),
+        (["--report", "{short}"], "short"),
+        (["-o", "{tmp_path}"], "is a folder"),
+        (["-o", "{tmp_path}/x.md"], "name the model .pme"),
+        (["--json", "{tmp_path}"], "is a folder"),
     ],
 )
 def test_bad_options_stop_before_the_first_step(files, tmp_path, words, message):
     out = tmp_path / "x.pme"
+    words = [word.format(tmp_path=tmp_path, **files) for word in words]
     result = run(files["a"], "--validation", files["unseen"], "-o", out, *words)
-    assert result.exit_code != 0
+    assert isinstance(result.exception, (ValueError, OSError))
     assert message in str(result.exception)
     assert list(tmp_path.iterdir()) == []
 
@@ -153,6 +170,8 @@ def test_without_options_the_last_file_picks_and_the_descriptor_names_the_model(
     assert isinstance(again.exception, FileExistsError)
     assert "synthetic.pme exists and is kept" in str(again.exception)
     assert (tmp_path / "synthetic.pme").read_bytes() == before
+    (tmp_path / "synthetic.pme").unlink()
+    assert "synthetic.md exists and is kept" in str(run(*words).exception)
 
 
 def test_one_file_cannot_do_both(files):

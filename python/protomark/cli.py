@@ -22,7 +22,7 @@ def tracks(
     folders: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FOLDER...",
+            metavar="FOLDER",
             help="Sequences: each holds images/ and a COLMAP model in sparse/ or sparse/0/.",
         ),
     ],

@@ -65,7 +65,8 @@ def train_encoder(
 ) -> Card:
     """Train an encoder and write `output`, its card beside it (.md), and `json_path`.
 
-    A checkpoint is kept beside the output (`<output>.checkpoint`) until training is done.
+    A checkpoint is kept beside the output (`<output>.checkpoint`) until training is done, and a
+    picture of its course (.png) for good.
 
     Args:
         training: tracks files to learn from.
@@ -84,16 +85,14 @@ def train_encoder(
 
     Raises:
         FileNotFoundError: a tracks file, the output's folder, or the checkpoint is missing.
-        ValueError: tracks, options, device or checkpoint do not fit.
+        ValueError: tracks, outputs, options, device or checkpoint do not fit.
         Interrupted: Ctrl-C; `resume` continues.
     """
     import protomark as pm
 
     options.check()
     _check_device(device)
-    for path in (output, json_path):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise FileNotFoundError(f"{path}: the folder {path.absolute().parent} does not exist")
+    _check_outputs(output, json_path)
     keep_freed_memory()
     threads = threads or os.cpu_count() or 1
     torch.set_num_threads(threads)
@@ -101,12 +100,14 @@ def train_encoder(
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such tracks file")
     data = load_training(training, validation, licences=data_licences, upright=upright)
+    for path in report:
+        _check_report(path, data, upright)
     half = has_fast_bfloat16(device)
     checkpoint = output.with_name(output.name + ".checkpoint")
     trainer = Trainer(data.views, data.trials, options, checkpoint, data.fingerprint, device, half)
     if resume:
         trainer.resume()
-    curve = output.with_suffix(".png")
+    card_path, curve = _beside(output)
     _run(trainer, curve, name or output.stem)
 
     encoder = pm.Encoder(
@@ -156,7 +157,7 @@ def train_encoder(
         history=[(p.step, p.loss, p.mean_precision) for p in trainer.history],
         curve=curve.name,
     )
-    write_text(output.with_suffix(".md"), card.markdown())
+    write_text(card_path, card.markdown())
     if json_path is not None:
         write_text(json_path, json.dumps(asdict(card), indent=1) + "\n")
     checkpoint.unlink(missing_ok=True)
@@ -167,12 +168,46 @@ def default_output(tracks: Path, resume: bool = False, upright: bool = False) ->
     """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
 
     Raises:
-        FileExistsError: it is there already, and would be overwritten.
+        FileExistsError: it, its card or its picture is there already, and would be overwritten.
     """
     output = Path(f"{read_tracks(tracks, upright).descriptor}.pme")
-    if output.exists() and not resume:
-        raise FileExistsError(f"{output} exists and is kept; name another file with -o")
+    for path in (output, *_beside(output)):
+        if path.exists() and not resume:
+            raise FileExistsError(f"{path} exists and is kept; name another file with -o")
     return output
+
+
+def _beside(output: Path) -> tuple[Path, Path]:
+    """The card and the picture of a model file."""
+    return output.with_suffix(".md"), output.with_suffix(".png")
+
+
+def _check_outputs(output: Path, json_path: Path | None) -> None:
+    """Raise before the first step if a result could not be written after the last."""
+    beside = _beside(output)
+    if output in beside:
+        raise ValueError(
+            f"{output}: {output.suffix} is the ending of what is written beside the model; name "
+            "the model .pme"
+        )
+    for path in (output, *beside, json_path):
+        if path is None:
+            continue
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder; name a file to write")
+        if not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"{path}: the folder {path.absolute().parent} does not exist")
+
+
+def _check_report(path: Path, data: TrainingData, upright: bool) -> None:
+    """Raise before the first step if the encoder could not be measured on these tracks."""
+    tracks = read_tracks(path, upright)
+    if (tracks.descriptor, tracks.bits) != (data.descriptor, data.bits):
+        raise ValueError(
+            f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but the encoder is "
+            f"for {data.descriptor} of {data.bits}; report on tracks of the same descriptor"
+        )
+    load_trials(tracks, path, REPORT_SEEDS)
 
 
 def _run(trainer: Trainer, curve: Path, name: str) -> None:

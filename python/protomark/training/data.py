@@ -117,8 +117,8 @@ def load_training(
 
     Raises:
         FileNotFoundError: a file is missing.
-        ValueError: a file is broken, descriptors are mixed or of a length that cannot be trained,
-            or there is too little to learn from.
+        ValueError: a file is broken, a sequence is for training and for validation, descriptors
+            are mixed or of a length that cannot be trained, or there is too little to learn from.
     """
     if not training:
         raise ValueError("no training tracks: give at least one tracks file")
@@ -141,6 +141,7 @@ def load_training(
     views: list[Views] = []
     trials: list[Trial] = []
     sources: list[Source] = []
+    learned: dict[str, str] = {}  # digest of what tracks were made from -> their file
     digest = hashlib.sha256()
     for i, path in enumerate(track([*training, *validation], "reading tracks")):
         tracks = read_tracks(path, upright)
@@ -155,6 +156,15 @@ def load_training(
             raise ValueError(
                 f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but "
                 f"{training[0]} has {descriptor} of {bits}; train on one descriptor at a time"
+            )
+        made_from = str(tracks.info.get("input", ""))
+        if i < len(training):
+            learned[made_from] = path.name
+        elif made_from and made_from in learned:
+            # Tracks with varied copies of the keyframes are another file of the same sequence.
+            raise ValueError(
+                f"{path.name} and {learned[made_from]} are of the same images; validate on a "
+                "sequence that is not trained on"
             )
         digest.update(tracks.descriptors.tobytes())
         digest.update(tracks.landmark_of_keypoint.tobytes())
