@@ -293,7 +293,7 @@ def test_looks_are_a_sealed_map_of_looks_in_the_bytes_of_one_prototype(tmp_path:
     support = Support(landmarks, descriptors)
     chosen = choose(choices([coder]), ["protomark-looks"])
     assert [c.name for c in chosen] == ["looks-17", "looks-33"]
-    assert chosen[1].label == "Protomark, looks, 48 x 4 bits"
+    assert chosen[1].label == "Looks, 48 x 4 bits"
     queries = random_descriptors(30)
     for choice, dim, size in zip(chosen, (24, 48), (17, 33), strict=True):
         scene = pm.PrototypeMap(coder, dim=dim, look_bits=10)

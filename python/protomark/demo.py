@@ -28,7 +28,11 @@ from protomark.tracks.file import Tracks
 
 PICTURE, OPEN_MAP, SEALED_MAP = "protomark_demo.png", "toy.pmk", "toy.sealed.pmk"
 BASELINES = ("unaggregated", "random", "majority", "medoid", "mean", "pca-16", "pca-32", "pca-64")
-OURS = ("protomark-16", "protomark-32", "protomark-64", "protomark-32x4", "looks-33")
+OURS = (
+    *("protomark-16", "protomark-32", "protomark-64"),
+    *("protomark-32x4", "protomark-64x4"),
+    *("looks-17", "looks-33", "looks-65"),
+)
 # Written into the picture, so that a later run knows its own.
 _MADE_BY = "protomark demo"
 # A position as a sealed map keeps it.

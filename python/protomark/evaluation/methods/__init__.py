@@ -139,7 +139,7 @@ def choices(
             listed.append(
                 MethodChoice(
                     f"looks-{size}{tail}",
-                    f"Protomark, looks, {dim} x 4 bits{mark}",
+                    f"Looks, {dim} x 4 bits{mark}",
                     f"protomark-looks{tail}",
                     _looks(encoder, dim, size, threads),
                 )
