@@ -96,6 +96,32 @@ def test_what_it_did_not_write_stays(ring: Path, model: str, tmp_path: Path, nam
     assert [path.name for path in output.iterdir()] == [name]
 
 
+@pytest.mark.parametrize("name", [OPEN_MAP, SEALED_MAP])
+def test_a_map_of_the_users_stays(
+    ring: Path, model: str, encoder: pm.Encoder, tmp_path: Path, name: str
+) -> None:
+    pm.PrototypeMap(encoder).save(tmp_path / name)
+    before = (tmp_path / name).read_bytes()
+    with pytest.raises(FileExistsError, match="was not written by `protomark demo`"):
+        run_demo(tmp_path, tracks_path=ring, encoder=model)
+    assert (tmp_path / name).read_bytes() == before
+
+
+def test_a_run_cut_short_leaves_nothing_in_the_way(
+    ring: Path, model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    output = tmp_path / "demo"
+    with monkeypatch.context() as patch:
+        patch.setattr("protomark.demo._draw", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_demo(output, tracks_path=ring, encoder=model)
+    assert list(output.iterdir()) == []
+    assert (output / SEALED_MAP).name in run_demo(output, tracks_path=ring, encoder=model).files
+
+
 def test_mistakes_are_one_sentence(ring: Path, model: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for arguments, message in (

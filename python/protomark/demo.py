@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -111,13 +112,27 @@ def run_demo(
     check_descriptor(tracks, coder)
     _check_output(output)
     output.mkdir(parents=True, exist_ok=True)
+    # The maps come to their places with the picture, by which a later run knows them as its own.
+    with tempfile.TemporaryDirectory(dir=output, prefix=".protomark-") as maps:
+        rows, shown, files = _compare(tracks, coder, Path(maps), output)
+    encoder_bytes = dict(pm.file_sections(output / SEALED_MAP))["encoder"]
+    seconds = time.perf_counter() - began
+    return DemoResult(rows, shown, str(output), files, encoder_bytes, seconds)
 
+
+def _compare(
+    tracks: Tracks, coder: pm.Encoder, maps: Path, output: Path
+) -> tuple[list[DemoRow], str, dict[str, int]]:
+    """Rows, the name of the one that is shown, and sizes of the files, which are in `output` then.
+
+    `maps` is a folder of the same file system for the maps until then.
+    """
     part = split(tracks, seed=0)
     support = Support(
         tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
     )
     frames = [pose.Frame.of(tracks, int(keyframe)) for keyframe in part.query_keyframes]
-    sealed, shown, files = _write_maps(tracks, part, coder, output)
+    sealed, shown, files = _write_maps(tracks, part, coder, maps)
 
     console.print(
         f"[bold]{tracks.info.get('sequence', 'toy')}[/]: {len(part.support_keyframes)} keyframes "
@@ -175,10 +190,10 @@ def run_demo(
             estimated=[one.cam_from_world for one in ours],
         )
         _draw(rows, next(r for r in rows if r.name == shown), scene, output / PICTURE)
-    encoder_bytes = dict(pm.file_sections(output / SEALED_MAP))["encoder"]
+    for name in (OPEN_MAP, SEALED_MAP):
+        (maps / name).replace(output / name)
     files[PICTURE] = (output / PICTURE).stat().st_size
-    seconds = time.perf_counter() - began
-    return DemoResult(rows, shown, str(output), files, encoder_bytes, seconds)
+    return rows, shown, files
 
 
 def show(result: DemoResult) -> None:
@@ -319,21 +334,19 @@ def _check_output(output: Path) -> None:
     if output.exists() and not output.is_dir():
         raise FileExistsError(f"{output} is not a folder: name another one with --output")
     picture = output / PICTURE
-    foreign = [picture] if picture.exists() and not _is_own_picture(picture) else []
-    for name in (OPEN_MAP, SEALED_MAP):
-        path = output / name
+    if _is_own_picture(picture):
+        return
+    # A map does not say who made it: without the picture it is somebody else's.
+    for path in (picture, output / OPEN_MAP, output / SEALED_MAP):
         if path.exists():
-            try:
-                pm.file_sections(path)
-            except (OSError, ValueError):
-                foreign.append(path)
-    if foreign:
-        raise FileExistsError(
-            f"{foreign[0]} was not written by `protomark demo` and would be replaced: "
-            "name another folder with --output"
-        )
+            raise FileExistsError(
+                f"{path} was not written by `protomark demo` and would be replaced: "
+                "name another folder with --output"
+            )
 
 
 def _is_own_picture(path: Path) -> bool:
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
         return _MADE_BY.encode() in file.read(4096)
