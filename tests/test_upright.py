@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark import sample
+from protomark.build import build_map
 from protomark.cli import app
 from protomark.evaluation.results import load_json
 from protomark.upright import BYTES, upright_descriptors, upright_tracks
@@ -82,3 +83,10 @@ def test_evaluate_gives_only_our_methods_the_longer_descriptors(tmp_path):
     assert result.descriptor == tracks.descriptor
     assert medoid.bytes_per_landmark == [64]
     assert ours.precision[0] > 0.05
+
+    # Without the flag the encoder does not fit, and it is said what is missing.
+    words = ["evaluate", str(sample.path()), "--encoder", str(tmp_path / "u.pme"), "--seeds", "1"]
+    done = CliRunner().invoke(app, [*words, "--methods", "first", "--pose-frames", "0"])
+    assert "give --upright" in " ".join(done.output.split())
+    with pytest.raises(ValueError, match="choose an encoder for freak, or build with --upright"):
+        build_map(tracks, encoder)

@@ -8,7 +8,7 @@ import numpy as np
 
 from protomark import Encoder, PrototypeMap
 from protomark.tracks import Tracks
-from protomark.upright import upright_tracks
+from protomark.upright import SUFFIX, upright_tracks
 
 
 def build_map(
@@ -52,10 +52,11 @@ def build_map(
 def check_descriptor(tracks: Tracks, encoder: Encoder) -> None:
     """Raise ValueError unless the encoder takes the descriptors of the tracks."""
     if encoder.descriptor != tracks.descriptor or encoder.bits != tracks.bits:
+        longer = encoder.descriptor == tracks.descriptor + SUFFIX
         raise ValueError(
             f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, the "
             f"tracks hold {tracks.descriptor} with {tracks.bits}: choose an encoder for "
-            f"{tracks.descriptor}"
+            f"{tracks.descriptor}{', or build with --upright' if longer else ''}"
         )
 
 

@@ -16,7 +16,7 @@ from protomark.evaluation.run import Options, evaluate
 from protomark.evaluation.support import Moments, Support
 from protomark.files import write_text
 from protomark.tracks.file import Tracks
-from protomark.upright import upright_tracks
+from protomark.upright import SUFFIX, upright_tracks
 
 if TYPE_CHECKING:
     import protomark as pm
@@ -161,9 +161,11 @@ def encoders_for(
     ]
     if not fitting:
         whose = "none of the encoders given is" if given else "no encoder ships"
+        longer = any(encoder.descriptor == tracks.descriptor + SUFFIX for encoder in encoders)
+        remedy = "give --upright" if given and longer else "train one with `protomark train`"
         progress_console.print(
             f"note: {whose} for {tracks.descriptor} with {tracks.bits} bits; "
-            "only the other methods are compared (train one with `protomark train`)",
+            f"only the other methods are compared ({remedy})",
             highlight=False,
             soft_wrap=True,
         )
