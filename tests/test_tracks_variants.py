@@ -101,6 +101,7 @@ def test_not_for_measuring_and_not_twice(folder: Path, plain: Tracks) -> None:
 
 
 def test_command_writes_both_and_keeps_what_is_there(folder: Path, tmp_path: Path) -> None:
+    tmp_path /= "of[today]"  # no markup of rich's
     words = ["tracks", str(folder), "-d", "orb", "--max-keypoints", "300", "-o", str(tmp_path)]
     words += ["--variants", "1", "--threads", "1"]
     done = CliRunner().invoke(app, words)
@@ -108,6 +109,7 @@ def test_command_writes_both_and_keeps_what_is_there(folder: Path, tmp_path: Pat
     path = tmp_path / "plane.orb.varied.safetensors"
     assert Tracks.load(path).info["variants"] == 1
     assert "more observations" in done.output
+    assert done.output.count("/of[today]/plane.orb.") == 2
     before = path.stat().st_mtime_ns
     assert CliRunner().invoke(app, words).exit_code == 0
     assert path.stat().st_mtime_ns == before

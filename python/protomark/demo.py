@@ -234,7 +234,9 @@ def show(result: DemoResult) -> None:
     )
     folder = Path(result.folder)
     written = ", ".join(f"{folder / name} ({size(count)})" for name, count in result.files.items())
-    console.print(f"Wrote {written} in {result.seconds:.0f} s.", highlight=False, soft_wrap=True)
+    console.print(
+        f"Wrote {written} in {result.seconds:.0f} s.", markup=False, highlight=False, soft_wrap=True
+    )
 
     rows = {row.name: row for row in result.rows}
     whole = rows["unaggregated"]

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
+
 from protomark.console import console, progress_bar, progress_console
 from protomark.files import write_text
 from protomark.tracks.extract import Progress, Settings, extract, find_source, fingerprint, is_done
@@ -67,6 +69,7 @@ def make_tracks(
                 progress_console.print(
                     f"{target}: is there already, made with these settings; skipped "
                     "(--force makes it anew)",
+                    markup=False,
                     highlight=False,
                     soft_wrap=True,
                 )
@@ -108,7 +111,12 @@ def _make_variants(
         except (ValueError, OSError):
             info = {}
         if all(info.get(key) == value for key, value in want.items()):
-            progress_console.print(f"{output}: is there already; skipped", highlight=False)
+            progress_console.print(
+                f"{output}: is there already; skipped",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
             return
     total = len(tracks.keyframe_names)
     varied = _with_bar(
@@ -120,7 +128,8 @@ def _make_variants(
     varied.save(output)
     added = len(varied.keypoints) - len(tracks.observations)
     console.print(
-        f"[bold]{output}[/]\n  {count} varied copies of each keyframe, {added} more observations",
+        f"[bold]{escape(str(output))}[/]\n  {count} varied copies of each keyframe, "
+        f"{added} more observations",
         highlight=False,
         soft_wrap=True,
     )
@@ -173,7 +182,7 @@ def _with_bar(name: str, make: Callable[[Progress], Tracks]) -> Tracks:
 def print_summary(summary: dict[str, Any], tracks: Tracks) -> None:
     """Counts, error and the histogram of track lengths as a bar chart, on stdout."""
     info = tracks.info
-    console.print(f"[bold]{summary['file']}[/]", highlight=False, soft_wrap=True)
+    console.print(f"[bold]{escape(summary['file'])}[/]", highlight=False, soft_wrap=True)
     console.print(
         f"  {summary['keyframes']} keyframes, {summary['keypoints']} keypoints, "
         f"{summary['landmarks']} landmarks, {summary['observations']} observations "

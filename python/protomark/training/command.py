@@ -358,11 +358,20 @@ def print_summary(card: Card, output: Path) -> None:
                 f"{f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f}",
             )
     console.print(table)
-    console.print(f"{output} ({card.bytes:,} bytes) and {output.with_suffix('.md')}")
+    card_path, curve = _beside(output)
+    console.print(
+        f"{output} ({card.bytes:,} bytes), {card_path} and {curve}",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def explain_interruption(stop: Interrupted, output: Path) -> None:
     """What to do after Ctrl-C, on stderr."""
     progress_console.print(
-        f"{stop}; the same command with --resume continues ({output.name}.checkpoint)"
+        f"{stop}; the same command with --resume continues ({output.name}.checkpoint)",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
     )
