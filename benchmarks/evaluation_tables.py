@@ -142,6 +142,9 @@ def card_table(results: list[SequenceResult]) -> str:
     ]
     for result in results:
         lines.append(f"| {result.sequence} | {_precisions(result, names)} |")
+    missing = [name for name in SPLITS["test"] if name not in {r.sequence for r in results}]
+    if missing:
+        lines += ["", f"Not measured: {', '.join(missing)}."]
     kept = [name for names in BUDGETS.values() for name in names[1:] if name]
     lines += [
         "",
@@ -178,7 +181,11 @@ def ratios(results: list[SequenceResult]) -> str:
         "|---:|---:|---:|---:|---:|---:|",
     ]
     for size, kept in BUDGETS.items():
-        cells = [PAPER.get(size), TARGETS[size], *(mean_ratio(results, name) for name in kept)]
+        # The project set itself targets for FREAK and ORB; the paper has FREAK alone.
+        descriptor = results[0].descriptor
+        paper = PAPER.get(size) if descriptor == "freak" else None
+        target = TARGETS[size] if descriptor in ("freak", "orb") else None
+        cells = [paper, target, *(mean_ratio(results, name) for name in kept)]
         texts = ["–" if cell is None else f"{cell:.3f}" for cell in cells]
         lines.append(f"| {size} | " + " | ".join(texts) + " |")
     return "\n".join(lines) + "\n"
