@@ -2,16 +2,22 @@
 #include "ward.h"
 
 #include <numeric>
+#include <utility>
 
 namespace protomark {
 namespace {
+
+// Comparing all pairs of more rows would take seconds and, in a file made to that end, minutes. A
+// sealed map keeps far fewer of any landmark.
+constexpr std::size_t kMostCompared = 2048;
 
 // Prototypes that are left, and for each the cheapest partner after it. (Muellner 2011, "Modern
 // hierarchical, agglomerative clustering algorithms", calls this the generic algorithm.)
 class Clusters {
  public:
+  // Joins made on the way to a number of rows that can be compared go to `joins`.
   Clusters(std::span<const std::int16_t> sums, std::span<const std::uint8_t> counts,
-           std::size_t dim)
+           std::size_t dim, std::vector<Join>& joins)
       : dim_(dim),
         sums_(sums.begin(), sums.end()),
         counts_(counts.begin(), counts.end()),
@@ -19,6 +25,7 @@ class Clusters {
         partner_(counts.size(), 0),
         cost_(counts.size(), 0) {
     std::iota(left_.begin(), left_.end(), std::size_t{0});
+    while (left_.size() > kMostCompared) halve(joins);
     for (std::size_t at = 0; at + 1 < left_.size(); ++at) find_partner(at);
   }
 
@@ -33,8 +40,7 @@ class Clusters {
     const std::size_t into = left_[best], from = partner_[into];
     const Join result{cost_[into], static_cast<std::uint16_t>(into),
                       static_cast<std::uint16_t>(from)};
-    for (std::size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[from * dim_ + d];
-    counts_[into] += counts_[from];
+    merge(into, from);
     std::erase(left_, from);
     for (std::size_t at = 0; at + 1 < left_.size() && left_[at] < from; ++at) {
       const std::size_t row = left_[at];
@@ -48,6 +54,24 @@ class Clusters {
   }
 
  private:
+  void merge(std::size_t into, std::size_t from) {
+    for (std::size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[from * dim_ + d];
+    counts_[into] += counts_[from];
+  }
+
+  // Each second row goes into the one before it.
+  void halve(std::vector<Join>& joins) {
+    std::vector<std::size_t> left;
+    for (std::size_t at = 0; at < left_.size(); at += 2) {
+      left.push_back(left_[at]);
+      if (at + 1 == left_.size()) break;
+      merge(left_[at], left_[at + 1]);
+      joins.push_back(
+          {0.0, static_cast<std::uint16_t>(left_[at]), static_cast<std::uint16_t>(left_[at + 1])});
+    }
+    left_ = std::move(left);
+  }
+
   void find_partner(std::size_t at) {
     const std::size_t row = left_[at];
     partner_[row] = left_[at + 1];
@@ -97,7 +121,7 @@ class Clusters {
 std::vector<Join> ward_joins(std::span<const std::int16_t> sums,
                              std::span<const std::uint8_t> counts, std::size_t dim) {
   std::vector<Join> result;
-  Clusters clusters(sums, counts, dim);
+  Clusters clusters(sums, counts, dim, result);
   while (clusters.size() > 1) result.push_back(clusters.join());
   return result;
 }

@@ -85,5 +85,18 @@ int main() {
   // Half of the rows at each end: 2 dimensions, 254 apart, n m / (n + m) = 300 * 255 / 2.
   CHECK(joins.back().cost == 2.0 * 254 * 254 * (300 * 255 / 2));
   CHECK(ward_joins({}, {}, 3).empty());
+
+  // As many rows as there can be, which took minutes before neighbours were joined first.
+  const std::size_t most = 65536;
+  std::vector<std::int16_t> many(most);
+  for (std::size_t i = 0; i < most; ++i) many[i] = static_cast<std::int16_t>(i % 251);
+  const auto all = ward_joins(many, std::vector<std::uint8_t>(most, 1), 1);
+  CHECK(all.size() == most - 1);
+  CHECK(all[0].into == 0 && all[0].from == 1 && all[0].cost == 0);
+  std::vector<bool> gone(most, false);
+  for (const auto& join : all) {
+    CHECK(join.into < join.from && !gone[join.into] && !gone[join.from]);
+    gone[join.from] = true;
+  }
   return check::result();
 }

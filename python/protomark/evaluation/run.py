@@ -65,6 +65,7 @@ def evaluate(
     depth = pose.scene_depth(tracks)
     for seed in options.seeds:
         part = split(tracks, seed)
+        sources = [tracks] if own is tracks else [tracks, own]
         # The same keypoints either way; only the bytes of their descriptors may differ.
         supports = {
             id(source): Support(
@@ -72,9 +73,9 @@ def evaluate(
                 source.descriptors[part.support_rows],
                 seed,
             )
-            for source in (tracks, own)
+            for source in sources
         }
-        frames = {id(t): draw_frames(t, part, options.pose_frames) for t in (tracks, own)}
+        frames = {id(t): draw_frames(t, part, options.pose_frames) for t in sources}
         support = supports[id(tracks)]
         sizes.append((len(support.ids), len(part.support_rows), len(part.query_rows)))
         for choice, result in zip(methods, results, strict=True):

@@ -155,9 +155,7 @@ def _copy(
     there = np.column_stack([features.keypoints - 0.5, np.ones(len(features))])
     back = there @ np.linalg.inv(homography).T
     xy = back[:, :2] / back[:, 2:] + 0.5
-    distances = ((xy[:, None] - keypoints[None]) ** 2).sum(2)
-    nearest = distances.argmin(1)
-    gap = distances[np.arange(len(xy)), nearest]
+    nearest, gap = _nearest(xy, keypoints)
     ratio = features.sizes / scale / sizes[nearest]
     fits = (gap < _NEAR**2) & (ratio < _SIZES) & (ratio > 1 / _SIZES)
     # A keypoint of the original takes the closest one that fits.
@@ -171,6 +169,20 @@ def _copy(
     features.angles[known] = np.mod(features.angles[known] - np.float32(angle), 360)
     features.angles[features.angles >= 360] = 0
     return _where(features, keep), landmarks[nearest[keep]]
+
+
+def _nearest(
+    xy: NDArray[np.float64], keypoints: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Of each point (n, 2) the nearest keypoint and its squared distance, in bounded memory."""
+    nearest, gap = np.empty(len(xy), np.int64), np.empty(len(xy))
+    for at in range(0, len(xy), 512):
+        rows = slice(at, at + 512)
+        distances = (xy[rows, None, 0] - keypoints[None, :, 0]) ** 2
+        distances += (xy[rows, None, 1] - keypoints[None, :, 1]) ** 2
+        nearest[rows] = distances.argmin(1)
+        gap[rows] = distances.min(1)
+    return nearest, gap
 
 
 def _where(features: Features, keep: NDArray[np.bool_]) -> Features:
