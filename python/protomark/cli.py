@@ -290,8 +290,10 @@ def build(
 ) -> None:
     """Build a map from a tracks file: prototypes of each landmark, and its position."""
     from protomark.build import build_file
+    from protomark.evaluation.command import check_outputs
     from protomark.info import describe, show
 
+    check_outputs(output, json_file)
     build_file(
         tracks,
         output,
