@@ -249,7 +249,10 @@ def main() -> int:
         upright = ROOT / "benchmarks" / "results" / f"upright.{descriptor}.json"
         if upright.is_file():
             parts.append(f"#### Cameras that do not roll: `{descriptor}-upright`\n")
-            parts.append(upright_table(same, load_json(upright)))
+            table = upright_table(same, load_json(upright))
+            parts.append(table)
+            heading = "## Beside the plain encoder\n\n"
+            replace_tables(MODELS / f"{descriptor}-upright.md", heading + table)
     parts.append("### Every figure\n")
     for split, members in SPLITS.items():
         chosen = [result for result in results if result.sequence in members]
@@ -260,9 +263,10 @@ def main() -> int:
     for descriptor in dict.fromkeys(result.descriptor for result in tests):
         card = MODELS / f"{descriptor}.md"
         if card.is_file():
-            _measure_encoding(card)
             replace_tables(card, card_table([r for r in tests if r.descriptor == descriptor]))
 
+    for card in sorted(MODELS.glob("*.md")):
+        _measure_encoding(card)
     failures, notes = check(results)
     for note in notes:
         print(f"int8 alone is not above PCA: {note}")
