@@ -50,9 +50,20 @@ std::uint32_t PrototypeStore::find_row(std::uint32_t landmark, std::uint16_t loo
   return row;
 }
 
+namespace {
+
+// Room for more elements, growing as push_back does, so that adding them cannot fail half-way.
+template <typename T, typename Allocator>
+void make_room(std::vector<T, Allocator>& v, std::size_t more) {
+  if (v.capacity() - v.size() < more) v.reserve(std::max(2 * v.capacity(), v.size() + more));
+}
+
+}  // namespace
+
 std::uint32_t PrototypeStore::find_or_create_row(std::int64_t id, std::uint16_t look) {
   std::uint32_t landmark = find(id);
   if (landmark == kNone) {
+    make_room_for_row();  // so that a landmark that is there has a row
     landmark = create_landmark(id);
   } else if (const std::uint32_t row = find_row(landmark, look); row != kNone) {
     return row;
@@ -64,15 +75,34 @@ std::uint32_t PrototypeStore::create_landmark(std::int64_t id) {
   // Checked here for the row that will follow, so that no landmark is left without one.
   if (rows() >= kNone) throw std::length_error("a map holds under 2^32 prototypes");
   const auto landmark = static_cast<std::uint32_t>(landmarks());
+  make_room(ids_, 1);
+  make_room(positions_, 1);
+  make_room(heads_, 1);
   ids_.push_back(id);
+  try {
+    index_.insert(ids_, landmark);
+  } catch (...) {
+    ids_.pop_back();
+    throw;
+  }
   if (!positions_.empty()) positions_.push_back(kNowhere);
   if (look_bits_ != 0) heads_.push_back(kNone);
-  index_.insert(ids_, landmark);
   return landmark;
+}
+
+void PrototypeStore::make_room_for_row() {
+  make_room(sums_, dim_);
+  make_room(counts_, 1);
+  make_room(packed_, packed_size(rows() + 1, dim_) - packed_.size());
+  if (look_bits_ == 0) return;
+  make_room(looks_, 1);
+  make_room(owners_, 1);
+  make_room(next_, 1);
 }
 
 std::uint32_t PrototypeStore::create_row(std::uint32_t landmark, std::uint16_t look) {
   if (rows() >= kNone) throw std::length_error("a map holds under 2^32 prototypes");
+  make_room_for_row();
   const auto row = static_cast<std::uint32_t>(rows());
   sums_.resize(sums_.size() + dim_, 0);
   counts_.push_back(0);

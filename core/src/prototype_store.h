@@ -41,6 +41,8 @@ class PrototypeStore {
   // needs a row at once; a new row has a sum and count of zero.
   std::uint32_t create_landmark(std::int64_t id);
   std::uint32_t create_row(std::uint32_t landmark, std::uint16_t look);
+  // Afterwards the next create_row does not throw for want of memory.
+  void make_room_for_row();
   // With its last row a landmark leaves.
   void erase_row(std::uint32_t row);
   void erase(std::int64_t id);

@@ -111,11 +111,20 @@ void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes code
   const std::unique_lock lock(store_->mutex);
   std::vector<std::uint32_t> rows;
   rows.reserve(landmarks.size());
-  for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    rows.push_back(store_->find_or_create_row(landmarks[i], store_->look_of(codes.row(i))));
-    store_->add(rows.back(), codes.row(i));
+  // Out of memory half-way: what was added stays, and answers.
+  const auto refresh = [&] {
+    for (const std::uint32_t row : rows) store_->refresh(row);
+  };
+  try {
+    for (std::size_t i = 0; i < landmarks.size(); ++i) {
+      rows.push_back(store_->find_or_create_row(landmarks[i], store_->look_of(codes.row(i))));
+      store_->add(rows.back(), codes.row(i));
+    }
+  } catch (...) {
+    refresh();
+    throw;
   }
-  for (const std::uint32_t row : rows) store_->refresh(row);
+  refresh();
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors descriptors,
