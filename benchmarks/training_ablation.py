@@ -62,6 +62,7 @@ VARIANTS = (
     Variant("no bit noise", "data", {"noise": 0.0}),
     Variant("2 views in the support", "objective", {"views": 3, "queries": 3}),
     Variant("batches of 300 landmarks", "objective", {"landmarks": 300}),
+    Variant("batches of 2000 landmarks", "objective", {"landmarks": 2000}),
     Variant("32 alone", "nesting", {"dims": (32,)}),
     Variant("linear", "capacity", {"hidden": ()}),
     Variant("256 hidden units", "capacity", {"hidden": (256,)}),
