@@ -67,9 +67,14 @@ def draw_precision(axes: Axes, rows: Sequence[Summary], title: str = "") -> None
     _place(axes, labels)
     axes.set_xscale("log", base=2)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
-    axes.set_xlabel("bytes per landmark (log)", color=INK)
-    axes.set_ylabel("precision", color=INK)
     axes.set_title(title, loc="left", color=INK, fontsize=11, fontweight="bold")
+    style_axes(axes, "bytes per landmark (log)", "precision")
+
+
+def style_axes(axes: Axes, x: str, y: str) -> None:
+    """Labels, grid and frame as all plots have them."""
+    axes.set_xlabel(x, color=INK)
+    axes.set_ylabel(y, color=INK)
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(colors=MUTED, length=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protomark.evaluation.plot import GRID, INK, MUTED, save_figure
+from protomark.evaluation.plot import INK, MUTED, save_figure, style_axes
 from protomark.reproduce.paper import PRECISION_BY_DIM, TABLE
 from protomark.reproduce.results import Curve, Results
 from protomark.reproduce.training import LAYERS, OBJECTIVES, SHAPES
@@ -40,7 +40,7 @@ def draw_depth(results: Results) -> Figure:
                 linewidth=1.8,
             )
     axes.set_xticks(LAYERS)
-    _style(axes, "layers", f"precision on {', '.join(results.names('validation'))}")
+    style_axes(axes, "layers", f"precision on {', '.join(results.names('validation'))}")
     axes.set_title("Precision against depth, 16 outputs", **_TITLE)
     axes.legend(frameon=False, labelcolor=INK, fontsize=9)
     return figure
@@ -73,8 +73,8 @@ def draw_dimension(results: Results) -> Figure:
         TABLE["unaggregated"], color=MUTED, linewidth=1, ls=":", label="unaggregated, the paper's"
     )
     share.axhline(1, color=INK, linewidth=1)
-    _style(plain, "dimensions of a prototype", "precision, mean of test sequences")
-    _style(share, "dimensions of a prototype", "share of the unaggregated precision")
+    style_axes(plain, "dimensions of a prototype", "precision, mean of test sequences")
+    style_axes(share, "dimensions of a prototype", "share of the unaggregated precision")
     plain.set_title("Precision against dimension", **_TITLE)
     plain.legend(frameon=False, labelcolor=INK, fontsize=8.5, loc="lower right")
     return figure
@@ -102,15 +102,3 @@ def _line(axes: Axes, curve: Curve, by: float, hollow: bool) -> None:
         color=_COLOURS[curve.training.objective],
         label=f"ours: {curve.training.label}",
     )
-
-
-def _style(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x, color=INK)
-    axes.set_ylabel(y, color=INK)
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=MUTED, length=0)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(GRID)
