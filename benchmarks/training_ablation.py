@@ -25,9 +25,8 @@ import protomark as pm
 from documents import replace_tables
 from protomark.console import progress_bar
 from protomark.files import replacing, write_text
-from protomark.tracks.file import Tracks
+from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.command import unaggregated_precision
-from protomark.training.data import sequence_name
 from protomark.training.network import default_hidden, embed
 from protomark.training.sampling import Views
 from protomark.training.train import Options, Trainer, has_fast_bfloat16, keep_freed_memory

@@ -13,8 +13,9 @@ import pytest
 
 import protomark as pm
 from evaluation_scene import ring_scene
-from protomark.evaluation.command import encoders_for, learn, sequence_name
+from protomark.evaluation.command import encoders_for, learn
 from protomark.evaluation.results import load_json
+from protomark.tracks.file import sequence_name
 
 
 def evaluate(*arguments: Any) -> subprocess.CompletedProcess[str]:

@@ -15,7 +15,7 @@ from protomark.evaluation.results import SequenceResult, mean_rows, save_json
 from protomark.evaluation.run import Options, evaluate
 from protomark.evaluation.support import Moments, Support
 from protomark.files import write_text
-from protomark.tracks.file import Tracks
+from protomark.tracks.file import Tracks, sequence_name
 from protomark.upright import SUFFIX, upright_tracks
 
 if TYPE_CHECKING:
@@ -131,11 +131,6 @@ def plot_paths(results: Sequence[SequenceResult], path: Path) -> dict[str, Path]
     if len(descriptors) == 1:
         return {descriptors[0]: path}
     return {name: path.with_name(f"{path.stem}.{name}{path.suffix}") for name in descriptors}
-
-
-def sequence_name(path: Path) -> str:
-    """The file's name up to its first dot: toy for toy.freak.safetensors."""
-    return path.name.split(".")[0] or path.name
 
 
 def load_encoders(sources: Sequence[str]) -> list[pm.Encoder]:

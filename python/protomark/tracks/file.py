@@ -231,3 +231,8 @@ class Tracks:
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path}: broken tracks file ({error!r})") from None
         return tracks
+
+
+def sequence_name(path: Path) -> str:
+    """The name of a sequence, its file's up to the first dot: toy for toy.freak.safetensors."""
+    return path.name.split(".")[0] or path.name

@@ -20,7 +20,7 @@ from protomark.evaluation.methods.bitwise import majority
 from protomark.evaluation.methods.medoid import medoid
 from protomark.evaluation.support import Support
 from protomark.files import write_text
-from protomark.tracks.file import Tracks
+from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.card import Card, Figures, describe_data
 from protomark.training.curve import save_curve, sparkline
 from protomark.training.data import (
@@ -28,7 +28,6 @@ from protomark.training.data import (
     load_training,
     load_trials,
     read_tracks,
-    sequence_name,
 )
 from protomark.training.network import embed
 from protomark.training.train import (

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from protomark.console import track
-from protomark.tracks.file import Tracks
+from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.sampling import Views
 from protomark.training.validation import Trial
 from protomark.upright import upright_tracks
@@ -61,11 +61,6 @@ class TrainingData:
     sources: list[Source]
     validation_sources: list[Source]
     fingerprint: str
-
-
-def sequence_name(path: Path) -> str:
-    """The name of a sequence: its file's name up to the first dot."""
-    return path.name.split(".")[0]
 
 
 def read_tracks(path: Path, upright: bool) -> Tracks:
