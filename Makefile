@@ -8,12 +8,13 @@ JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-python test-cpp check format clean
+.PHONY: help demo test test-python test-cpp test-arm check format clean
 help:
-	@echo "make demo    run the main job on the sample that ships"
-	@echo "make test    run the tests (C++ and Python)"
-	@echo "make check   formatting, lint and types of both languages"
-	@echo "make format  rewrite sources in the project's format"
+	@echo "make demo      run the main job on the sample that ships"
+	@echo "make test      run the tests (C++ and Python)"
+	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
+	@echo "make check     formatting, lint and types of both languages"
+	@echo "make format    rewrite sources in the project's format"
 
 demo: .venv/installed
 	.venv/bin/protomark demo
@@ -33,6 +34,15 @@ test-cpp: .venv-test/installed
 	  -DCMAKE_PREFIX_PATH=$(abspath build/prefix) > /dev/null
 	.venv-test/bin/cmake --build build/consumer
 	build/consumer/01_build_and_search python/protomark/models/freak.pme build
+
+# 64-bit ARM, NEON included, by Debian's cross compiler and qemu-user.
+test-arm: .venv-test/installed
+	@command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64 >/dev/null || { \
+	  echo "make test-arm needs: apt-get install g++-aarch64-linux-gnu qemu-user"; exit 1; }
+	$(call cmake,.venv-test) -S core -B build/arm -DPROTOMARK_BUILD_TESTS=ON \
+	  -DCMAKE_TOOLCHAIN_FILE=aarch64-linux.cmake > /dev/null
+	.venv-test/bin/cmake --build build/arm -j$(JOBS)
+	.venv-test/bin/ctest --test-dir build/arm --output-on-failure
 
 check: .venv-check/installed
 	.venv-check/bin/ruff format --check

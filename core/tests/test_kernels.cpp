@@ -101,10 +101,10 @@ void compare_hamming(const Kernels& set, test::Random& random, std::size_t words
 int main() {
   test::Random random(7);
   int sets = 0;
-  for (const char* name : {"portable", "avx512"}) {
-    const Kernels* set = kernels::find(name);
-    if (set == nullptr) continue;
-    std::printf("%s\n", name);
+  for (const char* const* name = kernels::names(); *name != nullptr; ++name) {
+    const Kernels* set = kernels::find(*name);
+    CHECK(set != nullptr);
+    std::printf("%s\n", *name);
     ++sets;
     for (int style = 0; style < 3; ++style) {
       for (const std::size_t inputs : {16, 64, 1024}) {

@@ -1,4 +1,4 @@
-// AVX-512 with VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
+// AVX-512 with VBMI, VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
 #include <immintrin.h>
 
 #include "kernels.h"
@@ -135,6 +135,11 @@ std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed
 
 }  // namespace
 
-const Kernels avx512 = {"avx512", dense, code_offsets, code_unpack4, code_scan, hamming_scan};
+const Kernels avx512 = {.name = "avx512",
+                        .dense = dense,
+                        .code_offsets = code_offsets,
+                        .code_unpack4 = code_unpack4,
+                        .code_scan = code_scan,
+                        .hamming_scan = hamming_scan};
 
 }  // namespace protomark::kernels

@@ -1,8 +1,14 @@
 // Which kernels run on this CPU.
+#include <algorithm>
+#include <array>
 #include <cstdlib>
 #include <cstring>
 #include <stdexcept>
 #include <string>
+
+#if defined(__aarch64__) && defined(__linux__)
+#include <sys/auxv.h>
+#endif
 
 #include "kernels.h"
 
@@ -10,34 +16,93 @@ namespace protomark::kernels {
 namespace {
 
 #if defined(__x86_64__)
+bool has_avx2() { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("popcnt"); }
+
 bool has_avx512() {
-  return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-         __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512vnni") &&
-         __builtin_cpu_supports("avx512vpopcntdq");
+  return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+         __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512vbmi") &&
+         __builtin_cpu_supports("avx512vnni") && __builtin_cpu_supports("avx512vpopcntdq");
+}
+#elif defined(__aarch64__)
+bool has_dot_product() {
+#if defined(__APPLE__)
+  return true;
+#elif defined(__linux__)
+  constexpr unsigned long kAsimdDotProduct = 1ul << 20;  // HWCAP_ASIMDDP
+  return (getauxval(AT_HWCAP) & kAsimdDotProduct) != 0;
+#else
+  return false;
+#endif
 }
 #endif
 
+// What `set` does and, for what it leaves out, what `below` does.
+Kernels over(const Kernels& set, const Kernels& below) {
+  Kernels result = below;
+  result.name = set.name;
+  const auto take = [](auto& mine, auto theirs) {
+    if (theirs != nullptr) mine = theirs;
+  };
+  take(result.dense, set.dense);
+  take(result.code_offsets, set.code_offsets);
+  take(result.code_unpack4, set.code_unpack4);
+  take(result.code_scan, set.code_scan);
+  take(result.hamming_scan, set.hamming_scan);
+  return result;
+}
+
+// All that run here, complete, best first.
+struct Sets {
+  std::array<Kernels, 4> kernels;
+  std::array<const char*, 5> names{};
+  std::size_t size = 0;
+
+  Sets() {
+    add(portable);
+#if defined(__x86_64__)
+    if (has_avx2()) add(avx2);
+    if (has_avx512()) add(avx512);
+#elif defined(__aarch64__)
+    if (has_dot_product()) add(neon);
+#endif
+    std::reverse(kernels.begin(), kernels.begin() + size);
+    for (std::size_t i = 0; i < size; ++i) names[i] = kernels[i].name;
+  }
+
+  void add(const Kernels& set) {
+    kernels[size] = size == 0 ? set : over(set, kernels[size - 1]);
+    ++size;
+  }
+};
+
+const Sets& sets() {
+  static const Sets found;
+  return found;
+}
+
 const Kernels& choose() {
   const char* wanted = std::getenv("PROTOMARK_ISA");
-  if (wanted != nullptr && *wanted != '\0') {
-    if (const Kernels* found = find(wanted)) return *found;
-    throw std::invalid_argument("PROTOMARK_ISA=" + std::string(wanted) +
-                                ": no such instruction set on this machine; "
-                                "leave it unset or use portable");
+  if (wanted == nullptr || *wanted == '\0') return sets().kernels.front();
+  if (const Kernels* found = find(wanted)) return *found;
+  std::string known;
+  for (const char* const* name = names(); *name != nullptr; ++name) {
+    known += (known.empty() ? "" : ", ") + std::string(*name);
   }
-  if (const Kernels* found = find("avx512")) return *found;
-  return portable;
+  throw std::invalid_argument("PROTOMARK_ISA=" + std::string(wanted) +
+                              ": no such instruction set on this machine; leave it unset or use " +
+                              known);
 }
 
 }  // namespace
 
 const Kernels* find(const char* name) {
-  if (std::strcmp(name, "portable") == 0) return &portable;
-#if defined(__x86_64__)
-  if (std::strcmp(name, "avx512") == 0 && has_avx512()) return &avx512;
-#endif
+  for (std::size_t i = 0; i < sets().size; ++i) {
+    if (std::strcmp(sets().names[i], name) == 0) return &sets().kernels[i];
+  }
   return nullptr;
 }
+
+const char* const* names() { return sets().names.data(); }
 
 const Kernels& active() {
   static const Kernels& chosen = choose();

@@ -113,6 +113,11 @@ std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed
 
 }  // namespace
 
-const Kernels portable = {"portable", dense, code_offsets, code_unpack4, code_scan, hamming_scan};
+const Kernels portable = {.name = "portable",
+                          .dense = dense,
+                          .code_offsets = code_offsets,
+                          .code_unpack4 = code_unpack4,
+                          .code_scan = code_scan,
+                          .hamming_scan = hamming_scan};
 
 }  // namespace protomark::kernels
