@@ -5,8 +5,6 @@
 #include <stdexcept>
 #include <string>
 
-#include "kernels/kernels.h"
-
 namespace protomark {
 namespace {
 
@@ -14,6 +12,9 @@ static_assert(kPackedRows == kernels::kCodeRows);
 
 // Squared distances reach 256 * 254^2 < 2^24, which float holds exactly; this is beyond all.
 constexpr std::int32_t kNoLimit = 1 << 25;
+
+// Codes that are compared with all queries at a time; they stay in the L2 cache.
+constexpr std::size_t kChunkBytes = 64 * 1024;
 
 std::int32_t squared_norm(const std::int8_t* code, std::size_t dim) {
   std::int32_t sum = 0;
@@ -63,9 +64,9 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
       unsigned_codes_(queries.rows * dim_, 128),
       best_ids_(queries.rows * kept_),
       best_distances_(queries.rows * kept_),
-      offsets_(kChunkRows),
-      hit_rows_(kChunkRows),
-      hit_distances_(kChunkRows) {
+      chunk_rows_(std::max<std::size_t>(kChunkBytes / dim_ / kPackedRows, 1) * kPackedRows),
+      biases_(chunk_rows_),
+      hits_(kernels::kHitRoom) {
   best_.reserve(queries.rows);
   for (std::size_t q = 0; q < queries.rows; ++q) {
     const std::int8_t* code = queries.row(q);
@@ -76,16 +77,25 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
   }
 }
 
+void CodeScan::gather(std::span<const std::uint32_t> queries) {
+  gathered_.resize(queries.size() * dim_);
+  for (std::size_t i = 0; i < queries.size(); ++i) {
+    std::copy_n(&unsigned_codes_[queries[i] * dim_], dim_, &gathered_[i * dim_]);
+  }
+}
+
 void CodeScan::start_chunk(const std::int8_t* packed, std::size_t rows) {
   packed_ = packed;
   blocks_ = (rows + kPackedRows - 1) / kPackedRows;
-  kernels::active().code_offsets(packed_, blocks_, dim_, offsets_.data());
+  kernels::active().code_biases(packed_, blocks_, dim_, biases_.data());
 }
 
-std::size_t CodeScan::scan_chunk(std::uint32_t query) {
-  return kernels::active().code_scan(&unsigned_codes_[query * dim_], packed_, blocks_, dim_,
-                                     offsets_.data(), best_[query].limit(),
-                                     {hit_rows_.data(), hit_distances_.data()});
+std::size_t CodeScan::scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
+                                 std::size_t* block) {
+  std::int32_t limits[kernels::kScanQueries];
+  for (std::size_t i = 0; i < group.size(); ++i) limits[i] = best_[group[i]].limit();
+  return kernels::active().code_scan({&gathered_[first * dim_], limits, group.size()},
+                                     {packed_, biases_.data(), blocks_, dim_}, block, hits_.data());
 }
 
 void CodeScan::finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const {

@@ -17,12 +17,6 @@ using kernels::kWordRows;
 // Rows that are packed at a time and then compared with all queries; they stay in the L2 cache.
 constexpr std::size_t kChunkRows = 1024;
 
-std::vector<std::uint64_t> to_words(const std::uint8_t* bytes, std::size_t n, std::size_t words) {
-  std::vector<std::uint64_t> result(words, 0);
-  std::memcpy(result.data(), bytes, n);
-  return result;
-}
-
 // Packs rows begin to end as the kernels want them (kernels.h), missing rows as zeros.
 void pack(Descriptors database, std::size_t begin, std::size_t end, std::size_t words,
           std::vector<std::uint64_t>& packed) {
@@ -69,26 +63,32 @@ void search(Descriptors queries, Descriptors database, const HammingOptions& opt
   const kernels::Kernels& kernel = kernels::active();
 
   parallel_for(options.threads, queries.rows, 16, [&](std::size_t first, std::size_t last) {
+    const std::size_t n = last - first;
     std::vector<TopK> best;
-    std::vector<std::vector<std::uint64_t>> query;
-    for (std::size_t q = first; q < last; ++q) {
-      best.emplace_back(ids.row(q), distances.row(q), ids.columns, limit);
-      query.push_back(to_words(queries.row(q), queries.columns, words));
+    best.reserve(n);
+    std::vector<std::uint64_t> query_words(n * words, 0);
+    for (std::size_t q = 0; q < n; ++q) {
+      best.emplace_back(ids.row(first + q), distances.row(first + q), ids.columns, limit);
+      std::memcpy(&query_words[q * words], queries.row(first + q), queries.columns);
     }
     std::vector<std::uint64_t> packed;
-    std::vector<std::uint32_t> hit_rows(kChunkRows);
-    std::vector<std::int32_t> hit_distances(kChunkRows);
+    std::vector<kernels::Hit> hits(kernels::kHitRoom);
+    std::int32_t limits[kernels::kScanQueries];
     for (std::size_t begin = 0; begin < database.rows; begin += kChunkRows) {
       const std::size_t end = std::min(database.rows, begin + kChunkRows);
       pack(database, begin, end, words, packed);
       const std::size_t blocks = (end - begin + kWordRows - 1) / kWordRows;
-      for (std::size_t q = 0; q < best.size(); ++q) {
-        const std::size_t found =
-            kernel.hamming_scan(query[q].data(), packed.data(), blocks, words, best[q].limit(),
-                                {hit_rows.data(), hit_distances.data()});
-        for (std::size_t i = 0; i < found; ++i) {
-          const std::size_t row = begin + hit_rows[i];
-          if (row < end) offer(best[q], hit_distances[i], row);
+      for (std::size_t q = 0; q < n; q += kernels::kScanQueries) {
+        const std::size_t group = std::min(kernels::kScanQueries, n - q);
+        for (std::size_t block = 0; block < blocks;) {
+          for (std::size_t i = 0; i < group; ++i) limits[i] = best[q + i].limit();
+          const std::size_t found =
+              kernel.hamming_scan({&query_words[q * words], limits, group},
+                                  {packed.data(), blocks, words}, &block, hits.data());
+          for (std::size_t i = 0; i < found; ++i) {
+            const std::size_t row = begin + hits[i].row;
+            if (row < end) offer(best[q + hits[i].query], hits[i].distance, row);
+          }
         }
       }
     }

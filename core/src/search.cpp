@@ -12,7 +12,7 @@ namespace protomark {
 namespace {
 
 // Rows that are compared with all queries at a time; codes and landmarks stay in the L1 cache.
-constexpr std::size_t kChunkRows = 32 * kPackedRows;
+constexpr std::size_t kChunkRows = 256 * kPackedRows;
 
 // The landmarks of a map's rows, chunk after chunk from the first row.
 class RowLandmarkCursor {

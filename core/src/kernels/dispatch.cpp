@@ -44,7 +44,7 @@ Kernels over(const Kernels& set, const Kernels& below) {
     if (theirs != nullptr) mine = theirs;
   };
   take(result.dense, set.dense);
-  take(result.code_offsets, set.code_offsets);
+  take(result.code_biases, set.code_biases);
   take(result.code_unpack4, set.code_unpack4);
   take(result.code_scan, set.code_scan);
   take(result.hamming_scan, set.hamming_scan);
