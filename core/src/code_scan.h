@@ -70,15 +70,15 @@ class CodeScan {
 
   Codes codes_;
   SearchOptions options_;
-  std::size_t dim_;         // of packed blocks
-  std::size_t kept_;        // landmarks a query
+  std::size_t dim_;   // of packed blocks
+  std::size_t kept_;  // landmarks a query
   std::vector<std::uint8_t> unsigned_codes_;
   std::vector<std::int64_t> best_ids_;
   std::vector<std::int32_t> best_distances_;
   std::vector<TopK> best_;
 
   std::vector<std::uint8_t> gathered_;   // codes of the queries that are compared
-  std::size_t chunk_rows_;  // compared with all queries at a time
+  std::size_t chunk_rows_;               // compared with all queries at a time
   const std::int8_t* packed_ = nullptr;  // the chunk
   std::size_t blocks_ = 0;
   std::vector<std::int32_t> biases_;

@@ -1,6 +1,7 @@
 // AVX-512 with VBMI, VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
 #include <immintrin.h>
 
+#include "avx512_hits.h"
 #include "kernels.h"
 
 namespace protomark::kernels {
@@ -41,7 +42,7 @@ void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, 
   for (; i < n; ++i) dense_batch<1>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
 }
 
-// -|p|^2 - 256 sum(p), see scan_tile.
+// -|p|^2 - 256 sum(p), see avx512_hits.h.
 void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
                  std::int32_t* biases) {
   const __m512i ones = _mm512_set1_epi8(1);
@@ -85,10 +86,14 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
   }
 }
 
+// _mm512_dpbusd_epi32 in place: of that, GCC makes two copies of every accumulator a step.
+void add_products(__m512i& acc, __m512i u, __m512i s) {
+  __asm__("vpdpbusd %2, %1, %0" : "+v"(acc) : "v"(u), "v"(s));
+}
+
 struct CodeTile {
   const std::uint8_t* queries;
   const std::int32_t* limits;
-  const std::int32_t* thresholds;
   const std::int8_t* rows;
   const std::int32_t* biases;
   std::size_t dim;
@@ -96,9 +101,6 @@ struct CodeTile {
   std::size_t first_row;
 };
 
-// A negated distance is 2 p . (q + 128) + bias. The accumulators start from half the bias, rounded
-// down, and so end with half of that, rounded down: what is not below half the negated limit may be
-// a hit, and the bit that was lost tells.
 template <int Queries, int Blocks>
 std::size_t scan_tile(const CodeTile& t, Hit* hits) {
   __m512i acc[Queries][Blocks];
@@ -117,7 +119,7 @@ std::size_t scan_tile(const CodeTile& t, Hit* hits) {
     for (int q = 0; q < Queries; ++q) {
       const __m512i query = _mm512_set1_epi32(load4(t.queries + q * t.dim + d));
 #pragma GCC unroll 8
-      for (int b = 0; b < Blocks; ++b) acc[q][b] = _mm512_dpbusd_epi32(acc[q][b], query, codes[b]);
+      for (int b = 0; b < Blocks; ++b) add_products(acc[q][b], query, codes[b]);
     }
   }
   unsigned any = 0;
@@ -126,7 +128,7 @@ std::size_t scan_tile(const CodeTile& t, Hit* hits) {
     __m512i best = acc[q][0];
 #pragma GCC unroll 8
     for (int b = 1; b < Blocks; ++b) best = _mm512_max_epi32(best, acc[q][b]);
-    any |= _mm512_cmpge_epi32_mask(best, _mm512_set1_epi32(t.thresholds[q]));
+    any |= _mm512_cmpge_epi32_mask(best, _mm512_set1_epi32(threshold(t.limits[q])));
   }
   if (any == 0) [[likely]]
     return 0;
@@ -140,15 +142,8 @@ std::size_t scan_tile(const CodeTile& t, Hit* hits) {
   std::size_t found = 0;
   for (std::size_t q = 0; q < Queries; ++q) {
     for (std::size_t b = 0; b < Blocks; ++b) {
-      unsigned hit = _mm512_cmpge_epi32_mask(_mm512_load_si512(halves[q][b]),
-                                             _mm512_set1_epi32(t.thresholds[q]));
-      for (; hit != 0; hit &= hit - 1) {
-        const auto r = static_cast<std::size_t>(__builtin_ctz(hit));
-        const std::int32_t distance = -2 * halves[q][b][r] - (t.biases[b * kCodeRows + r] & 1);
-        if (distance > t.limits[q]) continue;
-        hits[found++] = {static_cast<std::uint32_t>(t.first_query + q),
-                         static_cast<std::uint32_t>(t.first_row + b * kCodeRows + r), distance};
-      }
+      found += collect_hits(halves[q][b], t.biases + b * kCodeRows, t.limits[q], t.first_query + q,
+                            t.first_row + b * kCodeRows, hits + found);
     }
   }
   return found;
@@ -163,7 +158,6 @@ std::size_t scan_blocks(CodeTile t, std::size_t n, Hit* hits) {
     found += scan_tile<kTile, Blocks>(t, hits + found);
     t.queries += kTile * t.dim;
     t.limits += kTile;
-    t.thresholds += kTile;
     t.first_query += kTile;
   }
   switch (n - q) {
@@ -180,16 +174,11 @@ std::size_t scan_blocks(CodeTile t, std::size_t n, Hit* hits) {
 
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
-  std::int32_t thresholds[kScanQueries];
-  for (std::size_t q = 0; q < queries.n; ++q) {
-    thresholds[q] = -((queries.limits[q] >> 1) + (queries.limits[q] & 1));
-  }
   std::size_t found = 0;
   std::size_t b = *block;
   while (b < rows.blocks && found < kHitsEnough) {
     const CodeTile tile = {queries.codes,
                            queries.limits,
-                           thresholds,
                            rows.codes + b * kCodeRows * rows.dim,
                            rows.biases + b * kCodeRows,
                            rows.dim,

@@ -113,6 +113,7 @@ extern const Kernels portable;
 #if defined(__x86_64__)
 extern const Kernels avx2;
 extern const Kernels avx512;
+extern const Kernels amx;
 #elif defined(__aarch64__)
 extern const Kernels neon;
 #endif
