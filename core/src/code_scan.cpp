@@ -98,6 +98,13 @@ std::size_t CodeScan::scan_chunk(std::span<const std::uint32_t> group, std::size
                                      {packed_, biases_.data(), blocks_, dim_}, block, hits_.data());
 }
 
+void CodeScan::merge(const CodeScan& other) {
+  for (std::size_t i = 0; i < best_ids_.size(); ++i) {
+    if (other.best_ids_[i] < 0) continue;
+    best_[i / kept_].offer_distinct(other.best_distances_[i], other.best_ids_[i]);
+  }
+}
+
 void CodeScan::finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
   const std::size_t k = ids.columns;
   for (std::size_t q = 0; q < codes_.rows; ++q) {

@@ -32,6 +32,11 @@ class CodeScan {
   CodeScan(const CodeScan&) = delete;
   CodeScan& operator=(const CodeScan&) = delete;
 
+  std::size_t queries() const { return codes_.rows; }
+  // Rows that are compared with all queries at a time, a multiple of 16: what a caller that makes
+  // packed blocks as it goes had best make at a time.
+  std::size_t chunk_rows() const { return chunk_rows_; }
+
   // Compares the queries of these indices with the first `rows` rows of `packed`, blocks of 16 rows
   // as in PackedPrototypes, and calls offer(TopK& best, std::int32_t distance, std::size_t row) for
   // those that may be among the k nearest. `offer` calls best.offer(distance, id of the row), or
@@ -57,6 +62,9 @@ class CodeScan {
       }
     }
   }
+
+  // Takes what another scan of the same queries has found in other rows.
+  void merge(const CodeScan& other);
 
   // Writes (queries x k) landmarks and distances as protomark::search gives them back.
   void finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const;
