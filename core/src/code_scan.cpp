@@ -13,8 +13,12 @@ static_assert(kPackedRows == kernels::kCodeRows);
 // Squared distances reach 256 * 254^2 < 2^24, which float holds exactly; this is beyond all.
 constexpr std::int32_t kNoLimit = 1 << 25;
 
-// Codes that are compared with all queries at a time; they stay in the L2 cache.
-constexpr std::size_t kChunkBytes = 64 * 1024;
+// Rows that are compared with all queries at a time. Many queries come back to them from the L2
+// cache; for few, rows should come from memory while the last ones are compared.
+std::size_t rows_of_chunk(std::size_t queries, std::size_t dim) {
+  const std::size_t bytes = std::clamp<std::size_t>(256 * queries, 4 * 1024, 64 * 1024);
+  return std::max<std::size_t>(bytes / dim / kPackedRows, 1) * kPackedRows;
+}
 
 std::int32_t squared_norm(const std::int8_t* code, std::size_t dim) {
   std::int32_t sum = 0;
@@ -64,7 +68,7 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
       unsigned_codes_(queries.rows * dim_, 128),
       best_ids_(queries.rows * kept_),
       best_distances_(queries.rows * kept_),
-      chunk_rows_(std::max<std::size_t>(kChunkBytes / dim_ / kPackedRows, 1) * kPackedRows),
+      chunk_rows_(rows_of_chunk(queries.rows, dim_)),
       biases_(chunk_rows_),
       hits_(kernels::kHitRoom) {
   best_.reserve(queries.rows);
