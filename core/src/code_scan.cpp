@@ -16,7 +16,7 @@ constexpr std::int32_t kNoLimit = 1 << 25;
 // Rows that are compared with all queries at a time. Many queries come back to them from the L2
 // cache; for few, rows should come from memory while the last ones are compared.
 std::size_t rows_of_chunk(std::size_t queries, std::size_t dim) {
-  const std::size_t bytes = std::clamp<std::size_t>(256 * queries, 4 * 1024, 64 * 1024);
+  const auto bytes = std::clamp<std::size_t>(256 * queries, 4096, 65536);
   return std::max<std::size_t>(bytes / dim / kPackedRows, 1) * kPackedRows;
 }
 

@@ -19,7 +19,7 @@ using kernels::kWordRows;
 
 // Bytes of descriptors that are packed at a time and then compared with all queries; they stay in
 // the L1 cache.
-constexpr std::size_t kChunkBytes = 16 * 1024;
+constexpr std::size_t kChunkBytes = 16384;
 
 // Packs rows begin to end as the kernels want them (kernels.h), missing rows as zeros.
 void pack(Descriptors database, std::size_t begin, std::size_t end, std::size_t words,

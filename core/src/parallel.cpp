@@ -44,11 +44,11 @@ class Pool {
   }
 
  private:
-  // Goes on with fewer where the system gives no more.
   void start_threads(std::size_t n) {
     try {
       for (; threads_ < n; ++threads_) std::thread([this] { help(); }).detach();
     } catch (const std::system_error&) {
+      return;  // the system gives no more; fewer do
     }
   }
 
