@@ -30,9 +30,9 @@ bool has_avx512() {
          __builtin_cpu_supports("avx512vnni") && __builtin_cpu_supports("avx512vpopcntdq");
 }
 
+#if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
 // Linux gives a process the room that tiles need when it asks for it. Elsewhere AMX is not used.
 bool has_amx() {
-#if defined(__linux__)
   constexpr unsigned kTile = 1u << 24, kInt8 = 1u << 25;
   unsigned a = 0, b = 0, c = 0, d = 0;
   if (!has_avx512() || __get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
@@ -40,10 +40,8 @@ bool has_amx() {
   constexpr long kRequestPermission = 0x1023;  // ARCH_REQ_XCOMP_PERM
   constexpr long kTileData = 18;               // XFEATURE_XTILEDATA
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
-#else
-  return false;
-#endif
 }
+#endif
 #elif defined(__aarch64__)
 bool has_dot_product() {
 #if defined(__APPLE__)
@@ -83,7 +81,9 @@ struct Sets {
 #if defined(__x86_64__)
     if (has_avx2()) add(avx2);
     if (has_avx512()) add(avx512);
+#if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
     if (has_amx()) add(amx);
+#endif
 #elif defined(__aarch64__)
     if (has_dot_product()) add(neon);
 #endif
