@@ -11,7 +11,7 @@ namespace {
 using kernels::kOutputs;
 
 // Fewer descriptors than this are not worth a table.
-constexpr std::size_t kFew = 16;
+constexpr std::size_t kFew = 20;
 // 256 weights of -128 to 127 stay within 16 bits.
 constexpr std::size_t kSafeWords = 256 / 64;
 // Inputs of a dense layer that go through it together.

@@ -16,50 +16,40 @@ __m256i load(const void* p) { return _mm256_loadu_si256(static_cast<const __m256
 
 void store(void* p, __m256i v) { _mm256_storeu_si256(static_cast<__m256i*>(p), v); }
 
-// Outputs that are summed together: with a table of 16 KB for 64 inputs, in the L1 cache.
-constexpr std::size_t kHalf = kOutputs / 2;
+// Outputs that are summed together, in one register.
+constexpr std::size_t kQuarter = kOutputs / 4;
 
 __m256i load_weights(const std::int8_t* weights) {
   return _mm256_cvtepi8_epi16(_mm_loadu_si128(reinterpret_cast<const __m128i*>(weights)));
 }
 
-// The sums of all subsets of 4 inputs, for each 4 of 64 inputs; two registers each.
+// The sums of all subsets of 4 inputs, for each 4 of 64 inputs.
 void fill_table(const std::int8_t* weights, __m256i* table) {
-  for (int group = 0; group < 16; ++group, weights += 4 * kOutputs, table += 32) {
-    for (int part = 0; part < 2; ++part) {
-      const std::int8_t* w = weights + 16 * part;
-      const __m256i a = load_weights(w), b = load_weights(w + kOutputs);
-      const __m256i c = load_weights(w + 2 * kOutputs), d = load_weights(w + 3 * kOutputs);
-      const __m256i low[4] = {_mm256_setzero_si256(), a, b, _mm256_add_epi16(a, b)};
-      const __m256i high[4] = {_mm256_setzero_si256(), c, d, _mm256_add_epi16(c, d)};
-      __m256i* row = table + part;
-      for (const __m256i h : high) {
-        for (const __m256i l : low) {
-          *row = _mm256_add_epi16(h, l);
-          row += 2;
-        }
-      }
+  for (int group = 0; group < 16; ++group, weights += 4 * kOutputs) {
+    const __m256i a = load_weights(weights), b = load_weights(weights + kOutputs);
+    const __m256i c = load_weights(weights + 2 * kOutputs);
+    const __m256i d = load_weights(weights + 3 * kOutputs);
+    const __m256i low[4] = {_mm256_setzero_si256(), a, b, _mm256_add_epi16(a, b)};
+    const __m256i high[4] = {_mm256_setzero_si256(), c, d, _mm256_add_epi16(c, d)};
+    for (const __m256i h : high) {
+      for (const __m256i l : low) *table++ = _mm256_add_epi16(h, l);
     }
   }
 }
 
 void bit_sums(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
               std::size_t n, std::int16_t* sums) {
-  __m256i table[512];
+  __m256i table[256];
   for (std::size_t w = 0; w < count; ++w, words += n, weights += 64 * kOutputs) {
-    for (std::size_t half = 0; half < kOutputs; half += kHalf) {
-      fill_table(weights + half, table);
-      std::int16_t* sum = sums + half;
+    for (std::size_t quarter = 0; quarter < kOutputs; quarter += kQuarter) {
+      fill_table(weights + quarter, table);
+      std::int16_t* sum = sums + quarter;
       for (std::size_t i = 0; i < n; ++i, sum += kOutputs) {
-        __m256i low = w == 0 ? _mm256_setzero_si256() : load(sum);
-        __m256i high = w == 0 ? _mm256_setzero_si256() : load(sum + 16);
+        __m256i acc = w == 0 ? _mm256_setzero_si256() : load(sum);
         for (int group = 0; group < 16; ++group) {
-          const __m256i* row = table + 2 * (16 * group + (words[i] >> (4 * group) & 15));
-          low = _mm256_add_epi16(low, row[0]);
-          high = _mm256_add_epi16(high, row[1]);
+          acc = _mm256_add_epi16(acc, table[16 * group + (words[i] >> (4 * group) & 15)]);
         }
-        store(sum, low);
-        store(sum + 16, high);
+        store(sum, acc);
       }
     }
   }
