@@ -144,7 +144,7 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
   parallel_for(threads, descriptors.rows, kGrain, [&](std::size_t first, std::size_t last) {
     // Batches of the same size: a small rest would cost as much as a large one.
     const std::size_t batches = (last - first + kBatch - 1) / kBatch;
-    const std::size_t most = (last - first + batches - 1) / batches;
+    const std::size_t most = std::min(kBatch, last - first);
     auto x = std::make_unique_for_overwrite<std::uint8_t[]>(most * width);
     auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? most * width : 0);
     for (std::size_t b = 0; b < batches; ++b) {

@@ -30,7 +30,7 @@ bool fits_16_bits(const Layer& layer) {
   for (std::size_t o = 0; o < layer.outputs; ++o) {
     int low = 0, high = 0;
     for (std::size_t i = 0; i < layer.inputs; ++i) {
-      const int w = layer.weights[o * layer.inputs + i];
+      const std::int8_t w = layer.weights[o * layer.inputs + i];
       (w < 0 ? low : high) += w;
     }
     if (low < std::numeric_limits<std::int16_t>::min() ||
@@ -49,9 +49,7 @@ PackedActivation::PackedActivation(const Layer& layer, bool last)
       table_(layer.table),
       shift_(layer.shift) {
   if (!last) return;
-  for (int t = -128; t < 128; ++t) {
-    table_[static_cast<std::size_t>(t + 128)] = static_cast<std::uint8_t>(std::max(t, -127));
-  }
+  for (int i = 0; i < 256; ++i) table_[i] = static_cast<std::uint8_t>(std::max(i - 128, -127));
 }
 
 BitLayer::BitLayer(const Layer& layer, bool last)
@@ -124,7 +122,7 @@ class BitLayer::Input {
 void BitLayer::run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
                    std::size_t wanted, LayerOutput next) const {
   const Input input(*this, descriptors, n);
-  const kernels::Kernels& activate = activation_.kernels(kernel);
+  const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
   const auto sums = std::make_unique_for_overwrite<std::int16_t[]>(n * kOutputs);
   std::vector<std::int32_t> wide(span_ < words_ ? n * kOutputs : 0);
   for (std::size_t o = 0; o < wanted; o += kOutputs) {
@@ -157,7 +155,7 @@ DenseLayer::DenseLayer(const Layer& layer, bool last)
 
 void DenseLayer::run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride,
                      std::size_t n, std::size_t wanted, LayerOutput next) const {
-  const kernels::Kernels& activate = activation_.kernels(kernel);
+  const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
   std::vector<std::int32_t> sums(std::min(n, kDenseBatch) * kOutputs);
   for (std::size_t i = 0; i < n; i += kDenseBatch) {
     const std::size_t batch = std::min(kDenseBatch, n - i);

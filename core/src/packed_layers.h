@@ -28,10 +28,8 @@ class PackedActivation {
   kernels::Activation block(std::size_t first) const {
     return {&bias_[first], &multipliers_[first], table_.data(), shift_};
   }
-  // The vector kernels take all but small shifts, which no trained network has.
-  const kernels::Kernels& kernels(const kernels::Kernels& wanted) const {
-    return shift_ >= 32 ? wanted : kernels::portable;
-  }
+  // Vector kernels do not take small shifts, which no trained network has.
+  bool is_for_vectors() const { return shift_ >= 32; }
 
  private:
   std::vector<std::int32_t> bias_;
