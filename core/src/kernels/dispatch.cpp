@@ -62,7 +62,11 @@ Kernels over(const Kernels& set, const Kernels& below) {
   const auto take = [](auto& mine, auto theirs) {
     if (theirs != nullptr) mine = theirs;
   };
+  take(result.bit_sums, set.bit_sums);
+  take(result.bit_sum, set.bit_sum);
   take(result.dense, set.dense);
+  take(result.activate16, set.activate16);
+  take(result.activate32, set.activate32);
   take(result.code_biases, set.code_biases);
   take(result.code_unpack4, set.code_unpack4);
   take(result.code_scan, set.code_scan);
