@@ -11,6 +11,7 @@
 #endif
 
 #include "kernels.h"
+#include "protomark/instruction_set.h"
 
 namespace protomark::kernels {
 namespace {
@@ -110,3 +111,9 @@ const Kernels& active() {
 }
 
 }  // namespace protomark::kernels
+
+namespace protomark {
+
+const char* instruction_set() { return kernels::active().name; }
+
+}  // namespace protomark
