@@ -121,11 +121,19 @@ class Results:
         return max(rates, default=None)
 
     def share(self, contest: Contest) -> float | None:
-        """Our part of the vector ceiling of all threads, where the contest says its work."""
-        ceiling, ours = self.vector_ceiling, contest.ours
-        if ceiling is None or ours is None or "multiply_adds" not in contest.work:
+        """Our part of the ceiling that applies to the contest's work, None where none does.
+
+        Of multiply-adds: of the vector ceiling of all threads. Of bytes: of what one thread reads.
+        """
+        ours = contest.ours
+        if ours is None:
             return None
-        return contest.work["multiply_adds"] / ours.median / (ceiling * contest.threads)
+        if "multiply_adds" in contest.work and self.vector_ceiling is not None:
+            rate = contest.work["multiply_adds"] / ours.median
+            return rate / (self.vector_ceiling * contest.threads)
+        if "bytes" in contest.work and "read" in self.ceilings and contest.threads == 1:
+            return contest.work["bytes"] / ours.median / self.ceilings["read"]
+        return None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the JSON, whole or not at all."""

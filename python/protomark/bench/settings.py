@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from protomark.bench.race import Pace
@@ -37,7 +37,7 @@ class Settings:
     threads: int = 1
     build_threads: int = 1
     dim: int = 32
-    pace: Pace = Pace()
+    pace: Pace = field(default_factory=Pace)
     encoded: int = 20_000
     queries: int = 1_000
     tuned_on: float = 3.0
@@ -70,15 +70,15 @@ def choose(
         raise ValueError(f"--only {unknown[0]}: no such section ({', '.join(SECTIONS)})")
     if full and quick:
         raise ValueError("give --full or --quick, not both")
-    common = {
-        "sections": sections or SECTIONS,
-        "threads": threads,
-        "build_threads": build_threads,
-        "scratch": scratch,
-    }
+    default = Settings(
+        sections=sections or SECTIONS,
+        threads=threads,
+        build_threads=build_threads,
+        scratch=scratch,
+    )
     if quick:
-        return Settings(
-            **common,
+        return replace(
+            default,
             pace=Pace(rounds=3, shortest=0, longest=0.05),
             encoded=2_000,
             queries=100,
@@ -90,12 +90,12 @@ def choose(
             large=3_000,
         )
     if full:
-        return Settings(
-            **common,
+        return replace(
+            default,
             approximate=(100_000, 1_000_000, 10_000_000),
             hashed=1_000_000,
             graphs=1_000_000,
-            growth=(*Settings.growth, 3_000_000, 10_000_000),
+            growth=(*default.growth, 3_000_000, 10_000_000),
             large=100_000_000,
         )
-    return Settings(**common)
+    return default

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import log
 
@@ -43,7 +43,7 @@ def outcomes(results: Results) -> list[Outcome]:
 
 def _encode(results: Results) -> Iterator[Outcome]:
     for contest in _of(results, "encode"):
-        what = f"encode, {contest.title}"
+        what = f"encode {contest.title.replace(' at a time', '')}"
         for names, least in (
             (["PyTorch float"], 8.0),
             (["ONNX Runtime float"], 5.0),
@@ -61,7 +61,7 @@ def _search(results: Results) -> Iterator[Outcome]:
         contest = _at(_of(results, section), GOAL_SIZE)
         if contest is None:
             continue
-        what = f"exact search, {contest.landmarks:,} landmarks"
+        what = f"exact search, {short(contest.landmarks)} landmarks"
         for name, least in peers:
             yield _against(contest, [name], least, what, contest.landmarks == GOAL_SIZE)
         if section == "search":
@@ -72,7 +72,7 @@ def _graphs(results: Results) -> Iterator[Outcome]:
     size = 100_000
     contest = _at(_with_recall(results, 0.99), size)
     if contest is not None:
-        what = f"search at recall 0.99, {contest.landmarks:,} landmarks"
+        what = f"recall 0.99, {short(contest.landmarks)} landmarks"
         for name in ("FAISS HNSW", "hnswlib"):
             yield _against(contest, [name], 1.0, what, contest.landmarks == size)
 
@@ -83,7 +83,7 @@ def _approximate(results: Results) -> Iterator[Outcome]:
     if contest is None:
         return
     counts = contest.landmarks == size
-    what = f"approximate search at recall 0.98, {contest.landmarks:,} landmarks"
+    what = f"recall 0.98, {short(contest.landmarks)} landmarks"
     ours = _named(contest, ["Protomark, approximate"])
     if ours is None:
         yield Outcome(what, target="≥ 20 × the exact scan")
@@ -109,21 +109,25 @@ def _approximate(results: Results) -> Iterator[Outcome]:
 def _frame(results: Results) -> Iterator[Outcome]:
     least = 0.033 if "amx" in results.ceilings else 0.150
     for contest in _of(results, "frame"):
-        ours = contest.ours
-        if ours is None:
-            continue
         counts = contest.landmarks == GOAL_SIZE and contest.threads == 2
-        yield Outcome(
-            f"frame among {contest.landmarks:,} landmarks, {_threads(contest.threads)}",
-            f"{spread([1000 * s for s in ours.seconds])} ms",
-            target=f"≤ {1000 * least:.0f} ms" if contest.threads == 2 else "",
-            met=_if(counts, ours.median <= least),
-        )
+        for ours in contest.timings:
+            yield Outcome(
+                f"frame, {short(contest.landmarks)} landmarks, {_threads(contest.threads)}: "
+                + ours.name.partition(", ")[2],
+                f"{spread([1000 * s for s in ours.seconds])} ms",
+                target=f"≤ {1000 * least:.0f} ms" if contest.threads == 2 else "",
+                met=_if(counts, ours.median <= least),
+            )
 
 
 def _add(results: Results) -> Iterator[Outcome]:
     for contest in _of(results, "add"):
-        yield _against(contest, ["Protomark, encode alone"], 0.9, f"add, {contest.title}")
+        yield _against(
+            contest,
+            ["Protomark, encode alone"],
+            0.9,
+            f"add to {short(contest.landmarks)} landmarks",
+        )
 
 
 def _large(results: Results) -> Iterator[Outcome]:
@@ -134,7 +138,7 @@ def _large(results: Results) -> Iterator[Outcome]:
     counts = n == 100_000_000
     for bits in (8, 4):
         label = f"{bits} bits: "
-        what = f"sealed map of {n:,} landmarks, {bits} bits a number"
+        what = f"sealed, {short(n)} landmarks, {bits} bits"
         if label + "file bytes" not in figures:
             continue
         size = figures[label + "file bytes"]
@@ -170,7 +174,7 @@ def _growth(results: Results) -> Iterator[Outcome]:
         (n0, s0), (n1, s1) = points[0], points[-1]
         exponent = log(s1 / s0) / log(n1 / n0)
         yield Outcome(
-            f"growth of {method} search, {n0:,} to {n1:,} landmarks",
+            f"{method} search, {short(n0)} to {short(n1)} landmarks",
             f"time ~ landmarks^{exponent:.2f}",
             target="exponent clearly below 1" if method == "approximate" else "",
             met=exponent < 0.8 if method == "approximate" else None,
@@ -198,9 +202,9 @@ def _ratio_row(
 ) -> Outcome:
     return Outcome(
         what,
-        f"{duration(ours.median)} a {contest.unit}",
+        duration(ours.median),
         f"{peer.name}: {duration(peer.median)}",
-        "–" if ratio is None else f"{ratio.median:.2f} × ({ratio.low:.2f} to {ratio.high:.2f})",
+        "–" if ratio is None else factor(ratio),
         f"≥ {least:g} ×",
         _if(counts, ratio is not None and ratio.median >= least),
     )
@@ -234,8 +238,7 @@ def _with_recall(results: Results, recall: float) -> list[Contest]:
 def _at(contests: Sequence[Contest], landmarks: int) -> Contest | None:
     """The contest of this size, or else the largest."""
     same = [contest for contest in contests if contest.landmarks == landmarks]
-    by_size: Callable[[Contest], int] = lambda contest: contest.landmarks  # noqa: E731
-    return same[0] if same else max(contests, key=by_size, default=None)
+    return same[0] if same else max(contests, key=lambda c: c.landmarks, default=None)
 
 
 def _named(contest: Contest, names: Sequence[str]) -> Timing | None:
@@ -256,6 +259,19 @@ def spread(values: Sequence[float]) -> str:
     ordered = sorted(values)
     middle = ordered[len(ordered) // 2]
     return f"{middle:.1f} ({ordered[0]:.1f} to {ordered[-1]:.1f})"
+
+
+def factor(ratio: Ratio) -> str:
+    """Median, and least to greatest."""
+    return f"{ratio.median:.3g} ({ratio.low:.3g} to {ratio.high:.3g})"
+
+
+def short(count: int) -> str:
+    """1,000,000 as 1 M."""
+    for scale, unit in ((1_000_000, "M"), (1_000, "k")):
+        if count >= scale:
+            return f"{count / scale:g} {unit}"
+    return str(count)
 
 
 def duration(seconds: float) -> str:

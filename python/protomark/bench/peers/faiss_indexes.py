@@ -107,8 +107,8 @@ def _add(index: Any, rows: NDArray[np.int8], build_threads: int, threads: int) -
 
 
 def _cells(n: int) -> int:
-    """Four times the root: what FAISS's guide gives for up to millions of rows, at its lower end."""
-    return max(min(int(4 * sqrt(n)), n // 8), 1)
+    """Four times the root, as FAISS's guide has it for up to a million rows."""
+    return max(min(int(4 * sqrt(n)), n // _TRAINED_ON), 1)
 
 
 def _bytes(index: Any) -> int:

@@ -43,7 +43,8 @@ class Builder(Protocol):
         queries: NDArray[Any],
         threads: int,
         build_threads: int,
-    ) -> Index: ...
+    ) -> Index:
+        """The index."""
 
 
 def doubling(first: int, last: int) -> list[int]:

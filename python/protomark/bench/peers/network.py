@@ -63,7 +63,7 @@ def bits_of(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.unpackbits(descriptors, axis=1, bitorder="little")
 
 
-def selu(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def selu(x: NDArray[np.floating]) -> NDArray[np.floating]:
     """The activation of the networks that ship."""
     return _SCALE * np.where(x > 0, x, _ALPHA * np.expm1(np.minimum(x, 0)))
 

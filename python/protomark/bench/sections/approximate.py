@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.bench import ours
+from protomark.bench.machine import lacks
 from protomark.bench.peers import installed
 from protomark.bench.peers.index import Index, Search
 from protomark.bench.progress import Bar
@@ -22,6 +23,7 @@ from protomark.bench.tuning import Trial, tune
 from protomark.bench.workload import Workload
 
 GOALS = (0.95, 0.98, 0.99)
+BYTES = 1_200  # of a landmark in all indexes together, about
 
 
 @dataclass
@@ -50,6 +52,10 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
     settings = workload.settings
     bar.begin("approximate", len(settings.approximate) * (9 + len(GOALS) * turns(9, settings.pace)))
     for n in settings.approximate:
+        reason = lacks(n * BYTES)
+        if reason:
+            results.skipped.append(f"approximate, {n:,} landmarks: {reason}")
+            continue
         queries = workload.queries(n, settings.queries)
         codes = workload.codes(queries)
         scene = workload.map(n)
@@ -58,7 +64,12 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         }
         for entrant in _entrants(workload, results, n, queries, codes, scene):
             bar.advance(f"{n:,} landmarks, {entrant.name}")
-            for goal, contender in _tuned(entrant, n, settings.queries, settings.tuned_on):
+            try:
+                tuned = _tuned(entrant, n, settings.queries, settings.tuned_on)
+            except Exception as error:  # whatever a peer raises: the others go on
+                results.skipped.append(f"{entrant.name}, {n:,} landmarks: failed ({error})")
+                continue
+            for goal, contender in tuned:
                 if contender is not None:
                     fields[goal].append(contender)
                 else:

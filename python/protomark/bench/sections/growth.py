@@ -15,6 +15,7 @@ from protomark.bench.peers.index import K
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race
 from protomark.bench.results import Results
+from protomark.bench.settings import Settings
 from protomark.bench.workload import Workload
 
 RECALL = 0.98
@@ -24,7 +25,6 @@ OPEN_BYTES = 200  # of a landmark of an open map with its index, at most, about
 def run(workload: Workload, results: Results, bar: Bar) -> None:
     """Open maps of every size, searched exactly and approximately."""
     settings = workload.settings
-    pace = replace(settings.pace, rounds=3)
     bar.begin("growth", 3 * len(settings.growth))
     for n in settings.growth:
         reason = lacks(n * OPEN_BYTES)
@@ -39,17 +39,16 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         scene.search_codes(codes[:1], k=K)
         used = _since(before)
 
-        def timed(name: str, **how: float) -> float:
-            entrant = Contender(
-                name,
-                lambda q: scene.search_codes(codes[:q], k=K, threads=settings.threads, **how),
-                least=64,
-            )
-            return race([entrant], settings.queries, pace)[0].median
-
         bar.advance(f"{n:,} landmarks, exact")
         results.growth.append(
-            _point(n, "exact", timed("exact"), used, recall=1.0, threads=settings.threads)
+            _point(
+                n,
+                "exact",
+                _seconds(scene, codes, settings),
+                used,
+                recall=1.0,
+                threads=settings.threads,
+            )
         )
         if not hasattr(scene, "build_index"):
             continue
@@ -64,13 +63,23 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
             _point(
                 n,
                 "approximate",
-                timed("approximate", recall=RECALL),
+                _seconds(scene, codes, settings, recall=RECALL),
                 _since(before),
                 recall=recall,
                 build=built,
                 threads=settings.threads,
             )
         )
+
+
+def _seconds(scene: Any, codes: NDArray[np.int8], settings: Settings, **how: float) -> float:
+    """Of a query, by search in this way."""
+
+    def search(q: int) -> None:
+        scene.search_codes(codes[:q], k=K, threads=settings.threads, **how)
+
+    entrant = Contender("search", search, least=64)
+    return race([entrant], settings.queries, replace(settings.pace, rounds=3))[0].median
 
 
 def _point(
