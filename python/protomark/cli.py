@@ -573,7 +573,11 @@ def bench(
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
     )
-    results = command.bench(tracks or [], settings, output, json_file)
+    flags = [f"--only {only}"] if only else []
+    flags += ["--full"] if full else ["--quick"] if quick else []
+    flags += [f"--threads {threads}"] if threads != 1 else []
+    repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])
+    results = command.bench(tracks or [], settings, output, json_file, repeat)
     command.print_summary(results, output)
     if results.interrupted:
         raise typer.Exit(130)

@@ -56,6 +56,7 @@ def bench(
     settings: Settings,
     folder: Path | None = None,
     json_path: Path | None = None,
+    repeat: str = "protomark bench",
 ) -> Results:
     """Measure, and write what was asked for; after Ctrl-C, what there is by then.
 
@@ -64,6 +65,7 @@ def bench(
         settings: sections and sizes.
         folder: for benchmarks.md and its plots.
         json_path: for the figures.
+        repeat: the command line that does the same again, for the report.
 
     Raises:
         FileNotFoundError, ValueError: a file is missing or broken, or no encoder ships for it.
@@ -71,6 +73,7 @@ def bench(
     real = Observations.load(paths)
     encoder = pm.Encoder.load(real.descriptor)
     results = measure(Workload(real, encoder, settings))
+    results.command = repeat
     if json_path is not None:
         results.save(json_path)
     if folder is not None:
@@ -127,7 +130,7 @@ def write_report(results: Results, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     names = figures.save(results, folder)
     path = folder / "benchmarks.md"
-    write_text(path, "# Benchmarks\n\n" + report.markdown(results, names))
+    write_text(path, report.markdown(results, names))
     return path
 
 

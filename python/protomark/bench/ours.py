@@ -39,7 +39,8 @@ def cells(
         prepare,
         [doubling(1, count)],
         indexed,
-        f"{count:,} cells; setting: probes",
+        "probes",
+        f"{count:,} cells",
         more=(indexed - plain) / n,
     )
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
 from protomark.bench.results import Contest, Results
-from protomark.bench.targets import Outcome, duration, outcomes
+from protomark.bench.targets import Outcome, duration, factor, outcomes
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -44,18 +45,25 @@ _SECTIONS = {
 def markdown(results: Results, plots: Sequence[str] = ()) -> str:
     """The whole report; `plots` are names of pictures beside it."""
     parts = [
+        "# Benchmarks",
+        "Protomark beside its peers, and the ceilings of the machine: one run, the same data, the "
+        "same number of threads. To repeat it (docs/tracks.md says where tracks come from):",
+        f"    pip install protomark[bench]\n    {results.command}",
         "## Targets",
         "Ratios are how many times as fast ours is: median of the rounds, least to greatest in "
-        "brackets. In a round every contender runs once, one after the other.",
+        "brackets. In a round every contender runs once, one after the other. Times are of one "
+        "descriptor, query or observation, medians of the rounds; a turn too short to time is "
+        "repeated, and its quickest repetition counts. Rows of another size than the target's are "
+        "not held against it.",
         markdown_table(HEADS, [outcome_cells(row) for row in outcomes(results)]),
-        *(f"![{name.partition('.')[0]}]({name})" for name in plots),
+        *(f"![{PurePosixPath(name).stem}]({name})" for name in plots),
         "## Machine and data",
         bullets([f"{name}: {text}" for name, text in {**results.machine, **results.data}.items()]),
         "Ceilings of one thread, measured in the same run:",
         bullets(ceilings(results)),
     ]
     if results.interrupted:
-        parts.insert(0, "**The run was ended by Ctrl-C; what is missing was not measured.**")
+        parts.insert(1, "**The run was ended by Ctrl-C; what is missing was not measured.**")
     if results.resemblance:
         parts += [
             "### Grown data beside real data",
@@ -95,9 +103,16 @@ def rich_table(results: Results) -> Table:
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for head in HEADS:
-        table.add_column(head, justify="left", overflow="fold")
+        table.add_column(head, overflow="fold")
+    before = ""
     for row in outcomes(results):
-        table.add_row(*outcome_cells(row), style={True: "green", False: "red", None: ""}[row.met])
+        what, *rest = [text.replace("**", "") for text in outcome_cells(row)]
+        table.add_row(
+            "" if what == before else what,
+            *rest,
+            style={True: "green", False: "red", None: ""}[row.met],
+        )
+        before = what
     return table
 
 
@@ -111,7 +126,10 @@ def caption(results: Results, contest: Contest) -> str:
     """What was done, on how many threads, and how near the ceiling ours came."""
     text = f"{contest.title}; {contest.threads} thread{'s' if contest.threads != 1 else ''}"
     share = results.share(contest)
-    return text if share is None else f"{text}; ours at {100 * share:.0f} % of the vector ceiling"
+    if share is None:
+        return text
+    ceiling = "vector" if "multiply_adds" in contest.work else "reading"
+    return f"{text}; ours at {100 * share:.0f} % of the {ceiling} ceiling"
 
 
 def contest_table(contest: Contest) -> str:
@@ -139,9 +157,7 @@ def contest_table(contest: Contest) -> str:
             [
                 f"**{timing.name}**" if timing.ours else timing.name,
                 duration(timing.median),
-                "–"
-                if ratio is None
-                else f"{ratio.median:.2f} ({ratio.low:.2f} to {ratio.high:.2f})",
+                "–" if ratio is None else factor(ratio),
                 f"{timing.units:,}",
                 *(
                     format(timing.facts[key], facts[key][1]) if key in timing.facts else "–"

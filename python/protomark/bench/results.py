@@ -102,6 +102,7 @@ class Results:
         large: figures of the largest map, name -> value; empty where it was not made.
         skipped: what was left out, and why.
         interrupted: whether Ctrl-C ended the run early.
+        command: the command line that does the same again.
     """
 
     machine: dict[str, str] = field(default_factory=dict)
@@ -113,6 +114,7 @@ class Results:
     large: dict[str, float] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
     interrupted: bool = False
+    command: str = "protomark bench"
 
     @property
     def vector_ceiling(self) -> float | None:

@@ -41,7 +41,9 @@ def hnsw(
         index.hnsw.efSearch = ef
         return _search(index, asked)
 
-    return Index(prepare, [doubling(8, 2048)], _bytes(index), "M = 16, efConstruction = 64")
+    return Index(
+        prepare, [doubling(8, 2048)], _bytes(index), "efSearch", "M = 16, efConstruction = 64"
+    )
 
 
 def scalar_quantizer(
@@ -63,7 +65,7 @@ def scalar_quantizer(
         index.nprobe = probes
         return _search(index, asked)
 
-    return Index(prepare, [doubling(1, cells)], _bytes(index), f"{cells:,} cells")
+    return Index(prepare, [doubling(1, cells)], _bytes(index), "probes", f"{cells:,} cells")
 
 
 def product_quantizer(
@@ -82,8 +84,8 @@ def product_quantizer(
         return _search(index, asked)
 
     lines = [[(probes, factor) for probes in doubling(1, cells)] for factor in (4, 16, 64)]
-    note = f"{cells:,} cells, PQ{dim // 2}x4fs, refined by SQ8; setting: probes, factor"
-    return Index(prepare, lines, _bytes(base) + _bytes(refine), note)
+    note = f"{cells:,} cells, PQ{dim // 2}x4fs, refined by SQ8"
+    return Index(prepare, lines, _bytes(base) + _bytes(refine), "probes and factor", note)
 
 
 def _search(index: Any, queries: NDArray[Any]) -> Search:

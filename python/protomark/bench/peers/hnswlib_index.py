@@ -29,5 +29,9 @@ def hnsw(
         return run
 
     return Index(
-        prepare, [doubling(8, 2048)], index.index_file_size(), "M = 16, efConstruction = 64"
+        prepare,
+        [doubling(8, 2048)],
+        index.index_file_size(),
+        "efSearch",
+        "M = 16, efConstruction = 64",
     )

@@ -24,12 +24,14 @@ class Index:
         lines: settings, as `tuning.tune` takes them.
         bytes: of the whole index, as it would be stored.
         more: bytes a landmark beyond what an exact search needs, where that is known.
+        setting: what the settings are called.
         note: how it was built.
     """
 
     prepare: Callable[[Any], Search]
     lines: Sequence[Sequence[Any]]
     bytes: int
+    setting: str
     note: str = ""
     more: float | None = None
 

@@ -38,6 +38,7 @@ def kd_trees(
         lambda checks: _search(index, asked, checks),
         [doubling(32, 16384)],
         _bytes(index) + values.nbytes,
+        "checks",
         "4 trees",
     )
 
@@ -60,7 +61,8 @@ def lsh(
         lambda level: _search(indexes[level], queries, 32),
         [list(indexes)],
         _bytes(indexes[2]) + rows.nbytes,
-        "12 tables, keys of 20 bits; setting: multi-probe level",
+        "multi-probe level",
+        "12 tables, keys of 20 bits",
     )
 
 

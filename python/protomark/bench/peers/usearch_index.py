@@ -44,5 +44,6 @@ def _hnsw(
         prepare,
         [doubling(8, 2048)],
         int(index.serialized_length),
+        "expansion_search",
         "connectivity = 16, expansion_add = 64",
     )

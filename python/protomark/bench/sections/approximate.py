@@ -198,7 +198,7 @@ def _contender(
         ours=entrant.own,
         least=entrant.least,
         facts=facts,
-        note=f"{entrant.note}{index.note} {trial.setting}",
+        note=f"{entrant.note}{index.note}; {index.setting} {trial.setting}",
     )
 
 
