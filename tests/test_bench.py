@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from protomark import sample
+from protomark import _ceilings, sample
 from protomark.bench import command, peers, report
 from protomark.bench.grown import Grown, map_of, prototypes_of, rounded_means
 from protomark.bench.peers.network import bits_of, float_layers, selu
@@ -272,6 +273,25 @@ def test_missing_peers_are_named_with_their_remedy(monkeypatch: pytest.MonkeyPat
     notes = peers.missing()
     assert len(notes) == len(peers.DISTRIBUTIONS)
     assert "FAISS: not installed (pip install faiss-cpu" in "\n".join(notes)
+
+
+@pytest.mark.parametrize("name", ["portable", None])
+def test_instruction_set_is_the_one_in_use(name: str | None) -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "PROTOMARK_ISA"}
+    if name is not None:
+        environment["PROTOMARK_ISA"] = name
+    program = "import protomark as pm; print(pm.instruction_set())"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment)
+    said = done.stdout.decode().strip()
+    assert said == name if name else said in ("amx", "avx512", "avx2", "neon", "portable")
+
+
+def test_ceilings_are_named_by_instruction_set() -> None:
+    rates = _ceilings.multiply_adds(0.01)
+    assert all(rate > 1e9 for rate in rates.values())
+    assert set(rates) <= {"avx2", "avx512", "amx", "neon"}
+    with pytest.raises(ValueError, match="at least"):
+        _ceilings.read_bytes(8)
 
 
 def test_unknown_sections_are_refused() -> None:

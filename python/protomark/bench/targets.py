@@ -143,8 +143,8 @@ def _large(results: Results) -> Iterator[Outcome]:
             continue
         size = figures[label + "file bytes"]
         opening = figures[label + "open seconds"]
-        asking = figures[label + "query seconds"]
-        recall = figures.get(label + "recall")
+        asking = figures[label + "1,000 queries, seconds"]
+        recall = figures[label + "recall"]
         yield Outcome(
             f"{what}: file",
             f"{size / 1e9:.2f} GB",
@@ -157,12 +157,11 @@ def _large(results: Results) -> Iterator[Outcome]:
             target="≤ 50 ms",
             met=_if(counts, opening <= 0.05),
         )
-        found = "" if recall is None else f", recall {recall:.3f}"
         yield Outcome(
             f"{what}: 1,000 queries, 2 threads",
-            f"{asking:.3f} s{found}",
+            f"{asking:.3f} s, recall {recall:.3f}",
             target="≤ 0.5 s, recall ≥ 0.95",
-            met=_if(counts and recall is not None, asking <= 0.5 and (recall or 0) >= 0.95),
+            met=_if(counts, asking <= 0.5 and recall >= 0.95),
         )
 
 

@@ -230,8 +230,8 @@ def _as_near(
     exact: NDArray[np.int64],
     answers: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
-    near = _squared(rows, codes, answers) <= exact[: len(answers)]
-    return near & (answers >= 0)
+    known = _known(rows, answers)
+    return known & (_squared(rows, codes, np.where(known, answers, 0)) <= exact[: len(answers)])
 
 
 def _as_near_in_bits(
@@ -240,5 +240,11 @@ def _as_near_in_bits(
     exact: NDArray[np.int32],
     answers: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
-    different = np.unpackbits(rows[answers] ^ queries[: len(answers)], axis=1)
-    return (different.sum(axis=1) <= exact[: len(answers)]) & (answers >= 0)
+    known = _known(rows, answers)
+    different = np.unpackbits(rows[np.where(known, answers, 0)] ^ queries[: len(answers)], axis=1)
+    return known & (different.sum(axis=1) <= exact[: len(answers)])
+
+
+def _known(rows: NDArray[np.generic], answers: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which answers are rows: peers say in several ways that they found nothing."""
+    return (answers >= 0) & (answers < len(rows))
