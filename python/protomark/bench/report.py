@@ -191,7 +191,7 @@ def ceilings(results: Results) -> list[str]:
     return [
         f"reading memory: {rate / 1e9:.1f} GB/s"
         if name == "read"
-        else f"int8 multiply-adds, {name}: {rate / 1e9:,.0f} thousand million a second"
+        else f"int8 multiply-adds, {name}: {rate / 1e9:,.0f} × 10⁹ a second"
         for name, rate in results.ceilings.items()
     ]
 
