@@ -16,6 +16,7 @@ import protomark as pm
 from protomark import _ceilings, sample
 from protomark.bench import command, peers, report
 from protomark.bench.grown import Grown, map_of, prototypes_of, rounded_means
+from protomark.bench.machine import allocated_bytes
 from protomark.bench.peers.network import bits_of, float_layers, selu
 from protomark.bench.race import Contender, Pace, race
 from protomark.bench.real import Observations
@@ -292,6 +293,16 @@ def test_ceilings_are_named_by_instruction_set() -> None:
     assert set(rates) <= {"avx2", "avx512", "amx", "neon"}
     with pytest.raises(ValueError, match="at least"):
         _ceilings.read_bytes(8)
+
+
+def test_allocated_memory_counts_what_a_map_holds() -> None:
+    before = allocated_bytes()
+    if before is None:
+        pytest.skip("this C library does not say what is allocated")
+    held = np.ones(1 << 22, np.uint8)
+    after = allocated_bytes()
+    assert after is not None
+    assert abs(after - before - held.nbytes) < 1 << 16
 
 
 def test_unknown_sections_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import platform
 import shutil
@@ -14,7 +15,7 @@ from protomark.evaluation.threads import available_threads
 
 
 def describe() -> dict[str, str]:
-    """CPU, instruction set in use, cores, memory, system and compiler-independent versions."""
+    """CPU, instruction set in use, cores, memory, system and versions."""
     import protomark as pm
 
     facts = {
@@ -55,13 +56,44 @@ def versions(distributions: dict[str, str]) -> dict[str, str]:
 
 def memory_bytes(field: str) -> int | None:
     """A field of /proc/meminfo in bytes, None where there is none."""
-    return _proc_bytes("/proc/meminfo", field)
+    if not sys.platform.startswith("linux"):
+        return None
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return 1024 * int(line.split()[1])
+    return None
 
 
-def resident_bytes() -> int | None:
-    """Memory that this process holds now, None where the system does not say."""
+class _MallocInfo(ctypes.Structure):
+    """struct mallinfo2 of glibc."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena",
+            "ordblks",
+            "smblks",
+            "hblks",
+            "hblkhd",
+            "usmblks",
+            "fsmblks",
+            "uordblks",
+            "fordblks",
+            "keepcost",
+        )
+    )
+
+
+def allocated_bytes() -> int | None:
+    """Memory that this process has allocated and not freed; None without glibc 2.33 or newer."""
     gc.collect()
-    return _proc_bytes("/proc/self/status", "VmRSS")
+    try:
+        mallinfo = ctypes.CDLL(None).mallinfo2
+    except (AttributeError, OSError, TypeError):
+        return None
+    mallinfo.restype = _MallocInfo
+    info = mallinfo()
+    return int(info.uordblks + info.hblkhd)
 
 
 def lacks(memory: float, disk: float = 0, folder: Path | None = None) -> str | None:
@@ -80,12 +112,3 @@ def measure_ceilings(results: Results, seconds: float) -> None:
 
     results.ceilings = _ceilings.multiply_adds(seconds)
     results.ceilings["read"] = _ceilings.read_bytes(1 << 28, seconds)
-
-
-def _proc_bytes(path: str, field: str) -> int | None:
-    if not sys.platform.startswith("linux"):
-        return None
-    for line in Path(path).read_text().splitlines():
-        if line.startswith(field + ":"):
-            return 1024 * int(line.split()[1])
-    return None

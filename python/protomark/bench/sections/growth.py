@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.bench.grown import map_of
-from protomark.bench.machine import lacks, resident_bytes
+from protomark.bench.machine import allocated_bytes, lacks
 from protomark.bench.peers.index import K
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race
@@ -34,7 +34,7 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         bar.advance(f"{n:,} landmarks")
         codes = workload.codes(workload.queries(n, settings.queries))
         rows = workload.prototypes(n)
-        before = resident_bytes()
+        before = allocated_bytes()
         scene: Any = map_of(workload.encoder, rows)
         scene.search_codes(codes[:1], k=K)
         used = _since(before)
@@ -85,13 +85,13 @@ def _seconds(scene: Any, codes: NDArray[np.int8], settings: Settings, **how: flo
 def _point(
     n: int, method: str, seconds: float, memory: int | None, **facts: float
 ) -> dict[str, Any]:
-    """Memory is of the open map, all that the process has more, in bytes a landmark."""
+    """Memory is of the open map: what the process has allocated since, in bytes a landmark."""
     each = None if memory is None else memory / n
     return {"landmarks": n, "method": method, "seconds": seconds, "bytes": each, **facts}
 
 
 def _since(before: int | None) -> int | None:
-    now = resident_bytes()
+    now = allocated_bytes()
     return None if before is None or now is None else max(now - before, 0)
 
 
