@@ -1,7 +1,7 @@
 # The two commands for a fresh machine are `make demo` and `make test`. All of them make their own
 # virtual environments; PYTHON chooses the interpreter (3.10 or newer).
 PYTHON ?= python3
-SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_core.pyi') \
+SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_*.pyi') \
            CMakeLists.txt pyproject.toml constraints.txt
 CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h')
 JOBS := $(shell nproc 2>/dev/null || echo 2)
@@ -47,7 +47,7 @@ test-arm: .venv-test/installed
 check: .venv-check/installed
 	.venv-check/bin/ruff format --check
 	.venv-check/bin/ruff check
-	cp .venv-check/lib/python3*/site-packages/protomark/_core.pyi python/protomark/
+	cp .venv-check/lib/python3*/site-packages/protomark/_*.pyi python/protomark/
 	.venv-check/bin/mypy
 	.venv-check/bin/clang-format --dry-run -Werror $(CPP)
 	$(call cmake,.venv-check) -S core -B build/tidy -DPROTOMARK_BUILD_TESTS=OFF \

@@ -17,6 +17,7 @@
 #endif
 
 #include "kernels.h"
+#include "protomark/instruction_set.h"
 
 namespace protomark::kernels {
 namespace {
@@ -136,3 +137,9 @@ const Kernels& active() {
 }
 
 }  // namespace protomark::kernels
+
+namespace protomark {
+
+const char* instruction_set() { return kernels::active().name; }
+
+}  // namespace protomark
