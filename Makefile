@@ -75,6 +75,22 @@ coverage: .venv-sanitize/tools
 	.venv-sanitize/bin/gcovr --root core --filter core/src --filter core/include \
 	  --exclude-throw-branches --fail-under-line 90 build/coverage
 
+FUZZ_SECONDS ?= 60
+CLANG ?= clang++
+fuzz: .venv-sanitize/tools
+	@command -v $(CLANG) > /dev/null || { \
+	  echo "make fuzz needs clang with libFuzzer: apt-get install clang llvm, or set CLANG"; exit 1; }
+	$(call cmake,.venv-sanitize) -S core -B build/fuzz -DPROTOMARK_BUILD_FUZZERS=ON \
+	  -DPROTOMARK_BUILD_TESTS=OFF -DPROTOMARK_BUILD_EXAMPLES=OFF -DCMAKE_BUILD_TYPE= \
+	  -DCMAKE_CXX_COMPILER=$(CLANG) \
+	  -DCMAKE_CXX_FLAGS="$(memory) -fprofile-instr-generate -fcoverage-mapping" > /dev/null
+	.venv-sanitize/bin/cmake --build build/fuzz -j$(JOBS)
+	core/fuzz/run.sh build/fuzz $(FUZZ_SECONDS)
+
+KILLS ?= 600
+torture: .venv/installed
+	.venv/bin/python tests/torture/run.py --kills $(KILLS)
+
 check: .venv-check/installed
 	.venv-check/bin/ruff format --check
 	.venv-check/bin/ruff check

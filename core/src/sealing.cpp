@@ -197,7 +197,8 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
       for (std::size_t i = 0; i < 3; ++i) {
         const double distance = all_positions[landmark][i] - shape.origin[i];
         if (std::abs(distance) > std::numeric_limits<float>::max()) {
-          throw std::invalid_argument("positions are too far apart for the 32 bits of a sealed map");
+          throw std::invalid_argument(
+              "positions are too far apart for the 32 bits of a sealed map");
         }
         relative[i] = static_cast<float>(distance);
       }
