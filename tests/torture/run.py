@@ -210,7 +210,7 @@ def small_disk(size: int) -> Iterator[Path | None]:
 
 def full_disks(case: Case, n: int, rng: random.Random) -> Counter[str] | None:
     counts: Counter[str] = Counter()
-    size = len(case.contents[0]) + len(case.contents[1]) + (1 << 16)
+    size = len(case.contents[0]) + len(case.contents[1]) + (1 << 20)
     with small_disk(size) as folder:
         if folder is None:
             return None
@@ -218,9 +218,9 @@ def full_disks(case: Case, n: int, rng: random.Random) -> Counter[str] | None:
         scratch.mkdir()
         for _ in range(n):
             case.saves[0](scratch / "target")
-            free = shutil.disk_usage(folder).free
+            left = rng.randrange(len(case.contents[1]))
             with (folder / "ballast").open("wb") as ballast:
-                os.posix_fallocate(ballast.fileno(), 0, max(1, free - rng.randrange(free)))
+                os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(folder).free - left)
             met = refused(case, scratch, lambda: None, "No space left on device")
             counts["old" if met else "fitted"] += 1
             (folder / "ballast").unlink()
