@@ -126,9 +126,7 @@ def database(tmp_path: Path) -> Path:
     for i in range(3):
         keypoints = rng.uniform(1, 100, (20, 4)).astype("<f4")
         connection.execute("INSERT INTO images VALUES (?, ?)", (i, f"{i}.png"))
-        connection.execute(
-            "INSERT INTO keypoints VALUES (?, 20, 4, ?)", (i, keypoints.tobytes())
-        )
+        connection.execute("INSERT INTO keypoints VALUES (?, 20, 4, ?)", (i, keypoints.tobytes()))
         connection.execute("INSERT INTO descriptors VALUES (?, 20, 32, ?)", (i, rng.bytes(640)))
     connection.commit()
     connection.close()

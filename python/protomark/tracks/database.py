@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from protomark.tracks.features import DESCRIPTORS, Features, descriptor_kind
 from protomark.tracks.file import Tracks
 
-
 _FAR = 1e9  # pixels; a product of two such numbers is still a float32
 
 
@@ -145,9 +144,8 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
             for name, kr, kc, kd, dr, dc, dd in rows:
                 kr, kc, kd = kr or 0, kc or 2, kd or b""
                 dr, dc, dd = dr or 0, dc or width, dd or b""
-                types = [(name, str), (kd, bytes), (dd, bytes)]
-                types += [(number, int) for number in (kr, kc, dr, dc)]
-                if not all(isinstance(value, kind) for value, kind in types):
+                numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
+                if not (numbers_fit and isinstance(name, str) and type(kd) is type(dd) is bytes):
                     raise ValueError(f"{database}: not a COLMAP database, or a broken one")
                 if dr and dc != width:
                     guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
