@@ -4,9 +4,9 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
-#include <shared_mutex>
 #include <vector>
 
+#include "fair_shared_mutex.h"
 #include "id_index.h"
 #include "protomark/prototypes.h"
 
@@ -112,7 +112,7 @@ class PrototypeStore {
 // What users do not see of an open map.
 struct PrototypeMap::Store : PrototypeStore {
   using PrototypeStore::PrototypeStore;
-  mutable std::shared_mutex mutex;
+  mutable FairSharedMutex mutex;
 };
 
 bool is_nowhere(const Position& position);
