@@ -88,6 +88,13 @@ std::size_t CodeScan::scan_chunk(std::uint32_t query) {
                                      {hit_rows_.data(), hit_distances_.data()});
 }
 
+void CodeScan::merge(const CodeScan& other) {
+  for (std::size_t i = 0; i < other.best_ids_.size(); ++i) {
+    if (other.best_ids_[i] < 0) continue;
+    best_[i / kept_].offer_distinct(other.best_distances_[i], other.best_ids_[i]);
+  }
+}
+
 void CodeScan::finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
   const std::size_t k = ids.columns;
   for (std::size_t q = 0; q < codes_.rows; ++q) {

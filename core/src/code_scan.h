@@ -51,6 +51,9 @@ class CodeScan {
     }
   }
 
+  // Takes over what another scan of the same queries has met.
+  void merge(const CodeScan& other);
+
   // Writes (queries x k) landmarks and distances as protomark::search gives them back.
   void finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const;
 

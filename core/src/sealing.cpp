@@ -12,6 +12,7 @@
 #include "map_sections.h"
 #include "prototype_store.h"
 #include "quantize4.h"
+#include "rounded_mean.h"
 #include "ward.h"
 
 namespace protomark {

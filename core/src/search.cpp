@@ -7,6 +7,7 @@
 #include "code_scan.h"
 #include "kernels/kernels.h"
 #include "parallel.h"
+#include "row_landmarks.h"
 
 namespace protomark {
 namespace {
@@ -14,18 +15,17 @@ namespace {
 // Rows that are compared with all queries at a time; codes and landmarks stay in the L1 cache.
 constexpr std::size_t kChunkRows = 32 * kPackedRows;
 
-// The landmarks of a map's rows, chunk after chunk from the first row.
+// The landmarks of a map's rows where only their numbers of rows are known, chunk after chunk from
+// the first row.
 class RowLandmarkCursor {
  public:
   RowLandmarkCursor(const RowLandmarks& landmarks, std::size_t rows)
       : landmarks_(landmarks), end_(rows) {}
 
-  // Those of the next rows, up to kChunkRows; nullptr where a row is a landmark.
+  // Those of the next rows, up to kChunkRows.
   const std::uint32_t* next() {
     const std::size_t first = row_;
     row_ = std::min(end_, row_ + kChunkRows);
-    if (landmarks_.of_row != nullptr) return landmarks_.of_row + first;
-    if (landmarks_.rows_of == nullptr) return nullptr;
     room_.resize(kChunkRows);
     for (std::size_t i = 0; i < row_ - first; ++i) {
       room_[i] = landmark_;
@@ -53,6 +53,9 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
                    const SearchOptions& options, MatrixView<std::int64_t> ids,
                    MatrixView<float> distances) {
   check_search(prototypes.dim, queries, options, ids, distances);
+  if (options.recall || options.probes) {
+    throw std::invalid_argument("approximate search needs an index: call build_index first");
+  }
   parallel_for(options.threads, queries.rows, 16, [&](std::size_t first, std::size_t last) {
     const std::size_t n = last - first;
     const std::size_t k = ids.columns;
@@ -60,23 +63,22 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
     std::vector<std::uint32_t> all(n);
     std::iota(all.begin(), all.end(), 0u);
     std::vector<CodeVector> room;
+    const RowNumbers numbers(prototypes.landmarks);
     RowLandmarkCursor cursor(prototypes.landmarks, prototypes.rows);
-    const auto id = [&](std::size_t landmark) {
-      return prototypes.ids != nullptr ? prototypes.ids[landmark]
-                                       : static_cast<std::int64_t>(landmark);
-    };
     for (std::size_t row = 0; row < prototypes.rows; row += kChunkRows) {
       const std::size_t rows = std::min(kChunkRows, prototypes.rows - row);
       const std::int8_t* packed =
           chunk(row / kPackedRows, (rows + kPackedRows - 1) / kPackedRows, room);
-      const std::uint32_t* landmarks = cursor.next();
-      if (landmarks == nullptr) {
+      if (prototypes.landmarks.rows_of != nullptr) {
+        const std::uint32_t* landmarks = cursor.next();
         scan.compare(all, packed, rows, [&](TopK& best, std::int32_t distance, std::size_t i) {
-          best.offer(distance, id(row + i));
+          const std::uint32_t landmark = landmarks[i];
+          best.offer_distinct(distance, prototypes.ids != nullptr ? prototypes.ids[landmark]
+                                                                  : std::int64_t{landmark});
         });
       } else {
         scan.compare(all, packed, rows, [&](TopK& best, std::int32_t distance, std::size_t i) {
-          best.offer_distinct(distance, id(landmarks[i]));
+          numbers.offer(best, distance, row + i, prototypes.ids);
         });
       }
     }
