@@ -47,10 +47,12 @@ void scan_probes(const Prototypes& prototypes, const CellView& cells, const Chun
       const std::uint32_t* own = &blocks[first];
       const std::size_t own_rows = std::min(n * kPackedRows, rows - first * kPackedRows);
       const std::int8_t* packed = chunk(own, n, room);
-      scan.compare(queries, packed, own_rows, [&](TopK& best, std::int32_t distance, std::size_t r) {
-        const std::size_t row = std::size_t{own[r / kPackedRows]} * kPackedRows + r % kPackedRows;
-        numbers.offer(best, distance, row, prototypes.ids);
-      });
+      scan.compare(queries, packed, own_rows,
+                   [&](TopK& best, std::int32_t distance, std::size_t r) {
+                     const std::size_t row =
+                         std::size_t{own[r / kPackedRows]} * kPackedRows + r % kPackedRows;
+                     numbers.offer(best, distance, row, prototypes.ids);
+                   });
     }
   }
 }

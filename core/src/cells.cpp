@@ -138,9 +138,8 @@ Cells::Cells(std::vector<std::int8_t> centroids, std::size_t dim)
 
   const auto groups = static_cast<std::size_t>(std::ceil(std::sqrt(static_cast<double>(n))));
   const auto nearest_group = [&](const PackedPrototypes& to) {
-    return nearest_numbers(all, [&](Codes codes, auto ids, auto distances) {
-      search(to, codes, {}, ids, distances);
-    });
+    return nearest_numbers(
+        all, [&](Codes codes, auto ids, auto distances) { search(to, codes, {}, ids, distances); });
   };
   const auto assign = [&](const std::vector<std::int8_t>& to) {
     const Packed packed{pack_codes({to.data(), groups, dim_})};

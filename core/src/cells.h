@@ -19,7 +19,7 @@ std::vector<CodeVector> pack_codes(Codes codes);
 // all and takes some hundreds of comparisons for thousands of cells.
 class Cells {
  public:
-  static constexpr std::size_t kMaxCells = 1 << 20;
+  static constexpr std::size_t kMaxCells = 1 << 16;
 
   // None.
   Cells() = default;
@@ -53,9 +53,9 @@ class Cells {
   Packed packed_;
 
   Packed group_centroids_;
-  Packed grouped_;                          // centroids by group
-  std::vector<std::uint32_t> cell_of_;      // of each place in grouped_
-  std::vector<std::uint32_t> group_sizes_;  // of each group
+  Packed grouped_;                           // centroids by group
+  std::vector<std::uint32_t> cell_of_;       // of each place in grouped_
+  std::vector<std::uint32_t> group_sizes_;   // of each group
   std::vector<std::uint32_t> group_blocks_;  // first block of each group, and the end
 };
 

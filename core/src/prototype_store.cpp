@@ -203,6 +203,7 @@ void PrototypeStore::close_gap(std::uint32_t row) {
   if (const std::uint32_t last = blocks_.last(cell); last != row) relocate(last, row);
   const std::uint32_t gone = blocks_.pop(cell);
   --rows_;
+  ++changes_;
   if (gone == CellBlocks::kNone) return;
   const auto moved = static_cast<std::uint32_t>(blocks_.blocks());
   for (std::uint32_t i = 0; gone != moved && i < kPackedRows; ++i) {
@@ -414,6 +415,7 @@ void PrototypeStore::settle(int threads) {
       close_gap(row);
     }
   }
+  changes_ += unsettled_.size();
   unsettled_.clear();
 }
 
@@ -433,6 +435,7 @@ void PrototypeStore::set_cells(Cells cells, int threads) {
   rearrange(rows, cell_of_row, std::max<std::size_t>(cells.size(), 1));
   cells_ = std::move(cells);
   unsettled_.clear();
+  changes_ += rows_;
 }
 
 namespace {

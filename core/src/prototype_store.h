@@ -3,6 +3,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <mutex>
 #include <shared_mutex>
 #include <span>
 #include <vector>
@@ -10,6 +11,7 @@
 #include "cell_blocks.h"
 #include "cells.h"
 #include "id_index.h"
+#include "probe_ranks.h"
 #include "protomark/prototypes.h"
 
 namespace protomark {
@@ -102,6 +104,8 @@ class PrototypeStore {
   void set_cells(Cells cells, int threads);
   // Puts rows that were created or refreshed into their cells; ends every change.
   void settle(int threads);
+  // A number that grows with each row that came, changed or went while there was an index.
+  std::size_t changes() const { return changes_; }
 
   void set_position(std::uint32_t landmark, const Position& position);
   Position position(std::uint32_t landmark) const;
@@ -150,12 +154,21 @@ class PrototypeStore {
   CellBlocks blocks_;
   Cells cells_;
   std::vector<Key> unsettled_;
+  std::size_t changes_ = 0;
 };
 
 // What users do not see of an open map.
 struct PrototypeMap::Store : PrototypeStore {
   using PrototypeStore::PrototypeStore;
+  // As measured on the map, now or when it was much the same.
+  ProbeRanks ranks(int threads) const;
+
   mutable std::shared_mutex mutex;
+
+ private:
+  mutable std::mutex ranks_mutex_;
+  mutable ProbeRanks ranks_;  // empty: not measured
+  mutable std::size_t ranks_changes_ = 0;
 };
 
 bool is_nowhere(const Position& position);

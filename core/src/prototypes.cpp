@@ -326,12 +326,6 @@ void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
   search_codes({codes.data(), queries.rows, dim_}, options, ids, distances);
 }
 
-void PrototypeMap::search_codes(Codes queries, const SearchOptions& options,
-                                MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
-  const std::shared_lock lock(store_->mutex);
-  protomark::search(store_->view(), queries, options, ids, distances);
-}
-
 void PrototypeMap::save(const std::filesystem::path& path) const {
   const std::shared_lock lock(store_->mutex);
   const auto landmarks = store_->sorted_landmarks();
@@ -359,7 +353,9 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
     sums.insert(sums.end(), store_->sum(row), store_->sum(row) + dim_);
   }
 
-  ContainerWriter file(FileKind::open_map, with_looks ? 2 : 1);
+  const std::vector<std::int8_t>& cells = store_->cells().centroids();
+
+  ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
   file.add(section::kIds, std::as_bytes(std::span(ids)));
@@ -371,6 +367,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   file.add(section::kCounts, std::as_bytes(std::span(counts)));
   file.add(section::kSums, std::as_bytes(std::span(sums)));
   if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
+  if (!cells.empty()) file.add(section::kCells, std::as_bytes(std::span(cells)));
   file.write(path);
 }
 
@@ -430,6 +427,8 @@ PrototypeMap PrototypeMap::load(const std::filesystem::path& path) {
   }
   // After the landmarks, so that room for positions is made once.
   for (std::uint32_t i = 0; i < positions.size(); ++i) store.set_position(i, positions[i]);
+  if (auto cells = read_cells(file, dim); !cells.empty())
+    store.set_cells({std::move(cells), dim}, 1);
   return map;
 }
 

@@ -31,7 +31,7 @@ struct PackedPrototypes {
   std::size_t dim = 0;
   // Of each landmark; nullptr: its number; negative: there is none, rows are padding.
   const std::int64_t* ids = nullptr;
-  RowLandmarks landmarks = {};        // neither is set: a row is a landmark
+  RowLandmarks landmarks = {};  // neither is set: a row is a landmark
 };
 
 inline constexpr std::size_t kPackedRows = 16;
