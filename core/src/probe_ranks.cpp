@@ -52,8 +52,12 @@ ProbeRanks measure_ranks(
 
 std::size_t probes_for(const ProbeRanks& ranks, double recall, std::size_t cells) {
   if (recall >= 1 || ranks.empty()) return cells;
+  // A share of n test queries is uncertain by so much (one standard error); with twice that on top,
+  // less than the stated recall is rare.
   const auto n = static_cast<double>(ranks.size());
-  return ranks[static_cast<std::size_t>(std::ceil(recall * n)) - 1];
+  const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
+  if (enough > n) return cells;
+  return ranks[static_cast<std::size_t>(std::ceil(enough)) - 1];
 }
 
 std::optional<std::size_t> asked_probes(const SearchOptions& options, std::size_t cells,
