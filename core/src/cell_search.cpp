@@ -6,6 +6,7 @@
 
 #include "code_scan.h"
 #include "kernels/kernels.h"
+#include "nearest_cells.h"
 #include "parallel.h"
 #include "row_landmarks.h"
 
@@ -58,20 +59,20 @@ void scan_probes(const Prototypes& prototypes, const CellView& cells, const Chun
 }
 
 // Those of [first, last) cells of each query, nearest first, in the order of cells.
-std::vector<Probe> by_cell(const std::vector<std::int64_t>& nearest, std::size_t queries,
+std::vector<Probe> by_cell(const std::vector<std::uint32_t>& nearest, std::size_t queries,
                            std::size_t probes, std::size_t first, std::size_t last,
                            std::size_t cells) {
   std::vector<std::uint32_t> next(cells + 1, 0);
   for (std::size_t q = 0; q < queries; ++q) {
     for (std::size_t p = first; p < last; ++p) {
-      ++next[static_cast<std::size_t>(nearest[q * probes + p]) + 1];
+      ++next[nearest[q * probes + p] + 1];
     }
   }
   for (std::size_t c = 0; c < cells; ++c) next[c + 1] += next[c];
   std::vector<Probe> result(queries * (last - first));
   for (std::size_t q = 0; q < queries; ++q) {
     for (std::size_t p = first; p < last; ++p) {
-      const auto cell = static_cast<std::uint32_t>(nearest[q * probes + p]);
+      const std::uint32_t cell = nearest[q * probes + p];
       result[next[cell]++] = {cell, static_cast<std::uint32_t>(q)};
     }
   }
@@ -85,12 +86,8 @@ void search_chunks(const Prototypes& prototypes, const CellView& cells, const Ch
                    MatrixView<float> distances) {
   check_search(prototypes.dim, queries, options, ids, distances);
   probes = std::min(probes, cells.cells());
-  SearchOptions coarse;
-  coarse.threads = options.threads;
-  std::vector<std::int64_t> nearest(queries.rows * probes);
-  std::vector<float> nearest_distances(nearest.size());
-  search(centroids, queries, coarse, {nearest.data(), queries.rows, probes},
-         {nearest_distances.data(), queries.rows, probes});
+  const std::vector<std::uint32_t> nearest =
+      nearest_cells(centroids, queries, probes, options.threads);
 
   CodeScan scan(queries, ids.columns, options);
   // The nearest cell first: it leaves little that others have to offer.

@@ -19,7 +19,11 @@ std::int32_t squared_distance(const std::int8_t* a, const std::int8_t* b, std::s
 std::vector<std::size_t> test_rows(std::size_t rows) {
   const std::size_t n = std::min(rows, kTestQueries);
   std::vector<std::size_t> result(n);
-  for (std::size_t i = 0; i < n; ++i) result[i] = i * rows / n;
+  // Multiples of the golden ratio are as even, and in no step with what cells are learned from.
+  for (std::size_t i = 0; i < n; ++i) {
+    const std::uint64_t x = (i + 1) * std::uint64_t{0x9e3779b97f4a7c15};
+    result[i] = static_cast<std::size_t>((x >> 32) * rows >> 32);
+  }
   return result;
 }
 
@@ -52,10 +56,9 @@ ProbeRanks measure_ranks(
 
 std::size_t probes_for(const ProbeRanks& ranks, double recall, std::size_t cells) {
   if (recall >= 1 || ranks.empty()) return cells;
-  // A share of n test queries is uncertain by so much (one standard error); with twice that on top,
-  // less than the stated recall is rare.
+  // A share of n test queries is uncertain by so much: one standard error.
   const auto n = static_cast<double>(ranks.size());
-  const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
+  const double enough = n * recall + std::sqrt(n * recall * (1 - recall));
   if (enough > n) return cells;
   return ranks[static_cast<std::size_t>(std::ceil(enough)) - 1];
 }
