@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from documents import replace_tables
+from mined_batches import AveragePrecisionLoss, MinedSampler
 from protomark.console import progress_bar
 from protomark.files import replacing, write_text
 from protomark.tracks.file import Tracks, sequence_name
@@ -42,7 +43,10 @@ QUERIES = 5000
 
 @dataclass(frozen=True)
 class Variant:
-    """One change of the recipe: options that differ, and what is learned from."""
+    """One change of the recipe: options that differ, what is learned from, batches and loss.
+
+    `mined` is the share of a batch that `MinedSampler` picks.
+    """
 
     name: str
     group: str
@@ -50,6 +54,8 @@ class Variant:
     sequences: tuple[str, ...] = LEARNED
     varied: bool = True
     upright: bool = False
+    mined: float = 0.0
+    average_precision: bool = False
 
 
 VARIANTS = (
@@ -62,6 +68,9 @@ VARIANTS = (
     Variant("2 views in the support", "objective", {"views": 3, "queries": 3}),
     Variant("batches of 300 landmarks", "objective", {"landmarks": 300}),
     Variant("batches of 2000 landmarks", "objective", {"landmarks": 2000}),
+    Variant("batches of mined negatives", "objective", mined=1.0),
+    Variant("half of a batch mined negatives", "objective", mined=0.5),
+    Variant("average-precision loss", "objective", average_precision=True),
     Variant("32 alone", "nesting", {"dims": (32,)}),
     Variant("linear", "capacity", {"hidden": ()}),
     Variant("256 hidden units", "capacity", {"hidden": (256,)}),
@@ -102,6 +111,10 @@ def run(
     views = [Views.from_tracks(t, n) for n, t in zip(variant.sequences, learned, strict=True)]
     trials = [Trial.from_tracks(t, n, 0, QUERIES) for n, t in zip(MEASURED, measured, strict=True)]
     trainer = Trainer(views, trials[:1], options, half=has_fast_bfloat16("cpu"))
+    if variant.mined:
+        trainer.sampler = MinedSampler(trainer, variant.mined, every=max(many // 4, 1))
+    if variant.average_precision:
+        trainer.loss = AveragePrecisionLoss(options.dims)
     trainer.run(step)  # type: ignore[arg-type]
     bits, dims = trainer.network.bits, [d for d in DIMS if d in options.dims]
     found: dict[str, object] = {

@@ -108,8 +108,9 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     done = protomark(*build, "--sealed", "--code-bits", 4, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
-    # The ids are 0, 1, 2 and 7, so they are kept: 12 dimensions, a count and 8 bytes.
-    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 6 + 1 + 8)
+    # The ids are 0, 1, 2 and 7, so they are kept: 12 dimensions in two
+    # words of 8, a count and 8 bytes.
+    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 8)
     assert row(done.stdout, "code bits").split()[-1] == "4"
     done = protomark(*build, "--code-bits", 4)
     assert (done.returncode, done.stderr.strip()) == (

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -102,16 +103,24 @@ def test_not_for_measuring_and_not_twice(folder: Path, plain: Tracks) -> None:
 
 def test_command_writes_both_and_keeps_what_is_there(folder: Path, tmp_path: Path) -> None:
     tmp_path /= "of[today]"  # no markup of rich's
+    tmp_path.mkdir()
     words = ["tracks", str(folder), "-d", "orb", "--max-keypoints", "300", "-o", str(tmp_path)]
-    words += ["--variants", "1", "--threads", "1"]
+    facts = tmp_path / "facts.json"
+    words += ["--json", str(facts), "--threads", "1", "--variants", "1"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     path = tmp_path / "plane.orb.varied.safetensors"
     assert Tracks.load(path).info["variants"] == 1
     assert "more observations" in done.output
     assert done.output.count("/of[today]/plane.orb.") == 2
+    plain, varied = json.loads(facts.read_text())
+    assert (plain["file"], varied["file"]) == (str(tmp_path / "plane.orb.safetensors"), str(path))
+    assert "variants" not in plain
+    assert (varied["variants"], varied["skipped"]) == (1, False)
+    assert varied["observations"] == len(Tracks.load(path).observations) > plain["observations"]
     before = path.stat().st_mtime_ns
     assert CliRunner().invoke(app, words).exit_code == 0
     assert path.stat().st_mtime_ns == before
-    assert CliRunner().invoke(app, [*words[:-3], "2"]).exit_code == 0
+    assert json.loads(facts.read_text())[1] == {**varied, "skipped": True}
+    assert CliRunner().invoke(app, [*words[:-1], "2"]).exit_code == 0
     assert Tracks.load(path).info["variants"] == 2

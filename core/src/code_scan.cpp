@@ -5,8 +5,6 @@
 #include <stdexcept>
 #include <string>
 
-#include "kernels/kernels.h"
-
 namespace protomark {
 namespace {
 
@@ -14,6 +12,13 @@ static_assert(kPackedRows == kernels::kCodeRows);
 
 // Squared distances reach 256 * 254^2 < 2^24, which float holds exactly; this is beyond all.
 constexpr std::int32_t kNoLimit = 1 << 25;
+
+// Rows that are compared with all queries at a time. Many queries come back to them from the L2
+// cache; for few, rows should come from memory while the last ones are compared.
+std::size_t rows_of_chunk(std::size_t queries, std::size_t dim) {
+  const auto bytes = std::clamp<std::size_t>(256 * queries, 4096, 65536);
+  return std::max<std::size_t>(bytes / dim / kPackedRows, 1) * kPackedRows;
+}
 
 std::int32_t squared_norm(const std::int8_t* code, std::size_t dim) {
   std::int32_t sum = 0;
@@ -63,9 +68,9 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
       unsigned_codes_(queries.rows * dim_, 128),
       best_ids_(queries.rows * kept_),
       best_distances_(queries.rows * kept_),
-      offsets_(kChunkRows),
-      hit_rows_(kChunkRows),
-      hit_distances_(kChunkRows) {
+      chunk_rows_(rows_of_chunk(queries.rows, dim_)),
+      biases_(chunk_rows_),
+      hits_(kernels::kHitRoom) {
   best_.reserve(queries.rows);
   for (std::size_t q = 0; q < queries.rows; ++q) {
     const std::int8_t* code = queries.row(q);
@@ -76,20 +81,29 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
   }
 }
 
+void CodeScan::gather(std::span<const std::uint32_t> queries) {
+  gathered_.resize(queries.size() * dim_);
+  for (std::size_t i = 0; i < queries.size(); ++i) {
+    std::copy_n(&unsigned_codes_[queries[i] * dim_], dim_, &gathered_[i * dim_]);
+  }
+}
+
 void CodeScan::start_chunk(const std::int8_t* packed, std::size_t rows) {
   packed_ = packed;
   blocks_ = (rows + kPackedRows - 1) / kPackedRows;
-  kernels::active().code_offsets(packed_, blocks_, dim_, offsets_.data());
+  kernels::active().code_biases(packed_, blocks_, dim_, biases_.data());
 }
 
-std::size_t CodeScan::scan_chunk(std::uint32_t query) {
-  return kernels::active().code_scan(&unsigned_codes_[query * dim_], packed_, blocks_, dim_,
-                                     offsets_.data(), best_[query].limit(),
-                                     {hit_rows_.data(), hit_distances_.data()});
+std::size_t CodeScan::scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
+                                 std::size_t* block) {
+  std::int32_t limits[kernels::kScanQueries];
+  for (std::size_t i = 0; i < group.size(); ++i) limits[i] = best_[group[i]].limit();
+  return kernels::active().code_scan({&gathered_[first * dim_], limits, group.size()},
+                                     {packed_, biases_.data(), blocks_, dim_}, block, hits_.data());
 }
 
 void CodeScan::merge(const CodeScan& other) {
-  for (std::size_t i = 0; i < other.best_ids_.size(); ++i) {
+  for (std::size_t i = 0; i < best_ids_.size(); ++i) {
     if (other.best_ids_[i] < 0) continue;
     best_[i / kept_].offer_distinct(other.best_distances_[i], other.best_ids_[i]);
   }

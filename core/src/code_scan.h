@@ -6,6 +6,7 @@
 #include <span>
 #include <vector>
 
+#include "kernels/kernels.h"
 #include "protomark/search.h"
 #include "top_k.h"
 
@@ -31,6 +32,11 @@ class CodeScan {
   CodeScan(const CodeScan&) = delete;
   CodeScan& operator=(const CodeScan&) = delete;
 
+  std::size_t queries() const { return codes_.rows; }
+  // Rows that are compared with all queries at a time, a multiple of 16: what a caller that makes
+  // packed blocks as it goes had best make at a time.
+  std::size_t chunk_rows() const { return chunk_rows_; }
+
   // Compares the queries of these indices with the first `rows` rows of `packed`, blocks of 16 rows
   // as in PackedPrototypes, and calls offer(TopK& best, std::int32_t distance, std::size_t row) for
   // those that may be among the k nearest. `offer` calls best.offer(distance, id of the row), or
@@ -39,30 +45,36 @@ class CodeScan {
   template <typename Offer>
   void compare(std::span<const std::uint32_t> queries, const std::int8_t* packed, std::size_t rows,
                const Offer& offer) {
-    for (std::size_t row = 0; row < rows; row += kChunkRows) {
-      const std::size_t chunk_rows = std::min(kChunkRows, rows - row);
-      start_chunk(packed + packed_size(row, codes_.columns), chunk_rows);
-      for (const std::uint32_t query : queries) {
-        const std::size_t found = scan_chunk(query);
-        for (std::size_t i = 0; i < found; ++i) {
-          if (hit_rows_[i] < chunk_rows) offer(best_[query], hit_distances_[i], row + hit_rows_[i]);
+    gather(queries);
+    for (std::size_t row = 0; row < rows; row += chunk_rows_) {
+      const std::size_t chunk = std::min(chunk_rows_, rows - row);
+      start_chunk(packed + packed_size(row, codes_.columns), chunk);
+      for (std::size_t first = 0; first < queries.size(); first += kernels::kScanQueries) {
+        const auto group =
+            queries.subspan(first, std::min(kernels::kScanQueries, queries.size() - first));
+        for (std::size_t block = 0; block < blocks_;) {
+          const std::size_t found = scan_chunk(group, first, &block);
+          for (std::size_t i = 0; i < found; ++i) {
+            const kernels::Hit& hit = hits_[i];
+            if (hit.row < chunk) offer(best_[group[hit.query]], hit.distance, row + hit.row);
+          }
         }
       }
     }
   }
 
-  // Takes over what another scan of the same queries has met.
+  // Takes what another scan of the same queries has found in other rows.
   void merge(const CodeScan& other);
 
   // Writes (queries x k) landmarks and distances as protomark::search gives them back.
   void finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const;
 
  private:
-  // Rows that are compared with all queries at a time; they stay in the L1 cache (32 dimensions).
-  static constexpr std::size_t kChunkRows = 32 * kPackedRows;
-
+  void gather(std::span<const std::uint32_t> queries);
   void start_chunk(const std::int8_t* packed, std::size_t rows);
-  std::size_t scan_chunk(std::uint32_t query);
+  // Hits of gathered queries from `first` on, from a block of the chunk on.
+  std::size_t scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
+                         std::size_t* block);
 
   Codes codes_;
   SearchOptions options_;
@@ -73,11 +85,12 @@ class CodeScan {
   std::vector<std::int32_t> best_distances_;
   std::vector<TopK> best_;
 
+  std::vector<std::uint8_t> gathered_;   // codes of the queries that are compared
+  std::size_t chunk_rows_;               // compared with all queries at a time
   const std::int8_t* packed_ = nullptr;  // the chunk
   std::size_t blocks_ = 0;
-  std::vector<std::int32_t> offsets_;
-  std::vector<std::uint32_t> hit_rows_;
-  std::vector<std::int32_t> hit_distances_;
+  std::vector<std::int32_t> biases_;
+  std::vector<kernels::Hit> hits_;
 };
 
 }  // namespace protomark

@@ -1,6 +1,7 @@
 #include "nearest_cells.h"
 
 #include <algorithm>
+#include <array>
 
 #include "kernels/kernels.h"
 #include "parallel.h"
@@ -8,64 +9,85 @@
 namespace protomark {
 namespace {
 
-// One block in so many tells how near the nearest centroids are.
-constexpr std::size_t kSampleStep = 8;
+// So many blocks in kSampleStep tell how near the nearest centroids are.
+constexpr std::size_t kSampleBlocks = 4;
+constexpr std::size_t kSampleStep = 8 * kSampleBlocks;
 
-// All centroids against one query after the other. For one thread.
+// Beyond all distances.
+constexpr std::int32_t kNoLimit = 1 << 25;
+
+// All centroids against some queries at a time. For one thread.
 class Ranking {
  public:
   explicit Ranking(const PackedPrototypes& centroids)
       : centroids_(centroids),
         dim_(packed_dim(centroids.dim)),
         blocks_((centroids.rows + kPackedRows - 1) / kPackedRows),
-        query_(dim_, 128),
-        offsets_(blocks_ * kPackedRows),
-        rows_(offsets_.size()),
-        distances_(offsets_.size()) {
-    kernels::active().code_offsets(centroids.data, blocks_, dim_, offsets_.data());
+        queries_(kernels::kScanQueries * dim_),
+        biases_(blocks_ * kPackedRows),
+        hits_(kernels::kHitRoom),
+        found_(kernels::kScanQueries) {
+    kernels::active().code_biases(centroids.data, blocks_, dim_, biases_.data());
   }
 
-  void nearest(const std::int8_t* query, std::size_t probes, std::uint32_t* to) {
-    for (std::size_t d = 0; d < centroids_.dim; ++d) {
-      query_[d] = static_cast<std::uint8_t>(query[d] + 128);
+  // At most kScanQueries queries.
+  void nearest(Codes queries, std::size_t probes, std::uint32_t* to) {
+    std::fill(queries_.begin(), queries_.end(), 128);
+    for (std::size_t q = 0; q < queries.rows; ++q) {
+      for (std::size_t d = 0; d < queries.columns; ++d) {
+        queries_[q * dim_ + d] = static_cast<std::uint8_t>(queries.row(q)[d] + 128);
+      }
     }
-    scan(0, blocks_, limit_for(probes));
-    if (found_.size() < probes) {
-      found_.clear();
-      scan(0, blocks_, INT32_MAX);
+    std::fill(limits_.begin(), limits_.end(), kNoLimit);
+    for (std::size_t block = 0; block < blocks_; block += kSampleStep) {
+      scan(0, queries.rows, block, std::min(blocks_, block + kSampleBlocks));
     }
-    const auto end = found_.begin() + static_cast<std::ptrdiff_t>(probes);
-    if (end != found_.end()) std::nth_element(found_.begin(), end - 1, found_.end());
-    std::iter_swap(found_.begin(), std::min_element(found_.begin(), end));
-    for (std::size_t i = 0; i < probes; ++i) to[i] = static_cast<std::uint32_t>(found_[i]);
-    found_.clear();
+    for (std::size_t q = 0; q < queries.rows; ++q) limits_[q] = likely_limit(found_[q], probes);
+    scan(0, queries.rows, 0, blocks_);
+    for (std::size_t q = 0; q < queries.rows; ++q) {
+      if (found_[q].size() < probes) {
+        found_[q].clear();
+        limits_[q] = kNoLimit;
+        scan(q, 1, 0, blocks_);
+      }
+      select(found_[q], probes, to + q * probes);
+      found_[q].clear();
+    }
   }
 
  private:
-  // A distance that is likely to leave some more than `probes` centroids.
-  std::int32_t limit_for(std::size_t probes) {
-    for (std::size_t block = 0; block < blocks_; block += kSampleStep) scan(block, 1, INT32_MAX);
-    const std::size_t rank = probes * 3 / 2 / kSampleStep + 4;
-    std::int32_t limit = INT32_MAX;
-    if (rank < found_.size()) {
-      const auto at = found_.begin() + static_cast<std::ptrdiff_t>(rank);
-      std::nth_element(found_.begin(), at, found_.end());
+  // Distances above, numbers of cells below.
+  using Found = std::vector<std::int64_t>;
+
+  // A limit that is likely to leave some more than `probes` cells, by the distances to a sample.
+  static std::int32_t likely_limit(Found& sample, std::size_t probes) {
+    const std::size_t rank = probes * 3 / 2 * kSampleBlocks / kSampleStep + 4;
+    std::int32_t limit = kNoLimit;
+    if (rank < sample.size()) {
+      const auto at = sample.begin() + static_cast<std::ptrdiff_t>(rank);
+      std::nth_element(sample.begin(), at, sample.end());
       limit = static_cast<std::int32_t>(*at >> 32);
     }
-    found_.clear();
+    sample.clear();
     return limit;
   }
 
-  // Appends centroids within the limit: distances above, numbers below.
-  void scan(std::size_t block, std::size_t blocks, std::int32_t limit) {
-    const std::size_t n = kernels::active().code_scan(
-        query_.data(), centroids_.data + block * kPackedRows * dim_, blocks, dim_,
-        &offsets_[block * kPackedRows], limit, {rows_.data(), distances_.data()});
-    for (std::size_t i = 0; i < n; ++i) {
-      const std::size_t row = block * kPackedRows + rows_[i];
-      if (row < centroids_.rows) {
-        found_.push_back(std::int64_t{distances_[i]} * (std::int64_t{1} << 32) +
-                         static_cast<std::int64_t>(row));
+  static void select(Found& found, std::size_t probes, std::uint32_t* to) {
+    const auto end = found.begin() + static_cast<std::ptrdiff_t>(probes);
+    if (end != found.end()) std::nth_element(found.begin(), end - 1, found.end());
+    std::iter_swap(found.begin(), std::min_element(found.begin(), end));
+    for (std::size_t i = 0; i < probes; ++i) to[i] = static_cast<std::uint32_t>(found[i]);
+  }
+
+  void scan(std::size_t query, std::size_t queries, std::size_t block, std::size_t end) {
+    while (block < end) {
+      const std::size_t n = kernels::active().code_scan(
+          {&queries_[query * dim_], &limits_[query], queries},
+          {centroids_.data, biases_.data(), end, dim_}, &block, hits_.data());
+      for (std::size_t i = 0; i < n; ++i) {
+        if (hits_[i].row >= centroids_.rows) continue;
+        found_[query + hits_[i].query].push_back(
+            std::int64_t{hits_[i].distance} * (std::int64_t{1} << 32) + hits_[i].row);
       }
     }
   }
@@ -73,11 +95,11 @@ class Ranking {
   PackedPrototypes centroids_;
   std::size_t dim_;
   std::size_t blocks_;
-  std::vector<std::uint8_t> query_;
-  std::vector<std::int32_t> offsets_;
-  std::vector<std::uint32_t> rows_;
-  std::vector<std::int32_t> distances_;
-  std::vector<std::int64_t> found_;
+  std::vector<std::uint8_t> queries_;
+  std::array<std::int32_t, kernels::kScanQueries> limits_;
+  std::vector<std::int32_t> biases_;
+  std::vector<kernels::Hit> hits_;
+  std::vector<Found> found_;  // of each query
 };
 
 }  // namespace
@@ -87,8 +109,9 @@ std::vector<std::uint32_t> nearest_cells(const PackedPrototypes& centroids, Code
   std::vector<std::uint32_t> result(queries.rows * probes);
   parallel_for(threads, queries.rows, 16, [&](std::size_t first, std::size_t last) {
     Ranking ranking(centroids);
-    for (std::size_t q = first; q < last; ++q) {
-      ranking.nearest(queries.row(q), probes, &result[q * probes]);
+    for (std::size_t q = first; q < last; q += kernels::kScanQueries) {
+      const std::size_t n = std::min(kernels::kScanQueries, last - q);
+      ranking.nearest({queries.row(q), n, queries.columns}, probes, &result[q * probes]);
     }
   });
   return result;

@@ -1,8 +1,31 @@
-// Every instruction set that runs here gives the bytes of plain C++, also on extreme values.
+// Every instruction set that runs here gives the bytes of plain C++, and scans what the definition
+// says, also on extreme values.
 #include "kernels/kernels.h"
+
+#include <algorithm>
+#include <bit>
+#include <tuple>
 
 #include "check.h"
 #include "random.h"
+
+#ifdef PROTOMARK_EMULATE_AMX
+namespace protomark::kernels {
+extern const Kernels emulated_amx;  // see CMakeLists.txt
+}
+#endif
+
+namespace protomark::kernels {
+
+bool operator<(const Hit& a, const Hit& b) {
+  return std::tie(a.query, a.row) < std::tie(b.query, b.row);
+}
+
+bool operator==(const Hit& a, const Hit& b) {
+  return a.query == b.query && a.row == b.row && a.distance == b.distance;
+}
+
+}  // namespace protomark::kernels
 
 namespace {
 
@@ -31,25 +54,68 @@ void compare_dense(const Kernels& set, test::Random& random, std::size_t inputs,
   }
 }
 
+// All hits of a scan, whose step is scan(block, hits), in order.
+template <typename Scan>
+std::vector<kernels::Hit> all_hits(std::size_t blocks, const Scan& scan) {
+  std::vector<kernels::Hit> hits(kernels::kHitRoom), all;
+  for (std::size_t block = 0; block < blocks;) {
+    const std::size_t before = block;
+    const std::size_t found = scan(&block, hits.data());
+    CHECK(before < block && block <= blocks);
+    CHECK(found <= hits.size());
+    CHECK(found >= kernels::kHitsEnough || block == blocks);
+    all.insert(all.end(), hits.begin(), hits.begin() + static_cast<std::ptrdiff_t>(found));
+  }
+  std::sort(all.begin(), all.end());
+  return all;
+}
+
+// Limits of all kinds: what all and nothing is within, and just what some row has.
+std::vector<std::int32_t> some_limits(test::Random& random,
+                                      const std::vector<std::vector<std::int32_t>>& distances) {
+  std::vector<std::int32_t> limits;
+  for (const auto& row : distances) {
+    const std::int32_t one = row.empty() ? 0 : row[random.integer(0, row.size() - 1)];
+    const std::int32_t choice[] = {INT32_MIN, INT32_MIN + 1, INT32_MAX, 0, one, one, one - 1};
+    limits.push_back(choice[random.integer(0, 6)]);
+  }
+  return limits;
+}
+
+std::vector<kernels::Hit> expected_hits(const std::vector<std::vector<std::int32_t>>& distances,
+                                        const std::vector<std::int32_t>& limits) {
+  std::vector<kernels::Hit> hits;
+  for (std::uint32_t q = 0; q < limits.size(); ++q) {
+    for (std::uint32_t r = 0; r < distances[q].size(); ++r) {
+      if (distances[q][r] <= limits[q]) hits.push_back({q, r, distances[q][r]});
+    }
+  }
+  return hits;
+}
+
 void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, std::size_t blocks,
-                   int style) {
+                   std::size_t n, int style) {
   const std::size_t rows = 16 * blocks;
   const auto packed = values<std::int8_t>(random, rows * dim, style, -127, 127);
-  const auto query = values<std::uint8_t>(random, dim, style, 1, 255);
-  std::vector<std::int32_t> a(rows), b(rows);
-  kernels::portable.code_offsets(packed.data(), blocks, dim, a.data());
-  set.code_offsets(packed.data(), blocks, dim, b.data());
-  CHECK(a == b);
-  for (const std::int32_t limit : {INT32_MIN, -20000, 0, 100000, 1 << 25}) {
-    std::vector<std::uint32_t> rows_a(rows), rows_b(rows);
-    std::vector<std::int32_t> found_a(rows), found_b(rows);
-    const std::size_t n = kernels::portable.code_scan(
-        query.data(), packed.data(), blocks, dim, a.data(), limit, {rows_a.data(), found_a.data()});
-    CHECK(set.code_scan(query.data(), packed.data(), blocks, dim, a.data(), limit,
-                        {rows_b.data(), found_b.data()}) == n);
-    CHECK(rows_a == rows_b);
-    CHECK(found_a == found_b);
-    CHECK(limit != 1 << 25 || n == rows);
+  const auto queries = values<std::uint8_t>(random, n * dim, random.integer(0, 2), 1, 255);
+  std::vector<std::vector<std::int32_t>> distances(n, std::vector<std::int32_t>(rows));
+  for (std::size_t q = 0; q < n; ++q) {
+    for (std::size_t r = 0; r < rows; ++r) {
+      for (std::size_t d = 0; d < dim; ++d) {
+        const int p = packed[r / 16 * 16 * dim + d / 4 * 64 + r % 16 * 4 + d % 4];
+        distances[q][r] += p * p - 2 * p * (queries[q * dim + d] - 128);
+      }
+    }
+  }
+  std::vector<std::int32_t> biases(rows);
+  set.code_biases(packed.data(), blocks, dim, biases.data());
+  for (int repeat = 0; repeat < 3; ++repeat) {
+    const auto limits = some_limits(random, distances);
+    const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
+      return set.code_scan({queries.data(), limits.data(), n},
+                           {packed.data(), biases.data(), blocks, dim}, block, hits);
+    });
+    CHECK(found == expected_hits(distances, limits));
   }
 }
 
@@ -77,22 +143,39 @@ void compare_unpack4(const Kernels& set, test::Random& random, std::size_t dim,
 }
 
 void compare_hamming(const Kernels& set, test::Random& random, std::size_t words,
-                     std::size_t blocks, int style) {
-  auto packed = random.integers<std::uint64_t>(8 * words * blocks, 0, INT64_MAX);
-  auto query = random.integers<std::uint64_t>(words, 0, INT64_MAX);
-  if (style > 0) std::fill(packed.begin(), packed.end(), ~std::uint64_t{0});
-  if (style == 2) std::fill(query.begin(), query.end(), 0);
+                     std::size_t blocks, std::size_t n, int style) {
   const std::size_t rows = 8 * blocks;
-  for (const std::int32_t limit : {0, static_cast<std::int32_t>(32 * words), 1 << 16}) {
-    std::vector<std::uint32_t> rows_a(rows), rows_b(rows);
-    std::vector<std::int32_t> found_a(rows), found_b(rows);
-    const std::size_t n = kernels::portable.hamming_scan(query.data(), packed.data(), blocks, words,
-                                                         limit, {rows_a.data(), found_a.data()});
-    CHECK(set.hamming_scan(query.data(), packed.data(), blocks, words, limit,
-                           {rows_b.data(), found_b.data()}) == n);
-    CHECK(rows_a == rows_b);
-    CHECK(found_a == found_b);
-    CHECK(limit != 1 << 16 || n == rows);
+  auto packed = random.integers<std::uint64_t>(rows * words, 0, INT64_MAX);
+  auto queries = random.integers<std::uint64_t>(n * words, 0, INT64_MAX);
+  if (style > 0) std::fill(packed.begin(), packed.end(), ~std::uint64_t{0});
+  if (style == 2) std::fill(queries.begin(), queries.end(), 0);
+  std::vector<std::vector<std::int32_t>> distances(n, std::vector<std::int32_t>(rows));
+  for (std::size_t q = 0; q < n; ++q) {
+    for (std::size_t r = 0; r < rows; ++r) {
+      for (std::size_t w = 0; w < words; ++w) {
+        const std::uint64_t row = packed[r / 8 * 8 * words + w * 8 + r % 8];
+        distances[q][r] += std::popcount(queries[q * words + w] ^ row);
+      }
+    }
+  }
+  for (int repeat = 0; repeat < 3; ++repeat) {
+    const auto limits = some_limits(random, distances);
+    const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
+      return set.hamming_scan({queries.data(), limits.data(), n}, {packed.data(), blocks, words},
+                              block, hits);
+    });
+    CHECK(found == expected_hits(distances, limits));
+  }
+}
+
+void compare_code_scans(const Kernels& set, test::Random& random) {
+  for (int style = 0; style < 3; ++style) {
+    for (std::size_t dim = 4; dim <= 256; dim += dim < 72 ? 4 : 28) {
+      for (const std::size_t n : {1, 3, 6, 16}) {
+        const auto blocks = static_cast<std::size_t>(random.integer(0, 13));
+        compare_codes(set, random, dim, blocks, n, style);
+      }
+    }
   }
 }
 
@@ -114,18 +197,25 @@ int main() {
           }
         }
       }
-      for (const std::size_t dim : {4, 12, 32, 256}) {
-        for (const std::size_t blocks : {0, 1, 5}) compare_codes(*set, random, dim, blocks, style);
-      }
       for (std::size_t dim = 1; dim <= 33; ++dim) compare_unpack4(*set, random, dim, 3);
       for (const std::size_t blocks : {0, 1}) compare_unpack4(*set, random, 256, blocks);
-      for (const std::size_t words : {1, 4, 8, 16}) {
-        for (const std::size_t blocks : {0, 1, 9}) {
-          compare_hamming(*set, random, words, blocks, style);
+      for (const std::size_t words : {1, 4, 8, 31, 70, 512}) {
+        for (const std::size_t n : {1, 7, 8, 16}) {
+          const auto blocks = static_cast<std::size_t>(random.integer(0, 9));
+          compare_hamming(*set, random, words, blocks, n, style);
         }
       }
     }
+    compare_code_scans(*set, random);
   }
+#ifdef PROTOMARK_EMULATE_AMX
+  if (const Kernels* avx512 = kernels::find("avx512")) {
+    std::printf("amx, emulated\n");
+    Kernels set = *avx512;
+    set.code_scan = kernels::emulated_amx.code_scan;
+    compare_code_scans(set, random);
+  }
+#endif
   CHECK(sets > 0);
   CHECK(kernels::find("vax") == nullptr);
   return check::result();

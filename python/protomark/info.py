@@ -67,10 +67,13 @@ def _describe_encoder(path: Path) -> dict[str, Any]:
 def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
     """Bytes a landmark that matching needs of a sealed map: prototypes and count, ids left out.
 
-    An open map counts as if it were sealed as it is, with 8 bits a number.
+    An open map counts as if it were sealed as it is, with 8 bits a number. The numbers that pad
+    a prototype to a whole 4 bytes are counted; the up to 15 rows that pad the whole section
+    (`docs/format.md`) are not, as they do not grow with the map.
     """
     bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
-    prototype = (scene.dim * bits + 7) // 8
+    in_a_word = 32 // bits
+    prototype = 4 * -(-scene.dim // in_a_word)
     if scene.prototype_count == len(scene):
         return prototype + 1
     # One more byte says how many prototypes a landmark has.

@@ -1,6 +1,7 @@
 // AVX-512 with VBMI, VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
 #include <immintrin.h>
 
+#include "avx512_hits.h"
 #include "kernels.h"
 
 namespace protomark::kernels {
@@ -41,8 +42,9 @@ void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, 
   for (; i < n; ++i) dense_batch<1>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
 }
 
-void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                  std::int32_t* offsets) {
+// -|p|^2 - 256 sum(p), see avx512_hits.h.
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
+                 std::int32_t* biases) {
   const __m512i ones = _mm512_set1_epi8(1);
   for (std::size_t b = 0; b < blocks; ++b) {
     __m512i norm = _mm512_setzero_si512();
@@ -53,7 +55,8 @@ void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim
       norm = _mm512_dpbusd_epi32(norm, magnitude, magnitude);
       sum = _mm512_dpbusd_epi32(sum, ones, p);
     }
-    _mm512_storeu_si512(offsets + b * kCodeRows, _mm512_add_epi32(norm, _mm512_slli_epi32(sum, 8)));
+    const __m512i offset = _mm512_add_epi32(norm, _mm512_slli_epi32(sum, 8));
+    _mm512_storeu_si512(biases + b * kCodeRows, _mm512_sub_epi32(_mm512_setzero_si512(), offset));
   }
 }
 
@@ -83,51 +86,173 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
   }
 }
 
-std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
-                      std::size_t dim, const std::int32_t* offsets, std::int32_t limit, Hits hits) {
-  const __m512i limits = _mm512_set1_epi32(limit);
-  const __m512i lanes = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
-  std::size_t found = 0;
-  for (std::size_t b = 0; b < blocks; ++b) {
-    __m512i dot = _mm512_setzero_si512();
-    for (std::size_t d = 0; d < dim; d += 4, packed += 64) {
-      const __m512i q = _mm512_set1_epi32(load4(query + d));
-      dot = _mm512_dpbusd_epi32(dot, q, _mm512_loadu_si512(packed));
+// _mm512_dpbusd_epi32 in place: of that, GCC makes two copies of every accumulator a step.
+void add_products(__m512i& acc, __m512i u, __m512i s) {
+  __asm__("vpdpbusd %2, %1, %0" : "+v"(acc) : "v"(u), "v"(s));
+}
+
+struct CodeTile {
+  const std::uint8_t* queries;
+  const std::int32_t* limits;
+  const std::int8_t* rows;
+  const std::int32_t* biases;
+  std::size_t dim;
+  std::size_t first_query;
+  std::size_t first_row;
+};
+
+template <int Queries, int Blocks>
+std::size_t scan_tile(const CodeTile& t, Hit* hits) {
+  __m512i acc[Queries][Blocks];
+#pragma GCC unroll 8
+  for (int b = 0; b < Blocks; ++b) {
+    const __m512i half = _mm512_srai_epi32(_mm512_loadu_si512(t.biases + b * kCodeRows), 1);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) acc[q][b] = half;
+  }
+  const std::int8_t* p = t.rows;
+  for (std::size_t d = 0; d < t.dim; d += 4, p += 64) {
+    __m512i codes[Blocks];
+#pragma GCC unroll 8
+    for (int b = 0; b < Blocks; ++b) codes[b] = _mm512_loadu_si512(p + b * kCodeRows * t.dim);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) {
+      const __m512i query = _mm512_set1_epi32(load4(t.queries + q * t.dim + d));
+#pragma GCC unroll 8
+      for (int b = 0; b < Blocks; ++b) add_products(acc[q][b], query, codes[b]);
     }
-    const __m512i distance =
-        _mm512_sub_epi32(_mm512_loadu_si512(offsets + b * kCodeRows), _mm512_slli_epi32(dot, 1));
-    const __mmask16 hit = _mm512_cmple_epi32_mask(distance, limits);
-    if (hit) {
-      const __m512i rows =
-          _mm512_add_epi32(lanes, _mm512_set1_epi32(static_cast<int>(b * kCodeRows)));
-      _mm512_mask_compressstoreu_epi32(hits.rows + found, hit, rows);
-      _mm512_mask_compressstoreu_epi32(hits.distances + found, hit, distance);
-      found += static_cast<std::size_t>(_mm_popcnt_u32(hit));
+  }
+  unsigned any = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    __m512i best = acc[q][0];
+#pragma GCC unroll 8
+    for (int b = 1; b < Blocks; ++b) best = _mm512_max_epi32(best, acc[q][b]);
+    any |= _mm512_cmpge_epi32_mask(best, _mm512_set1_epi32(threshold(t.limits[q])));
+  }
+  if (any == 0) [[likely]]
+    return 0;
+
+  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows];
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+#pragma GCC unroll 8
+    for (int b = 0; b < Blocks; ++b) _mm512_store_si512(halves[q][b], acc[q][b]);
+  }
+  std::size_t found = 0;
+  for (std::size_t q = 0; q < Queries; ++q) {
+    for (std::size_t b = 0; b < Blocks; ++b) {
+      found += collect_hits(halves[q][b], t.biases + b * kCodeRows, t.limits[q], t.first_query + q,
+                            t.first_row + b * kCodeRows, hits + found);
     }
   }
   return found;
 }
 
-std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed,
-                         std::size_t blocks, std::size_t words, std::int32_t limit, Hits hits) {
-  const __m256i limits = _mm256_set1_epi32(limit);
-  const __m256i lanes = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
+template <int Blocks>
+std::size_t scan_blocks(CodeTile t, std::size_t n, Hit* hits) {
   std::size_t found = 0;
-  for (std::size_t b = 0; b < blocks; ++b) {
-    __m512i count = _mm512_setzero_si512();
-    for (std::size_t w = 0; w < words; ++w, packed += kWordRows) {
-      const __m512i q = _mm512_set1_epi64(static_cast<long long>(query[w]));
-      const __m512i differ = _mm512_xor_si512(q, _mm512_loadu_si512(packed));
-      count = _mm512_add_epi64(count, _mm512_popcnt_epi64(differ));
+  constexpr int kTile = 4;
+  std::size_t q = 0;
+  for (; q + kTile <= n; q += kTile) {
+    found += scan_tile<kTile, Blocks>(t, hits + found);
+    t.queries += kTile * t.dim;
+    t.limits += kTile;
+    t.first_query += kTile;
+  }
+  switch (n - q) {
+    case 1:
+      return found + scan_tile<1, Blocks>(t, hits + found);
+    case 2:
+      return found + scan_tile<2, Blocks>(t, hits + found);
+    case 3:
+      return found + scan_tile<3, Blocks>(t, hits + found);
+    default:
+      return found;
+  }
+}
+
+std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
+                      Hit* hits) {
+  std::size_t found = 0;
+  std::size_t b = *block;
+  while (b < rows.blocks && found < kHitsEnough) {
+    const CodeTile tile = {queries.codes,
+                           queries.limits,
+                           rows.codes + b * kCodeRows * rows.dim,
+                           rows.biases + b * kCodeRows,
+                           rows.dim,
+                           0,
+                           b * kCodeRows};
+    if (b + 4 <= rows.blocks) {
+      found += scan_blocks<4>(tile, queries.n, hits + found);
+      b += 4;
+    } else {
+      found += scan_blocks<1>(tile, queries.n, hits + found);
+      b += 1;
     }
-    const __m256i distance = _mm512_cvtepi64_epi32(count);
-    const __mmask8 hit = _mm256_cmple_epi32_mask(distance, limits);
-    if (hit) {
-      const __m256i rows =
-          _mm256_add_epi32(lanes, _mm256_set1_epi32(static_cast<int>(b * kWordRows)));
-      _mm256_mask_compressstoreu_epi32(hits.rows + found, hit, rows);
-      _mm256_mask_compressstoreu_epi32(hits.distances + found, hit, distance);
-      found += static_cast<std::size_t>(_mm_popcnt_u32(hit));
+  }
+  *block = b;
+  return found;
+}
+
+// `Queries` queries share each load of the rows.
+template <int Queries>
+std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limits,
+                         const std::uint64_t* packed, std::size_t words, std::size_t first_query,
+                         std::size_t first_row, Hit* hits) {
+  __m512i count[Queries];
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) count[q] = _mm512_setzero_si512();
+  for (std::size_t w = 0; w < words; ++w, packed += kWordRows) {
+    const __m512i row = _mm512_loadu_si512(packed);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) {
+      const __m512i query = _mm512_set1_epi64(static_cast<long long>(queries[q * words + w]));
+      count[q] = _mm512_add_epi64(count[q], _mm512_popcnt_epi64(_mm512_xor_si512(query, row)));
+    }
+  }
+  unsigned any = 0;
+  __mmask8 hit[Queries];
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    hit[q] = _mm512_cmple_epi64_mask(count[q], _mm512_set1_epi64(limits[q]));
+    any |= hit[q];
+  }
+  if (any == 0) [[likely]]
+    return 0;
+
+  std::size_t found = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    alignas(64) std::int64_t distances[kWordRows];
+    _mm512_store_si512(distances, count[q]);
+    for (unsigned left = hit[q]; left != 0; left &= left - 1) {
+      const auto r = static_cast<std::size_t>(__builtin_ctz(left));
+      hits[found++] = {static_cast<std::uint32_t>(first_query + q),
+                       static_cast<std::uint32_t>(first_row + r),
+                       static_cast<std::int32_t>(distances[r])};
+    }
+  }
+  return found;
+}
+
+std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, std::size_t* block,
+                         Hit* hits) {
+  constexpr std::size_t kTile = 8;
+  const std::size_t words = rows.words;
+  std::size_t found = 0;
+  for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
+    const std::size_t row = *block * kWordRows;
+    const std::uint64_t* packed = rows.words_of_rows + row * words;
+    std::size_t q = 0;
+    for (; q + kTile <= queries.n; q += kTile) {
+      found += hamming_tile<kTile>(queries.words + q * words, queries.limits + q, packed, words, q,
+                                   row, hits + found);
+    }
+    for (; q < queries.n; ++q) {
+      found += hamming_tile<1>(queries.words + q * words, queries.limits + q, packed, words, q, row,
+                               hits + found);
     }
   }
   return found;
@@ -137,7 +262,7 @@ std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed
 
 const Kernels avx512 = {.name = "avx512",
                         .dense = dense,
-                        .code_offsets = code_offsets,
+                        .code_biases = code_biases,
                         .code_unpack4 = code_unpack4,
                         .code_scan = code_scan,
                         .hamming_scan = hamming_scan};

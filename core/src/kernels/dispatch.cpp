@@ -8,6 +8,12 @@
 
 #if defined(__aarch64__) && defined(__linux__)
 #include <sys/auxv.h>
+#elif defined(__x86_64__)
+#include <cpuid.h>
+#if defined(__linux__)
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
 #endif
 
 #include "kernels.h"
@@ -22,6 +28,21 @@ bool has_avx512() {
   return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
          __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512vbmi") &&
          __builtin_cpu_supports("avx512vnni") && __builtin_cpu_supports("avx512vpopcntdq");
+}
+
+// Linux gives a process the room that tiles need when it asks for it. Elsewhere AMX is not used.
+bool has_amx() {
+#if defined(__linux__)
+  constexpr unsigned kTile = 1u << 24, kInt8 = 1u << 25;
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  if (!has_avx512() || __get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
+  if ((d & kTile) == 0 || (d & kInt8) == 0) return false;
+  constexpr long kRequestPermission = 0x1023;  // ARCH_REQ_XCOMP_PERM
+  constexpr long kTileData = 18;               // XFEATURE_XTILEDATA
+  return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
+#else
+  return false;
+#endif
 }
 #elif defined(__aarch64__)
 bool has_dot_product() {
@@ -44,7 +65,7 @@ Kernels over(const Kernels& set, const Kernels& below) {
     if (theirs != nullptr) mine = theirs;
   };
   take(result.dense, set.dense);
-  take(result.code_offsets, set.code_offsets);
+  take(result.code_biases, set.code_biases);
   take(result.code_unpack4, set.code_unpack4);
   take(result.code_scan, set.code_scan);
   take(result.hamming_scan, set.hamming_scan);
@@ -62,6 +83,7 @@ struct Sets {
 #if defined(__x86_64__)
     if (has_avx2()) add(avx2);
     if (has_avx512()) add(avx512);
+    if (has_amx()) add(amx);
 #elif defined(__aarch64__)
     if (has_dot_product()) add(neon);
 #endif

@@ -24,9 +24,48 @@ struct PackedLayer {
   std::size_t outputs;
 };
 
-struct Hits {
-  std::uint32_t* rows;
-  std::int32_t* distances;
+// A row that is near enough to a query. Both are counted from 0 within what a scan was given.
+struct Hit {
+  std::uint32_t query;
+  std::uint32_t row;
+  std::int32_t distance;
+};
+
+// Queries that a scan takes at a time, so that they share its loads.
+inline constexpr std::size_t kScanQueries = 16;
+// A scan stops early once it has this many hits, so that limits can follow; it may have more by
+// what kScanQueries queries can hit in 64 rows.
+inline constexpr std::size_t kHitsEnough = 64;
+inline constexpr std::size_t kHitRoom = kHitsEnough + kScanQueries * 64;
+
+// Codes q + 128, unsigned, n x dim; n is 1 to kScanQueries.
+struct CodeQueries {
+  const std::uint8_t* codes;
+  const std::int32_t* limits;
+  std::size_t n;
+};
+
+// Codes p, -127 to 127, in blocks of 16 rows: for every 4 dimensions, 16 rows x 4 codes. `dim` is a
+// multiple of 4, 256 at most.
+struct PackedCodes {
+  const std::int8_t* codes;
+  const std::int32_t* biases;  // from code_biases of the same set
+  std::size_t blocks;
+  std::size_t dim;
+};
+
+// n x words; n is 1 to kScanQueries.
+struct WordQueries {
+  const std::uint64_t* words;
+  const std::int32_t* limits;
+  std::size_t n;
+};
+
+// Bits in blocks of 8 rows: for every 64-bit word, the word of 8 rows.
+struct PackedWords {
+  const std::uint64_t* words_of_rows;
+  std::size_t blocks;
+  std::size_t words;
 };
 
 struct Kernels {
@@ -37,11 +76,9 @@ struct Kernels {
   void (*dense)(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n,
                 std::size_t outputs, std::int32_t* sums) = nullptr;
 
-  // Codes are packed in blocks of 16 rows: for every 4 dimensions, 16 rows x 4 codes. `dim` is a
-  // multiple of 4, `blocks` counts blocks. offsets[row] = |p|^2 + 256 sum(p), what code_scan adds
-  // to a product so that it becomes a squared distance.
-  void (*code_offsets)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                       std::int32_t* offsets) = nullptr;
+  // What code_scan of the same set starts from, a number a row.
+  void (*code_biases)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
+                      std::int32_t* biases) = nullptr;
 
   // 4-bit numbers u as codes half_step * (2 u - 15), packed as code_scan takes them, `dim` rounded
   // up to a multiple of 4 with zeros, whatever `packed` holds there. They are packed in blocks of
@@ -50,17 +87,15 @@ struct Kernels {
   void (*code_unpack4)(const std::uint8_t* packed, std::size_t blocks, std::size_t dim,
                        int half_step, std::int8_t* codes) = nullptr;
 
-  // All rows with offsets[row] - 2 * (q + 128) . p <= limit, in ascending order, with that value;
-  // `query` is q + 128, unsigned. Returns how many were written to `hits`.
-  std::size_t (*code_scan)(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
-                           std::size_t dim, const std::int32_t* offsets, std::int32_t limit,
-                           Hits hits) = nullptr;
+  // Finds all rows with |p|^2 - 2 p . q <= limits[q], and that value, from block *block on. Stops
+  // at the end, or after a block with kHitsEnough hits; *block is then where to go on. Returns the
+  // number of hits, in no order.
+  std::size_t (*code_scan)(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
+                           Hit* hits) = nullptr;
 
-  // Bits are packed in blocks of 8 rows: for every 64-bit word, the word of 8 rows. All rows with a
-  // Hamming distance <= limit, in ascending order. Returns how many were written to `hits`.
-  std::size_t (*hamming_scan)(const std::uint64_t* query, const std::uint64_t* packed,
-                              std::size_t blocks, std::size_t words, std::int32_t limit,
-                              Hits hits) = nullptr;
+  // The same for rows with a Hamming distance <= limits[q].
+  std::size_t (*hamming_scan)(const WordQueries& queries, const PackedWords& rows,
+                              std::size_t* block, Hit* hits) = nullptr;
 };
 
 // The best set that this CPU runs, complete, or the one that the environment variable PROTOMARK_ISA
@@ -78,6 +113,7 @@ extern const Kernels portable;
 #if defined(__x86_64__)
 extern const Kernels avx2;
 extern const Kernels avx512;
+extern const Kernels amx;
 #elif defined(__aarch64__)
 extern const Kernels neon;
 #endif

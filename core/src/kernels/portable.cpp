@@ -23,8 +23,9 @@ void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, 
   }
 }
 
-void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                  std::int32_t* offsets) {
+// Queries come as q + 128: |p|^2 - 2 p . q = |p|^2 + 256 sum(p) - 2 p . (q + 128).
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
+                 std::int32_t* biases) {
   for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
     for (std::size_t r = 0; r < kCodeRows; ++r) {
       std::int32_t sum = 0;
@@ -34,7 +35,7 @@ void code_offsets(const std::int8_t* packed, std::size_t blocks, std::size_t dim
           sum += p * p + 256 * p;
         }
       }
-      offsets[b * kCodeRows + r] = sum;
+      biases[b * kCodeRows + r] = sum;
     }
   }
 }
@@ -55,24 +56,28 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
   }
 }
 
-std::size_t code_scan(const std::uint8_t* query, const std::int8_t* packed, std::size_t blocks,
-                      std::size_t dim, const std::int32_t* offsets, std::int32_t limit, Hits hits) {
+std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
+                      Hit* hits) {
+  const std::size_t dim = rows.dim;
   std::size_t found = 0;
-  for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
-    std::int32_t dot[kCodeRows] = {};
-    for (std::size_t d = 0; d < dim; d += 4) {
-      const std::int8_t* p = packed + d * kCodeRows;
-      for (std::size_t r = 0; r < kCodeRows; ++r) {
-        dot[r] += p[4 * r] * query[d] + p[4 * r + 1] * query[d + 1] + p[4 * r + 2] * query[d + 2] +
-                  p[4 * r + 3] * query[d + 3];
+  for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
+    const std::size_t row = *block * kCodeRows;
+    for (std::size_t q = 0; q < queries.n; ++q) {
+      const std::uint8_t* query = queries.codes + q * dim;
+      const std::int8_t* p = rows.codes + row * dim;
+      std::int32_t dot[kCodeRows] = {};
+      for (std::size_t d = 0; d < dim; d += 4, p += 4 * kCodeRows) {
+        for (std::size_t r = 0; r < kCodeRows; ++r) {
+          dot[r] += p[4 * r] * query[d] + p[4 * r + 1] * query[d + 1] +
+                    p[4 * r + 2] * query[d + 2] + p[4 * r + 3] * query[d + 3];
+        }
       }
-    }
-    for (std::size_t r = 0; r < kCodeRows; ++r) {
-      const std::size_t row = b * kCodeRows + r;
-      const std::int32_t distance = offsets[row] - 2 * dot[r];
-      if (distance <= limit) {
-        hits.rows[found] = static_cast<std::uint32_t>(row);
-        hits.distances[found++] = distance;
+      for (std::size_t r = 0; r < kCodeRows; ++r) {
+        const std::int32_t distance = rows.biases[row + r] - 2 * dot[r];
+        if (distance <= queries.limits[q]) {
+          hits[found++] = {static_cast<std::uint32_t>(q), static_cast<std::uint32_t>(row + r),
+                           distance};
+        }
       }
     }
   }
@@ -90,21 +95,26 @@ std::uint64_t popcount(std::uint64_t x) {
   return x & 0xff;
 }
 
-std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed,
-                         std::size_t blocks, std::size_t words, std::int32_t limit, Hits hits) {
+std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, std::size_t* block,
+                         Hit* hits) {
+  const std::size_t words = rows.words;
   std::size_t found = 0;
-  for (std::size_t b = 0; b < blocks; ++b, packed += kWordRows * words) {
-    std::uint64_t count[kWordRows] = {};
-    for (std::size_t w = 0; w < words; ++w) {
-      for (std::size_t r = 0; r < kWordRows; ++r) {
-        count[r] += popcount(query[w] ^ packed[w * kWordRows + r]);
+  for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
+    const std::size_t row = *block * kWordRows;
+    for (std::size_t q = 0; q < queries.n; ++q) {
+      std::uint64_t count[kWordRows] = {};
+      for (std::size_t w = 0; w < words; ++w) {
+        for (std::size_t r = 0; r < kWordRows; ++r) {
+          count[r] += popcount(queries.words[q * words + w] ^
+                               rows.words_of_rows[row * words + w * kWordRows + r]);
+        }
       }
-    }
-    for (std::size_t r = 0; r < kWordRows; ++r) {
-      const auto distance = static_cast<std::int32_t>(count[r]);
-      if (distance <= limit) {
-        hits.rows[found] = static_cast<std::uint32_t>(b * kWordRows + r);
-        hits.distances[found++] = distance;
+      for (std::size_t r = 0; r < kWordRows; ++r) {
+        const auto distance = static_cast<std::int32_t>(count[r]);
+        if (distance <= queries.limits[q]) {
+          hits[found++] = {static_cast<std::uint32_t>(q), static_cast<std::uint32_t>(row + r),
+                           distance};
+        }
       }
     }
   }
@@ -115,7 +125,7 @@ std::size_t hamming_scan(const std::uint64_t* query, const std::uint64_t* packed
 
 const Kernels portable = {.name = "portable",
                           .dense = dense,
-                          .code_offsets = code_offsets,
+                          .code_biases = code_biases,
                           .code_unpack4 = code_unpack4,
                           .code_scan = code_scan,
                           .hamming_scan = hamming_scan};

@@ -36,7 +36,8 @@ def make_tracks(
     """Make the tracks of each folder with each settings; write and print them.
 
     Returns:
-        One summary for each file, see `protomark.tracks.summary.summarise`.
+        One summary for each file, see `protomark.tracks.summary.summarise`; that of a file with
+        varied copies follows that of its plain one and has `variants`, their number.
     """
     if variants < 0:
         raise ValueError(f"--variants {variants}: give the number of copies, 0 for none")
@@ -78,20 +79,22 @@ def make_tracks(
                 tracks = _with_bar(folder.resolve().name, make)
                 tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
                 tracks.save(target)
-            summary = {
-                "file": str(target),
-                **summarise(tracks),
-                "seconds": tracks.info.get("seconds"),
-                "skipped": skipped,
-            }
+            summary = _summary(target, tracks, skipped)
             summaries.append(summary)
             print_summary(summary, tracks)
             if variants:
                 folder_of_images = find_source(folder, images, model).images
-                _make_variants(tracks, folder_of_images, variants, target, force, threads)
+                summaries.append(
+                    _make_variants(tracks, folder_of_images, variants, target, force, threads)
+                )
     if json_path is not None:
         write_text(json_path, json.dumps(summaries, indent=2) + "\n")
     return summaries
+
+
+def _summary(path: Path, tracks: Tracks, skipped: bool) -> dict[str, Any]:
+    seconds = tracks.info.get("seconds")
+    return {"file": str(path), **summarise(tracks), "seconds": seconds, "skipped": skipped}
 
 
 def variants_path(target: Path) -> Path:
@@ -101,23 +104,24 @@ def variants_path(target: Path) -> Path:
 
 def _make_variants(
     tracks: Tracks, images: Path, count: int, target: Path, force: bool, threads: int
-) -> None:
+) -> dict[str, Any]:
     output = variants_path(target)
     want: dict[str, Any] = {"variants": count, "variants_method": METHOD}
     want |= {key: tracks.info.get(key) for key in ("method", "settings", "input")}
     if output.is_file() and not force:
         try:
-            info = Tracks.load(output).info
+            kept = Tracks.load(output)
         except (ValueError, OSError):
-            info = {}
-        if all(info.get(key) == value for key, value in want.items()):
+            kept = None
+        if kept and all(kept.info.get(key) == value for key, value in want.items()):
             progress_console.print(
                 f"{output}: is there already; skipped",
                 markup=False,
                 highlight=False,
                 soft_wrap=True,
             )
-            return
+            return {**_summary(output, kept, skipped=True), "variants": count}
+    begin = time.perf_counter()
     total = len(tracks.keyframe_names)
     varied = _with_bar(
         target.name.split(".")[0],
@@ -125,6 +129,7 @@ def _make_variants(
             tracks, images, count, threads, lambda done: progress("vary", done, total)
         ),
     )
+    varied.info["seconds"] = round(time.perf_counter() - begin, 1)
     varied.save(output)
     added = len(varied.keypoints) - len(tracks.observations)
     console.print(
@@ -133,6 +138,7 @@ def _make_variants(
         highlight=False,
         soft_wrap=True,
     )
+    return {**_summary(output, varied, skipped=False), "variants": count}
 
 
 def _from_images(

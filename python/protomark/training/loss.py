@@ -69,5 +69,9 @@ class PrototypeLoss(nn.Module):
             logits = torch.addmm(-inverse * p.square().sum(1), q, p.T * (2 * inverse))
             own_logit = inverse * (2 * (q * o).sum(1) - o.square().sum(1))
             logits = logits.scatter(1, column, own_logit[:, None])
-            losses.append(functional.cross_entropy(logits, target))
+            losses.append(self.of_logits(logits, target))
         return torch.stack(losses).mean()
+
+    def of_logits(self, logits: Tensor, target: Tensor) -> Tensor:
+        """Scalar loss of logits (q, m), higher for nearer prototypes, and targets (q,) int64."""
+        return functional.cross_entropy(logits, target)

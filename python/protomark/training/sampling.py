@@ -115,11 +115,17 @@ class BatchSampler:
         weight = np.array([(s.counts >= 3).sum() for s in sequences], float) ** balance
         self.probability = weight / weight.sum()
 
+    def choose(self, sequence: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """The landmarks of a batch, (m,) int64, distinct: here at random."""
+        views = self.sequences[sequence]
+        size = min(self.landmarks, len(views))
+        return rng.choice(len(views), size, replace=False, shuffle=False)
+
     def sample(self, rng: np.random.Generator) -> Batch:
         """One batch; the same state of `rng` gives the same batch."""
-        views = self.sequences[rng.choice(len(self.sequences), p=self.probability)]
-        size = min(self.landmarks, len(views))
-        chosen = rng.choice(len(views), size, replace=False, shuffle=False)
+        sequence = int(rng.choice(len(self.sequences), p=self.probability))
+        views = self.sequences[sequence]
+        chosen = self.choose(sequence, rng)
         rows, group, rank = random_views(views, chosen, self.views, rng)
         descriptors = views.descriptors[rows]
         if self.noise:

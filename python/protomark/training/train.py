@@ -218,7 +218,7 @@ class Trainer:
         with _interrupt_flag() as interrupted:
             while self.step < options.steps:
                 if self.step == options.quantized_from:
-                    self._calibrate()
+                    self.calibrate()
                 loss = self._train_step()
                 self.step += 1
                 self.seconds = time.perf_counter() - started
@@ -260,7 +260,8 @@ class Trainer:
         self._losses.append(value)
         return value
 
-    def _calibrate(self) -> None:
+    def calibrate(self) -> None:
+        """Set the ranges of `quantized` by descriptors of all training sequences."""
         self.quantized.calibrate(to_signs(self._calibration, self.device))
 
     def _validate(self) -> Progress:

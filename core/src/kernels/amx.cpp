@@ -1,0 +1,130 @@
+// AMX with int8 tiles, beside AVX-512: Sapphire Rapids and later.
+#include <immintrin.h>
+
+#include "avx512_hits.h"
+#include "kernels.h"
+#ifdef PROTOMARK_EMULATE_AMX
+#include "emulated_tiles.h"
+#else
+#include "amx_tiles.h"
+#endif
+
+namespace protomark::kernels {
+namespace {
+
+struct alignas(64) TileConfig {
+  std::uint8_t palette = 1;
+  std::uint8_t start_row = 0;
+  std::uint8_t reserved[14] = {};
+  std::uint16_t row_bytes[16] = {};
+  std::uint8_t rows[16] = {};
+
+  void set(int tile, std::size_t tile_rows, std::size_t tile_row_bytes) {
+    rows[tile] = static_cast<std::uint8_t>(tile_rows);
+    row_bytes[tile] = static_cast<std::uint16_t>(tile_row_bytes);
+  }
+};
+static_assert(sizeof(TileConfig) == 64);
+
+// Dimensions of a full tile.
+constexpr std::size_t kTileDim = 64;
+// Blocks that are compared at a time, as many as products must be under way at once.
+constexpr std::size_t kStep = 4;
+
+// Packed blocks are tiles as they stand, and so are queries. Tiles 0 to 3 are the results of four
+// blocks, 4 and 5 queries, 6 and 7 a block; the first of each pair is for 64 dimensions, the second
+// for those that are left.
+TileConfig configuration(std::size_t queries, std::size_t dim) {
+  TileConfig config;
+  for (int tile = 0; tile < 4; ++tile) config.set(tile, queries, 4 * kCodeRows);
+  const std::size_t rest = dim % kTileDim;
+  if (dim >= kTileDim) {
+    config.set(4, queries, kTileDim);
+    config.set(6, kTileDim / 4, 4 * kCodeRows);
+  }
+  if (rest != 0) {
+    config.set(5, queries, rest);
+    config.set(7, rest / 4, 4 * kCodeRows);
+  }
+  return config;
+}
+
+// halves: blocks x queries x 16. Blocks beyond `blocks` repeat the last one.
+void scan_step(const CodeQueries& queries, const PackedCodes& rows, std::size_t block,
+               std::size_t blocks, std::int32_t (*halves)[kScanQueries][kCodeRows]) {
+  alignas(64) std::int32_t start[kStep][kCodeRows];
+  const std::int8_t* codes[kStep];
+  for (std::size_t i = 0; i < kStep; ++i) {
+    const std::size_t b = block + (i < blocks ? i : blocks - 1);
+    const __m512i bias = _mm512_loadu_si512(rows.biases + b * kCodeRows);
+    _mm512_store_si512(start[i], _mm512_srai_epi32(bias, 1));
+    codes[i] = rows.codes + b * kCodeRows * rows.dim;
+  }
+  // All rows of a result tile start alike.
+  TILE_LOAD(0, start[0], 0);
+  TILE_LOAD(1, start[1], 0);
+  TILE_LOAD(2, start[2], 0);
+  TILE_LOAD(3, start[3], 0);
+  std::size_t d = 0;
+  for (; d + kTileDim <= rows.dim; d += kTileDim) {
+    TILE_LOAD(4, queries.codes + d, rows.dim);
+    TILE_LOAD(6, codes[0] + d * kCodeRows, 64);
+    TILE_DPBUSD(0, 4, 6);
+    TILE_LOAD(6, codes[1] + d * kCodeRows, 64);
+    TILE_DPBUSD(1, 4, 6);
+    TILE_LOAD(6, codes[2] + d * kCodeRows, 64);
+    TILE_DPBUSD(2, 4, 6);
+    TILE_LOAD(6, codes[3] + d * kCodeRows, 64);
+    TILE_DPBUSD(3, 4, 6);
+  }
+  if (d < rows.dim) {
+    TILE_LOAD(5, queries.codes + d, rows.dim);
+    TILE_LOAD(7, codes[0] + d * kCodeRows, 64);
+    TILE_DPBUSD(0, 5, 7);
+    TILE_LOAD(7, codes[1] + d * kCodeRows, 64);
+    TILE_DPBUSD(1, 5, 7);
+    TILE_LOAD(7, codes[2] + d * kCodeRows, 64);
+    TILE_DPBUSD(2, 5, 7);
+    TILE_LOAD(7, codes[3] + d * kCodeRows, 64);
+    TILE_DPBUSD(3, 5, 7);
+  }
+  TILE_STORE(0, halves[0], 64);
+  TILE_STORE(1, halves[1], 64);
+  TILE_STORE(2, halves[2], 64);
+  TILE_STORE(3, halves[3], 64);
+}
+
+std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
+                      Hit* hits) {
+  const TileConfig config = configuration(queries.n, rows.dim);
+  TILE_CONFIGURE(config);
+  std::size_t found = 0;
+  while (*block < rows.blocks && found < kHitsEnough) {
+    const std::size_t left = rows.blocks - *block;
+    const std::size_t blocks = left < kStep ? left : kStep;
+    alignas(64) std::int32_t halves[kStep][kScanQueries][kCodeRows];
+    scan_step(queries, rows, *block, blocks, halves);
+    for (std::size_t q = 0; q < queries.n; ++q) {
+      __m512i best = _mm512_load_si512(halves[0][q]);
+      for (std::size_t i = 1; i < kStep; ++i) {
+        best = _mm512_max_epi32(best, _mm512_load_si512(halves[i][q]));
+      }
+      const __m512i enough = _mm512_set1_epi32(threshold(queries.limits[q]));
+      if (_mm512_cmpge_epi32_mask(best, enough) == 0) continue;
+      for (std::size_t i = 0; i < blocks; ++i) {
+        const std::size_t row = (*block + i) * kCodeRows;
+        found +=
+            collect_hits(halves[i][q], rows.biases + row, queries.limits[q], q, row, hits + found);
+      }
+    }
+    *block += blocks;
+  }
+  TILE_RELEASE();
+  return found;
+}
+
+}  // namespace
+
+const Kernels amx = {.name = "amx", .code_scan = code_scan};
+
+}  // namespace protomark::kernels
