@@ -136,7 +136,8 @@ Cells::Cells(std::vector<std::int8_t> centroids, std::size_t dim)
   const Codes all{centroids_.data(), n, dim_};
   packed_.codes = pack_codes(all);
 
-  const auto groups = static_cast<std::size_t>(std::ceil(std::sqrt(static_cast<double>(n))));
+  const auto groups =
+      std::min(n, static_cast<std::size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
   const auto nearest_group = [&](const PackedPrototypes& to) {
     return nearest_numbers(
         all, [&](Codes codes, auto ids, auto distances) { search(to, codes, {}, ids, distances); });

@@ -9,9 +9,10 @@
 namespace protomark {
 namespace {
 
-// So many blocks in kSampleStep tell how near the nearest centroids are.
-constexpr std::size_t kSampleBlocks = 4;
-constexpr std::size_t kSampleStep = 8 * kSampleBlocks;
+// One block in so many tells how near the nearest centroids are.
+constexpr std::size_t kSampleStep = 16;
+// Up to here a heap of the nearest is faster than selection.
+constexpr std::size_t kFewProbes = 16;
 
 // Beyond all distances.
 constexpr std::int32_t kNoLimit = 1 << 25;
@@ -40,7 +41,7 @@ class Ranking {
     }
     std::fill(limits_.begin(), limits_.end(), kNoLimit);
     for (std::size_t block = 0; block < blocks_; block += kSampleStep) {
-      scan(0, queries.rows, block, std::min(blocks_, block + kSampleBlocks));
+      scan(0, queries.rows, block, block + 1);
     }
     for (std::size_t q = 0; q < queries.rows; ++q) limits_[q] = likely_limit(found_[q], probes);
     scan(0, queries.rows, 0, blocks_);
@@ -61,7 +62,7 @@ class Ranking {
 
   // A limit that is likely to leave some more than `probes` cells, by the distances to a sample.
   static std::int32_t likely_limit(Found& sample, std::size_t probes) {
-    const std::size_t rank = probes * 3 / 2 * kSampleBlocks / kSampleStep + 4;
+    const std::size_t rank = probes * 3 / 2 / kSampleStep + 4;
     std::int32_t limit = kNoLimit;
     if (rank < sample.size()) {
       const auto at = sample.begin() + static_cast<std::ptrdiff_t>(rank);
@@ -74,8 +75,12 @@ class Ranking {
 
   static void select(Found& found, std::size_t probes, std::uint32_t* to) {
     const auto end = found.begin() + static_cast<std::ptrdiff_t>(probes);
-    if (end != found.end()) std::nth_element(found.begin(), end - 1, found.end());
-    std::iter_swap(found.begin(), std::min_element(found.begin(), end));
+    if (probes <= kFewProbes) {
+      std::partial_sort(found.begin(), end, found.end());
+    } else {
+      std::nth_element(found.begin(), end - 1, found.end());
+      std::iter_swap(found.begin(), std::min_element(found.begin(), end));
+    }
     for (std::size_t i = 0; i < probes; ++i) to[i] = static_cast<std::uint32_t>(found[i]);
   }
 
