@@ -2,8 +2,8 @@
 
 python benchmarks/index_recall.py TRACKS... --json FILE --plot FILE.svg [--dim 32]
 
-Each tracks file is split as `protomark evaluate` does: a random 90 % of the keyframes build the map,
-what the others saw asks. The last map is that of all files together, each with its own ids. A query
+Each tracks file is split as `protomark evaluate` does: a random 90 % of the keyframes build the
+map, what the others saw asks. The last map is that of all files together, each with its own ids. A query
 counts as found where the nearest landmark of the exact search, or one as near, comes first.
 
 Rounds: keyframes of the support come in their order in ten parts. The cells are learned after the
@@ -29,7 +29,7 @@ from protomark.tracks.file import Tracks
 RECALLS = (0.8, 0.9, 0.95, 0.98, 0.99)
 ROUND_RECALL = 0.98
 ROUNDS = 10
-MAX_QUERIES = 4000
+MAX_QUERIES = 2000
 
 
 @dataclass

@@ -1,11 +1,13 @@
 #include "cells.h"
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <queue>
 #include <utility>
 
 #include "cell_search.h"
+#include "probe_ranks.h"
 #include "rounded_mean.h"
 
 namespace protomark {
@@ -168,11 +170,16 @@ Cells Cells::learn(Codes codes, std::size_t cells, int threads) {
   return {k_means(codes, cells, assign), codes.columns};
 }
 
-std::size_t Cells::number_for(std::size_t prototypes) {
-  const double cells = std::ceil(4 * std::sqrt(static_cast<double>(prototypes)));
-  // Cells of a few rows are a waste.
-  return std::clamp<std::size_t>(
-      std::min(static_cast<std::size_t>(cells), prototypes / kPackedRows), 1, kMaxCells);
+std::size_t Cells::number_for(std::size_t prototypes, std::size_t dim) {
+  const auto n = static_cast<double>(prototypes);
+  // What docs/format.md has: numbers of landmarks, ranks, and for each cell its centroid, its
+  // number of rows and half a block of padding, somewhat rounded up.
+  const double left =
+      n * (4 - std::bit_width(prototypes) / 8.0) -
+      static_cast<double>(std::min(prototypes, kTestQueries) * sizeof(std::uint32_t));
+  const double cell = 9.5 * static_cast<double>(packed_dim(dim)) + 4;
+  const double cells = std::min(4 * std::sqrt(n), left / cell);
+  return static_cast<std::size_t>(std::clamp(cells, 1.0, static_cast<double>(kMaxCells)));
 }
 
 std::vector<std::uint32_t> Cells::assign(Codes codes, int threads) const {
