@@ -28,11 +28,14 @@ namespace {
 using Path = std::filesystem::path;
 
 SearchOptions search_options(std::optional<float> max_distance, std::optional<float> ratio,
-                             int threads) {
+                             int threads, std::optional<double> recall,
+                             std::optional<std::size_t> probes) {
   SearchOptions options;
   options.max_distance = max_distance;
   options.ratio = ratio;
   options.threads = threads;
+  options.recall = recall;
+  options.probes = probes;
   return options;
 }
 
@@ -72,9 +75,10 @@ nb::tuple answer(std::size_t queries, std::size_t k, const Run& run) {
 // Open and sealed maps search alike.
 template <typename Map>
 nb::tuple search(const Map& map, nb::object queries, std::size_t k,
-                 std::optional<float> max_distance, std::optional<float> ratio, int threads) {
+                 std::optional<float> max_distance, std::optional<float> ratio, int threads,
+                 std::optional<double> recall, std::optional<std::size_t> probes) {
   const auto q = descriptors(queries);
-  const SearchOptions options = search_options(max_distance, ratio, threads);
+  const SearchOptions options = search_options(max_distance, ratio, threads, recall, probes);
   return answer(q.shape(0), k, [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
     map.search(view(q), options, ids, distances);
   });
@@ -82,9 +86,10 @@ nb::tuple search(const Map& map, nb::object queries, std::size_t k,
 
 template <typename Map>
 nb::tuple search_codes(const Map& map, nb::object queries, std::size_t k,
-                       std::optional<float> max_distance, std::optional<float> ratio, int threads) {
+                       std::optional<float> max_distance, std::optional<float> ratio, int threads,
+                       std::optional<double> recall, std::optional<std::size_t> probes) {
   const auto q = codes(queries);
-  const SearchOptions options = search_options(max_distance, ratio, threads);
+  const SearchOptions options = search_options(max_distance, ratio, threads, recall, probes);
   return answer(q.shape(0), k, [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
     map.search_codes(view(q), options, ids, distances);
   });
@@ -128,6 +133,8 @@ void bind_reading(nb::class_<Map>& map) {
       .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
       .def_prop_ro("prototype_count", &Map::prototype_count,
                    "Number of prototypes: one a landmark, or one for each of its looks.")
+      .def_prop_ro("index_cells", &Map::index_cells,
+                   "Number of cells of the index; 0: there is none.")
       .def_prop_ro(
           "ids", [](const Map& m) { return new_vector(m.ids()); },
           nb::sig("def ids(self) -> NDArray[numpy.int64]"),
@@ -149,11 +156,13 @@ void bind_reading(nb::class_<Map>& map) {
           "World coordinates, (n, 3) float64, NaN where there are none. Raises KeyError for an id "
           "that is not in the map.")
       .def("search", &search<Map>, "descriptors"_a, "k"_a = 2, "max_distance"_a = nb::none(),
-           "ratio"_a = nb::none(), "threads"_a = 1,
+           "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
+           "probes"_a = nb::none(),
            nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
                    "max_distance: float | None = None, ratio: float | None = None, "
-                   "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
-           R"(The k nearest landmarks of each descriptor, exactly; ties go to the smaller id.
+                   "threads: int = 1, recall: float | None = None, probes: int | None = None) -> "
+                   "tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
+           R"(The k nearest landmarks of each descriptor; ties go to the smaller id.
 
 Args:
     descriptors: (q, bits / 8) uint8.
@@ -162,15 +171,23 @@ Args:
     ratio: Lowe's ratio test, in (0, 1]: a query keeps its neighbours only where the nearest
         landmark is closer than ratio times the second nearest.
     threads: threads to use.
+    recall: in (0, 1]: an approximate search in a map with an index that finds the nearest landmark
+        of this share of the queries, as measured on the map (probes()). None: an exact search.
+    probes: instead of recall, the number of cells to search.
 
 Returns:
     ids (q, k) int64, nearest first, -1 where there is none, and distances (q, k) float32,
-    Euclidean in code units, infinite where there is none.)")
+    Euclidean in code units, infinite where there is none.
+
+Raises:
+    ValueError: recall or probes is given where the map has no index (PrototypeMap.build_index).)")
       .def("search_codes", &search_codes<Map>, "codes"_a, "k"_a = 2, "max_distance"_a = nb::none(),
-           "ratio"_a = nb::none(), "threads"_a = 1,
+           "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
+           "probes"_a = nb::none(),
            nb::sig("def search_codes(self, codes: NDArray[numpy.int8], k: int = 2, "
                    "max_distance: float | None = None, ratio: float | None = None, "
-                   "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
+                   "threads: int = 1, recall: float | None = None, probes: int | None = None) -> "
+                   "tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
            "Like search, for descriptors that are encoded already: (q, dim) int8.");
 }
 
@@ -471,6 +488,28 @@ Raises:
           "Set world coordinates, (n, 3) float64; NaN takes a position away. Raises KeyError for "
           "an "
           "unknown id.")
+      .def("build_index", &PrototypeMap::build_index, "cells"_a = nb::none(), "threads"_a = 1,
+           nb::call_guard<nb::gil_scoped_release>(),
+           nb::sig("def build_index(self, cells: int | None = None, threads: int = 1) -> None"),
+           R"(Learn coarse cells from the map's prototypes, for search with recall or probes.
+
+Prototypes are kept by cell from then on, through every change. Once more: learns anew.
+
+Args:
+    cells: number of cells, 1 to 65536 and at most that of prototypes; None: one that fits the map.
+    threads: threads to use.
+
+Raises:
+    ValueError: cells is none of these, or the map is empty.)")
+      .def("drop_index", &PrototypeMap::drop_index, nb::call_guard<nb::gil_scoped_release>(),
+           nb::sig("def drop_index(self) -> None"), "Forget the cells.")
+      .def("probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1,
+           nb::call_guard<nb::gil_scoped_release>(),
+           nb::sig("def probes(self, recall: float, threads: int = 1) -> int"),
+           "Number of cells that are searched for a recall in (0, 1], as measured on the map: the "
+           "nearest landmark to a landmark's prototype, itself left out, is in one of them that "
+           "often. Measured once, and again when a tenth of the map has changed. Raises ValueError "
+           "for another recall, and without an index.")
       .def("save", &PrototypeMap::save, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the map, whole or not at all. Raises FileError.")
@@ -525,8 +564,12 @@ void bind_sealed_map(nb::module_& m) {
           "looks",
           [](const SealedMap& m, std::int64_t id) { return stacked(m.looks(id), m.dim()); },
           "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
-          "Prototypes of one landmark, (r, dim) float32, in code units. Raises KeyError for an id "
-          "that is not in the map.");
+          "Prototypes of one landmark, (r, dim) float32, in code units, with an index in no "
+          "particular order. Raises KeyError for an id that is not in the map.")
+      .def("probes", &SealedMap::probes, "recall"_a,
+           nb::sig("def probes(self, recall: float) -> int"),
+           "Number of cells that are searched for a recall in (0, 1], as measured when the map was "
+           "sealed. Raises ValueError for another recall, and without an index.");
   map.def_prop_ro("code_bits", &SealedMap::code_bits,
                   "Bits of a prototype's number: 8, or 4 where the map was sealed so.");
   map.def("__repr__", [](const SealedMap& self) {

@@ -250,8 +250,8 @@ def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
 def test_later_formats_are_refused(coder: pm.Encoder, tmp_path: Path) -> None:
     path = tmp_path / "s.pmk"
     filled(coder, 9, 20, 100, 0).seal(path, bits=4)
-    path.write_bytes(container(sections(path.read_bytes()), version=3))
-    with pytest.raises(pm.FileError, match="format version 3, this Protomark reads versions 1 to"):
+    path.write_bytes(container(sections(path.read_bytes()), version=4))
+    with pytest.raises(pm.FileError, match="format version 4, this Protomark reads versions 1 to"):
         pm.open(path)
 
 

@@ -22,7 +22,7 @@ static_assert(std::endian::native == std::endian::little,
               "the file format is little-endian; a big-endian machine needs byte swaps here");
 
 constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
-constexpr std::uint32_t kNewestVersion = 2;
+constexpr std::uint32_t kNewestVersion = 3;
 constexpr std::size_t kAlignment = 64;
 constexpr std::uint32_t kMaxSections = 64;
 

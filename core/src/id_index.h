@@ -20,6 +20,16 @@ class IdIndex {
     }
   }
 
+  // Ask for the memory that `find` will read: first its slot, and when that has come, the id there.
+  void prefetch_slot(std::int64_t id) const {
+    if (!slots_.empty()) __builtin_prefetch(&slots_[home(id)]);
+  }
+  void prefetch_id(const std::vector<std::int64_t>& ids, std::int64_t id) const {
+    if (slots_.empty()) return;
+    const std::uint32_t row = slots_[home(id)];
+    if (row != kNone) __builtin_prefetch(&ids[row]);
+  }
+
   // Takes a row whose id is not there yet.
   void insert(const std::vector<std::int64_t>& ids, std::uint32_t row) {
     if (3 * (used_ + 1) > 2 * slots_.size()) grow(ids);
@@ -30,6 +40,13 @@ class IdIndex {
   // Changes the row of an id that is there.
   void move(const std::vector<std::int64_t>& ids, std::int64_t id, std::uint32_t to) {
     slots_[slot_of(ids, id)] = to;
+  }
+
+  // All rows change; `to` has the new one of each.
+  void renumber(const std::vector<std::uint32_t>& to) {
+    for (std::uint32_t& row : slots_) {
+      if (row != kNone) row = to[row];
+    }
   }
 
   // Removes an id that is there; `ids` must still hold it.

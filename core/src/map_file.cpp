@@ -1,12 +1,18 @@
 #include "protomark/map_file.h"
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
+#include <mutex>
 #include <numeric>
 #include <stdexcept>
 
+#include "bit_numbers.h"
+#include "cell_search.h"
+#include "cells.h"
 #include "container.h"
 #include "map_sections.h"
+#include "probe_ranks.h"
 #include "protomark/error.h"
 #include "quantize4.h"
 
@@ -30,6 +36,12 @@ void verify_file(const std::filesystem::path& path) {
   ContainerReader(mapped.bytes(), path.string()).verify();
 }
 
+namespace {
+
+constexpr char kRemedy[] = "call build_index before the map is sealed";
+
+}  // namespace
+
 struct SealedMap::Content {
   explicit Content(const std::filesystem::path& path)
       : Content(std::make_unique<MappedFile>(path), path.string()) {}
@@ -44,17 +56,27 @@ struct SealedMap::Content {
     const std::size_t n = shape.landmarks;
     rows = n;
     if (const auto bytes = file.read_if_there(section::kRows)) read_rows();
+    RowLandmarks landmarks;
+    std::size_t places = rows;
+    if (file.map_if_there(section::kCells)) {
+      places = read_index();
+      landmarks.packed_of_row = order;
+      landmarks.bits = order_bits();
+      landmarks.end = static_cast<std::uint32_t>(n);
+    } else {
+      landmarks.rows_of = rows_of;
+    }
     if (file.map_if_there(section::kLevels)) {
       code_bits = 4;
       const int half_step = read_levels(file);
-      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(rows, shape.dim)), rows,
-                     shape.dim, half_step};
-      check_padding();
+      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(places, shape.dim)),
+                     places, shape.dim, half_step};
+      if (!indexed()) check_padding();
     } else {
-      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(rows, shape.dim)), rows,
+      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(places, shape.dim)), places,
                     shape.dim};
     }
-    prototypes.landmarks.rows_of = prototypes4.landmarks.rows_of = rows_of;
+    prototypes.landmarks = prototypes4.landmarks = landmarks;
     counts = map<std::uint8_t>(section::kCounts, n);
     if (const auto bytes = file.read_if_there(section::kIds)) {
       ids = map<std::int64_t>(section::kIds, n);
@@ -99,6 +121,63 @@ struct SealedMap::Content {
     }
   }
 
+  // Cells, and the places of their rows, of which there are as many as this returns.
+  std::size_t read_index() {
+    centroids = read_cells(file, shape.dim);
+    const std::size_t cells = centroids.size() / shape.dim;
+    packed_centroids = pack_codes({centroids.data(), cells, shape.dim});
+    cell_rows = {map<std::uint32_t>(section::kCellRows, cells), cells};
+    first_blocks.push_back(0);
+    std::uint64_t all = 0;
+    for (const std::uint32_t n : cell_rows) {
+      all += n;
+      if (all > rows) break;
+      first_blocks.push_back(
+          first_blocks.back() +
+          static_cast<std::uint32_t>((std::uint64_t{n} + kPackedRows - 1) / kPackedRows));
+    }
+    if (all != rows) file.fail("its cells do not have as many prototypes as the map");
+    const std::size_t places = std::size_t{first_blocks.back()} * kPackedRows;
+    order = map<std::uint8_t>(section::kOrder, bit_numbers_size(places, order_bits()));
+    const auto bytes = file.read(section::kProbes);
+    ranks.resize(bytes.size() / sizeof(std::uint32_t));
+    SectionReader(file, section::kProbes).copy(ranks.data(), ranks.size());
+    if (bytes.size() % sizeof(std::uint32_t) != 0 || ranks.size() > kTestQueries ||
+        !std::is_sorted(ranks.begin(), ranks.end()) ||
+        (!ranks.empty() && (ranks.front() < 1 || ranks.back() > cells))) {
+      file.fail("its section 'probes' is impossible");
+    }
+    return places;
+  }
+
+  bool indexed() const { return !centroids.empty(); }
+  std::size_t index_cells() const { return cell_rows.size(); }
+  // Numbers of landmarks and, for padding, the next one.
+  int order_bits() const {
+    return static_cast<int>(std::bit_width(std::max<std::size_t>(shape.landmarks, 1)));
+  }
+
+  // The place of a row. With an index places are looked for once, in all of the order.
+  std::size_t place(std::size_t row) const {
+    if (!indexed()) return row;
+    std::call_once(places_found, [&] {
+      std::vector<std::uint32_t> found(rows), taken(shape.landmarks, 0);
+      const std::size_t all = std::size_t{first_blocks.back()} * kPackedRows;
+      std::size_t total = 0;
+      for (std::size_t p = 0; p < all; ++p) {
+        const std::uint32_t landmark = bit_number(order, order_bits(), p);
+        if (landmark >= shape.landmarks) continue;
+        const auto [first, end] = rows_at(landmark);
+        if (first + taken[landmark] == end) file.fail("its order names a landmark too often");
+        found[first + taken[landmark]++] = static_cast<std::uint32_t>(p);
+        ++total;
+      }
+      if (total != rows) file.fail("its order lacks landmarks");
+      places = std::move(found);
+    });
+    return places[row];
+  }
+
   // The rows of landmark i: the first one and the one behind the last.
   std::pair<std::size_t, std::size_t> rows_at(std::size_t i) const {
     if (rows_of == nullptr) return {i, i + 1};
@@ -126,8 +205,8 @@ struct SealedMap::Content {
   }
 
   int prototype(std::size_t row, std::size_t d) const {
-    if (code_bits == 4) return level4(value4(row, d), prototypes4.half_step);
-    return prototypes.data[packed_index(row, d, shape.dim)];
+    if (code_bits == 4) return level4(value4(place(row), d), prototypes4.half_step);
+    return prototypes.data[packed_index(place(row), d, shape.dim)];
   }
 
   // Landmarks whose first rows are remembered: every one of these.
@@ -143,6 +222,16 @@ struct SealedMap::Content {
   int code_bits = 8;
   PackedPrototypes prototypes;    // where it is 8
   PackedPrototypes4 prototypes4;  // where it is 4
+  // The index, or nothing.
+  std::vector<std::int8_t> centroids;
+  std::vector<CodeVector> packed_centroids;
+  std::span<const std::uint32_t> cell_rows;
+  std::vector<std::uint32_t> first_blocks;  // of each cell, and the end
+  const std::uint8_t* order = nullptr;      // landmark of each place, in order_bits()
+  ProbeRanks ranks;
+  mutable std::once_flag places_found;
+  mutable std::vector<std::uint32_t> places;  // of each row
+
   const std::uint8_t* counts = nullptr;
   const std::int64_t* ids = nullptr;
   const std::array<float, 3>* positions = nullptr;
@@ -164,6 +253,13 @@ std::size_t SealedMap::dim() const { return content_->shape.dim; }
 std::size_t SealedMap::size() const { return content_->shape.landmarks; }
 std::size_t SealedMap::prototype_count() const { return content_->rows; }
 int SealedMap::code_bits() const { return content_->code_bits; }
+
+std::size_t SealedMap::index_cells() const { return content_->index_cells(); }
+
+std::size_t SealedMap::probes(double recall) const {
+  check_recall(recall, index_cells(), kRemedy);
+  return probes_for(content_->ranks, recall, index_cells());
+}
 
 std::vector<std::int64_t> SealedMap::ids() const {
   std::vector<std::int64_t> result(size());
@@ -234,10 +330,23 @@ void SealedMap::search(Descriptors queries, const SearchOptions& options,
 
 void SealedMap::search_codes(Codes queries, const SearchOptions& options,
                              MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
-  if (content_->code_bits == 4) {
-    protomark::search(content_->prototypes4, queries, options, ids, distances);
+  const Content& c = *content_;
+  const auto probes = asked_probes(options, c.index_cells(), kRemedy);
+  const auto run = [&](const auto& prototypes) {
+    if (!probes) {
+      protomark::search(prototypes, queries, options, ids, distances);
+      return;
+    }
+    const PackedPrototypes centroids{
+        reinterpret_cast<const std::int8_t*>(c.packed_centroids.data()), c.index_cells(), dim()};
+    search_cells(prototypes, CellView(c.cell_rows, c.first_blocks), centroids,
+                 options.recall ? this->probes(*options.recall) : *probes, queries, exact(options),
+                 ids, distances);
+  };
+  if (c.code_bits == 4) {
+    run(c.prototypes4);
   } else {
-    protomark::search(content_->prototypes, queries, options, ids, distances);
+    run(c.prototypes);
   }
 }
 

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <string>
 
+#include "cells.h"
+
 namespace protomark {
 
 std::vector<std::byte> write_shape(const MapShape& shape) {
@@ -78,6 +80,20 @@ std::size_t read_look_bits(const ContainerReader& file, std::size_t dim) {
               std::to_string(most));
   }
   return look_bits;
+}
+
+std::vector<std::int8_t> read_cells(const ContainerReader& file, std::size_t dim) {
+  const auto bytes = file.map_if_there(section::kCells);
+  if (!bytes) return {};
+  const std::size_t cells = bytes->size() / dim;
+  if (cells == 0 || cells > Cells::kMaxCells || bytes->size() != cells * dim) {
+    file.fail("its section 'cells' has the wrong size");
+  }
+  auto centroids = read_section<std::int8_t>(file, section::kCells, cells * dim);
+  if (std::find(centroids.begin(), centroids.end(), -128) != centroids.end()) {
+    file.fail("its cells have impossible centroids");
+  }
+  return centroids;
 }
 
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {

@@ -23,6 +23,10 @@ inline constexpr char kLooks[] = "looks";         // open: uint16, of each row
 inline constexpr char kSums[] = "sums";           // open: int16, rows x dim
 inline constexpr char kPrototypes[] = "protos";   // sealed: packed (protomark/search.h)
 inline constexpr char kLevels[] = "levels";       // sealed, 4 bits a number: u32 4, u32 half-step
+inline constexpr char kCells[] = "cells";         // int8, centroids, cells x dim
+inline constexpr char kCellRows[] = "cellrows";   // sealed, with cells: uint32, rows of each
+inline constexpr char kOrder[] = "order";         // ... landmark of each place (bit_numbers.h)
+inline constexpr char kProbes[] = "probes";       // ... uint32, ProbeRanks
 inline constexpr char kPositions[] = "position";  // open: 3 x float64; sealed: 3 x float32
 }  // namespace section
 
@@ -41,6 +45,8 @@ int read_levels(const ContainerReader& file);
 // Signs that tell looks apart; 0 where the file says nothing of them.
 std::vector<std::byte> write_look_bits(std::size_t look_bits);
 std::size_t read_look_bits(const ContainerReader& file, std::size_t dim);
+// Centroids, (cells x dim); empty where there is no index.
+std::vector<std::int8_t> read_cells(const ContainerReader& file, std::size_t dim);
 // Throws FileError unless ids are ascending and not negative.
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
 // The middle of the positions that are there.

@@ -4,17 +4,25 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
+#include <mutex>
+#include <span>
 #include <vector>
 
+#include "cell_blocks.h"
+#include "cells.h"
 #include "fair_shared_mutex.h"
 #include "id_index.h"
+#include "probe_ranks.h"
 #include "protomark/prototypes.h"
 
 namespace protomark {
 
 // Neither landmarks nor rows are sorted. Without looks a row is a landmark and has its number; with
-// them, the rows of a landmark are a chain. What goes is replaced by the last one, so numbers of
-// landmarks and rows hold until the next one goes.
+// them, the rows of a landmark are a chain.
+//
+// Rows stand in blocks by cell (CellBlocks): one without an index, else that of their rounded
+// prototype. Row numbers that no row has are padding. Numbers of landmarks and rows hold until one
+// goes or `settle` is called: others take the places of those that go.
 class PrototypeStore {
  public:
   static constexpr std::uint32_t kNone = IdIndex::kNone;
@@ -23,9 +31,15 @@ class PrototypeStore {
 
   std::size_t dim() const { return dim_; }
   std::size_t look_bits() const { return look_bits_; }
-  std::size_t landmarks() const { return ids_.size(); }
-  std::size_t rows() const { return counts_.size(); }
+  std::size_t landmarks() const { return look_bits_ == 0 ? rows_ : ids_.size(); }
+  std::size_t rows() const { return rows_; }
+  // Of each landmark number, -1 where there is no landmark.
   const std::vector<std::int64_t>& ids() const { return ids_; }
+  // Row numbers are below.
+  std::size_t places() const { return blocks_.blocks() * kPackedRows; }
+  bool is_row(std::size_t place) const {
+    return look_bits_ == 0 ? ids_[place] >= 0 : owners_[place] != kNone;
+  }
 
   // Bit j is set where code[j] > 0, j < look_bits.
   std::uint16_t look_of(const std::int8_t* code) const;
@@ -72,56 +86,92 @@ class PrototypeStore {
   std::uint8_t count(std::uint32_t row) const { return counts_[row]; }
   void set_count(std::uint32_t row, int count) { counts_[row] = static_cast<std::uint8_t>(count); }
   std::int8_t rounded(std::uint32_t row, std::size_t d) const {
-    return packed_[packed_index(row, d, dim_)];
+    return packed()[packed_index(row, d, dim_)];
   }
+  // The rounded prototypes of some rows, (rows x dim).
+  std::vector<std::int8_t> rounded(std::span<const std::uint32_t> rows) const;
 
-  // Eq. 2; the rounded mean follows with `refresh`.
-  void add(std::uint32_t row, const std::int8_t* code);
+  // Eq. 2 for one code after the other, with new landmarks and rows where there are none yet;
+  // rounded means follow.
+  void add(std::span<const std::int64_t> landmarks, Codes codes);
   // Adds another sum and count, and halves where the count does not fit.
   void join(std::uint32_t row, const std::int16_t* sum, int count);
+  // The rounded mean follows the sum and count.
   void refresh(std::uint32_t row);
+
+  // Coarse cells; none: there is no index.
+  const Cells& cells() const { return cells_; }
+  const CellBlocks& blocks() const { return blocks_; }
+  void set_cells(Cells cells, int threads);
+  // Puts rows that were created or refreshed into their cells; ends every change.
+  void settle(int threads);
+  // A number that grows with each row that came, changed or went while there was an index.
+  std::size_t changes() const { return changes_; }
 
   void set_position(std::uint32_t landmark, const Position& position);
   Position position(std::uint32_t landmark) const;
-  // Empty while no landmark has ever had one, else one for each landmark.
+  // Empty while no landmark has ever had one, else one for each landmark number.
   const std::vector<Position>& positions() const { return positions_; }
 
   PackedPrototypes view() const;
 
  private:
+  // A row by what does not change when others go.
+  struct Key {
+    std::int64_t id;
+    std::uint16_t look;
+  };
+
+  const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
+  std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
+  void add(std::uint32_t row, const std::int8_t* code);
+  void prefetch_rounded(std::uint32_t row) const;
   std::uint32_t* link_to(std::uint32_t row);
-  void move_last_row(std::uint32_t to);
+  std::uint32_t take_place(std::uint32_t cell);
+  void resize_rows(std::size_t places);
+  void relocate(std::uint32_t from, std::uint32_t to);
+  void close_gap(std::uint32_t row);
   void erase_landmark(std::uint32_t landmark);
+  void rearrange(const std::vector<std::uint32_t>& rows, const std::vector<std::uint32_t>& cells,
+                 std::size_t number_of_cells);
 
   std::size_t dim_;
   std::size_t look_bits_;
+  std::size_t rows_ = 0;
 
   std::vector<std::int64_t> ids_;
   std::vector<Position> positions_;
   IdIndex index_;
   std::vector<std::uint32_t> heads_;  // first row; empty without looks
 
+  // By place.
   std::vector<std::int16_t> sums_;  // rows x dim
   std::vector<std::uint8_t> counts_;
-  std::vector<std::int8_t> packed_;    // rounded means, see PackedPrototypes
+  std::vector<CodeVector> packed_;     // rounded means, see PackedPrototypes
   std::vector<std::uint16_t> looks_;   // empty without looks
   std::vector<std::uint32_t> owners_;  // landmark of a row; empty without looks
   std::vector<std::uint32_t> next_;    // row of the same landmark; empty without looks
+
+  CellBlocks blocks_;
+  Cells cells_;
+  std::vector<Key> unsettled_;
+  std::size_t changes_ = 0;
 };
 
 // What users do not see of an open map.
 struct PrototypeMap::Store : PrototypeStore {
   using PrototypeStore::PrototypeStore;
+  // As measured on the map, now or when it was much the same.
+  ProbeRanks ranks(int threads) const;
+
   mutable FairSharedMutex mutex;
+
+ private:
+  mutable std::mutex ranks_mutex_;
+  mutable ProbeRanks ranks_;  // empty: not measured
+  mutable std::size_t ranks_changes_ = 0;
 };
 
 bool is_nowhere(const Position& position);
-
-// sum / n rounded to the nearest integer, halves away from zero.
-template <typename Integer>
-std::int8_t rounded_mean(Integer sum, Integer n) {
-  const Integer magnitude = (2 * std::abs(sum) + n) / (2 * n);
-  return static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
-}
 
 }  // namespace protomark

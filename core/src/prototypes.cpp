@@ -85,7 +85,11 @@ std::size_t PrototypeMap::look_bits() const { return store_->look_bits(); }
 
 std::vector<std::int64_t> PrototypeMap::ids() const {
   const std::shared_lock lock(store_->mutex);
-  std::vector<std::int64_t> result = store_->ids();
+  std::vector<std::int64_t> result;
+  result.reserve(store_->landmarks());
+  for (const std::int64_t id : store_->ids()) {
+    if (id >= 0) result.push_back(id);
+  }
   std::sort(result.begin(), result.end());
   return result;
 }
@@ -100,7 +104,9 @@ void PrototypeMap::add(std::span<const std::int64_t> landmarks, Descriptors desc
     const std::size_t n = std::min(kEncodeChunk, descriptors.rows - begin);
     encoder_->encode({descriptors.row(begin), n, descriptors.columns}, {buffer.data(), n, dim_},
                      threads);
-    add_codes(landmarks.subspan(begin, n), {buffer.data(), n, dim_});
+    const std::unique_lock lock(store_->mutex);
+    store_->add(landmarks.subspan(begin, n), {buffer.data(), n, dim_});
+    store_->settle(threads);
   }
 }
 
@@ -109,22 +115,8 @@ void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes code
   check_codes(codes, dim_);
   check_new_ids(landmarks);
   const std::unique_lock lock(store_->mutex);
-  std::vector<std::uint32_t> rows;
-  rows.reserve(landmarks.size());
-  // Out of memory half-way: what was added stays, and answers.
-  const auto refresh = [&] {
-    for (const std::uint32_t row : rows) store_->refresh(row);
-  };
-  try {
-    for (std::size_t i = 0; i < landmarks.size(); ++i) {
-      rows.push_back(store_->find_or_create_row(landmarks[i], store_->look_of(codes.row(i))));
-      store_->add(rows.back(), codes.row(i));
-    }
-  } catch (...) {
-    refresh();
-    throw;
-  }
-  refresh();
+  store_->add(landmarks, codes);
+  store_->settle(1);
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors descriptors,
@@ -173,10 +165,11 @@ void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes c
       if (std::abs(store_->sum(row)[d] - part.sum[d]) > 127 * left) throw never_added(id);
     }
   }
-  std::vector<std::uint32_t> empty;
+  // By what does not change when others go.
+  std::vector<std::pair<std::int64_t, std::uint16_t>> empty;
   for (const auto& [row, part] : parts) {
     if (store_->count(row) == part.count) {
-      empty.push_back(row);
+      empty.emplace_back(store_->ids()[store_->landmark_of(row)], store_->look(row));
       continue;
     }
     for (std::size_t d = 0; d < dim_; ++d) {
@@ -185,9 +178,10 @@ void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes c
     store_->set_count(row, store_->count(row) - part.count);
     store_->refresh(row);
   }
-  // From the last one on, so that none of them takes the place of another.
-  std::sort(empty.begin(), empty.end(), std::greater<>());
-  for (const std::uint32_t row : empty) store_->erase_row(row);
+  for (const auto& [id, look] : empty) {
+    store_->erase_row(store_->find_row(store_->at(id), look));
+  }
+  store_->settle(1);
 }
 
 void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source) {
@@ -221,6 +215,7 @@ void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std
     }
     store_->erase(source[i]);
   }
+  store_->settle(1);
 }
 
 void PrototypeMap::discard(std::span<const std::int64_t> landmarks) {
@@ -247,11 +242,14 @@ void PrototypeMap::update(const PrototypeMap& other) {
   }
   const std::scoped_lock lock(store_->mutex, other.store_->mutex);
   const Store& from = *other.store_;
-  for (std::uint32_t i = 0; i < from.rows(); ++i) {
+  for (std::uint32_t i = 0; i < from.places(); ++i) {
+    if (!from.is_row(i)) continue;
     const std::int64_t id = from.ids()[from.landmark_of(i)];
     store_->join(store_->find_or_create_row(id, from.look(i)), from.sum(i), from.count(i));
   }
-  for (std::uint32_t i = 0; i < from.landmarks(); ++i) {
+  store_->settle(1);
+  for (std::uint32_t i = 0; i < from.ids().size(); ++i) {
+    if (from.ids()[i] < 0) continue;
     const std::uint32_t landmark = store_->at(from.ids()[i]);
     if (is_nowhere(store_->position(landmark))) store_->set_position(landmark, from.position(i));
   }
@@ -328,12 +326,6 @@ void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
   search_codes({codes.data(), queries.rows, dim_}, options, ids, distances);
 }
 
-void PrototypeMap::search_codes(Codes queries, const SearchOptions& options,
-                                MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
-  const std::shared_lock lock(store_->mutex);
-  protomark::search(store_->view(), queries, options, ids, distances);
-}
-
 void PrototypeMap::save(const std::filesystem::path& path) const {
   const std::shared_lock lock(store_->mutex);
   const auto landmarks = store_->sorted_landmarks();
@@ -361,7 +353,9 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
     sums.insert(sums.end(), store_->sum(row), store_->sum(row) + dim_);
   }
 
-  ContainerWriter file(FileKind::open_map, with_looks ? 2 : 1);
+  const std::vector<std::int8_t>& cells = store_->cells().centroids();
+
+  ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
   file.add(section::kIds, std::as_bytes(std::span(ids)));
@@ -373,6 +367,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   file.add(section::kCounts, std::as_bytes(std::span(counts)));
   file.add(section::kSums, std::as_bytes(std::span(sums)));
   if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
+  if (!cells.empty()) file.add(section::kCells, std::as_bytes(std::span(cells)));
   file.write(path);
 }
 
@@ -436,6 +431,8 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
   }
   // After the landmarks, so that room for positions is made once.
   for (std::uint32_t i = 0; i < positions.size(); ++i) store.set_position(i, positions[i]);
+  if (auto cells = read_cells(file, dim); !cells.empty())
+    store.set_cells({std::move(cells), dim}, 1);
   return map;
 }
 

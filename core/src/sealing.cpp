@@ -1,6 +1,7 @@
 // PrototypeMap::seal: what a map knows, in as few bytes as were asked for.
 #include <algorithm>
 #include <array>
+#include <bit>
 #include <cmath>
 #include <functional>
 #include <limits>
@@ -10,10 +11,14 @@
 #include <string>
 #include <utility>
 
+#include "bit_numbers.h"
+#include "cells.h"
 #include "container.h"
 #include "map_sections.h"
+#include "probe_ranks.h"
 #include "prototype_store.h"
 #include "quantize4.h"
+#include "rounded_mean.h"
 #include "ward.h"
 
 namespace protomark {
@@ -133,27 +138,79 @@ Rounded rounded(const PrototypeStore& store, const std::vector<std::uint32_t>& l
   return joined(store, landmarks, Joins(store, landmarks, most));
 }
 
-// As PackedPrototypes has them ...
-std::vector<std::uint8_t> pack8(const Rounded& from, std::size_t dim) {
-  std::vector<std::uint8_t> result(packed_size(from.rows, dim), 0);
+// As PackedPrototypes has them, row i at places[i] of so many...
+std::vector<CodeVector> pack8(const Rounded& from, const std::vector<std::uint32_t>& places,
+                              std::size_t all_places, std::size_t dim) {
+  std::vector<CodeVector> result(packed_size(all_places, dim) / sizeof(CodeVector));
+  auto* to = reinterpret_cast<std::int8_t*>(result.data());
   for (std::size_t row = 0; row < from.rows; ++row) {
     for (std::size_t d = 0; d < dim; ++d) {
-      result[packed_index(row, d, dim)] = static_cast<std::uint8_t>(from.codes[row * dim + d]);
+      to[packed_index(places[row], d, dim)] = from.codes[row * dim + d];
     }
   }
   return result;
 }
 
 // ... and as PackedPrototypes4.
-std::vector<std::uint8_t> pack4(const Rounded& from, std::size_t dim, int half_step) {
-  std::vector<std::uint8_t> result(packed4_size(from.rows, dim), 0);
+std::vector<std::uint8_t> pack4(const Rounded& from, const std::vector<std::uint32_t>& places,
+                                std::size_t all_places, std::size_t dim, int half_step) {
+  std::vector<std::uint8_t> result(packed4_size(all_places, dim), 0);
   for (std::size_t row = 0; row < from.rows; ++row) {
     for (std::size_t d = 0; d < dim; ++d) {
       const std::uint8_t u = quantize4(from.codes[row * dim + d], half_step);
-      result[packed4_index(row, d, dim)] |= static_cast<std::uint8_t>(packed4_high(d) ? u << 4 : u);
+      std::uint8_t& byte = result[packed4_index(places[row], d, dim)];
+      byte |= static_cast<std::uint8_t>(packed4_high(d) ? u << 4 : u);
     }
   }
   return result;
+}
+
+// Landmark of each row.
+std::vector<std::uint32_t> landmarks_of(const Rounded& rows) {
+  std::vector<std::uint32_t> result;
+  result.reserve(rows.rows);
+  for (std::size_t i = 0; i < rows.rows_of.size(); ++i) {
+    result.insert(result.end(), rows.rows_of[i], static_cast<std::uint32_t>(i));
+  }
+  return result;
+}
+
+// How well the cells of a sealed map serve it. `prototypes` numbers landmarks by row; a landmark's
+// rows begin at first_rows[landmark].
+template <typename Prototypes>
+ProbeRanks ranks(const Prototypes& prototypes, const Rounded& rows, const Cells& cells,
+                 const std::vector<std::uint32_t>& cell_of_row, int half_step) {
+  const std::size_t dim = prototypes.dim;
+  const std::vector<std::uint32_t> landmark_of = landmarks_of(rows);
+  std::vector<std::int8_t> codes;
+  std::vector<std::int64_t> own;
+  for (const std::size_t row : test_rows(rows.rows)) {
+    codes.insert(codes.end(), &rows.codes[row * dim], &rows.codes[row * dim] + dim);
+    own.push_back(landmark_of[row]);
+  }
+  const Codes queries{codes.data(), own.size(), dim};
+  const auto search_two = [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+    search(prototypes, queries, {}, ids, distances);
+  };
+  const auto cell_of = [&](std::int64_t landmark, const std::int8_t* query) {
+    const auto begin = std::lower_bound(landmark_of.begin(), landmark_of.end(), landmark);
+    std::uint32_t cell = 0;
+    std::int32_t least = INT32_MAX;
+    for (auto at = begin; at != landmark_of.end() && *at == landmark; ++at) {
+      const auto row = static_cast<std::size_t>(at - landmark_of.begin());
+      std::int32_t distance = 0;
+      for (std::size_t d = 0; d < dim; ++d) {
+        const std::int8_t code = rows.codes[row * dim + d];
+        const int value = half_step == 0 ? code : level4(quantize4(code, half_step), half_step);
+        distance += (query[d] - value) * (query[d] - value);
+      }
+      if (distance >= least) continue;
+      least = distance;
+      cell = cell_of_row[row];
+    }
+    return cell;
+  };
+  return measure_ranks(queries, own, cells.centroids(), search_two, cell_of);
 }
 
 Occurrences occurrences(const std::vector<std::int8_t>& codes) {
@@ -185,8 +242,40 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
   }
   const Rounded kept = rounded(*store_, landmarks, prototypes);
   const int half_step = bits == 4 ? best_half_step(occurrences(kept.codes)) : 0;
-  const std::vector<std::uint8_t> packed =
-      bits == 4 ? pack4(kept, dim_, half_step) : pack8(kept, dim_);
+  const Cells& cells = store_->cells();
+  const bool indexed = cells.size() != 0;
+  const std::vector<std::uint32_t> cell_of_row =
+      indexed ? cells.assign({kept.codes.data(), kept.rows, dim_}, 1)
+              : std::vector<std::uint32_t>(kept.rows, 0);
+  const CellOrder order(cell_of_row, std::max<std::size_t>(cells.size(), 1));
+  const std::size_t places = order.first_blocks.back() * kPackedRows;
+  std::vector<CodeVector> packed8;
+  std::vector<std::uint8_t> packed4;
+  if (bits == 4) {
+    packed4 = pack4(kept, order.places, places, dim_, half_step);
+  } else {
+    packed8 = pack8(kept, order.places, places, dim_);
+  }
+  std::vector<std::uint8_t> landmark_numbers;
+  ProbeRanks probe_ranks;
+  if (indexed) {
+    std::vector<std::uint32_t> landmark_at(places, static_cast<std::uint32_t>(n));
+    const std::vector<std::uint32_t> landmark_of = landmarks_of(kept);
+    for (std::size_t row = 0; row < kept.rows; ++row) {
+      landmark_at[order.places[row]] = landmark_of[row];
+    }
+    landmark_numbers = pack_bit_numbers(landmark_at, std::bit_width(std::max<std::size_t>(n, 1)));
+    RowLandmarks numbers;
+    numbers.of_row = landmark_at.data();
+    numbers.end = static_cast<std::uint32_t>(n);
+    const auto* codes = reinterpret_cast<const std::int8_t*>(packed8.data());
+    probe_ranks =
+        bits == 4
+            ? ranks(PackedPrototypes4{packed4.data(), places, dim_, half_step, nullptr, numbers},
+                    kept, cells, cell_of_row, half_step)
+            : ranks(PackedPrototypes{codes, places, dim_, nullptr, numbers}, kept, cells,
+                    cell_of_row, 0);
+  }
   MapShape shape{n, dim_, {}};
   std::vector<std::array<float, 3>> positions;
   const auto& all_positions = store_->positions();
@@ -207,15 +296,22 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
   const bool implicit_ids = n == 0 || (ids.front() == 0 && ids.back() == std::int64_t(n) - 1);
   const bool several = kept.rows != n;
 
-  ContainerWriter file(FileKind::sealed_map, bits == 4 || several ? 2 : 1);
+  ContainerWriter file(FileKind::sealed_map, indexed ? 3 : bits == 4 || several ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape(shape));
   if (!implicit_ids) file.add(section::kIds, std::as_bytes(std::span(ids)));
   file.add(section::kCounts, std::as_bytes(std::span(counts)));
   if (several) file.add(section::kRows, std::as_bytes(std::span(kept.rows_of)));
   if (bits == 4) file.add(section::kLevels, write_levels(half_step));
-  file.add(section::kPrototypes, std::as_bytes(std::span(packed)));
+  file.add(section::kPrototypes,
+           bits == 4 ? std::as_bytes(std::span(packed4)) : std::as_bytes(std::span(packed8)));
   if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
+  if (indexed) {
+    file.add(section::kCells, std::as_bytes(std::span(cells.centroids())));
+    file.add(section::kCellRows, std::as_bytes(std::span(order.rows)));
+    file.add(section::kOrder, std::as_bytes(std::span(landmark_numbers)));
+    file.add(section::kProbes, std::as_bytes(std::span(probe_ranks)));
+  }
   file.write(path);
 }
 

@@ -8,18 +8,17 @@
 #include "code_scan.h"
 #include "kernels/kernels.h"
 #include "parallel.h"
+#include "row_landmarks.h"
 #include "search_pieces.h"
 
 namespace protomark {
 namespace {
 
-// The landmark of each row of a map. Rows are asked for chunk after chunk.
+// The landmark of each row where only numbers of rows are known. Rows are asked for chunk after
+// chunk.
 class RowLandmarkReader {
  public:
   explicit RowLandmarkReader(const RowLandmarks& landmarks) : landmarks_(landmarks) {}
-
-  // Whether a landmark may have several rows.
-  bool several() const { return landmarks_.of_row != nullptr || landmarks_.rows_of != nullptr; }
 
   void start_chunk(std::size_t row, std::size_t rows) {
     chunk_ = row;
@@ -28,7 +27,6 @@ class RowLandmarkReader {
   }
 
   std::uint32_t operator[](std::size_t row) {
-    if (landmarks_.of_row != nullptr) return landmarks_.of_row[row];
     if (of_chunk_.empty()) count_chunk();  // most chunks have no hits once neighbours are near
     return of_chunk_[row - chunk_];
   }
@@ -63,21 +61,20 @@ void scan_rows(const Prototypes& prototypes, const Chunk& chunk, SearchPieces::R
   std::iota(all.begin(), all.end(), 0u);
   std::vector<CodeVector> room;
   RowLandmarkReader landmarks(prototypes.landmarks);
-  const auto id = [&](std::size_t landmark) {
-    return prototypes.ids != nullptr ? prototypes.ids[landmark]
-                                     : static_cast<std::int64_t>(landmark);
-  };
+  const RowNumbers numbers(prototypes.landmarks);
   for (std::size_t row = rows.begin; row < rows.end; row += scan.chunk_rows()) {
     const std::size_t n = std::min(scan.chunk_rows(), rows.end - row);
     const std::int8_t* packed = chunk(row, n, room);
-    landmarks.start_chunk(row, n);
-    if (!landmarks.several()) {
+    if (prototypes.landmarks.rows_of == nullptr) {
       scan.compare(all, packed, n, [&](TopK& best, std::int32_t distance, std::size_t i) {
-        best.offer(distance, id(row + i));
+        numbers.offer(best, distance, row + i, prototypes.ids);
       });
     } else {
+      landmarks.start_chunk(row, n);
       scan.compare(all, packed, n, [&](TopK& best, std::int32_t distance, std::size_t i) {
-        best.offer_distinct(distance, id(landmarks[row + i]));
+        const std::uint32_t landmark = landmarks[row + i];
+        best.offer_distinct(distance, prototypes.ids != nullptr ? prototypes.ids[landmark]
+                                                                : std::int64_t{landmark});
       });
     }
   }
@@ -88,6 +85,9 @@ void search_chunks(const Prototypes& prototypes, const Chunk& chunk, Codes queri
                    const SearchOptions& options, MatrixView<std::int64_t> ids,
                    MatrixView<float> distances) {
   check_search(prototypes.dim, queries, options, ids, distances);
+  if (options.recall || options.probes) {
+    throw std::invalid_argument("approximate search needs an index: call build_index first");
+  }
   const SearchPieces pieces(options.threads, queries.rows, prototypes.rows);
   const std::size_t row_pieces = pieces.row_pieces();
   std::vector<std::unique_ptr<CodeScan>> scans(pieces.query_pieces() * row_pieces);

@@ -72,10 +72,12 @@ def build_file(
     upright: bool = False,
     look_bits: int = 0,
     prototypes: float | None = None,
+    index: bool = False,
 ) -> PrototypeMap:
     """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor.
 
-    With `upright` angles and sizes of the keypoints go in, too (`protomark.upright`).
+    With `upright` angles and sizes of the keypoints go in, too (`protomark.upright`); with `index`
+    the map can be searched approximately.
 
     Raises:
         ValueError: as `build_map`; or `code_bits`, those of a sealed map, is neither 8 nor 4, or is
@@ -106,6 +108,8 @@ def build_file(
         threads,
         look_bits,
     )
+    if index:
+        scene.build_index(threads=threads)
     if seal:
         scene.seal(output, bits=code_bits, prototypes=prototypes)
     else:

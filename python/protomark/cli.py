@@ -276,6 +276,14 @@ def build(
             "looks are joined until it fits. By default all are kept."
         ),
     ] = None,
+    index: Annotated[
+        bool,
+        typer.Option(
+            "--index",
+            help="Learn coarse cells, for approximate search in large maps: at most 4 bytes a "
+            "landmark more.",
+        ),
+    ] = False,
     upright: Annotated[
         bool,
         typer.Option(
@@ -306,6 +314,7 @@ def build(
         upright=upright,
         look_bits=look_bits,
         prototypes=prototypes,
+        index=index,
     )
     facts = describe(output)
     _write_json(json_file, facts)

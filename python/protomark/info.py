@@ -80,6 +80,17 @@ def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
     return prototype * scene.prototype_count / len(scene) + 2
 
 
+def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]) -> float | None:
+    """Bytes a landmark that the index of a sealed map takes, blocks that are not full included."""
+    if not isinstance(scene, pm.SealedMap) or scene.index_cells == 0:
+        return None
+    width = {8: 4, 4: 8}[scene.code_bits]  # dimensions in 4 bytes
+    blocks = -(-scene.prototype_count // 16)
+    packed = blocks * 16 * -(-scene.dim // width) * 4
+    own = sum(sections[name] for name in ("cells", "cellrows", "order", "probes"))
+    return (own + sections["protos"] - packed) / max(1, len(scene))
+
+
 def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     scene = pm.open(path)
     ids = scene.ids
@@ -98,6 +109,8 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "look_bits": look_bits or None,
         "dim": scene.dim,
         "code_bits": code_bits,
+        "index_cells": scene.index_cells or None,
+        "index_bytes_per_landmark": _index_bytes(scene, sections),
         "observations": int(counts.sum()),
         "count_histogram": np.bincount(np.minimum(counts, 255)).tolist() if len(counts) else [],
         "landmarks_with_position": len(placed),

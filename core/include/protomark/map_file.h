@@ -52,13 +52,19 @@ class SealedMap {
   // Bits of a prototype's number: 8, or 4 where it was sealed so.
   int code_bits() const;
   std::vector<std::int64_t> ids() const;
+  // Number of cells of the index; 0: there is none.
+  std::size_t index_cells() const;
+  // Cells that are searched for a recall above 0 and at most 1, as measured when the map was sealed
+  // (protomark/prototypes.h). Throws std::invalid_argument for another recall, and without an
+  // index.
+  std::size_t probes(double recall) const;
 
   // Throw UnknownLandmark. Counts are at most 255. Prototypes are the rounded ones; with 4 bits,
   // the levels nearest to these. Of a landmark with several they are the mean, each counting alike.
   // Positions are 32-bit, relative to the middle of the map; NaN where there is none.
   std::vector<std::uint32_t> counts(std::span<const std::int64_t> landmarks) const;
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
-  // The prototypes of one landmark.
+  // The prototypes of one landmark, with an index in no particular order.
   std::vector<std::vector<float>> looks(std::int64_t landmark) const;
   std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
 

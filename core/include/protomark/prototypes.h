@@ -94,14 +94,27 @@ class PrototypeMap {
   // The looks of one landmark, by ascending sign bits.
   std::vector<Look> looks(std::int64_t landmark) const;
 
+  // Learns coarse cells from the map's prototypes, as many as `cells`, at most 65536 and at most as
+  // many as there are prototypes; by default a number that fits the map. Prototypes are kept by
+  // cell from then on, through every change, and search may take `recall` or `probes`. Once more:
+  // learns anew. Throws std::invalid_argument for other `cells`, and for a map without landmarks.
+  void build_index(std::optional<std::size_t> cells = std::nullopt, int threads = 1);
+  void drop_index();
+  // Number of cells; 0: there is no index.
+  std::size_t index_cells() const;
+  // Cells that are searched for a recall above 0 and at most 1, as measured on the map: prototypes
+  // of landmarks are searched for among those of all others. Measured once and again when a tenth
+  // of the map has changed. Throws std::invalid_argument for another recall, and without an index.
+  std::size_t probes(double recall, int threads = 1) const;
+
   // See protomark/search.h.
   void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
               MatrixView<float> distances) const;
   void search_codes(Codes queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
                     MatrixView<float> distances) const;
 
-  // Writes the map, landmarks by ascending id, so that equal maps give equal files. Whole or not at
-  // all. Throws FileError.
+  // Writes the map, landmarks by ascending id, so that equal maps (of equal cells) give equal
+  // files. Whole or not at all. Throws FileError.
   void save(const std::filesystem::path& path) const;
   static PrototypeMap load(const std::filesystem::path& path);
   // Reads and checks the bytes of a map file; `name` is what errors call them.
@@ -111,9 +124,9 @@ class PrototypeMap {
   // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
   // average over the map, at least 1: looks of a landmark are joined, those first whose joining
   // adds least to the squared distances of all observations to their prototypes (Ward's criterion),
-  // until the map fits. One landmark keeps at most 255 looks. Throws FileError, and
-  // std::invalid_argument for other `bits` and `prototypes` and for positions further than 3.4e38
-  // from their middle.
+  // until the map fits. One landmark keeps at most 255 looks. An index goes along. Throws
+  // FileError, and std::invalid_argument for other `bits` and `prototypes` and for positions
+  // further than 3.4e38 from their middle.
   void seal(const std::filesystem::path& path, int bits = 8,
             std::optional<double> prototypes = std::nullopt) const;
 

@@ -10,11 +10,16 @@
 
 namespace protomark {
 
-// Which landmark each row is of, where landmarks may have several; at most one of these is set.
+// Which landmark each row is of, where that is not its number; at most one of the pointers is set.
 struct RowLandmarks {
   const std::uint32_t* of_row = nullptr;  // number of the landmark of each row
   // Number of rows of each landmark, at least 1; a landmark's rows follow each other.
   const std::uint8_t* rows_of = nullptr;
+  // Number of the landmark of each row in `bits` bits, 1 to 32, one after the other, least
+  // significant first, and 7 bytes behind them.
+  const std::uint8_t* packed_of_row = nullptr;
+  int bits = 0;
+  std::uint32_t end = UINT32_MAX;  // numbers from this on are of no landmark: rows are padding
 };
 
 // Prototypes as search reads them and as a sealed map stores them: blocks of 16 rows; within a
@@ -24,8 +29,9 @@ struct PackedPrototypes {
   const std::int8_t* data = nullptr;
   std::size_t rows = 0;
   std::size_t dim = 0;
-  const std::int64_t* ids = nullptr;  // of each landmark; nullptr: its number
-  RowLandmarks landmarks = {};        // neither is set: a row is a landmark
+  // Of each landmark; nullptr: its number; negative: there is none, rows are padding.
+  const std::int64_t* ids = nullptr;
+  RowLandmarks landmarks = {};  // neither is set: a row is a landmark
 };
 
 inline constexpr std::size_t kPackedRows = 16;
@@ -69,6 +75,11 @@ constexpr std::size_t packed4_index(std::size_t row, std::size_t d, std::size_t 
 constexpr bool packed4_high(std::size_t d) { return d % 8 >= 4; }
 
 struct SearchOptions {
+  // Approximate search in a map with an index: as many of the cells nearest to the query are
+  // searched as bring this recall, above 0 and at most 1; or `probes` cells, at least 1. At most
+  // one of these is set; none: all prototypes are searched.
+  std::optional<double> recall;
+  std::optional<std::size_t> probes;
   // Neighbours further away than this (Euclidean, in code units) are not reported.
   std::optional<float> max_distance;
   // Lowe's ratio test: a query keeps its neighbours only where its nearest landmark is closer than
@@ -82,7 +93,8 @@ struct SearchOptions {
 //
 // ids and distances are (queries x k), k = ids.columns. Distances are Euclidean, in code units: the
 // float nearest to the root of the integer squared distance. Where there is no neighbour the id is
-// -1 and the distance infinite. Throws std::invalid_argument where shapes or options do not fit.
+// -1 and the distance infinite. Throws std::invalid_argument where shapes or options do not fit;
+// there is no index here.
 void search(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
             MatrixView<std::int64_t> ids, MatrixView<float> distances);
 void search(const PackedPrototypes4& prototypes, Codes queries, const SearchOptions& options,

@@ -1,0 +1,125 @@
+#include "nearest_cells.h"
+
+#include <algorithm>
+#include <array>
+
+#include "kernels/kernels.h"
+#include "parallel.h"
+
+namespace protomark {
+namespace {
+
+// One block in so many tells how near the nearest centroids are.
+constexpr std::size_t kSampleStep = 16;
+// Up to here a heap of the nearest is faster than selection.
+constexpr std::size_t kFewProbes = 16;
+
+// Beyond all distances.
+constexpr std::int32_t kNoLimit = 1 << 25;
+
+// All centroids against some queries at a time. For one thread.
+class Ranking {
+ public:
+  explicit Ranking(const PackedPrototypes& centroids)
+      : centroids_(centroids),
+        dim_(packed_dim(centroids.dim)),
+        blocks_((centroids.rows + kPackedRows - 1) / kPackedRows),
+        queries_(kernels::kScanQueries * dim_),
+        biases_(blocks_ * kPackedRows),
+        hits_(kernels::kHitRoom),
+        found_(kernels::kScanQueries) {
+    kernels::active().code_biases(centroids.data, blocks_, dim_, biases_.data());
+  }
+
+  // At most kScanQueries queries.
+  void nearest(Codes queries, std::size_t probes, std::uint32_t* to) {
+    std::fill(queries_.begin(), queries_.end(), 128);
+    for (std::size_t q = 0; q < queries.rows; ++q) {
+      for (std::size_t d = 0; d < queries.columns; ++d) {
+        queries_[q * dim_ + d] = static_cast<std::uint8_t>(queries.row(q)[d] + 128);
+      }
+    }
+    std::fill(limits_.begin(), limits_.end(), kNoLimit);
+    for (std::size_t block = 0; block < blocks_; block += kSampleStep) {
+      scan(0, queries.rows, block, block + 1);
+    }
+    for (std::size_t q = 0; q < queries.rows; ++q) limits_[q] = likely_limit(found_[q], probes);
+    scan(0, queries.rows, 0, blocks_);
+    for (std::size_t q = 0; q < queries.rows; ++q) {
+      if (found_[q].size() < probes) {
+        found_[q].clear();
+        limits_[q] = kNoLimit;
+        scan(q, 1, 0, blocks_);
+      }
+      select(found_[q], probes, to + q * probes);
+      found_[q].clear();
+    }
+  }
+
+ private:
+  // Distances above, numbers of cells below.
+  using Found = std::vector<std::int64_t>;
+
+  // A limit that is likely to leave some more than `probes` cells, by the distances to a sample.
+  static std::int32_t likely_limit(Found& sample, std::size_t probes) {
+    const std::size_t rank = probes * 3 / 2 / kSampleStep + 4;
+    std::int32_t limit = kNoLimit;
+    if (rank < sample.size()) {
+      const auto at = sample.begin() + static_cast<std::ptrdiff_t>(rank);
+      std::nth_element(sample.begin(), at, sample.end());
+      limit = static_cast<std::int32_t>(*at >> 32);
+    }
+    sample.clear();
+    return limit;
+  }
+
+  static void select(Found& found, std::size_t probes, std::uint32_t* to) {
+    const auto end = found.begin() + static_cast<std::ptrdiff_t>(probes);
+    if (probes <= kFewProbes) {
+      std::partial_sort(found.begin(), end, found.end());
+    } else {
+      std::nth_element(found.begin(), end - 1, found.end());
+      std::iter_swap(found.begin(), std::min_element(found.begin(), end));
+    }
+    for (std::size_t i = 0; i < probes; ++i) to[i] = static_cast<std::uint32_t>(found[i]);
+  }
+
+  void scan(std::size_t query, std::size_t queries, std::size_t block, std::size_t end) {
+    while (block < end) {
+      const std::size_t n = kernels::active().code_scan(
+          {&queries_[query * dim_], &limits_[query], queries},
+          {centroids_.data, biases_.data(), end, dim_}, &block, hits_.data());
+      for (std::size_t i = 0; i < n; ++i) {
+        if (hits_[i].row >= centroids_.rows) continue;
+        found_[query + hits_[i].query].push_back(
+            std::int64_t{hits_[i].distance} * (std::int64_t{1} << 32) + hits_[i].row);
+      }
+    }
+  }
+
+  PackedPrototypes centroids_;
+  std::size_t dim_;
+  std::size_t blocks_;
+  std::vector<std::uint8_t> queries_;
+  std::array<std::int32_t, kernels::kScanQueries> limits_;
+  std::vector<std::int32_t> biases_;
+  std::vector<kernels::Hit> hits_;
+  std::vector<Found> found_;  // of each query
+};
+
+}  // namespace
+
+std::vector<std::uint32_t> nearest_cells(const PackedPrototypes& centroids, Codes queries,
+                                         std::size_t probes, int threads) {
+  std::vector<std::uint32_t> result(queries.rows * probes);
+  parallel_for(threads, queries.rows, 16, [&](std::size_t first, std::size_t last) {
+    Ranking ranking(centroids);
+    for (std::size_t q = first; q < last; q += kernels::kScanQueries) {
+      const std::size_t n = std::min(kernels::kScanQueries, last - q);
+      ranking.nearest({queries.row(q), n, queries.columns}, probes, &result[q * probes]);
+    }
+  });
+  return result;
+}
+
+}  // namespace protomark

@@ -1,0 +1,29 @@
+// The rounding of every mean of codes.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+
+namespace protomark {
+
+// sum / n rounded to the nearest integer, halves away from zero.
+template <typename Integer>
+std::int8_t rounded_mean(Integer sum, Integer n) {
+  const Integer magnitude = (2 * std::abs(sum) + n) / (2 * n);
+  return static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
+}
+
+// The same for the sums of a row, n from 1 to 255 and magnitudes at most 127 n, without divisions:
+// with the half added, no quotient is as near to an integer as its error, 2^-23 of itself.
+inline void rounded_means(const std::int16_t* sums, int n, std::size_t dim, std::int8_t* means) {
+  const float reciprocal = 1.0f / static_cast<float>(2 * n);
+  for (std::size_t d = 0; d < dim; ++d) {
+    const int sum = sums[d];
+    const auto twice = static_cast<float>(2 * (sum < 0 ? -sum : sum) + n);
+    const auto magnitude = static_cast<int>((twice + 0.5f) * reciprocal);
+    means[d] = static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
+  }
+}
+
+}  // namespace protomark

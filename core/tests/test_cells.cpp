@@ -1,0 +1,376 @@
+#include <unistd.h>
+
+#include <algorithm>
+#include <cmath>
+#include <map>
+#include <numeric>
+#include <set>
+#include <string>
+
+#include "bit_numbers.h"
+#include "cell_blocks.h"
+#include "cell_search.h"
+#include "cells.h"
+#include "check.h"
+#include "container.h"
+#include "protomark/error.h"
+#include "protomark/map_file.h"
+#include "random.h"
+#include "rounded_mean.h"
+
+using namespace protomark;
+namespace fs = std::filesystem;
+
+namespace {
+
+constexpr std::size_t kDim = 12;
+
+struct Found {
+  std::vector<std::int64_t> ids;
+  std::vector<float> distances;
+  bool operator==(const Found&) const = default;
+};
+
+template <typename Map>
+Found search(const Map& map, Codes queries, std::size_t k, SearchOptions options = {}) {
+  Found found{std::vector<std::int64_t>(queries.rows * k), std::vector<float>(queries.rows * k)};
+  map.search_codes(queries, options, {found.ids.data(), queries.rows, k},
+                   {found.distances.data(), queries.rows, k});
+  return found;
+}
+
+SearchOptions with_probes(std::size_t probes, int threads = 1) {
+  SearchOptions options;
+  options.probes = probes;
+  options.threads = threads;
+  return options;
+}
+
+SearchOptions with_recall(double recall) {
+  SearchOptions options;
+  options.recall = recall;
+  return options;
+}
+
+// Codes in clumps, as real ones are.
+std::vector<std::int8_t> clumped(test::Random& random, std::size_t n, std::size_t dim = kDim) {
+  std::vector<std::int8_t> result;
+  for (std::size_t i = 0; i < n; ++i) {
+    test::Random clump(static_cast<std::uint32_t>(random.integer(0, 19)));
+    for (std::size_t d = 0; d < dim; ++d) {
+      result.push_back(static_cast<std::int8_t>(clump.integer(-90, 90) + random.integer(-37, 37)));
+    }
+  }
+  return result;
+}
+
+// What an open map answers in all ways that are exact.
+template <typename Map>
+void check_exact(const Map& map, const Found& expected, Codes queries) {
+  CHECK(search(map, queries, 3) == expected);
+  for (const int threads : {1, 3}) {
+    CHECK(search(map, queries, 3, with_probes(map.index_cells(), threads)) == expected);
+  }
+  CHECK(search(map, queries, 3, with_recall(1)) == expected);
+}
+
+void blocks() {
+  test::Random random(3);
+  CellBlocks blocks(5);
+  // Of each cell its rows in order, and what stands in each row.
+  std::map<std::uint32_t, std::vector<int>> expected;
+  std::vector<int> stands;
+  int next = 0;
+  for (int step = 0; step < 4000; ++step) {
+    const auto cell = static_cast<std::uint32_t>(random.integer(0, 4));
+    // Rises, then falls to nothing.
+    if (random.integer(0, 99) < (step < 2000 ? 65 : 25)) {
+      const std::uint32_t row = blocks.append(cell);
+      stands.resize(blocks.blocks() * kPackedRows, -1);
+      stands[row] = next;
+      expected[cell].push_back(next++);
+    } else if (!expected[cell].empty()) {
+      const std::uint32_t last = blocks.last(cell);
+      CHECK(stands[last] == expected[cell].back());
+      stands[last] = -1;
+      expected[cell].pop_back();
+      const std::uint32_t gone = blocks.pop(cell);
+      if (gone != CellBlocks::kNone) {
+        const std::size_t moved = blocks.blocks() * kPackedRows;
+        std::copy_n(stands.begin() + static_cast<long>(moved), kPackedRows,
+                    stands.begin() + gone * kPackedRows);
+        stands.resize(moved);
+      }
+    }
+    if (step % 50 != 0) continue;
+    std::size_t all = 0;
+    const CellView view(blocks);
+    for (std::uint32_t c = 0; c < 5; ++c) {
+      std::vector<std::uint32_t> list;
+      view.list(c, list);
+      CHECK(view.rows(c) == expected[c].size());
+      CHECK(list.size() == (expected[c].size() + kPackedRows - 1) / kPackedRows);
+      for (std::size_t i = 0; i < expected[c].size(); ++i) {
+        const std::size_t row = list[i / kPackedRows] * kPackedRows + i % kPackedRows;
+        CHECK(stands[row] == expected[c][i]);
+        CHECK(blocks.cell_of(row) == c);
+      }
+      all += list.size();
+    }
+    CHECK(all == blocks.blocks());
+  }
+}
+
+void numbers() {
+  test::Random random(4);
+  for (const int bits : {1, 7, 8, 20, 24, 31, 32}) {
+    const auto values = random.integers<std::uint32_t>(1001, 0, (std::int64_t{1} << bits) - 1);
+    const std::vector<std::uint8_t> packed = pack_bit_numbers(values, bits);
+    CHECK(packed.size() == bit_numbers_size(values.size(), bits));
+    CHECK(packed.size() == (1001u * static_cast<unsigned>(bits) + 7) / 8 + 7);
+    bool equal = true;
+    for (std::size_t i = 0; i < values.size(); ++i) {
+      equal = equal && bit_number(packed.data(), bits, i) == values[i];
+    }
+    CHECK(equal);
+  }
+}
+
+void means() {
+  bool equal = true;
+  for (int n = 1; n <= 255; ++n) {
+    std::vector<std::int16_t> sums;
+    for (int sum = -127 * n; sum <= 127 * n; ++sum) sums.push_back(static_cast<std::int16_t>(sum));
+    std::vector<std::int8_t> found(sums.size());
+    rounded_means(sums.data(), n, sums.size(), found.data());
+    for (std::size_t i = 0; i < sums.size(); ++i) {
+      equal = equal && found[i] == rounded_mean<int>(sums[i], n);
+    }
+  }
+  CHECK(equal);
+}
+
+void learning() {
+  test::Random random(5);
+  const std::size_t n = 3000;
+  const auto codes = clumped(random, n);
+  const Codes view{codes.data(), n, kDim};
+  const Cells cells = Cells::learn(view, 40, 1);
+  CHECK(cells.size() == 40);
+  CHECK(Cells::learn(view, 40, 3).centroids() == cells.centroids());
+  const auto own = cells.assign(view, 1);
+  CHECK(cells.assign(view, 4) == own);
+  // One code alone is where it is among others.
+  for (const std::size_t i : {0, 17, 2999})
+    CHECK(cells.assign({view.row(i), 1, kDim}, 1)[0] == own[i]);
+  // All cells are used, and nearly all codes are in that of the nearest centroid.
+  CHECK(std::set(own.begin(), own.end()).size() == 40);
+  std::vector<std::int64_t> nearest(n);
+  std::vector<float> distances(n);
+  protomark::search(cells.packed(), view, {}, {nearest.data(), n, 1}, {distances.data(), n, 1});
+  std::size_t same = 0;
+  for (std::size_t i = 0; i < n; ++i) same += nearest[i] == own[i] ? 1 : 0;
+  CHECK(same > n * 98 / 100);
+  // Equal codes, and as many cells as codes.
+  const std::vector<std::int8_t> equal(50 * kDim, 7);
+  const Cells alike = Cells::learn({equal.data(), 50, kDim}, 50, 1);
+  CHECK(alike.size() == 50);
+  CHECK(alike.assign({equal.data(), 50, kDim}, 1) == std::vector<std::uint32_t>(50, 0));
+  CHECK(Cells::learn({codes.data(), 1, kDim}, 1, 1).assign(view, 1) ==
+        std::vector<std::uint32_t>(n, 0));
+}
+
+// Whatever happens to a map with an index, it answers as one without.
+void histories(std::size_t look_bits) {
+  const auto encoder = test::random_encoder();
+  test::Random random(6);
+  PrototypeMap with(encoder, kDim, look_bits), without(encoder, kDim, look_bits);
+  const auto codes = clumped(random, 64);
+  const Codes queries{codes.data(), 64, kDim};
+  struct Observation {
+    std::int64_t id;
+    std::vector<std::int8_t> code;
+  };
+  std::vector<Observation> added;
+  const auto both = [&](const auto& change) {
+    change(with);
+    change(without);
+  };
+  const auto add = [&](std::size_t n, std::int64_t ids) {
+    const auto landmarks = random.integers<std::int64_t>(n, 0, ids - 1);
+    const auto more = clumped(random, n);
+    both([&](PrototypeMap& map) { map.add_codes(landmarks, {more.data(), n, kDim}); });
+    for (std::size_t i = 0; i < n; ++i) {
+      added.push_back({landmarks[i], {&more[i * kDim], &more[i * kDim] + kDim}});
+    }
+  };
+  add(500, 300);
+  with.build_index(16);
+  CHECK(with.index_cells() == 16);
+  for (int round = 0; round < 12; ++round) {
+    add(400, 300 + 100 * round);
+    // Some observations are taken back, all of some landmarks among them.
+    std::vector<std::int64_t> landmarks;
+    std::vector<std::int8_t> taken;
+    const std::int64_t gone = random.integer(0, 300);
+    std::erase_if(added, [&](const Observation& o) {
+      if (o.id % 40 != gone % 40 && random.integer(0, 9) != 0) return false;
+      landmarks.push_back(o.id);
+      taken.insert(taken.end(), o.code.begin(), o.code.end());
+      return true;
+    });
+    both([&](PrototypeMap& map) {
+      map.remove_codes(landmarks, {taken.data(), landmarks.size(), kDim});
+    });
+    const auto ids = with.ids();
+    CHECK(ids == without.ids());
+    const std::vector<std::int64_t> discarded = {ids[5], ids[77]};
+    both([&](PrototypeMap& map) { map.discard(discarded); });
+    std::erase_if(
+        added, [&](const Observation& o) { return o.id == discarded[0] || o.id == discarded[1]; });
+    if (round % 3 == 1) {
+      const std::vector<std::int64_t> into = {ids[1], ids[1]}, source = {ids[20], ids[30]};
+      both([&](PrototypeMap& map) { map.merge(into, source); });
+      for (Observation& o : added) {
+        if (o.id == ids[20] || o.id == ids[30]) o.id = ids[1];
+      }
+    }
+    if (round % 4 == 2) {
+      PrototypeMap other(encoder, kDim, look_bits);
+      const auto more = clumped(random, 100);
+      const auto those = random.integers<std::int64_t>(100, 200, 2000);
+      other.add_codes(those, {more.data(), 100, kDim});
+      if (round % 8 == 2) other.build_index(3);
+      both([&](PrototypeMap& map) { map.update(other); });
+      for (std::size_t i = 0; i < 100; ++i) {
+        added.push_back({those[i], {&more[i * kDim], &more[i * kDim] + kDim}});
+      }
+    }
+    CHECK(with.prototype_count() == without.prototype_count());
+    CHECK(with.counts(with.ids()) == without.counts(without.ids()));
+    check_exact(with, search(without, queries, 3), queries);
+
+    // The cells do not depend on how the map came about: built anew from its file it answers alike.
+    const fs::path path =
+        fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
+    with.save(path);
+    const PrototypeMap again = PrototypeMap::load(path);
+    CHECK(again.index_cells() == 16);
+    CHECK(search(again, queries, 3, with_probes(2)) == search(with, queries, 3, with_probes(2)));
+    const auto bytes = MappedFile(path);
+    const std::vector<std::byte> first(bytes.bytes().begin(), bytes.bytes().end());
+    again.save(path);
+    const auto second = MappedFile(path);
+    CHECK(std::ranges::equal(first, second.bytes()));
+    fs::remove(path);
+    if (round == 6) {
+      with.drop_index();
+      CHECK(with.index_cells() == 0);
+      CHECK(search(with, queries, 3) == search(without, queries, 3));
+      with.build_index(16, 2);
+    }
+  }
+  // To nothing and up again.
+  both([&](PrototypeMap& map) { map.discard(map.ids()); });
+  CHECK(search(with, queries, 2, with_probes(4)).ids == std::vector<std::int64_t>(128, -1));
+  add(300, 100);
+  check_exact(with, search(without, queries, 3), queries);
+}
+
+void sealed(std::size_t look_bits, int bits, std::optional<double> prototypes) {
+  const auto encoder = test::random_encoder();
+  test::Random random(8);
+  PrototypeMap with(encoder, kDim, look_bits), without(encoder, kDim, look_bits);
+  const std::size_t n = 5000;
+  const auto landmarks = random.integers<std::int64_t>(n, 0, 1500);
+  const auto codes = clumped(random, n);
+  for (PrototypeMap* map : {&with, &without}) map->add_codes(landmarks, {codes.data(), n, kDim});
+  with.build_index(30);
+  const fs::path path =
+      fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
+  const fs::path plain_path = path.string() + ".plain";
+  with.seal(path, bits, prototypes);
+  without.seal(plain_path, bits, prototypes);
+  const SealedMap map(path), plain(plain_path);
+  CHECK(map.index_cells() == 30);
+  CHECK(map.prototype_count() == plain.prototype_count());
+  const Codes queries{codes.data(), 80, kDim};
+  check_exact(map, search(plain, queries, 3), queries);
+  CHECK(map.ids() == plain.ids());
+  CHECK(map.counts(map.ids()) == plain.counts(plain.ids()));
+  const auto ids = map.ids();
+  std::vector<float> means(ids.size() * kDim), plain_means(means.size());
+  map.prototypes(ids, {means.data(), ids.size(), kDim});
+  plain.prototypes(ids, {plain_means.data(), ids.size(), kDim});
+  CHECK(means == plain_means);
+  for (const std::int64_t id : {ids[0], ids[700], ids.back()}) {
+    auto looks = map.looks(id), plain_looks = plain.looks(id);
+    std::sort(looks.begin(), looks.end());
+    std::sort(plain_looks.begin(), plain_looks.end());
+    CHECK(looks == plain_looks);
+  }
+  if (bits == 8 && !prototypes) {
+    CHECK(map.probes(0.9) == with.probes(0.9));
+    for (const SearchOptions& options : {with_recall(0.9), with_probes(3)}) {
+      CHECK(search(map, queries, 2, options) == search(with, queries, 2, options));
+    }
+  }
+  CHECK(fs::file_size(path) > fs::file_size(plain_path));
+  CHECK(map.probes(0.5) <= map.probes(0.9));
+  CHECK(map.probes(1) == 30);
+  CHECK(check::throws<std::invalid_argument>([&] { plain.probes(0.9); }, "needs an index"));
+  CHECK(check::throws<std::invalid_argument>([&] { search(plain, queries, 2, with_recall(0.9)); },
+                                             "build_index before the map is sealed"));
+  fs::remove(path);
+  fs::remove(plain_path);
+}
+
+void errors() {
+  const auto encoder = test::random_encoder();
+  test::Random random(9);
+  PrototypeMap map(encoder);
+  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(); }, "without landmarks"));
+  const std::vector<std::int64_t> landmarks = {1, 2, 3};
+  const auto codes = clumped(random, 3);
+  const Codes queries{codes.data(), 3, kDim};
+  map.add_codes(landmarks, queries);
+  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(4); }, "1 to 3 cells"));
+  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(0); }, "1 to 3 cells"));
+  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(2, 0); }, "threads"));
+  CHECK(check::throws<std::invalid_argument>([&] { map.probes(0.9); }, "build_index"));
+  for (const SearchOptions& options : {with_recall(0.9), with_probes(2)}) {
+    CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, options); },
+                                               "needs an index: call build_index first"));
+  }
+  map.build_index(3);
+  for (const double recall : {0.0, -1.0, 1.1, std::nan("")}) {
+    CHECK(check::throws<std::invalid_argument>(
+        [&] { search(map, queries, 1, with_recall(recall)); }, "recall must be above 0"));
+  }
+  CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, with_probes(0)); },
+                                             "probes must be at least 1"));
+  SearchOptions two = with_probes(1);
+  two.recall = 0.9;
+  CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, two); }, "exclude"));
+  CHECK(search(map, queries, 1, with_probes(1000)).ids == landmarks);
+  map.build_index();
+  CHECK(map.index_cells() == 1);
+}
+
+}  // namespace
+
+int main() {
+  blocks();
+  numbers();
+  means();
+  learning();
+  histories(0);
+  histories(5);
+  sealed(0, 8, std::nullopt);
+  sealed(0, 4, std::nullopt);
+  sealed(5, 8, std::nullopt);
+  sealed(5, 8, 1.5);
+  sealed(5, 4, 2.0);
+  errors();
+  return check::result();
+}

@@ -1,0 +1,321 @@
+"""Approximate search: all cells are the exact answer, whatever happened to the map."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import protomark as pm
+from conftest import balanced_encoder
+from map_container import SEALED_MAP, Section, container, sections
+from protomark import sample
+from protomark.build import build_file, build_map
+from protomark.evaluation.protocol import split
+from protomark.info import describe
+
+DIM = 12
+
+
+@pytest.fixture(scope="module")
+def coder() -> pm.Encoder:
+    return balanced_encoder()
+
+
+def random_codes(n: int, seed: int) -> NDArray[np.int8]:
+    """In clumps, as real ones are."""
+    rng = np.random.default_rng(seed)
+    clumps = np.random.default_rng(0).integers(-90, 91, (20, DIM))
+    return (clumps[rng.integers(0, 20, n)] + rng.integers(-37, 38, (n, DIM))).astype(np.int8)
+
+
+def filled(coder: pm.Encoder, landmarks: int, look_bits: int = 0, seed: int = 0) -> pm.PrototypeMap:
+    scene = pm.PrototypeMap(coder, look_bits=look_bits)
+    ids = np.random.default_rng(seed).integers(0, landmarks, 3 * landmarks)
+    scene.add_codes(ids, random_codes(len(ids), seed))
+    return scene
+
+
+def assert_same(a: tuple[object, object], b: tuple[object, object]) -> None:
+    for x, y in zip(a, b, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def assert_exact(scene: pm.PrototypeMap | pm.SealedMap, expected: tuple[object, object]) -> None:
+    queries = random_codes(40, 99)
+    assert_same(scene.search_codes(queries, k=3), expected)
+    assert_same(scene.search_codes(queries, k=3, recall=1.0), expected)
+    cells = scene.index_cells
+    assert_same(scene.search_codes(queries, k=3, probes=cells, threads=2), expected)
+
+
+STEP = st.tuples(
+    st.sampled_from(["add", "remove", "merge", "discard", "update", "learn", "drop", "file"]),
+    st.integers(0, 2**32 - 1),
+)
+
+
+@settings(max_examples=25)
+@given(
+    steps=st.lists(STEP, max_size=12), look_bits=st.sampled_from([0, 4]), cells=st.integers(1, 9)
+)
+def test_all_cells_are_the_exact_answer_under_any_history(
+    tmp_path_factory: pytest.TempPathFactory,
+    steps: list[tuple[str, int]],
+    look_bits: int,
+    cells: int,
+) -> None:
+    coder = balanced_encoder()
+    path = tmp_path_factory.mktemp("history") / "m.pmk"
+    scene, plain = (filled(coder, 60, look_bits) for _ in range(2))
+    scene.build_index(cells)
+    for step, seed in steps:
+        rng = np.random.default_rng(seed)
+        ids = plain.ids
+        if step == "add" or len(ids) < 5:
+            new = rng.integers(0, 200, 50)
+            for m in (scene, plain):
+                m.add_codes(new, random_codes(50, seed))
+        elif step == "remove":
+            more, some = random_codes(30, seed), rng.choice(ids, 30)
+            for m in (scene, plain):
+                m.add_codes(some, more)
+                m.add_codes(np.arange(300, 330), more)
+                m.remove_codes(np.arange(300, 330), more)
+                m.remove_codes(some[:20], more[:20])
+        elif step == "merge":
+            into, source = rng.choice(ids, 2, replace=False)
+            for m in (scene, plain):
+                m.merge([into], [source])
+        elif step == "discard":
+            gone = rng.choice(ids, len(ids) // 2, replace=False)
+            for m in (scene, plain):
+                m.discard(gone)
+        elif step == "update":
+            other = filled(coder, 40, look_bits, seed)
+            for m in (scene, plain):
+                m.update(other)
+        elif step == "learn":
+            scene.build_index(min(cells, scene.prototype_count), threads=2)
+        elif step == "drop":
+            scene.drop_index()
+            assert scene.index_cells == 0
+            scene.build_index(1)
+        else:
+            scene.save(path)
+            scene = pm.open(path)  # type: ignore[assignment]
+        np.testing.assert_array_equal(scene.ids, plain.ids)
+        np.testing.assert_array_equal(scene.prototype(plain.ids), plain.prototype(plain.ids))
+        assert_exact(scene, plain.search_codes(random_codes(40, 99), k=3))
+
+
+@pytest.mark.parametrize("look_bits", [0, 4])
+def test_cells_do_not_depend_on_history_or_threads(
+    coder: pm.Encoder, tmp_path: Path, look_bits: int
+) -> None:
+    """Equal maps whose cells are equal give equal files and equal approximate answers."""
+    ids, codes = np.arange(2000) % 700, random_codes(2000, 1)
+    a, b = (pm.PrototypeMap(coder, look_bits=look_bits) for _ in range(2))
+    a.add_codes(ids, codes)
+    a.build_index(25, threads=3)
+    order = np.random.default_rng(2).permutation(2000)
+    b.add_codes(ids[order], codes[order])
+    b.build_index(25)
+    for _ in range(2):
+        a.save(tmp_path / "a.pmk")
+        b.save(tmp_path / "b.pmk")
+        assert (tmp_path / "a.pmk").read_bytes() == (tmp_path / "b.pmk").read_bytes()
+        queries = random_codes(200, 7)
+        assert_same(a.search_codes(queries, probes=3), b.search_codes(queries, probes=3, threads=4))
+        # More observations, in one go and one by one.
+        more = random_codes(300, 8)
+        a.add_codes(ids[:300], more)
+        for i in order[order < 300]:
+            b.add_codes(ids[i : i + 1], more[i : i + 1])
+
+
+@pytest.mark.parametrize(("bits", "prototypes"), [(8, None), (4, None), (8, 1.5), (4, 2.0)])
+@pytest.mark.parametrize("look_bits", [0, 4])
+def test_a_sealed_map_keeps_the_index(
+    coder: pm.Encoder, tmp_path: Path, bits: int, prototypes: float | None, look_bits: int
+) -> None:
+    scene = filled(coder, 800, look_bits)
+    plain = scene.seal(tmp_path / "plain.pmk", bits=bits, prototypes=prototypes)
+    assert plain.index_cells == 0
+    scene.build_index(20)
+    sealed = scene.seal(tmp_path / "s.pmk", bits=bits, prototypes=prototypes)
+    assert sealed.index_cells == 20
+    assert_exact(sealed, plain.search_codes(random_codes(40, 99), k=3))
+    np.testing.assert_array_equal(sealed.prototype(sealed.ids), plain.prototype(plain.ids))
+    assert 1 <= sealed.probes(0.8) <= sealed.probes(0.99) <= sealed.probes(1.0) == 20
+    if bits == 8 and prototypes is None:
+        queries = random_codes(100, 5)
+        assert sealed.probes(0.9) == scene.probes(0.9)
+        for options in ({"recall": 0.9}, {"probes": 2}):
+            assert_same(
+                sealed.search_codes(queries, **options), scene.search_codes(queries, **options)
+            )
+    pm.verify_file(tmp_path / "s.pmk")
+
+
+def test_stated_recall_holds_for_held_out_descriptors_of_the_sample() -> None:
+    tracks = sample.load()
+    part = split(tracks, 0)
+    scene = pm.PrototypeMap(pm.Encoder.load("freak"), 32)
+    scene.add(tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows])
+    scene.build_index(250)
+    queries = tracks.descriptors[part.query_rows]
+    exact = scene.search(queries, k=1)[1]
+    for recall in (0.9, 0.95, 0.98):
+        assert scene.probes(recall) < scene.index_cells / 2
+        found = scene.search(queries, k=1, recall=recall)[1]
+        # Of some thousand queries a share is uncertain by half a percent.
+        assert np.mean(found <= exact) >= recall - 0.01
+
+
+def test_recall_is_kept_while_the_map_learns() -> None:
+    tracks = sample.load()
+    rows = tracks.observations
+    ids = tracks.landmark_of_keypoint[rows]
+    scene = pm.PrototypeMap(pm.Encoder.load("freak"), 32)
+    for i, part in enumerate(np.array_split(np.arange(len(rows)), 5)):
+        scene.add(ids[part], tracks.descriptors[rows[part]])
+        if i == 0:
+            scene.build_index(100)
+        queries = tracks.descriptors[:: len(tracks.descriptors) // 2000]
+        exact = scene.search(queries, k=1)[1]
+        found = scene.search(queries, k=1, recall=0.95)[1]
+        assert np.mean(found <= exact) >= 0.94
+
+
+def test_errors(coder: pm.Encoder, tmp_path: Path) -> None:
+    empty = pm.PrototypeMap(coder)
+    with pytest.raises(ValueError, match="without landmarks"):
+        empty.build_index()
+    scene = filled(coder, 50)
+    codes = random_codes(3, 0)
+    sealed = scene.seal(tmp_path / "s.pmk")
+    for options in ({"recall": 0.9}, {"probes": 2}):
+        with pytest.raises(ValueError, match="needs an index: call build_index first"):
+            scene.search_codes(codes, **options)
+        with pytest.raises(ValueError, match="call build_index before the map is sealed"):
+            sealed.search_codes(codes, **options)
+    for m in (scene, sealed):
+        with pytest.raises(ValueError, match="needs an index"):
+            m.probes(0.9)
+    for cells in (0, 1000):
+        with pytest.raises(ValueError, match=f"cells, not {cells}"):
+            scene.build_index(cells)
+    with pytest.raises(ValueError, match="threads"):
+        scene.build_index(threads=0)
+    scene.build_index(5)
+    for recall in (0.0, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="above 0 and at most 1"):
+            scene.search_codes(codes, recall=recall)
+    with pytest.raises(ValueError, match="probes must be at least 1"):
+        scene.search_codes(codes, probes=0)
+    with pytest.raises(ValueError, match="exclude each other"):
+        scene.search_codes(codes, probes=1, recall=0.5)
+
+
+def replaced(parts: list[Section], name: str, content: bytes | None) -> list[Section]:
+    """With another content of a section, or without it."""
+    return [(n, c if n != name else content) for n, c in parts if n != name or content is not None]
+
+
+def changed(name: str, change: Callable[[bytes], bytes | None]) -> Callable[..., list[Section]]:
+    return lambda parts: replaced(parts, name, change(dict(parts)[name]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (changed("cells", lambda c: c[:-1]), "'cells' has the wrong size"),
+        (changed("cells", lambda c: b""), "'cells' has the wrong size"),
+        (changed("cells", lambda c: b"\x80" + c[1:]), "impossible centroids"),
+        (changed("cells", lambda c: c[:-DIM]), "'cellrows' has the wrong size"),
+        (changed("cellrows", lambda c: None), "lacks the section 'cellrows'"),
+        (changed("cellrows", lambda c: struct.pack("<I", 2**32 - 1) + c[4:]), "as many prototypes"),
+        (changed("cellrows", lambda c: struct.pack("<I", 0) + c[4:]), "as many prototypes"),
+        (changed("order", lambda c: c + b"\0"), "'order' has the wrong size"),
+        (changed("order", lambda c: None), "lacks the section 'order'"),
+        (changed("probes", lambda c: c[:-1]), "'probes' is impossible"),
+        (changed("probes", lambda c: c[::-1]), "'probes' is impossible"),
+        (changed("probes", lambda c: bytes(len(c))), "'probes' is impossible"),
+        (changed("probes", lambda c: c * 100), "'probes' is impossible"),
+        (changed("protos", lambda c: c[:-64]), "'protos' has the wrong size"),
+    ],
+)
+def test_hostile_sections_are_refused(
+    coder: pm.Encoder,
+    tmp_path: Path,
+    change: Callable[[list[Section]], list[Section]],
+    message: str,
+) -> None:
+    path = tmp_path / "s.pmk"
+    scene = filled(coder, 200)
+    scene.build_index(10)
+    scene.seal(path)
+    path.write_bytes(container(change(sections(path.read_bytes())), version=3, kind=SEALED_MAP))
+    with pytest.raises(pm.FileError, match=message):
+        pm.open(path)
+
+
+def test_a_hostile_order_gives_no_landmark_that_is_not_there(
+    coder: pm.Encoder, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.pmk"
+    scene = filled(coder, 200)
+    scene.build_index(10)
+    scene.seal(path)
+    parts = sections(path.read_bytes())
+    size = len(dict(parts)["order"])
+    for content in (b"\xff" * size, bytes(size)):
+        path.write_bytes(container(replaced(parts, "order", content), 3, SEALED_MAP))
+        sealed = pm.open(path)
+        known = set(sealed.ids.tolist()) | {-1}
+        for options in ({}, {"probes": 10}, {"recall": 0.9}):
+            ids, _ = sealed.search_codes(random_codes(50, 3), k=4, **options)
+            assert set(ids.ravel().tolist()) <= known
+        with pytest.raises(pm.FileError, match="its order"):
+            sealed.prototype(sealed.ids[:3])
+
+
+def test_all_instruction_sets_learn_the_same_cells(coder: pm.Encoder, tmp_path: Path) -> None:
+    scene = filled(coder, 1500)
+    scene.save(tmp_path / "m.pmk")
+    scene.build_index(60)
+    scene.seal(tmp_path / "here.pmk")
+    code = (
+        "import sys, protomark as pm; m = pm.open(sys.argv[1]); m.build_index(60); "
+        "m.seal(sys.argv[2])"
+    )
+    subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "m.pmk", tmp_path / "there.pmk"],
+        check=True,
+        env={**os.environ, "PROTOMARK_ISA": "portable"},
+    )
+    assert (tmp_path / "here.pmk").read_bytes() == (tmp_path / "there.pmk").read_bytes()
+
+
+@pytest.mark.parametrize("bits", [8, 4])
+def test_build_and_info_show_the_index(tmp_path: Path, bits: int) -> None:
+    path = tmp_path / "s.pmk"
+    build_file(sample.path(), path, None, 32, 2, True, 1, bits, index=True)
+    facts = describe(path)
+    assert facts["index_cells"] == pm.open(path).index_cells > 1
+    assert 1 < facts["index_bytes_per_landmark"] <= 4
+    build_file(sample.path(), path, None, 32, 2, False, 1, index=True)
+    assert describe(path)["index_cells"] == facts["index_cells"]
+    scene = build_map(sample.load(), pm.Encoder.load("freak"), 32)
+    scene.seal(path)
+    assert describe(path)["index_cells"] is None
