@@ -1,8 +1,9 @@
 """Write docs/benchmarks.md and its plots from the JSON of `protomark bench`.
 
-python benchmarks/bench_document.py [RESULTS.json]
+python benchmarks/bench_document.py [RESULTS.json ...]
 
-Without an argument: from benchmarks/results/bench.json. Exit code 1 if a target was missed.
+Without an argument: from benchmarks/results/bench*.json, the first of which names the machine; the
+others add larger maps. Exit code 1 if a target was missed.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ DOCUMENT = ROOT / "docs" / "benchmarks.md"
 
 def main() -> int:
     """Write the document, and say which targets were missed."""
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "benchmarks/results/bench.json"
-    results = Results.load(path)
+    paths = [Path(name) for name in sys.argv[1:]]
+    first, *others = paths or sorted((ROOT / "benchmarks/results").glob("bench*.json"))
+    results = Results.load(first)
+    for path in others:
+        results.extend(Results.load(path))
     plots = DOCUMENT.with_suffix("")
     plots.mkdir(exist_ok=True)
     names = [f"{plots.name}/{name}" for name in figures.save(results, plots)]

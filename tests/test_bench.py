@@ -317,6 +317,30 @@ def test_unknown_sections_are_refused() -> None:
         )
 
 
+def test_sizes_of_maps_may_be_chosen(tmp_path: Path) -> None:
+    common = {"sections": (), "threads": 1, "build_threads": 1, "full": False, "quick": False}
+    chosen = choose(**common, scratch=tmp_path, landmarks=(500, 20, 500))  # type: ignore[arg-type]
+    assert chosen.exact == chosen.approximate == chosen.growth == (20, 500)
+    with pytest.raises(ValueError, match="--landmarks 0"):
+        choose(**common, scratch=tmp_path, landmarks=(0,))  # type: ignore[arg-type]
+
+
+def test_runs_are_joined_only_where_machine_and_data_are_the_same() -> None:
+    def run(landmarks: int, cpu: str = "a") -> Results:
+        contest = Contest(
+            "search", f"{landmarks} landmarks", "query", 1, landmarks, work={"bytes": 1}
+        )
+        return Results(machine={"CPU": cpu}, contests=[contest], command=f"bench {landmarks}")
+
+    results = run(10)
+    results.extend(run(10))
+    results.extend(run(20))
+    assert [(c.landmarks, bool(c.work)) for c in results.contests] == [(10, True), (20, False)]
+    assert results.command.split("\n    ") == ["bench 10", "bench 10", "bench 20"]
+    with pytest.raises(ValueError, match="two machines"):
+        results.extend(run(30, cpu="b"))
+
+
 def test_ctrl_c_keeps_what_is_measured(
     real: Observations, encoder: pm.Encoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:

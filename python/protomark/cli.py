@@ -550,6 +550,13 @@ def bench(
     quick: Annotated[
         bool, typer.Option("--quick", help="Tiny sizes: whether it runs, not how fast.")
     ] = False,
+    landmarks: Annotated[
+        str,
+        typer.Option(
+            help="Sizes of the maps that are searched (search, hamming, approximate, growth), for "
+            "example 10000,1000000, in place of the usual ones."
+        ),
+    ] = "",
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
     scratch: Annotated[
         Path | None,
@@ -581,8 +588,10 @@ def bench(
         full=full,
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
+        landmarks=_numbers("--landmarks", landmarks),
     )
     flags = [f"--only {only}"] if only else []
+    flags += [f"--landmarks {landmarks}"] if landmarks else []
     flags += ["--full"] if full else ["--quick"] if quick else []
     flags += [f"--threads {threads}"] if threads != 1 else []
     repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])
@@ -590,6 +599,14 @@ def bench(
     command.print_summary(results, output)
     if results.interrupted:
         raise typer.Exit(130)
+
+
+def _numbers(option: str, text: str) -> tuple[int, ...]:
+    """The numbers of a list such as 10000,1000000."""
+    try:
+        return tuple(int(number) for number in text.split(",") if number.strip())
+    except ValueError:
+        raise ValueError(f"{option} {text}: not numbers with commas between them") from None
 
 
 def _write_json(path: Path | None, facts: dict[str, Any]) -> None:

@@ -116,6 +116,28 @@ class Results:
     interrupted: bool = False
     command: str = "protomark bench"
 
+    def extend(self, later: Results) -> None:
+        """Take what another run on this machine measured, where it is no share of a ceiling.
+
+        Raises:
+            ValueError: it was another machine, or data of another kind.
+        """
+        for name in ("CPU", "instruction set"):
+            if self.machine.get(name) != later.machine.get(name):
+                raise ValueError(f"runs of two machines: {name} {later.machine.get(name)}")
+        if self.data != later.data:
+            raise ValueError(f"runs on different data: {later.data}")
+        known = {(c.section, c.title, c.threads, c.recall) for c in self.contests}
+        for contest in later.contests:
+            if (contest.section, contest.title, contest.threads, contest.recall) not in known:
+                contest.work = {}
+                self.contests.append(contest)
+        self.growth += later.growth
+        self.large |= later.large
+        self.skipped += [note for note in later.skipped if note not in self.skipped]
+        self.interrupted |= later.interrupted
+        self.command += f"\n    {later.command}"
+
     @property
     def vector_ceiling(self) -> float | None:
         """Multiply-adds a second of one thread's best vector instructions; tiles left out."""

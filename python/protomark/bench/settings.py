@@ -59,12 +59,32 @@ def choose(
     full: bool,
     quick: bool,
     scratch: Path,
+    landmarks: tuple[int, ...] = (),
 ) -> Settings:
     """The settings of `--full`, of `--quick` (a few seconds, for tests), or of neither.
 
+    `landmarks` are sizes of the maps that are searched, in place of these settings' own.
+
     Raises:
-        ValueError: a section is unknown, or both are asked for.
+        ValueError: a section is unknown, both are asked for, or a map has no landmark.
     """
+    chosen = _of_scale(sections, threads, build_threads, full, quick, scratch)
+    if any(n < 1 for n in landmarks):
+        raise ValueError(f"--landmarks {min(landmarks)}: a map needs at least 1")
+    if not landmarks:
+        return chosen
+    sizes = tuple(sorted(set(landmarks)))
+    return replace(chosen, exact=sizes, approximate=sizes, growth=sizes)
+
+
+def _of_scale(
+    sections: tuple[str, ...],
+    threads: int,
+    build_threads: int,
+    full: bool,
+    quick: bool,
+    scratch: Path,
+) -> Settings:
     unknown = [name for name in sections if name not in SECTIONS]
     if unknown:
         raise ValueError(f"--only {unknown[0]}: no such section ({', '.join(SECTIONS)})")

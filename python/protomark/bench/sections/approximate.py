@@ -121,9 +121,8 @@ def _entrants(
             return
         found.append(_Entrant(name, lambda: build(rows, codes, threads, build_threads), near))
 
-    if hasattr(scene, "build_index"):
-        build = partial(ours.cells, workload, n, codes, threads, build_threads)
-        found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
+    build = partial(ours.cells, workload, n, codes, threads, build_threads)
+    found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
     if installed("faiss"):
         from protomark.bench.peers import faiss_indexes
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark import PrototypeMap
 from protomark.bench.grown import map_of
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race, turns
@@ -18,22 +17,20 @@ DESCRIPTORS, RATIO, RECALL = 1_000, 0.8, 0.98
 
 
 def run(workload: Workload, results: Results, bar: Bar) -> None:
-    """1,000 descriptors, exactly and, where the map has an index, approximately."""
+    """1,000 descriptors, exactly and approximately."""
     settings = workload.settings
     bar.begin("frame", len(THREADS) * turns(2, settings.pace) + 2)
     bar.advance("map")
-    scene: Any = workload.map(settings.map)
-    indexed: Any = None
-    if hasattr(scene, "build_index"):
-        bar.advance("index")
-        indexed = map_of(workload.encoder, workload.prototypes(settings.map))
-        indexed.build_index(threads=settings.build_threads)
+    scene = workload.map(settings.map)
+    bar.advance("index")
+    indexed = map_of(workload.encoder, workload.prototypes(settings.map))
+    indexed.build_index(threads=settings.build_threads)
     queries = workload.queries(settings.map, DESCRIPTORS)
     for threads in THREADS:
-        entrants = [_contender("Protomark, exact", scene, queries, threads)]
-        if indexed is not None:
-            name = f"Protomark, recall {RECALL}"
-            entrants.append(_contender(name, indexed, queries, threads, recall=RECALL))
+        entrants = [
+            _contender("Protomark, exact", scene, queries, threads),
+            _contender(f"Protomark, recall {RECALL}", indexed, queries, threads, RECALL),
+        ]
         results.contests.append(
             Contest(
                 "frame",
@@ -48,8 +45,13 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
 
 
 def _contender(
-    name: str, scene: Any, queries: NDArray[np.uint8], threads: int, **how: float
+    name: str,
+    scene: PrototypeMap,
+    queries: NDArray[np.uint8],
+    threads: int,
+    recall: float | None = None,
 ) -> Contender:
-    return Contender(
-        name, lambda _: scene.search(queries, k=2, ratio=RATIO, threads=threads, **how), ours=True
-    )
+    def search(_: int) -> None:
+        scene.search(queries, k=2, ratio=RATIO, threads=threads, recall=recall)
+
+    return Contender(name, search, ours=True)

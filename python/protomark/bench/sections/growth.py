@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark import PrototypeMap
 from protomark.bench.grown import map_of
 from protomark.bench.machine import allocated_bytes, lacks
 from protomark.bench.peers.index import K
@@ -35,7 +36,7 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         codes = workload.codes(workload.queries(n, settings.queries))
         rows = workload.prototypes(n)
         before = allocated_bytes()
-        scene: Any = map_of(workload.encoder, rows)
+        scene = map_of(workload.encoder, rows)
         scene.search_codes(codes[:1], k=K)
         used = _since(before)
 
@@ -50,8 +51,6 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
                 threads=settings.threads,
             )
         )
-        if not hasattr(scene, "build_index"):
-            continue
         bar.advance(f"{n:,} landmarks, approximate")
         exact = scene.search_codes(codes, k=1, threads=settings.build_threads)[1]
         began = time.perf_counter()
@@ -72,11 +71,16 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         )
 
 
-def _seconds(scene: Any, codes: NDArray[np.int8], settings: Settings, **how: float) -> float:
-    """Of a query, by search in this way."""
+def _seconds(
+    scene: PrototypeMap,
+    codes: NDArray[np.int8],
+    settings: Settings,
+    recall: float | None = None,
+) -> float:
+    """Of a query, exactly or at a recall."""
 
     def search(q: int) -> None:
-        scene.search_codes(codes[:q], k=K, threads=settings.threads, **how)
+        scene.search_codes(codes[:q], k=K, threads=settings.threads, recall=recall)
 
     entrant = Contender("search", search, least=64)
     return race([entrant], settings.queries, replace(settings.pace, rounds=3))[0].median

@@ -6,7 +6,6 @@ import tempfile
 import time
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,7 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         threads=settings.build_threads,
     )
     workload.forget()
-    scene: Any = pm.PrototypeMap(workload.encoder, dim=settings.dim)
+    scene = pm.PrototypeMap(workload.encoder, dim=settings.dim)
     began = time.perf_counter()
     for begin in range(0, n, _PART):
         bar.advance(f"{begin:,} of {n:,} landmarks")
@@ -55,11 +54,9 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         scene.add_codes(np.arange(begin, begin + len(rows)), rows)
     figures = {"landmarks": float(n), "grow seconds": time.perf_counter() - began}
     bar.advance("index")
-    indexed = hasattr(scene, "build_index")
-    if indexed:
-        began = time.perf_counter()
-        scene.build_index(threads=settings.build_threads)
-        figures["index seconds"] = time.perf_counter() - began
+    began = time.perf_counter()
+    scene.build_index(threads=settings.build_threads)
+    figures["index seconds"] = time.perf_counter() - began
     landmarks = np.random.default_rng(7).integers(0, n, settings.queries)
     codes = workload.codes(grown.queries(landmarks))
     with tempfile.TemporaryDirectory(dir=settings.scratch) as folder:
@@ -70,20 +67,20 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         del scene
         for bits, path in paths.items():
             bar.advance(f"searching, {bits} bits")
-            measured = _measured(path, codes, {"recall": RECALL} if indexed else {})
+            measured = _measured(path, codes)
             figures |= {f"{bits} bits: {name}": value for name, value in measured.items()}
     results.large = figures
 
 
-def _measured(path: Path, codes: NDArray[np.int8], how: dict[str, float]) -> dict[str, float]:
+def _measured(path: Path, codes: NDArray[np.int8]) -> dict[str, float]:
     """Of one sealed map; recall is against an exact search of the same map."""
     began = time.perf_counter()
-    scene: Any = pm.open(path)
+    scene = pm.open(path)
     opened = time.perf_counter() - began
     seconds = []
     for _ in range(5):
         began = time.perf_counter()
-        found = scene.search_codes(codes, k=K, threads=THREADS, **how)[1][:, 0]
+        found = scene.search_codes(codes, k=K, threads=THREADS, recall=RECALL)[1][:, 0]
         seconds.append(time.perf_counter() - began)
     exact = scene.search_codes(codes, k=K, threads=THREADS)[1][:, 0]
     per = 1_000 / len(codes)
