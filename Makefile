@@ -1,18 +1,22 @@
 # The two commands for a fresh machine are `make demo` and `make test`. All of them make their own
 # virtual environments; PYTHON chooses the interpreter (3.10 or newer).
 PYTHON ?= python3
-SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_core.pyi') \
+SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_*.pyi') \
            CMakeLists.txt pyproject.toml constraints.txt
 CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h')
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-python test-cpp test-arm check format clean
+.PHONY: help demo test test-python test-cpp test-arm sanitize coverage fuzz torture check format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make test      run the tests (C++ and Python)"
 	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
+	@echo "make sanitize  run the tests of the core under sanitizers (memory, undefined behaviour, threads)"
+	@echo "make coverage  print the lines of the core that its C++ tests run"
+	@echo "make fuzz      feed mutated files to every reader of the core (FUZZ_SECONDS=60 each)"
+	@echo "make torture   kill savers, fill disks (KILLS=600)"
 	@echo "make check     formatting, lint and types of both languages"
 	@echo "make format    rewrite sources in the project's format"
 
@@ -44,10 +48,53 @@ test-arm: .venv-test/installed
 	.venv-test/bin/cmake --build build/arm -j$(JOBS)
 	.venv-test/bin/ctest --test-dir build/arm --output-on-failure
 
+# The C++ tests under each set of sanitizers, then the Python tests of the core, in a module that was
+# built with the first one.
+comma := ,
+sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$(1)
+memory := $(call sanitizers,address$(comma)undefined)
+threads := $(call sanitizers,thread)
+CORE_TESTS := $(addprefix tests/test_,encoder.py example_reader.py files.py four_bit_maps.py \
+  hamming.py limits.py looks.py map_file.py mutated_maps.py prototypes.py)
+sanitize: sanitize-memory sanitize-threads .venv-sanitize/installed
+	LD_PRELOAD="$(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)" \
+	ASAN_OPTIONS=detect_leaks=0 .venv-sanitize/bin/python -m pytest -p no:cacheprovider $(CORE_TESTS)
+
+sanitize-memory sanitize-threads: sanitize-%: .venv-sanitize/tools
+	$(call cmake,.venv-sanitize) -S core -B build/sanitize-$* -DPROTOMARK_BUILD_EXAMPLES=OFF \
+	  -DCMAKE_BUILD_TYPE= -DCMAKE_CXX_FLAGS="$($*)" > /dev/null
+	.venv-sanitize/bin/cmake --build build/sanitize-$* -j$(JOBS)
+	.venv-sanitize/bin/ctest --test-dir build/sanitize-$* --output-on-failure
+
+coverage: .venv-sanitize/tools
+	$(call cmake,.venv-sanitize) -S core -B build/coverage -DPROTOMARK_BUILD_EXAMPLES=OFF \
+	  -DCMAKE_BUILD_TYPE= -DCMAKE_CXX_FLAGS="-O1 --coverage -fprofile-update=atomic" > /dev/null
+	.venv-sanitize/bin/cmake --build build/coverage -j$(JOBS)
+	find build/coverage -name '*.gcda' -delete
+	.venv-sanitize/bin/ctest --test-dir build/coverage --output-on-failure
+	.venv-sanitize/bin/gcovr --root core --filter core/src --filter core/include \
+	  --exclude-throw-branches --fail-under-line 90 build/coverage
+
+FUZZ_SECONDS ?= 60
+CLANG ?= clang++
+fuzz: .venv-sanitize/tools
+	@command -v $(CLANG) > /dev/null || { \
+	  echo "make fuzz needs clang with libFuzzer: apt-get install clang llvm, or set CLANG"; exit 1; }
+	$(call cmake,.venv-sanitize) -S core -B build/fuzz -DPROTOMARK_BUILD_FUZZERS=ON \
+	  -DPROTOMARK_BUILD_TESTS=OFF -DPROTOMARK_BUILD_EXAMPLES=OFF -DCMAKE_BUILD_TYPE= \
+	  -DCMAKE_CXX_COMPILER=$(CLANG) \
+	  -DCMAKE_CXX_FLAGS="$(memory) -fprofile-instr-generate -fcoverage-mapping" > /dev/null
+	.venv-sanitize/bin/cmake --build build/fuzz -j$(JOBS)
+	core/fuzz/run.sh build/fuzz $(FUZZ_SECONDS)
+
+KILLS ?= 600
+torture: .venv/installed
+	.venv/bin/python tests/torture/run.py --kills $(KILLS)
+
 check: .venv-check/installed
 	.venv-check/bin/ruff format --check
 	.venv-check/bin/ruff check
-	cp .venv-check/lib/python3*/site-packages/protomark/_core.pyi python/protomark/
+	cp .venv-check/lib/python3*/site-packages/protomark/_*.pyi python/protomark/
 	.venv-check/bin/mypy
 	.venv-check/bin/clang-format --dry-run -Werror $(CPP)
 	$(call cmake,.venv-check) -S core -B build/tidy -DPROTOMARK_BUILD_TESTS=OFF \
@@ -60,7 +107,7 @@ format: .venv-check/installed
 	.venv-check/bin/clang-format -i $(CPP)
 
 clean:
-	rm -rf build .venv .venv-test .venv-check
+	rm -rf build .venv .venv-test .venv-sanitize .venv-check
 
 .venv/installed: $(SOURCES)
 	test -x .venv/bin/python || $(PYTHON) -m venv .venv
@@ -71,6 +118,21 @@ clean:
 	test -x .venv-test/bin/python || $(PYTHON) -m venv .venv-test
 	.venv-test/bin/pip install --quiet -c constraints.txt cmake ninja
 	.venv-test/bin/pip install --quiet -c constraints.txt '.[test,train]'
+	touch $@
+
+.venv-sanitize/tools:
+	test -x .venv-sanitize/bin/python || $(PYTHON) -m venv .venv-sanitize
+	.venv-sanitize/bin/pip install --quiet -c constraints.txt cmake ninja gcovr
+	touch $@
+
+# Without what the package needs beside NumPy: the core's tests do not.
+.venv-sanitize/installed: $(SOURCES) .venv-sanitize/tools
+	.venv-sanitize/bin/pip install --quiet -c constraints.txt scikit-build-core nanobind numpy \
+	  hypothesis pytest
+	# The stub is made by a Python that has not loaded the sanitizer first.
+	ASAN_OPTIONS=detect_leaks=0:verify_asan_link_order=0 .venv-sanitize/bin/pip install --quiet \
+	  --no-deps --no-build-isolation . -C build-dir=build/sanitize-python \
+	  -C cmake.build-type= -C cmake.define.CMAKE_CXX_FLAGS="$(memory)"
 	touch $@
 
 .venv-check/installed: $(SOURCES)

@@ -7,6 +7,7 @@
 #include <array>
 #include <cstdint>
 #include <memory>
+#include <new>
 #include <span>
 #include <string>
 #include <vector>
@@ -77,8 +78,9 @@ inline std::span<const std::int64_t> view(const Vector<std::int64_t>& v) {
 template <typename T>
 class NewMatrix {
  public:
+  // Throws std::bad_alloc where there is no such memory.
   NewMatrix(std::size_t rows, std::size_t columns)
-      : data_(new T[rows * columns]()), rows_(rows), columns_(columns) {}
+      : data_(new T[size(rows, columns)]()), rows_(rows), columns_(columns) {}
 
   MatrixView<T> view() const { return {data_.get(), rows_, columns_}; }
 
@@ -89,6 +91,11 @@ class NewMatrix {
   }
 
  private:
+  static std::size_t size(std::size_t rows, std::size_t columns) {
+    if (columns != 0 && rows > SIZE_MAX / columns) throw std::bad_alloc();
+    return rows * columns;
+  }
+
   std::unique_ptr<T[]> data_;
   std::size_t rows_;
   std::size_t columns_;

@@ -15,6 +15,7 @@
 #include "protomark/encoder.h"
 #include "protomark/error.h"
 #include "protomark/hamming.h"
+#include "protomark/instruction_set.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"
 
@@ -622,6 +623,9 @@ Args:
 Returns:
     Rows of database, or landmark ids, (q, k) int64, nearest first, ties to the smaller, -1 where
     there is none; and distances (q, k) int32, bits + 1 where there is none.)");
+  m.def("instruction_set", &instruction_set,
+        "The instruction set in use, for example avx512; the environment variable PROTOMARK_ISA "
+        "chooses another one. All give the same bytes.");
   m.def(
       "open",
       [](const Path& path) -> nb::object {

@@ -10,6 +10,7 @@
 #include <bit>
 #include <cerrno>
 #include <cstring>
+#include <random>
 
 #include "crc32.h"
 #include "protomark/error.h"
@@ -60,14 +61,16 @@ std::string system_error() { return std::strerror(errno); }
 class TemporaryFile {
  public:
   explicit TemporaryFile(const std::filesystem::path& target) : target_(target) {
-    std::string pattern = target.string() + ".XXXXXX";
-    descriptor_ = ::mkstemp(pattern.data());
-    if (descriptor_ < 0) fail();
-    path_ = pattern;
-    // mkstemp gives 0600; a map is as readable as any file its user makes.
-    const mode_t mask = ::umask(0);
-    ::umask(mask);
-    if (::fchmod(descriptor_, 0666 & ~mask) != 0) fail();
+    // Not mkstemp, whose files only their owner may read: a map is as readable as any file.
+    std::random_device random;
+    do {
+      path_ = target.string() + "." + std::to_string(random());
+      descriptor_ = ::open(path_.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    } while (descriptor_ < 0 && errno == EEXIST);
+    if (descriptor_ < 0) {
+      path_.clear();
+      fail();
+    }
   }
   ~TemporaryFile() {
     if (descriptor_ >= 0) ::close(descriptor_);
@@ -103,10 +106,14 @@ class TemporaryFile {
   void sync_folder() const {
     auto folder = target_.parent_path();
     if (folder.empty()) folder = ".";
-    const int descriptor = ::open(folder.c_str(), O_RDONLY | O_DIRECTORY);
+    const int descriptor = ::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
     if (descriptor < 0) return;  // a folder may be writable and yet not readable
-    ::fsync(descriptor);
+    const bool failed = ::fsync(descriptor) != 0 && errno != EINVAL && errno != ENOTSUP;
+    const std::string why = system_error();
     ::close(descriptor);
+    if (failed) {
+      throw FileError(target_.string() + ": is written, but its folder cannot be synced: " + why);
+    }
   }
 
   std::filesystem::path target_;

@@ -59,7 +59,9 @@ class ContainerWriter {
 };
 
 // Writes bytes beside `path`, syncs, renames over it, syncs the folder. On any failure the old file
-// is still there and the new one is gone. Throws FileError.
+// is still there and the new one is gone; only where the folder cannot be synced is it the new one
+// that is there, and may be lost with the power. A process that is killed leaves
+// `path`.<number> behind, which nobody reads. Throws FileError.
 void write_file(const std::filesystem::path& path, Bytes bytes);
 
 // A checked view of the bytes of a file. `name` is what errors call it.

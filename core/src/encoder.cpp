@@ -2,12 +2,14 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
+#include <cstring>
 #include <limits>
+#include <memory>
 #include <stdexcept>
 
 #include "container.h"
 #include "kernels/kernels.h"
+#include "packed_layers.h"
 #include "parallel.h"
 #include "protomark/error.h"
 #include "sha256.h"
@@ -21,10 +23,10 @@ constexpr std::size_t kMaxDim = 256;
 constexpr std::size_t kMaxWidth = 4096;
 constexpr std::size_t kMaxLayers = 16;
 
-// Descriptors that go through the network together; their activations stay in the L1 and L2 cache.
-constexpr std::size_t kBatch = 64;
-
-constexpr std::size_t round_up(std::size_t n, std::size_t to) { return (n + to - 1) / to * to; }
+// Descriptors that go through the network together at most; their activations stay in the L2 cache.
+constexpr std::size_t kBatch = 512;
+// Threads share descriptors in multiples of this.
+constexpr std::size_t kGrain = 64;
 
 [[noreturn]] void invalid(const std::string& what) {
   throw std::invalid_argument("encoder: " + what);
@@ -68,11 +70,6 @@ void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t
   check_sums(layer, first, where);
 }
 
-// Rounds half up. sum * multiplier is below 2^62, so adding 2^61 at most cannot overflow.
-std::int64_t requantise(std::int32_t sum, std::int32_t multiplier, int shift) {
-  return (std::int64_t{sum} * multiplier + (std::int64_t{1} << (shift - 1))) >> shift;
-}
-
 void write_text(SectionWriter& out, const std::string& text) {
   out.value(static_cast<std::uint32_t>(text.size()));
   out.values(text.data(), text.size());
@@ -80,25 +77,16 @@ void write_text(SectionWriter& out, const std::string& text) {
 
 }  // namespace
 
-// Padded to whole vectors with zero weights; see kernels::PackedLayer.
 struct Encoder::Packed {
-  std::size_t inputs;
-  std::size_t outputs;
-  std::vector<std::int8_t> weights;
-  std::vector<std::int32_t> bias;
+  BitLayer first;
+  std::vector<DenseLayer> later;
+  std::size_t widest;
 
-  explicit Packed(const Layer& layer)
-      : inputs(round_up(layer.inputs, kernels::kCodeRows)),
-        outputs(round_up(layer.outputs, kernels::kCodeRows)),
-        weights(inputs * outputs, 0),
-        bias(outputs, 0) {
-    std::copy(layer.bias.begin(), layer.bias.end(), bias.begin());
-    for (std::size_t o = 0; o < layer.outputs; ++o) {
-      for (std::size_t i = 0; i < layer.inputs; ++i) {
-        const std::size_t group = o / kernels::kCodeRows * kernels::kCodeRows;
-        weights[group * inputs + i / 4 * 4 * kernels::kCodeRows + o % kernels::kCodeRows * 4 +
-                i % 4] = layer.weights[o * layer.inputs + i];
-      }
+  explicit Packed(const std::vector<Layer>& layers)
+      : first(layers.front(), layers.size() == 1), widest(first.outputs()) {
+    for (std::size_t l = 1; l < layers.size(); ++l) {
+      later.emplace_back(layers[l], l + 1 == layers.size());
+      widest = std::max(widest, later.back().outputs());
     }
   }
 };
@@ -125,13 +113,7 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::s
   if (dim() > kMaxDim) invalid("a code has at most 256 dimensions");
   if (!(scale_ > 0) || !std::isfinite(scale_)) invalid("scale must be positive");
   identity_ = sha256(network_bytes());
-  pack();
-}
-
-void Encoder::pack() {
-  auto packed = std::make_shared<std::vector<Packed>>();
-  for (const Layer& layer : layers_) packed->emplace_back(layer);
-  packed_ = std::move(packed);
+  packed_ = std::make_shared<const Packed>(layers_);
 }
 
 std::size_t Encoder::multiply_adds() const {
@@ -156,42 +138,28 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
                                 " dimensions, not " + std::to_string(codes.columns));
   }
   const kernels::Kernels& kernel = kernels::active();
-  std::size_t widest = 0;
-  for (const Packed& layer : *packed_) {
-    widest = std::max({widest, layer.inputs, layer.outputs});
-  }
+  const Packed& network = *packed_;
+  const std::size_t depth = layers_.size(), width = network.widest;
 
-  parallel_for(threads, descriptors.rows, kBatch, [&](std::size_t first, std::size_t last) {
-    std::vector<std::uint8_t> x(kBatch * widest);
-    std::vector<std::int32_t> sums(kBatch * widest);
-    for (std::size_t begin = first; begin < last; begin += kBatch) {
-      const std::size_t n = std::min(kBatch, last - begin);
-      const std::size_t width = packed_->front().inputs;
-      for (std::size_t i = 0; i < n; ++i) {
-        const std::uint8_t* row = descriptors.row(begin + i);
-        for (std::size_t b = 0; b < bits(); ++b) x[i * width + b] = row[b / 8] >> (b % 8) & 1;
+  parallel_for(threads, descriptors.rows, kGrain, [&](std::size_t first, std::size_t last) {
+    // Batches of the same size: a small rest would cost as much as a large one.
+    const std::size_t batches = (last - first + kBatch - 1) / kBatch;
+    const std::size_t most = std::min(kBatch, last - first);
+    auto x = std::make_unique_for_overwrite<std::uint8_t[]>(most * width);
+    auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? most * width : 0);
+    for (std::size_t b = 0; b < batches; ++b) {
+      const std::size_t begin = first + (last - first) * b / batches;
+      const std::size_t n = first + (last - first) * (b + 1) / batches - begin;
+      const auto wanted = [&](std::size_t l) {
+        return l + 1 < depth ? layers_[l].outputs : codes.columns;
+      };
+      network.first.run(kernel, descriptors.row(begin), n, wanted(0), {x.get(), width});
+      for (std::size_t l = 1; l < depth; ++l) {
+        network.later[l - 1].run(kernel, x.get(), width, n, wanted(l), {next.get(), width});
+        std::swap(x, next);
       }
-      for (std::size_t l = 0; l < layers_.size(); ++l) {
-        const Layer& layer = layers_[l];
-        const Packed& packed = (*packed_)[l];
-        const bool hidden = l + 1 < layers_.size();
-        const std::size_t wanted = hidden ? layer.outputs : codes.columns;
-        const std::size_t outputs = round_up(wanted, kernels::kCodeRows);
-        kernel.dense({packed.weights.data(), packed.bias.data(), packed.inputs, packed.outputs},
-                     x.data(), n, outputs, sums.data());
-        for (std::size_t i = 0; i < n; ++i) {
-          for (std::size_t o = 0; o < wanted; ++o) {
-            const std::int64_t t =
-                requantise(sums[i * outputs + o], layer.multipliers[o], layer.shift);
-            if (hidden) {
-              x[i * packed.outputs + o] = layer.table[static_cast<std::size_t>(
-                  std::clamp<std::int64_t>(t, -128, 127) + 128)];
-            } else {
-              codes.row(begin + i)[o] =
-                  static_cast<std::int8_t>(std::clamp<std::int64_t>(t, -127, 127));
-            }
-          }
-        }
+      for (std::size_t i = 0; i < n; ++i) {
+        std::memcpy(codes.row(begin + i), x.get() + i * width, codes.columns);
       }
     }
   });

@@ -44,7 +44,12 @@ constexpr char kRemedy[] = "call build_index before the map is sealed";
 
 struct SealedMap::Content {
   explicit Content(const std::filesystem::path& path)
-      : mapped(path), file(mapped.bytes(), path.string()) {
+      : Content(std::make_unique<MappedFile>(path), path.string()) {}
+  Content(std::unique_ptr<MappedFile> from, const std::string& name)
+      : Content(from->bytes(), name) {
+    mapped = std::move(from);
+  }
+  Content(Bytes bytes, const std::string& name) : file(bytes, name) {
     file.expect(FileKind::sealed_map);
     encoder = read_encoder(file);
     shape = read_shape(file, *encoder);
@@ -207,7 +212,7 @@ struct SealedMap::Content {
   // Landmarks whose first rows are remembered: every one of these.
   static constexpr std::size_t kFirstRowsStep = 64;
 
-  MappedFile mapped;
+  std::unique_ptr<MappedFile> mapped;  // nullptr: the bytes are the caller's
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
@@ -234,6 +239,12 @@ struct SealedMap::Content {
 
 SealedMap::SealedMap(const std::filesystem::path& path)
     : content_(std::make_unique<const Content>(path)) {}
+SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
+  if (reinterpret_cast<std::uintptr_t>(bytes.data()) % 64 != 0) {
+    throw std::invalid_argument("the bytes of a map must stand at a multiple of 64");
+  }
+  content_ = std::make_unique<const Content>(bytes, name);
+}
 SealedMap::~SealedMap() = default;
 SealedMap::SealedMap(SealedMap&&) noexcept = default;
 
@@ -303,7 +314,9 @@ std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmar
     if (content_->positions != nullptr) {
       for (std::size_t i = 0; i < 3; ++i) p[i] = origin[i] + content_->positions[row][i];
     }
-    result.push_back(p);
+    // Nobody has looked at them yet; what is no position is given as none.
+    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
+    result.push_back(finite ? p : Position{NAN, NAN, NAN});
   }
   return result;
 }

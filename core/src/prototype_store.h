@@ -4,12 +4,12 @@
 #include <cstddef>
 #include <cstdint>
 #include <mutex>
-#include <shared_mutex>
 #include <span>
 #include <vector>
 
 #include "cell_blocks.h"
 #include "cells.h"
+#include "fair_shared_mutex.h"
 #include "id_index.h"
 #include "probe_ranks.h"
 #include "protomark/prototypes.h"
@@ -163,7 +163,7 @@ struct PrototypeMap::Store : PrototypeStore {
   // As measured on the map, now or when it was much the same.
   ProbeRanks ranks(int threads) const;
 
-  mutable std::shared_mutex mutex;
+  mutable FairSharedMutex mutex;
 
  private:
   mutable std::mutex ranks_mutex_;

@@ -373,7 +373,11 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
 
 PrototypeMap PrototypeMap::load(const std::filesystem::path& path) {
   const MappedFile mapped(path);
-  const ContainerReader file(mapped.bytes(), path.string());
+  return parse(mapped.bytes(), path.string());
+}
+
+PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::string& name) {
+  const ContainerReader file(bytes, name);
   file.expect(FileKind::open_map);
   auto encoder = read_encoder(file);
   const MapShape shape = read_shape(file, *encoder);

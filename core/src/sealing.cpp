@@ -1,8 +1,10 @@
 // PrototypeMap::seal: what a map knows, in as few bytes as were asked for.
 #include <algorithm>
+#include <array>
 #include <bit>
 #include <cmath>
 #include <functional>
+#include <limits>
 #include <mutex>
 #include <queue>
 #include <stdexcept>
@@ -280,10 +282,15 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
   if (!std::all_of(all_positions.begin(), all_positions.end(), is_nowhere)) {
     shape.origin = middle(all_positions);
     for (const std::uint32_t landmark : landmarks) {
-      const Position& p = all_positions[landmark];
-      positions.push_back({static_cast<float>(p[0] - shape.origin[0]),
-                           static_cast<float>(p[1] - shape.origin[1]),
-                           static_cast<float>(p[2] - shape.origin[2])});
+      std::array<float, 3>& relative = positions.emplace_back();
+      for (std::size_t i = 0; i < 3; ++i) {
+        const double distance = all_positions[landmark][i] - shape.origin[i];
+        if (std::abs(distance) > std::numeric_limits<float>::max()) {
+          throw std::invalid_argument(
+              "positions are too far apart for the 32 bits of a sealed map");
+        }
+        relative[i] = static_cast<float>(distance);
+      }
     }
   }
   const bool implicit_ids = n == 0 || (ids.front() == 0 && ids.back() == std::int64_t(n) - 1);

@@ -4,6 +4,8 @@
 
 #include <algorithm>
 #include <bit>
+#include <cstring>
+#include <limits>
 #include <tuple>
 
 #include "check.h"
@@ -40,18 +42,97 @@ std::vector<T> values(test::Random& random, std::size_t n, int style, std::int64
   return random.integers<T>(n, low, high);
 }
 
-void compare_dense(const Kernels& set, test::Random& random, std::size_t inputs,
-                   std::size_t outputs, std::size_t n, int style) {
-  const auto weights = values<std::int8_t>(random, inputs * outputs, style, -128, 127);
-  const auto bias = random.integers<std::int32_t>(outputs, -100000, 100000);
-  const auto x = values<std::uint8_t>(random, inputs * n, style, style == 1 ? 255 : 0, 255);
-  const kernels::PackedLayer layer{weights.data(), bias.data(), inputs, outputs};
-  for (std::size_t wanted = 16; wanted <= outputs; wanted += 16) {
-    std::vector<std::int32_t> a(n * wanted), b(n * wanted);
-    kernels::portable.dense(layer, x.data(), n, wanted, a.data());
-    set.dense(layer, x.data(), n, wanted, b.data());
-    CHECK(a == b);
+constexpr std::size_t kOutputs = kernels::kOutputs;
+
+// Weights so large that sums just stay within 16 bits: 256 of them are set at most.
+void compare_bits(const Kernels& set, test::Random& random, std::size_t count, std::size_t n,
+                  int style) {
+  const std::int64_t most = count <= 4 ? 128 : 32;
+  const auto weights = values<std::int8_t>(random, count * 64 * kOutputs, style, -most, most - 1);
+  std::vector<std::uint64_t> words(count * n);
+  std::vector<std::int16_t> expected(n * kOutputs);
+  std::vector<std::vector<std::uint16_t>> bits(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    for (std::size_t j = 0; j < count * 64; ++j) {
+      if (style == 0 && random.integer(0, 1) == 0) continue;
+      words[j / 64 * n + i] |= std::uint64_t{1} << (j % 64);
+      bits[i].push_back(static_cast<std::uint16_t>(j));
+      for (std::size_t o = 0; o < kOutputs; ++o) {
+        expected[i * kOutputs + o] =
+            static_cast<std::int16_t>(expected[i * kOutputs + o] + weights[j * kOutputs + o]);
+      }
+    }
   }
+  // What is there before does not count; nothing is written behind the end.
+  std::vector<std::int16_t> sums(n * kOutputs + 1, 99);
+  set.bit_sums(weights.data(), words.data(), count, n, sums.data());
+  CHECK(std::equal(expected.begin(), expected.end(), sums.begin()));
+  CHECK(sums.back() == 99);
+  std::fill(sums.begin(), sums.end(), 99);
+  for (std::size_t i = 0; i < n; ++i) {
+    set.bit_sum(weights.data(), bits[i].data(), bits[i].size(), &sums[i * kOutputs]);
+  }
+  CHECK(std::equal(expected.begin(), expected.end(), sums.begin()));
+  CHECK(sums.back() == 99);
+}
+
+void compare_dense(const Kernels& set, test::Random& random, std::size_t inputs, std::size_t n,
+                   int style) {
+  const auto weights = values<std::int8_t>(random, inputs * kOutputs, style, -128, 127);
+  const std::size_t stride = inputs + 3;
+  const auto x = values<std::uint8_t>(random, stride * n, style, style == 1 ? 255 : 0, 255);
+  for (std::size_t outputs = 16; outputs <= kOutputs; outputs += 16) {
+    // Other outputs stay as they are.
+    std::vector<std::int32_t> expected(n * kOutputs, 99), sums = expected;
+    for (std::size_t i = 0; i < n; ++i) {
+      for (std::size_t o = 0; o < outputs; ++o) {
+        std::int32_t sum = 0;
+        for (std::size_t j = 0; j < inputs; ++j) {
+          sum +=
+              x[i * stride + j] * weights[o / 16 * 16 * inputs + j / 4 * 64 + o % 16 * 4 + j % 4];
+        }
+        expected[i * kOutputs + o] = sum;
+      }
+    }
+    set.dense(weights.data(), inputs, x.data(), stride, n, outputs, sums.data());
+    CHECK(sums == expected);
+  }
+}
+
+template <typename Sum>
+void compare_activation(void (*activate)(const kernels::Activation&, const Sum*, std::size_t,
+                                         std::uint8_t*, std::size_t),
+                        test::Random& random, int shift, std::size_t n, int style) {
+  const auto table = random.integers<std::uint8_t>(256, 0, 255);
+  // Style 0: results on both sides of -128 and 127; styles 1 and 2: extreme numbers.
+  const std::int64_t reach = std::min<std::int64_t>(INT32_MAX / 2, std::int64_t{1} << 20);
+  const std::int64_t sum = style == 0 ? reach : INT32_MAX / 2;
+  const std::int64_t fit = (std::int64_t{512} << shift >> 20) + 1;
+  const std::int64_t most =
+      style == 0 && shift < 42 ? std::min<std::int64_t>(fit, INT32_MAX) : std::int64_t{INT32_MAX};
+  const auto bias = values<std::int32_t>(random, kOutputs, style, -sum - 1, sum);
+  const auto multipliers =
+      values<std::int32_t>(random, kOutputs, style == 0 ? 0 : 2, (most + 1) / 2, most);
+  const std::int64_t low = std::max<std::int64_t>(std::numeric_limits<Sum>::min(), -sum);
+  const std::int64_t high = std::min<std::int64_t>(std::numeric_limits<Sum>::max(), sum);
+  auto sums = values<Sum>(random, n * kOutputs, style, low, high);
+  // Small sums, among them those that are halves once scaled.
+  for (std::size_t i = 0; i < sums.size(); i += 3) {
+    sums[i] = static_cast<Sum>(random.integer(-300, 300));
+  }
+  const std::size_t stride = kOutputs + 5;
+  std::vector<std::uint8_t> expected(n * stride, 99), next = expected;
+  for (std::size_t i = 0; i < n; ++i) {
+    for (std::size_t o = 0; o < kOutputs; ++o) {
+      const std::int64_t s = std::int64_t{sums[i * kOutputs + o]} + bias[o];
+      const std::int64_t t = (s * multipliers[o] + (std::int64_t{1} << (shift - 1))) >> shift;
+      expected[i * stride + o] =
+          table[static_cast<std::size_t>(std::clamp<std::int64_t>(t, -128, 127) + 128)];
+    }
+  }
+  activate({bias.data(), multipliers.data(), table.data(), shift}, sums.data(), n, next.data(),
+           stride);
+  CHECK(next == expected);
 }
 
 // All hits of a scan, whose step is scan(block, hits), in order.
@@ -190,11 +271,18 @@ int main() {
     std::printf("%s\n", *name);
     ++sets;
     for (int style = 0; style < 3; ++style) {
-      for (const std::size_t inputs : {16, 64, 1024}) {
-        for (const std::size_t outputs : {16, 48}) {
-          for (const std::size_t n : {1, 7, 8, 19}) {
-            compare_dense(*set, random, inputs, outputs, n, style);
-          }
+      for (const std::size_t count : {1, 4, 8, 16}) {
+        for (const std::size_t n : {0, 1, 2, 7, 33}) compare_bits(*set, random, count, n, style);
+      }
+      for (const std::size_t inputs : {64, 192, 4096}) {
+        for (const std::size_t n : {0, 1, 7, 8, 19}) {
+          compare_dense(*set, random, inputs, n, style);
+        }
+      }
+      for (int shift = std::strcmp(*name, "portable") == 0 ? 1 : 32; shift <= 62; ++shift) {
+        for (const std::size_t n : {0, 1, 6}) {
+          compare_activation(set->activate16, random, shift, n, style);
+          compare_activation(set->activate32, random, shift, n, style);
         }
       }
       for (std::size_t dim = 1; dim <= 33; ++dim) compare_unpack4(*set, random, dim, 3);

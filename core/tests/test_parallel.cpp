@@ -85,6 +85,7 @@ int main() {
   }
   CHECK(covers(4, 100, 1));
 
+#ifndef PROTOMARK_NO_FORK
   // A child process starts afresh, and leaves though its threads sleep.
   const pid_t child = ::fork();
   if (child == 0) {
@@ -95,6 +96,7 @@ int main() {
   int status = 1;
   CHECK(::waitpid(child, &status, 0) == child);
   CHECK(WIFEXITED(status) && WEXITSTATUS(status) == 0);
+#endif
 
   CHECK(check::throws<std::invalid_argument>([] { covers(0, 1, 1); }, "at least 1"));
   CHECK(check::throws<std::invalid_argument>([] { run_tasks(-1, 1, [](std::size_t) {}); }));

@@ -16,6 +16,7 @@ from protomark._core import (
     SealedMap,
     file_sections,
     hamming_search,
+    instruction_set,
     open,
     verify_file,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "__version__",
     "file_sections",
     "hamming_search",
+    "instruction_set",
     "open",
     "upright_descriptors",
     "verify_file",

@@ -523,6 +523,75 @@ def reproduce(
     command.print_summary(results, output)
 
 
+@app.command()
+def bench(
+    tracks: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="TRACKS",
+            help="Tracks files of one descriptor, to grow data from; by default the sample.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for the report: benchmarks.md and its plots."),
+    ] = None,
+    only: Annotated[
+        str,
+        typer.Option(
+            help="Sections, for example encode,search; of encode, search, hamming, approximate, "
+            "frame, add, growth and large. By default all."
+        ),
+    ] = "",
+    full: Annotated[
+        bool,
+        typer.Option("--full", help="Also 10 and 100 million landmarks: hours, and much memory."),
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Tiny sizes: whether it runs, not how fast.")
+    ] = False,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
+    scratch: Annotated[
+        Path | None,
+        typer.Option(help="Folder for maps that are thrown away; the system's by default."),
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file.")
+    ] = None,
+) -> None:
+    """Measure speed beside PyTorch, ONNX Runtime, FAISS, OpenCV, hnswlib and USearch.
+
+    All contenders take turns in one run, on the same data and as many threads; ratios come with
+    their spread, and beside the machine's own ceilings. Peers that are not installed are left out:
+    `pip install protomark[bench]`. Ctrl-C ends the run and keeps what is measured.
+    docs/benchmarks.md holds a whole run.
+    """
+    import tempfile
+
+    from protomark.bench import command
+    from protomark.bench.settings import choose
+    from protomark.evaluation.command import check_outputs
+    from protomark.evaluation.threads import available_threads
+
+    check_outputs(json_file)
+    settings = choose(
+        sections=tuple(name.strip() for name in only.split(",") if name.strip()),
+        threads=threads,
+        build_threads=available_threads(),
+        full=full,
+        quick=quick,
+        scratch=scratch or Path(tempfile.gettempdir()),
+    )
+    flags = [f"--only {only}"] if only else []
+    flags += ["--full"] if full else ["--quick"] if quick else []
+    flags += [f"--threads {threads}"] if threads != 1 else []
+    repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])
+    results = command.bench(tracks or [], settings, output, json_file, repeat)
+    command.print_summary(results, output)
+    if results.interrupted:
+        raise typer.Exit(130)
+
+
 def _write_json(path: Path | None, facts: dict[str, Any]) -> None:
     if path is not None:
         from protomark.files import write_text

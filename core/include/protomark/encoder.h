@@ -73,17 +73,16 @@ class Encoder {
   void encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads = 1) const;
 
  private:
-  struct Packed;  // the weights as the kernels read them
+  struct Packed;  // the layers as the kernels take them
 
   std::vector<std::byte> network_bytes() const;
-  void pack();
 
   EncoderInfo info_;
   std::vector<Layer> layers_;
   std::vector<std::size_t> dims_;
   float scale_;
   std::string identity_;
-  std::shared_ptr<const std::vector<Packed>> packed_;
+  std::shared_ptr<const Packed> packed_;
 };
 
 }  // namespace protomark

@@ -37,6 +37,9 @@ class SealedMap {
  public:
   // Throws FileError. The large sections are not read; verify_file checks them.
   explicit SealedMap(const std::filesystem::path& path);
+  // Opens the bytes of a map file, which stand at a multiple of 64 and stay the caller's for as
+  // long as the map is there; `name` is what errors call them.
+  SealedMap(std::span<const std::byte> bytes, const std::string& name);
   ~SealedMap();
   SealedMap(SealedMap&&) noexcept;
 

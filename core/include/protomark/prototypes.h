@@ -9,6 +9,7 @@
 #include <memory>
 #include <optional>
 #include <span>
+#include <string>
 #include <vector>
 
 #include "protomark/encoder.h"
@@ -116,13 +117,16 @@ class PrototypeMap {
   // files. Whole or not at all. Throws FileError.
   void save(const std::filesystem::path& path) const;
   static PrototypeMap load(const std::filesystem::path& path);
+  // Reads and checks the bytes of a map file; `name` is what errors call them.
+  static PrototypeMap parse(std::span<const std::byte> bytes, const std::string& name);
   // Writes a sealed map (protomark/map_file.h) whose prototypes have 8 or 4 bits a number. With 8
   // it gives the same answers; with 4 numbers are rounded to 16 levels that fit this map best,
   // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
   // average over the map, at least 1: looks of a landmark are joined, those first whose joining
   // adds least to the squared distances of all observations to their prototypes (Ward's criterion),
   // until the map fits. One landmark keeps at most 255 looks. An index goes along. Throws
-  // FileError, and std::invalid_argument for other `bits` and `prototypes`.
+  // FileError, and std::invalid_argument for other `bits` and `prototypes` and for positions
+  // further than 3.4e38 from their middle.
   void seal(const std::filesystem::path& path, int bits = 8,
             std::optional<double> prototypes = std::nullopt) const;
 

@@ -13,33 +13,136 @@ std::int32_t load4(const void* p) {
   return v;
 }
 
-// `Batch` inputs share each load of the weights.
-template <int Batch>
-void dense_batch(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t outputs,
-                 std::int32_t* sums) {
-  for (std::size_t group = 0; group < outputs; group += kCodeRows) {
-    __m512i acc[Batch];
-    for (int i = 0; i < Batch; ++i) acc[i] = _mm512_loadu_si512(layer.bias + group);
-    const std::int8_t* w = layer.weights + group * layer.inputs;
-    for (std::size_t j = 0; j < layer.inputs; j += 4, w += 64) {
-      const __m512i weights = _mm512_loadu_si512(w);
-      for (int i = 0; i < Batch; ++i) {
-        const __m512i x = _mm512_set1_epi32(load4(inputs + i * layer.inputs + j));
-        acc[i] = _mm512_dpbusd_epi32(acc[i], x, weights);
-      }
+// Outputs that are summed together: with a table of 16 KB for 64 inputs, in the L1 cache.
+constexpr std::size_t kHalf = kOutputs / 2;
+
+__m512i load_weights(const std::int8_t* weights) {
+  return _mm512_cvtepi8_epi16(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(weights)));
+}
+
+// The sums of all subsets of 4 inputs, for each 4 of 64 inputs.
+void fill_table(const std::int8_t* weights, __m512i* table) {
+  for (int group = 0; group < 16; ++group, weights += 4 * kOutputs) {
+    const __m512i a = load_weights(weights), b = load_weights(weights + kOutputs);
+    const __m512i c = load_weights(weights + 2 * kOutputs);
+    const __m512i d = load_weights(weights + 3 * kOutputs);
+    const __m512i low[4] = {_mm512_setzero_si512(), a, b, _mm512_add_epi16(a, b)};
+    const __m512i high[4] = {_mm512_setzero_si512(), c, d, _mm512_add_epi16(c, d)};
+    for (const __m512i h : high) {
+      for (const __m512i l : low) *table++ = _mm512_add_epi16(h, l);
     }
-    for (int i = 0; i < Batch; ++i) _mm512_storeu_si512(sums + i * outputs + group, acc[i]);
   }
 }
 
-void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, std::size_t outputs,
-           std::int32_t* sums) {
+void bit_sums(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
+              std::size_t n, std::int16_t* sums) {
+  __m512i table[256];
+  for (std::size_t w = 0; w < count; ++w, words += n, weights += 64 * kOutputs) {
+    for (std::size_t half = 0; half < kOutputs; half += kHalf) {
+      fill_table(weights + half, table);
+      std::int16_t* sum = sums + half;
+      for (std::size_t i = 0; i < n; ++i, sum += kOutputs) {
+        __m512i acc = w == 0 ? _mm512_setzero_si512() : _mm512_loadu_si512(sum);
+        for (int group = 0; group < 16; ++group) {
+          acc = _mm512_add_epi16(acc, table[16 * group + (words[i] >> (4 * group) & 15)]);
+        }
+        _mm512_storeu_si512(sum, acc);
+      }
+    }
+  }
+}
+
+void bit_sum(const std::int8_t* weights, const std::uint16_t* set, std::size_t count,
+             std::int16_t* sums) {
+  __m512i low = _mm512_setzero_si512(), high = low;
+  for (std::size_t i = 0; i < count; ++i) {
+    const std::int8_t* row = weights + set[i] * kOutputs;
+    low = _mm512_add_epi16(low, load_weights(row));
+    high = _mm512_add_epi16(high, load_weights(row + kHalf));
+  }
+  _mm512_storeu_si512(sums, low);
+  _mm512_storeu_si512(sums + kHalf, high);
+}
+
+// `Batch` inputs share each load of the weights, `Groups` times 16 outputs each load of the inputs.
+template <int Batch, int Groups>
+void dense_tile(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+                std::size_t stride, std::int32_t* sums) {
+  __m512i acc[Batch][Groups];
+  for (auto& row : acc) {
+    for (__m512i& a : row) a = _mm512_setzero_si512();
+  }
+  for (std::size_t j = 0; j < inputs; j += 4) {
+    __m512i w[Groups];
+    for (int g = 0; g < Groups; ++g) w[g] = _mm512_loadu_si512(weights + 16 * (g * inputs + j));
+    for (int i = 0; i < Batch; ++i) {
+      const __m512i four = _mm512_set1_epi32(load4(x + i * stride + j));
+      for (int g = 0; g < Groups; ++g) acc[i][g] = _mm512_dpbusd_epi32(acc[i][g], four, w[g]);
+    }
+  }
+  for (int i = 0; i < Batch; ++i) {
+    for (int g = 0; g < Groups; ++g) _mm512_storeu_si512(sums + i * kOutputs + 16 * g, acc[i][g]);
+  }
+}
+
+template <int Groups>
+void dense_groups(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+                  std::size_t stride, std::size_t n, std::int32_t* sums) {
   constexpr int kBatch = 8;
   std::size_t i = 0;
   for (; i + kBatch <= n; i += kBatch) {
-    dense_batch<kBatch>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
+    dense_tile<kBatch, Groups>(weights, inputs, x + i * stride, stride, sums + i * kOutputs);
   }
-  for (; i < n; ++i) dense_batch<1>(layer, inputs + i * layer.inputs, outputs, sums + i * outputs);
+  for (; i < n; ++i) {
+    dense_tile<1, Groups>(weights, inputs, x + i * stride, stride, sums + i * kOutputs);
+  }
+}
+
+void dense(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+           std::size_t stride, std::size_t n, std::size_t outputs, std::int32_t* sums) {
+  std::size_t o = 0;
+  for (; o + 32 <= outputs; o += 32) {
+    dense_groups<2>(weights + o * inputs, inputs, x, stride, n, sums + o);
+  }
+  if (o < outputs) dense_groups<1>(weights + o * inputs, inputs, x, stride, n, sums + o);
+}
+
+__m512i load_sums(const std::int32_t* sums) { return _mm512_loadu_si512(sums); }
+
+__m512i load_sums(const std::int16_t* sums) {
+  return _mm512_cvtepi16_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(sums)));
+}
+
+template <typename Sum>
+void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
+              std::size_t stride) {
+  __m512i bias[4], even[4], odd[4], table[4];
+  for (int q = 0; q < 4; ++q) {
+    bias[q] = _mm512_loadu_si512(a.bias + 16 * q);
+    even[q] = _mm512_loadu_si512(a.multipliers + 16 * q);
+    odd[q] = _mm512_srli_epi64(even[q], 32);
+    table[q] = _mm512_loadu_si512(a.table + 64 * q);
+  }
+  const __m512i half = _mm512_set1_epi64(std::int64_t{1} << (a.shift - 1));
+  const __m128i shift = _mm_cvtsi32_si128(a.shift - 32);
+  // Packing works within each 128 bits.
+  const __m512i order = _mm512_set_epi32(15, 11, 7, 3, 14, 10, 6, 2, 13, 9, 5, 1, 12, 8, 4, 0);
+  for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
+    __m512i t[4];
+    for (int q = 0; q < 4; ++q) {
+      const __m512i s = _mm512_add_epi32(load_sums(sums + 16 * q), bias[q]);
+      const __m512i e = _mm512_add_epi64(_mm512_mul_epi32(s, even[q]), half);
+      const __m512i o = _mm512_add_epi64(_mm512_mul_epi32(_mm512_srli_epi64(s, 32), odd[q]), half);
+      const __m512i upper = _mm512_mask_shuffle_epi32(o, 0x5555, e, _MM_PERM_DDBB);
+      t[q] = _mm512_sra_epi32(upper, shift);
+    }
+    const __m512i packed = _mm512_permutexvar_epi32(
+        order, _mm512_packs_epi16(_mm512_packs_epi32(t[0], t[1]), _mm512_packs_epi32(t[2], t[3])));
+    // The lower 7 bits choose in each half of the table, the sign bit the half.
+    const __m512i above = _mm512_permutex2var_epi8(table[2], packed, table[3]);
+    const __m512i below = _mm512_permutex2var_epi8(table[0], packed, table[1]);
+    _mm512_storeu_si512(next, _mm512_mask_mov_epi8(above, _mm512_movepi8_mask(packed), below));
+  }
 }
 
 // -|p|^2 - 256 sum(p), see avx512_hits.h.
@@ -261,7 +364,11 @@ std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, st
 }  // namespace
 
 const Kernels avx512 = {.name = "avx512",
+                        .bit_sums = bit_sums,
+                        .bit_sum = bit_sum,
                         .dense = dense,
+                        .activate16 = activate<std::int16_t>,
+                        .activate32 = activate<std::int32_t>,
                         .code_biases = code_biases,
                         .code_unpack4 = code_unpack4,
                         .code_scan = code_scan,

@@ -17,6 +17,7 @@
 #endif
 
 #include "kernels.h"
+#include "protomark/instruction_set.h"
 
 namespace protomark::kernels {
 namespace {
@@ -30,9 +31,9 @@ bool has_avx512() {
          __builtin_cpu_supports("avx512vnni") && __builtin_cpu_supports("avx512vpopcntdq");
 }
 
+#if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
 // Linux gives a process the room that tiles need when it asks for it. Elsewhere AMX is not used.
 bool has_amx() {
-#if defined(__linux__)
   constexpr unsigned kTile = 1u << 24, kInt8 = 1u << 25;
   unsigned a = 0, b = 0, c = 0, d = 0;
   if (!has_avx512() || __get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
@@ -40,10 +41,8 @@ bool has_amx() {
   constexpr long kRequestPermission = 0x1023;  // ARCH_REQ_XCOMP_PERM
   constexpr long kTileData = 18;               // XFEATURE_XTILEDATA
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
-#else
-  return false;
-#endif
 }
+#endif
 #elif defined(__aarch64__)
 bool has_dot_product() {
 #if defined(__APPLE__)
@@ -64,7 +63,11 @@ Kernels over(const Kernels& set, const Kernels& below) {
   const auto take = [](auto& mine, auto theirs) {
     if (theirs != nullptr) mine = theirs;
   };
+  take(result.bit_sums, set.bit_sums);
+  take(result.bit_sum, set.bit_sum);
   take(result.dense, set.dense);
+  take(result.activate16, set.activate16);
+  take(result.activate32, set.activate32);
   take(result.code_biases, set.code_biases);
   take(result.code_unpack4, set.code_unpack4);
   take(result.code_scan, set.code_scan);
@@ -83,7 +86,9 @@ struct Sets {
 #if defined(__x86_64__)
     if (has_avx2()) add(avx2);
     if (has_avx512()) add(avx512);
+#if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
     if (has_amx()) add(amx);
+#endif
 #elif defined(__aarch64__)
     if (has_dot_product()) add(neon);
 #endif
@@ -132,3 +137,9 @@ const Kernels& active() {
 }
 
 }  // namespace protomark::kernels
+
+namespace protomark {
+
+const char* instruction_set() { return kernels::active().name; }
+
+}  // namespace protomark

@@ -14,14 +14,17 @@ namespace protomark::kernels {
 inline constexpr std::size_t kCodeRows = 16;
 inline constexpr std::size_t kWordRows = 8;
 
-// One fully connected layer. Weights are packed for 4-way dot products: group g holds the outputs
-// 16 g to 16 g + 15; within it, for every 4 inputs, 16 outputs x 4 weights. Both are padded with
-// zeros: `inputs` is a multiple of 4, `outputs` one of 16.
-struct PackedLayer {
-  const std::int8_t* weights;
+// The encoder works on blocks of 64 outputs; numbers of outputs are padded to whole blocks.
+inline constexpr std::size_t kOutputs = 64;
+
+// What follows the sums of 64 outputs: with s = sum + bias[o],
+//   next = table[clamp((s * multipliers[o] + 2^(shift - 1)) >> shift, -128, 127) + 128].
+// s is within 32 bits, multipliers are positive.
+struct Activation {
   const std::int32_t* bias;
-  std::size_t inputs;
-  std::size_t outputs;
+  const std::int32_t* multipliers;
+  const std::uint8_t* table;
+  int shift;
 };
 
 // A row that is near enough to a query. Both are counted from 0 within what a scan was given.
@@ -71,10 +74,30 @@ struct PackedWords {
 struct Kernels {
   const char* name = nullptr;
 
-  // sums[i * outputs + o] = bias[o] + sum_j weights[o][j] * inputs[i * layer.inputs + j] for n
-  // inputs and the first `outputs` outputs (a multiple of 16).
-  void (*dense)(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n,
-                std::size_t outputs, std::int32_t* sums) = nullptr;
+  // Inputs that are bits: sums[i * 64 + o] is the sum of weights[j * 64 + o] over the bits j that
+  // are set in descriptor i, for 64 outputs and n descriptors. Bit j % 64 of words[j / 64 * n + i]
+  // is bit j of descriptor i; there are `count` words a descriptor. No sum may leave 16 bits.
+  void (*bit_sums)(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
+                   std::size_t n, std::int16_t* sums) = nullptr;
+
+  // The same for a single descriptor, of which the `count` bits in `set` are set.
+  void (*bit_sum)(const std::int8_t* weights, const std::uint16_t* set, std::size_t count,
+                  std::int16_t* sums) = nullptr;
+
+  // Inputs that are bytes: sums[i * 64 + o] = sum_j weights[o][j] * x[i * stride + j] for n inputs
+  // and the first `outputs` of 64 outputs, a multiple of 16. Weights are packed for 4-way dot
+  // products: for every 16 outputs, for every 4 inputs, 16 outputs x 4 weights. `inputs` is a
+  // multiple of 64.
+  void (*dense)(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+                std::size_t stride, std::size_t n, std::size_t outputs,
+                std::int32_t* sums) = nullptr;
+
+  // 64 sums of n inputs to next[i * stride + o]. Sets other than portable take only shifts of 32
+  // and more, where a 64-bit product's upper half is enough.
+  void (*activate16)(const Activation& activation, const std::int16_t* sums, std::size_t n,
+                     std::uint8_t* next, std::size_t stride) = nullptr;
+  void (*activate32)(const Activation& activation, const std::int32_t* sums, std::size_t n,
+                     std::uint8_t* next, std::size_t stride) = nullptr;
 
   // What code_scan of the same set starts from, a number a row.
   void (*code_biases)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,

@@ -4,21 +4,83 @@
 namespace protomark::kernels {
 namespace {
 
-void dense(const PackedLayer& layer, const std::uint8_t* inputs, std::size_t n, std::size_t outputs,
-           std::int32_t* sums) {
-  for (std::size_t i = 0; i < n; ++i) {
-    const std::uint8_t* x = inputs + i * layer.inputs;
-    for (std::size_t group = 0; group < outputs; group += kCodeRows) {
-      std::int32_t acc[kCodeRows];
-      for (std::size_t o = 0; o < kCodeRows; ++o) acc[o] = layer.bias[group + o];
-      const std::int8_t* w = layer.weights + group * layer.inputs;
-      for (std::size_t j = 0; j < layer.inputs; j += 4, w += 4 * kCodeRows) {
-        for (std::size_t o = 0; o < kCodeRows; ++o) {
+// Outputs that are summed together: with a table of 16 KB for 64 inputs, in the L1 cache.
+constexpr std::size_t kHalf = kOutputs / 2;
+
+// The sums of all subsets of 4 inputs, for each 4 of 64 inputs.
+void fill_table(const std::int8_t* weights, std::int16_t (*table)[kHalf]) {
+  for (std::size_t group = 0; group < 16; ++group, weights += 4 * kOutputs, table += 16) {
+    for (std::size_t o = 0; o < kHalf; ++o) table[0][o] = 0;
+    for (std::size_t j = 0; j < 4; ++j) {
+      const std::size_t bit = std::size_t{1} << j;
+      for (std::size_t subset = 0; subset < bit; ++subset) {
+        for (std::size_t o = 0; o < kHalf; ++o) {
+          table[bit + subset][o] =
+              static_cast<std::int16_t>(table[subset][o] + weights[j * kOutputs + o]);
+        }
+      }
+    }
+  }
+}
+
+void bit_sums(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
+              std::size_t n, std::int16_t* sums) {
+  std::int16_t table[256][kHalf];
+  for (std::size_t i = 0; i < n * kOutputs; ++i) sums[i] = 0;
+  for (std::size_t w = 0; w < count; ++w, words += n, weights += 64 * kOutputs) {
+    for (std::size_t half = 0; half < kOutputs; half += kHalf) {
+      fill_table(weights + half, table);
+      for (std::size_t i = 0; i < n; ++i) {
+        std::int16_t* sum = sums + i * kOutputs + half;
+        std::int16_t acc[kHalf] = {};
+        for (std::size_t group = 0; group < 16; ++group) {
+          const std::int16_t* row = table[16 * group + (words[i] >> (4 * group) & 15)];
+          for (std::size_t o = 0; o < kHalf; ++o)
+            acc[o] = static_cast<std::int16_t>(acc[o] + row[o]);
+        }
+        for (std::size_t o = 0; o < kHalf; ++o) sum[o] = static_cast<std::int16_t>(sum[o] + acc[o]);
+      }
+    }
+  }
+}
+
+void bit_sum(const std::int8_t* weights, const std::uint16_t* set, std::size_t count,
+             std::int16_t* sums) {
+  std::int16_t acc[kOutputs] = {};
+  for (std::size_t i = 0; i < count; ++i) {
+    const std::int8_t* row = weights + set[i] * kOutputs;
+    for (std::size_t o = 0; o < kOutputs; ++o) acc[o] = static_cast<std::int16_t>(acc[o] + row[o]);
+  }
+  for (std::size_t o = 0; o < kOutputs; ++o) sums[o] = acc[o];
+}
+
+void dense(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+           std::size_t stride, std::size_t n, std::size_t outputs, std::int32_t* sums) {
+  for (std::size_t i = 0; i < n; ++i, x += stride, sums += kOutputs) {
+    const std::int8_t* w = weights;
+    for (std::size_t group = 0; group < outputs; group += 16) {
+      std::int32_t acc[16] = {};
+      for (std::size_t j = 0; j < inputs; j += 4, w += 4 * 16) {
+        for (std::size_t o = 0; o < 16; ++o) {
           acc[o] += w[4 * o] * x[j] + w[4 * o + 1] * x[j + 1] + w[4 * o + 2] * x[j + 2] +
                     w[4 * o + 3] * x[j + 3];
         }
       }
-      for (std::size_t o = 0; o < kCodeRows; ++o) sums[i * outputs + group + o] = acc[o];
+      for (std::size_t o = 0; o < 16; ++o) sums[group + o] = acc[o];
+    }
+  }
+}
+
+// Rounds half up. s * multiplier is below 2^62, so adding 2^61 at most cannot overflow.
+template <typename Sum>
+void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
+              std::size_t stride) {
+  const std::int64_t half = std::int64_t{1} << (a.shift - 1);
+  for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
+    for (std::size_t o = 0; o < kOutputs; ++o) {
+      const std::int64_t s = std::int64_t{sums[o]} + a.bias[o];
+      const std::int64_t t = (s * a.multipliers[o] + half) >> a.shift;
+      next[o] = a.table[t < -128 ? 0 : t > 127 ? 255 : t + 128];
     }
   }
 }
@@ -124,7 +186,11 @@ std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, st
 }  // namespace
 
 const Kernels portable = {.name = "portable",
+                          .bit_sums = bit_sums,
+                          .bit_sum = bit_sum,
                           .dense = dense,
+                          .activate16 = activate<std::int16_t>,
+                          .activate32 = activate<std::int32_t>,
                           .code_biases = code_biases,
                           .code_unpack4 = code_unpack4,
                           .code_scan = code_scan,

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from protomark.tracks.features import DESCRIPTORS, Features, descriptor_kind
 from protomark.tracks.file import Tracks
 
+_FAR = 1e9  # pixels; a product of two such numbers is still a float32
+
 
 @dataclass(frozen=True)
 class _Image:
@@ -133,6 +135,7 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
         # Read-only, and never created: a database that is open elsewhere stays as it is.
         connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
         try:
+            _check_tables(connection, database)
             rows = connection.execute(
                 "SELECT i.name, k.rows, k.cols, k.data, d.rows, d.cols, d.data FROM images i "
                 "LEFT JOIN keypoints k ON k.image_id = i.image_id "
@@ -141,6 +144,9 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
             for name, kr, kc, kd, dr, dc, dd in rows:
                 kr, kc, kd = kr or 0, kc or 2, kd or b""
                 dr, dc, dd = dr or 0, dc or width, dd or b""
+                numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
+                if not (numbers_fit and isinstance(name, str) and type(kd) is type(dd) is bytes):
+                    raise ValueError(f"{database}: not a COLMAP database, or a broken one")
                 if dr and dc != width:
                     guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
                     raise ValueError(
@@ -153,15 +159,28 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
                         f"{database}: image {name} has {kr} keypoints and {dr} descriptors that do "
                         "not fit together, extract its features anew"
                     )
-                images[name] = _Image(
-                    np.frombuffer(kd, "<f4").reshape(kr, kc),
-                    np.frombuffer(dd, np.uint8).reshape(dr, dc),
-                )
+                keypoints = np.frombuffer(kd, "<f4").reshape(kr, kc)
+                if not (np.abs(keypoints) < _FAR).all():
+                    raise ValueError(
+                        f"{database}: image {name} has keypoints that are not in any image"
+                    )
+                images[name] = _Image(keypoints, np.frombuffer(dd, np.uint8).reshape(dr, dc))
         finally:
             connection.close()
     except sqlite3.Error as error:
         raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
     return images
+
+
+def _check_tables(connection: sqlite3.Connection, database: Path) -> None:
+    """Raise ValueError unless what is read is stored; views and computed columns can be endless."""
+    for table in ("images", "keypoints", "descriptors"):
+        (kind,) = connection.execute(
+            "SELECT type FROM sqlite_master WHERE name = ?", (table,)
+        ).fetchone() or ("missing",)
+        columns = connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
+        if kind != "table" or any(hidden for *_, hidden in columns):
+            raise ValueError(f"{database}: not a COLMAP database, {table} is no plain table")
 
 
 def _features(image: _Image) -> Features:

@@ -163,6 +163,14 @@ class Tracks:
         for name in ("cam_from_world", "keypoints", "landmark_positions"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"tracks: {name} contains NaN or infinity")
+        if not all(isinstance(name, str) for name in (self.descriptor, *self.keyframe_names)):
+            raise ValueError("tracks: descriptor and keyframe_names are texts")
+        if not isinstance(self.info, dict):
+            raise ValueError("tracks: info is not a JSON object")
+        for number, c in self.cameras.items():
+            sizes_fit = all(type(size) is int and 0 < size < 2**31 for size in (c.width, c.height))
+            if not isinstance(c.model, str) or not sizes_fit or not np.isfinite(c.params).all():
+                raise ValueError(f"tracks: camera {number} is {str(c)[:200]}")
         for i, camera in enumerate(self.keyframe_camera):
             if int(camera) not in self.cameras:
                 raise ValueError(
@@ -214,13 +222,9 @@ class Tracks:
                 if missing:
                     raise ValueError(f"{path}: tracks file lacks {', '.join(sorted(missing))}")
                 arrays = {name: file.get_tensor(name) for name in _ARRAYS}
-            cameras = {
-                int(k): Camera(c["model"], int(c["width"]), int(c["height"]), tuple(c["params"]))
-                for k, c in json.loads(header["cameras"]).items()
-            }
             tracks = cls(
                 descriptor=header["descriptor"],
-                cameras=cameras,
+                cameras=_cameras(json.loads(header["cameras"])),
                 keyframe_names=json.loads(header["keyframe_names"]),
                 info=json.loads(header["info"]),
                 **arrays,
@@ -228,9 +232,19 @@ class Tracks:
             tracks.check()
         except SafetensorError as error:
             raise ValueError(f"{path}: not a tracks file, or a broken one ({error})") from None
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ValueError(f"{path}: broken tracks file ({error!r})") from None
         return tracks
+
+
+def _cameras(value: Any) -> dict[int, Camera]:
+    """Cameras as the header has them in JSON."""
+    if not isinstance(value, dict):
+        raise TypeError("cameras are not a JSON object")
+    return {
+        int(k): Camera(c["model"], c["width"], c["height"], tuple(map(float, c["params"])))
+        for k, c in value.items()
+    }
 
 
 def sequence_name(path: Path) -> str:

@@ -1,0 +1,67 @@
+// What an open or a sealed map answers, against its prototypes one by one.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "expect.h"
+#include "protomark/search.h"
+#include "random.h"
+
+namespace protomark::fuzz {
+
+inline std::vector<std::int64_t> first_ids(std::vector<std::int64_t> ids) {
+  ids.resize(std::min<std::size_t>(ids.size(), 50));
+  return ids;
+}
+
+// looks(id) gives the prototypes of a landmark, rounded as search compares them. Only where `exact`
+// are answers compared with these.
+template <typename Map, typename Looks>
+void search_map(const Map& map, const Looks& looks, bool exact = true) {
+  const std::size_t n = 3, dim = map.dim(), k = 2;
+  test::Random random(5);
+  auto codes = random.integers<std::int8_t>(n * dim, -127, 127);
+  std::fill_n(codes.begin(), dim, std::int8_t{-127});
+  const Codes queries{codes.data(), n, dim};
+  std::vector<std::int64_t> ids(n * k);
+  std::vector<float> distances(n * k);
+  SearchOptions options;
+  options.ratio = 0.8f;
+  options.max_distance = 300.0f;
+  map.search_codes(queries, options, {ids.data(), n, k}, {distances.data(), n, k});
+  map.search_codes(queries, {}, {ids.data(), n, k}, {distances.data(), n, k});
+
+  const auto all = map.ids();
+  EXPECT(all.size() == map.size());
+  if (!exact || all.size() > 300) return;
+  for (std::size_t q = 0; q < n; ++q) {
+    std::vector<std::pair<std::int64_t, std::int64_t>> found;  // squared distance, id
+    for (const std::int64_t id : all) {
+      auto least = std::numeric_limits<std::int64_t>::max();
+      for (const std::vector<float>& look : looks(id)) {
+        std::int64_t squared = 0;
+        for (std::size_t d = 0; d < dim; ++d) {
+          const auto difference = static_cast<std::int64_t>(look[d]) - queries.row(q)[d];
+          squared += difference * difference;
+        }
+        least = std::min(least, squared);
+      }
+      found.emplace_back(least, id);
+    }
+    std::sort(found.begin(), found.end());
+    for (std::size_t j = 0; j < k; ++j) {
+      if (j >= found.size()) {
+        EXPECT(ids[q * k + j] == -1 && std::isinf(distances[q * k + j]));
+        continue;
+      }
+      EXPECT(ids[q * k + j] == found[j].second);
+      EXPECT(distances[q * k + j] == std::sqrt(static_cast<float>(found[j].first)));
+    }
+  }
+}
+
+}  // namespace protomark::fuzz

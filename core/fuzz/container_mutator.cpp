@@ -1,0 +1,147 @@
+// Mutates what is in a file of docs/format.md and makes its checksums right again, so that the
+// fuzzer gets behind them. A part of its inputs stays as broken as it is.
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <random>
+#include <vector>
+
+#include "container.h"
+#include "crc32.h"
+#include "protomark/error.h"
+
+// Of libFuzzer.
+extern "C" std::size_t LLVMFuzzerMutate(std::uint8_t* data, std::size_t size, std::size_t max_size);
+
+namespace protomark::fuzz {
+namespace {
+
+using Random = std::minstd_rand;
+using Content = std::vector<std::byte>;
+
+struct File {
+  FileKind kind;
+  std::uint32_t version;
+  std::vector<std::pair<std::string, Content>> sections;
+
+  // Throws FileError where these are not the bytes of a file with a good header.
+  explicit File(Bytes bytes) {
+    const ContainerReader reader(bytes, "input");
+    kind = reader.kind();
+    std::memcpy(&version, bytes.data() + 8, sizeof(version));
+    for (const auto& [name, size] : reader.sections()) {
+      const Bytes content = *reader.map_if_there(name);
+      sections.emplace_back(name, Content(content.begin(), content.end()));
+    }
+  }
+
+  Content serialize() const {
+    ContainerWriter writer(kind, version);
+    for (const auto& [name, content] : sections) writer.add(name, Bytes(content));
+    return writer.serialize();
+  }
+};
+
+// Whatever libFuzzer does to bytes that know nothing of a format.
+void mutate(Content& bytes, std::size_t most) {
+  const std::size_t size = bytes.size();
+  bytes.resize(std::max(size, std::min(2 * size + 16, most)));
+  bytes.resize(LLVMFuzzerMutate(reinterpret_cast<std::uint8_t*>(bytes.data()), size, bytes.size()));
+}
+
+// Of the header and table, whose checksum is made right.
+Content mutate_table(Bytes file) {
+  Content bytes(file.begin(), file.end());
+  std::uint32_t sections;
+  std::memcpy(&sections, &bytes[24], sizeof(sections));
+  const std::size_t size = 64 + 32 * std::size_t{sections};
+  Content head(bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(size));
+  LLVMFuzzerMutate(reinterpret_cast<std::uint8_t*>(head.data()), size, size);
+  std::memset(&head[28], 0, 4);
+  const std::uint32_t crc = crc32(head);
+  std::memcpy(&head[28], &crc, sizeof(crc));
+  std::copy(head.begin(), head.end(), bytes.begin());
+  return bytes;
+}
+
+Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
+  const auto one_in = [&](unsigned n) { return random() % n == 0; };
+  File file(bytes);
+  auto& sections = file.sections;
+  if (one_in(16)) return mutate_table(bytes);
+  if (one_in(16)) file.version = 1 + random() % 3;
+  if (one_in(32)) file.kind = static_cast<FileKind>(1 + random() % 3);
+  if (sections.empty()) return file.serialize();
+  auto& [name, content] = sections[random() % sections.size()];
+  if (one_in(16)) {
+    std::swap(content, sections[random() % sections.size()].second);
+  } else if (one_in(16)) {
+    content.clear();
+  } else if (one_in(16)) {
+    sections.erase(sections.begin() + static_cast<std::ptrdiff_t>(random() % sections.size()));
+  } else if (name == "encoder" && !one_in(8)) {
+    try {
+      content = mutate_file(content, random, most);
+    } catch (const FileError&) {
+      mutate(content, most);
+    }
+  } else {
+    mutate(content, most);
+  }
+  return file.serialize();
+}
+
+// Sections of the same name, from one file or the other.
+Content cross(Bytes one, Bytes other, Random& random) {
+  File file(one);
+  for (auto& section : File(other).sections) {
+    if (random() % 2 != 0) continue;
+    const auto mine = std::find_if(file.sections.begin(), file.sections.end(),
+                                   [&](const auto& s) { return s.first == section.first; });
+    if (mine != file.sections.end()) {
+      mine->second = std::move(section.second);
+    } else {
+      file.sections.push_back(std::move(section));
+    }
+  }
+  return file.serialize();
+}
+
+std::size_t put(const Content& from, std::uint8_t* to, std::size_t most) {
+  if (from.size() > most) return 0;
+  std::memcpy(to, from.data(), from.size());
+  return from.size();
+}
+
+}  // namespace
+}  // namespace protomark::fuzz
+
+using namespace protomark;
+
+extern "C" std::size_t LLVMFuzzerCustomMutator(std::uint8_t* data, std::size_t size,
+                                               std::size_t max_size, unsigned seed) {
+  fuzz::Random random(seed);
+  if (random() % 32 != 0) {
+    try {
+      const auto mutated =
+          fuzz::mutate_file(std::as_bytes(std::span(data, size)), random, max_size);
+      if (const std::size_t n = fuzz::put(mutated, data, max_size); n > 0) return n;
+    } catch (const FileError&) {  // not a file any more: mutated as it is
+    }
+  }
+  return LLVMFuzzerMutate(data, size, max_size);
+}
+
+extern "C" std::size_t LLVMFuzzerCustomCrossOver(const std::uint8_t* one, std::size_t one_size,
+                                                 const std::uint8_t* other, std::size_t other_size,
+                                                 std::uint8_t* out, std::size_t max_size,
+                                                 unsigned seed) {
+  fuzz::Random random(seed);
+  try {
+    return fuzz::put(fuzz::cross(std::as_bytes(std::span(one, one_size)),
+                                 std::as_bytes(std::span(other, other_size)), random),
+                     out, max_size);
+  } catch (const FileError&) {
+    return 0;
+  }
+}

@@ -1,0 +1,39 @@
+#include "aligned_copy.h"
+#include "answers.h"
+#include "container.h"
+#include "protomark/error.h"
+#include "protomark/map_file.h"
+
+using namespace protomark;
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+  const fuzz::AlignedCopy input(data, size);
+  try {
+    const SealedMap map(input.bytes(), "input");
+    EXPECT(map.prototype_count() >= map.size());
+    // With 8 bits nobody has checked that padding is zero, which counts, and that codes are -127 to
+    // 127, so kernels may differ.
+    bool exact = map.code_bits() == 4 || map.dim() % 4 == 0;
+    for (const std::int64_t id : map.ids()) {
+      for (const auto& look : map.looks(id)) exact &= std::ranges::count(look, -128.0f) == 0;
+    }
+    fuzz::search_map(map, [&](std::int64_t id) { return map.looks(id); }, exact);
+    const auto ids = fuzz::first_ids(map.ids());
+    std::vector<float> means(ids.size() * map.dim());
+    map.prototypes(ids, {means.data(), ids.size(), map.dim()});
+    for (const std::uint32_t count : map.counts(ids)) EXPECT(count <= 255);
+    for (const Position& p : map.positions(ids)) {
+      EXPECT(std::isnan(p[0]) == std::isnan(p[1]) && std::isnan(p[0]) == std::isnan(p[2]));
+      EXPECT(!std::isinf(p[0]) && !std::isinf(p[1]) && !std::isinf(p[2]));
+    }
+    const std::int64_t unknown = -1;
+    try {
+      map.counts(std::span(&unknown, 1));
+      EXPECT(false);
+    } catch (const UnknownLandmark&) {
+    }
+    ContainerReader(input.bytes(), "input").verify();
+  } catch (const FileError&) {
+  }
+  return 0;
+}

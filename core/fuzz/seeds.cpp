@@ -1,0 +1,84 @@
+// Writes small valid files for the fuzzer to start from: seeds FOLDER makes FOLDER/<target>/.
+#include <cstdio>
+#include <filesystem>
+#include <limits>
+
+#include "protomark/map_file.h"
+#include "protomark/prototypes.h"
+#include "random.h"
+
+using namespace protomark;
+namespace fs = std::filesystem;
+
+namespace {
+
+std::shared_ptr<const Encoder> small_encoder(std::size_t dim, std::size_t layers) {
+  test::Random random(static_cast<std::uint32_t>(dim + layers));
+  std::vector<Layer> built;
+  std::size_t width = 64;
+  for (std::size_t l = 1; l < layers; ++l) {
+    built.push_back(test::random_layer(random, width, 6));
+    width = 6;
+  }
+  built.push_back(test::random_layer(random, width, dim));
+  return std::make_shared<const Encoder>(Encoder(
+      {"seed", "test", "none", "none", {{"key", "value"}}}, std::move(built),
+      dim > 1 ? std::vector<std::size_t>{dim / 2, dim} : std::vector<std::size_t>{dim}, 0.5f));
+}
+
+void fill(PrototypeMap& map, std::size_t landmarks, std::int64_t step, bool positions) {
+  test::Random random(7);
+  std::vector<std::int64_t> ids;
+  for (std::size_t i = 0; i < 3 * landmarks; ++i) {
+    ids.push_back(static_cast<std::int64_t>(i % landmarks) * step);
+  }
+  const auto codes = random.integers<std::int8_t>(ids.size() * map.dim(), -127, 127);
+  map.add_codes(ids, {codes.data(), ids.size(), map.dim()});
+  if (!positions) return;
+  constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+  for (const std::int64_t id : map.ids()) {
+    const Position p =
+        id == step ? Position{kNaN, kNaN, kNaN} : Position{5e5 + static_cast<double>(id), -2.5, 0};
+    map.set_positions(std::span(&id, 1), std::span(&p, 1));
+  }
+}
+
+}  // namespace
+
+int main(int argc, char** argv) try {
+  if (argc != 2) {
+    std::fprintf(stderr, "usage: %s FOLDER\n", argv[0]);
+    return 2;
+  }
+  const fs::path folder = argv[1];
+  for (const char* target : {"container", "encoder", "open_map", "sealed_map"}) {
+    fs::create_directories(folder / target);
+  }
+  const auto plain = small_encoder(4, 2), deep = small_encoder(9, 4), flat = small_encoder(1, 1);
+  plain->save(folder / "encoder" / "plain");
+  deep->save(folder / "encoder" / "deep");
+  flat->save(folder / "encoder" / "flat");
+
+  int number = 0;
+  for (const auto& encoder : {plain, deep, flat}) {
+    for (const std::size_t look_bits : {0, 1, 3}) {
+      if (look_bits > encoder->dim()) continue;
+      for (const std::size_t landmarks : {0, 1, 5, 20}) {
+        PrototypeMap map(encoder, 0, look_bits);
+        const std::string name = std::to_string(number++);
+        if (landmarks > 0) fill(map, landmarks, number % 2 == 0 ? 1 : 7, number % 3 == 0);
+        map.save(folder / "open_map" / name);
+        map.seal(folder / "sealed_map" / name);
+        map.seal(folder / "sealed_map" / (name + ".4"), 4);
+        map.seal(folder / "sealed_map" / (name + ".1"), 8, 1.5);
+      }
+    }
+  }
+  fs::copy(folder / "encoder" / "plain", folder / "container" / "encoder");
+  fs::copy(folder / "open_map" / "2", folder / "container" / "open");
+  fs::copy(folder / "sealed_map" / "2", folder / "container" / "sealed");
+  return 0;
+} catch (const std::exception& error) {
+  std::fprintf(stderr, "error: %s\n", error.what());
+  return 1;
+}

@@ -1,0 +1,52 @@
+// A lock for many readers or one writer that serves them in the order in which they came.
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <shared_mutex>
+
+namespace protomark {
+
+// std::shared_mutex of glibc lets readers in for as long as any is there, so that a writer waits
+// for ever where a few threads search all the time.
+class FairSharedMutex {
+ public:
+  void lock() {
+    enter();
+    mutex_.lock();
+    leave();
+  }
+  void lock_shared() {
+    enter();
+    mutex_.lock_shared();
+    leave();
+  }
+  bool try_lock() {
+    std::uint32_t ticket = serving_.load();
+    if (!next_.compare_exchange_strong(ticket, ticket + 1)) return false;
+    const bool locked = mutex_.try_lock();
+    leave();
+    return locked;
+  }
+  void unlock() { mutex_.unlock(); }
+  void unlock_shared() { mutex_.unlock_shared(); }
+
+ private:
+  // One thread at a time waits at the mutex, the others for their turn.
+  void enter() {
+    const std::uint32_t ticket = next_.fetch_add(1);
+    for (std::uint32_t now = serving_.load(); now != ticket; now = serving_.load()) {
+      serving_.wait(now);
+    }
+  }
+  void leave() {
+    serving_.fetch_add(1);
+    serving_.notify_all();
+  }
+
+  std::shared_mutex mutex_;
+  std::atomic<std::uint32_t> next_ = 0;
+  std::atomic<std::uint32_t> serving_ = 0;
+};
+
+}  // namespace protomark

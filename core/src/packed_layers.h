@@ -1,0 +1,79 @@
+// The layers of an encoder as the kernels take them: weights in blocks of 64 outputs, padded with
+// zeros to whole blocks.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "kernels/kernels.h"
+#include "protomark/encoder.h"
+
+namespace protomark {
+
+// Next bytes (n x `stride`), at least as many columns as the outputs padded to whole blocks.
+struct LayerOutput {
+  std::uint8_t* data;
+  std::size_t stride;
+};
+
+// From sums to bytes.
+class PackedActivation {
+ public:
+  // A last layer's codes are bytes of a table, too.
+  PackedActivation(const Layer& layer, bool last);
+
+  std::size_t outputs() const { return bias_.size(); }
+  kernels::Activation block(std::size_t first) const {
+    return {&bias_[first], &multipliers_[first], table_.data(), shift_};
+  }
+  // Vector kernels do not take small shifts, which no trained network has.
+  bool is_for_vectors() const { return shift_ >= 32; }
+
+ private:
+  std::vector<std::int32_t> bias_;
+  std::vector<std::int32_t> multipliers_;
+  std::array<std::uint8_t, 256> table_;
+  int shift_;
+};
+
+// A first layer, whose inputs are bits. For a block of outputs, the sums of all subsets of every 4
+// inputs are tabulated once for many descriptors: one load and one 16-bit add then stand for 4
+// inputs ("four Russians"). Few descriptors add the weights of the bits that are set.
+class BitLayer {
+ public:
+  BitLayer(const Layer& layer, bool last);
+
+  std::size_t outputs() const { return activation_.outputs(); }
+  // The first `wanted` outputs of n descriptors, n x bytes.
+  void run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
+           std::size_t wanted, LayerOutput next) const;
+
+ private:
+  class Input;
+
+  std::size_t bytes_;
+  std::size_t words_;                 // 64 bits each
+  std::size_t span_;                  // words whose sums stay within 16 bits
+  std::vector<std::int8_t> weights_;  // blocks x inputs x 64
+  PackedActivation activation_;
+};
+
+// A later layer, whose inputs are bytes.
+class DenseLayer {
+ public:
+  DenseLayer(const Layer& layer, bool last);
+
+  std::size_t outputs() const { return activation_.outputs(); }
+  // The first `wanted` outputs of n inputs.
+  void run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride, std::size_t n,
+           std::size_t wanted, LayerOutput next) const;
+
+ private:
+  std::size_t inputs_;
+  std::vector<std::int8_t> weights_;
+  PackedActivation activation_;
+};
+
+}  // namespace protomark

@@ -1,0 +1,187 @@
+// Several searchers and one writer: every answer is that of the map between two changes.
+#include <unistd.h>
+
+#include <algorithm>
+#include <atomic>
+#include <filesystem>
+#include <numeric>
+#include <stop_token>
+#include <thread>
+
+#include "check.h"
+#include "protomark/map_file.h"
+#include "protomark/prototypes.h"
+#include "random.h"
+
+using namespace protomark;
+namespace fs = std::filesystem;
+
+namespace {
+
+constexpr std::size_t kDim = 12, kNeighbours = 3, kQueries = 40;
+constexpr int kRounds = 30;
+
+struct Answer {
+  std::vector<std::int64_t> ids = std::vector<std::int64_t>(kQueries * kNeighbours);
+  std::vector<float> distances = std::vector<float>(kQueries * kNeighbours);
+  bool operator==(const Answer&) const = default;
+};
+
+struct Observations {
+  std::vector<std::int64_t> ids;
+  std::vector<std::int8_t> codes;
+  Codes view() const { return {codes.data(), ids.size(), kDim}; }
+};
+
+Observations observations(test::Random& random, std::size_t n, std::int64_t first_id) {
+  return {random.integers<std::int64_t>(n, first_id, first_id + 199),
+          random.integers<std::int8_t>(n * kDim, -127, 127)};
+}
+
+template <typename Map>
+Answer ask(const Map& map, Codes queries, int threads) {
+  Answer answer;
+  SearchOptions options;
+  options.threads = threads;
+  map.search_codes(queries, options, {answer.ids.data(), kQueries, kNeighbours},
+                   {answer.distances.data(), kQueries, kNeighbours});
+  return answer;
+}
+
+// Changes that lead from the first state through others and back to it.
+class Cycle {
+ public:
+  static constexpr std::size_t kSteps = 5;
+
+  explicit Cycle(std::uint32_t seed) {
+    test::Random random(seed);
+    first_ = observations(random, 1500, 0);
+    more_ = observations(random, 700, 100);
+    passing_ = observations(random, 200, 1000);
+    std::iota(passing_.ids.begin(), passing_.ids.end(), 1000);
+    into_.assign(passing_.ids.begin(), passing_.ids.begin() + 100);
+    source_.assign(passing_.ids.begin() + 100, passing_.ids.end());
+  }
+
+  void start(PrototypeMap& map) const { map.add_codes(first_.ids, first_.view()); }
+
+  void step(PrototypeMap& map, std::size_t i) const {
+    switch (i % kSteps) {
+      case 0:
+        return map.add_codes(more_.ids, more_.view());
+      case 1:
+        return map.add_codes(passing_.ids, passing_.view());
+      case 2:
+        return map.merge(into_, source_);
+      case 3:
+        return map.discard(into_);
+      default:
+        return map.remove_codes(more_.ids, more_.view());
+    }
+  }
+
+ private:
+  Observations first_, more_, passing_;
+  std::vector<std::int64_t> into_, source_;
+};
+
+// What there is to see of a map that goes through the cycle, from one thread alone.
+struct States {
+  States(const Cycle& cycle, Codes queries, PrototypeMap map) {
+    cycle.start(map);
+    for (std::size_t i = 0; i < Cycle::kSteps; ++i) {
+      answers.push_back(ask(map, queries, 1));
+      sizes.push_back(map.size());
+      cycle.step(map, i);
+    }
+    CHECK(ask(map, queries, 1) == answers.front());
+  }
+  bool has(const Answer& answer) const {
+    return std::ranges::find(answers, answer) != answers.end();
+  }
+  bool has(std::size_t size) const { return std::ranges::find(sizes, size) != sizes.end(); }
+
+  std::vector<Answer> answers;
+  std::vector<std::size_t> sizes;
+};
+
+void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path& folder) {
+  const auto encoder = test::random_encoder();
+  const Cycle cycle(7);
+  test::Random random(8);
+  const auto codes = random.integers<std::int8_t>(kQueries * kDim, -127, 127);
+  const Codes queries{codes.data(), kQueries, kDim};
+
+  const States states(cycle, queries, PrototypeMap(encoder, kDim, look_bits));
+
+  PrototypeMap shared(encoder, kDim, look_bits);
+  cycle.start(shared);
+  std::atomic<int> wrong = 0, searches = 0, files = 0;
+  const auto search = [&](const std::stop_token& stop, int threads) {
+    while (!stop.stop_requested()) {
+      wrong += states.has(ask(shared, queries, threads)) ? 0 : 1;
+      wrong += states.has(shared.size()) ? 0 : 1;
+      ++searches;
+    }
+  };
+  const auto write_and_read = [&](const std::stop_token& stop) {
+    const fs::path open = folder / "shared.pmk", sealed = folder / "shared.sealed.pmk";
+    const std::int64_t id = shared.ids().front();
+    std::vector<float> mean(kDim);
+    while (!stop.stop_requested()) {
+      shared.save(open);
+      wrong += states.has(ask(PrototypeMap::load(open), queries, 1)) ? 0 : 1;
+      shared.seal(sealed);
+      wrong += states.has(ask(SealedMap(sealed), queries, 1)) ? 0 : 1;
+      shared.prototypes(std::span(&id, 1), {mean.data(), 1, kDim});
+      shared.looks(id);
+      shared.positions(std::span(&id, 1));
+      shared.counts(std::span(&id, 1));
+      ++files;
+    }
+  };
+  {
+    std::vector<std::jthread> readers;
+    for (const int threads : {1, 1, 2}) {
+      readers.emplace_back([&, threads](const std::stop_token& s) { search(s, threads); });
+    }
+    readers.emplace_back(write_and_read);
+    for (std::size_t i = 0; i < kRounds * Cycle::kSteps; ++i) cycle.step(shared, i);
+    while (searches == 0 || files == 0) std::this_thread::yield();
+  }
+  CHECK(wrong == 0);
+  CHECK(ask(shared, queries, 1) == states.answers.front());
+  std::printf("look_bits %zu: %d searches, %d files during %zu changes\n", look_bits,
+              searches.load(), files.load(), kRounds * Cycle::kSteps);
+}
+
+// Two maps that take each other over at the same time.
+void test_updates_of_each_other() {
+  const auto encoder = test::random_encoder();
+  test::Random random(9);
+  const Observations a = observations(random, 300, 0), b = observations(random, 300, 1000);
+  for (int round = 0; round < 20; ++round) {
+    PrototypeMap left(encoder), right(encoder);
+    left.add_codes(a.ids, a.view());
+    right.add_codes(b.ids, b.view());
+    {
+      const std::jthread one([&] { left.update(right); });
+      const std::jthread other([&] { right.update(left); });
+    }
+    CHECK(left.size() == right.size());
+  }
+}
+
+}  // namespace
+
+int main() {
+  const fs::path folder =
+      fs::temp_directory_path() / ("protomark_concurrency_" + std::to_string(::getpid()));
+  fs::create_directory(folder);
+  for (const std::size_t look_bits : {0, 3}) {
+    test_searches_while_a_writer_changes(look_bits, folder);
+  }
+  test_updates_of_each_other();
+  fs::remove_all(folder);
+  return check::result();
+}

@@ -1,0 +1,156 @@
+// What a save does to the disk, in which order, and what is there when a step of it fails.
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <cstdio>
+#include <filesystem>
+#include <fstream>
+#include <iterator>
+
+#include "check.h"
+#include "protomark/error.h"
+#include "protomark/prototypes.h"
+#include "random.h"
+
+namespace fs = std::filesystem;
+
+namespace {
+
+// The system calls of this program go through here.
+struct Disk {
+  std::vector<std::string> calls;
+  long room = -1;           // bytes until the disk is full; -1: never
+  long write_at_most = -1;  // bytes that one call writes, which a signal interrupts each time
+  int fsync_file = 0, fsync_folder = 0, rename = 0;  // errno of each; 0: it works
+  bool interrupted = false;
+} disk;
+
+int failed(int error) {
+  errno = error;
+  return -1;
+}
+
+}  // namespace
+
+extern "C" ssize_t write(int descriptor, const void* data, std::size_t size) {
+  if (descriptor <= 2) return syscall(SYS_write, descriptor, data, size);
+  if (disk.write_at_most >= 0) {
+    disk.interrupted = !disk.interrupted;
+    if (disk.interrupted) return failed(EINTR);
+    size = std::min(size, static_cast<std::size_t>(disk.write_at_most));
+  }
+  if (disk.room >= 0) {
+    if (disk.room == 0 && size > 0) return failed(ENOSPC);
+    size = std::min(size, static_cast<std::size_t>(disk.room));
+    disk.room -= static_cast<long>(size);
+  }
+  return syscall(SYS_write, descriptor, data, size);
+}
+
+extern "C" int fsync(int descriptor) {
+  struct stat status;
+  ::fstat(descriptor, &status);
+  const bool folder = S_ISDIR(status.st_mode);
+  disk.calls.emplace_back(folder ? "sync folder" : "sync file");
+  const int error = folder ? disk.fsync_folder : disk.fsync_file;
+  return error != 0 ? failed(error) : static_cast<int>(syscall(SYS_fsync, descriptor));
+}
+
+extern "C" int rename(const char* from, const char* to) noexcept {
+  disk.calls.emplace_back("rename");
+  if (disk.rename != 0) return failed(disk.rename);
+  return static_cast<int>(syscall(SYS_renameat2, AT_FDCWD, from, AT_FDCWD, to, 0));
+}
+
+using namespace protomark;
+
+namespace {
+
+std::vector<char> read(const fs::path& path) {
+  std::ifstream file(path, std::ios::binary);
+  return {std::istreambuf_iterator<char>(file), {}};
+}
+
+std::size_t files(const fs::path& folder) {
+  return static_cast<std::size_t>(std::distance(fs::directory_iterator(folder), {}));
+}
+
+PrototypeMap map_of(std::size_t landmarks) {
+  PrototypeMap map(test::random_encoder());
+  test::Random random(3);
+  const auto codes = random.integers<std::int8_t>(landmarks * 12, -127, 127);
+  std::vector<std::int64_t> ids(landmarks);
+  for (std::size_t i = 0; i < landmarks; ++i) ids[i] = static_cast<std::int64_t>(i);
+  map.add_codes(ids, {codes.data(), landmarks, 12});
+  return map;
+}
+
+}  // namespace
+
+int main() {
+  const fs::path folder =
+      fs::temp_directory_path() / ("protomark_durability_" + std::to_string(::getpid()));
+  fs::create_directory(folder);
+  const fs::path path = folder / "map.pmk";
+  const PrototypeMap old_map = map_of(50), new_map = map_of(100);
+
+  disk = {};
+  new_map.save(path);
+  CHECK(disk.calls == std::vector<std::string>{"sync file", "rename", "sync folder"});
+  const auto new_bytes = read(path);
+  disk = {};
+  old_map.save(path);
+  const auto old_bytes = read(path);
+  CHECK(old_bytes != new_bytes && files(folder) == 1);
+
+  // A full disk, from the first byte to the last.
+  const long size = static_cast<long>(new_bytes.size());
+  for (const long room : {0l, 1l, 63l, 64l, 500l, size / 2, size - 64, size - 1}) {
+    disk = {};
+    disk.room = room;
+    CHECK(check::throws<FileError>([&] { new_map.save(path); },
+                                   "map.pmk: cannot be written: No space left on device"));
+    CHECK(read(path) == old_bytes && files(folder) == 1);
+  }
+  const auto fails = [&](int Disk::* step, int error, const std::string& message) {
+    disk = {};
+    disk.*step = error;
+    CHECK(check::throws<FileError>([&] { new_map.save(path); }, message));
+    CHECK(files(folder) == 1);
+  };
+  fails(&Disk::fsync_file, EIO, "map.pmk: cannot be written: Input/output error");
+  CHECK(read(path) == old_bytes);
+  fails(&Disk::rename, EACCES, "map.pmk: cannot be written: Permission denied");
+  CHECK(read(path) == old_bytes);
+  disk = {};
+  CHECK(check::throws<FileError>([&] { new_map.save(folder / "none" / "map.pmk"); },
+                                 "No such file or directory"));
+
+  // Here the new map is there, and the caller knows that it may not stay.
+  fails(&Disk::fsync_folder, EIO, "its folder cannot be synced: Input/output error");
+  CHECK(read(path) == new_bytes);
+
+  // Not every file system can sync a folder, and a write may stop early or be interrupted.
+  disk = {};
+  disk.fsync_folder = EINVAL;
+  old_map.save(path);
+  CHECK(read(path) == old_bytes);
+  disk = {};
+  disk.write_at_most = 77;
+  new_map.save(path);
+  CHECK(read(path) == new_bytes && files(folder) == 1);
+
+  disk = {};
+  const mode_t mask = ::umask(027);
+  old_map.save(folder / "other.pmk");
+  ::umask(mask);
+  CHECK(fs::status(folder / "other.pmk").permissions() == fs::perms(0640));
+  old_map.seal(folder / "sealed.pmk");
+  CHECK(disk.calls.size() == 6);
+  fs::remove_all(folder);
+  return check::result();
+}

@@ -1,0 +1,472 @@
+// Values at and beyond the limits that docs/limits.md states.
+#include <unistd.h>
+#include <cmath>
+#include <cstring>
+#include <filesystem>
+#include <limits>
+
+#include "check.h"
+#include "container.h"
+#include "map_sections.h"
+#include "protomark/error.h"
+#include "protomark/hamming.h"
+#include "protomark/map_file.h"
+#include "protomark/prototypes.h"
+#include "random.h"
+
+using namespace protomark;
+namespace fs = std::filesystem;
+
+namespace {
+
+constexpr std::size_t kDim = 12;
+constexpr std::int64_t kMostId = std::numeric_limits<std::int64_t>::max();
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
+
+template <typename F>
+bool refused(const F& f, const std::string& message) {
+  return check::throws<std::invalid_argument>(f, message);
+}
+
+using Ids = std::vector<std::int64_t>;
+
+std::vector<std::int8_t> codes_of(std::size_t n, std::uint32_t seed = 1) {
+  test::Random random(seed);
+  return random.integers<std::int8_t>(n * kDim, -127, 127);
+}
+
+Codes view(const std::vector<std::int8_t>& codes) {
+  return {codes.data(), codes.size() / kDim, kDim};
+}
+
+template <typename Map>
+Ids search(const Map& map, const std::vector<std::int8_t>& codes, std::size_t k) {
+  const std::size_t n = codes.size() / kDim;
+  Ids ids(n * k);
+  std::vector<float> distances(n * k);
+  map.search_codes(view(codes), {}, {ids.data(), n, k}, {distances.data(), n, k});
+  return ids;
+}
+
+struct Parts {
+  EncoderInfo info{"tiny", "test", "", "", {}};
+  std::vector<Layer> layers;
+  std::vector<std::size_t> dims{6, 12};
+  float scale = 1;
+
+  Parts() {
+    test::Random random(1);
+    layers = {test::random_layer(random, 64, 40), test::random_layer(random, 40, 12)};
+  }
+};
+
+void test_encoder() {
+  const auto bad = [](const auto& change, const std::string& message) {
+    Parts p;
+    change(p);
+    CHECK(refused([&] { Encoder(p.info, p.layers, p.dims, p.scale); }, message));
+  };
+  test::Random random(2);
+  const auto layer = [&](std::size_t inputs, std::size_t outputs) {
+    return test::random_layer(random, inputs, outputs);
+  };
+  bad([](Parts& p) { p.info.name.clear(); }, "name and descriptor");
+  bad([](Parts& p) { p.layers.clear(); }, "it has 0 layers, 1 to 16");
+  bad([&](Parts& p) { p.layers.assign(17, layer(64, 64)); }, "it has 17 layers");
+  bad([&](Parts& p) { p.layers = {layer(56, 12)}; }, "64 to 1024 bits");
+  bad([&](Parts& p) { p.layers = {layer(1032, 12)}; }, "64 to 1024 bits");
+  bad([&](Parts& p) { p.layers = {layer(68, 12)}; }, "a multiple of 8, not 68");
+  bad([&](Parts& p) { p.layers[1] = layer(41, 12); }, "layer 1 has 41 inputs, 40 are needed");
+  bad([&](Parts& p) { p.layers = {layer(64, 0)}; }, "layer 0 has 0 outputs, 1 to 4096");
+  bad([&](Parts& p) { p.layers[0] = layer(64, 4097); }, "layer 0 has 4097 outputs");
+  bad([](Parts& p) { p.layers[0].bias.pop_back(); }, "do not match its size");
+  bad([](Parts& p) { p.layers[0].shift = 0; }, "shift must be 1 to 62");
+  bad([](Parts& p) { p.layers[1].shift = 63; }, "shift must be 1 to 62");
+  bad([](Parts& p) { p.layers[1].multipliers[3] = 0; }, "multipliers must be positive");
+  bad([](Parts& p) { p.layers[1].bias[2] = std::numeric_limits<std::int32_t>::max(); },
+      "sums of output 2 could leave 32 bits");
+  bad([](Parts& p) { p.layers[0].bias[0] = std::numeric_limits<std::int32_t>::min(); },
+      "could leave 32 bits");
+  for (const auto& dims : std::vector<std::vector<std::size_t>>{{}, {0, 12}, {12, 12}, {6}}) {
+    bad([&](Parts& p) { p.dims = dims; }, "dims must ascend");
+  }
+  bad([&](Parts& p) { p.layers[1] = layer(40, 257), p.dims = {257}; }, "at most 256 dimensions");
+  for (const float scale : {0.0f, -1.0f, NAN, INFINITY}) {
+    bad([&](Parts& p) { p.scale = scale; }, "scale must be positive");
+  }
+
+  // The largest shift and sums that just fit.
+  Parts p;
+  p.layers = {layer(1024, 256)};
+  p.dims = {256};
+  p.layers[0].shift = 62;
+  for (auto& weight : p.layers[0].weights) weight = -128;
+  for (auto& bias : p.layers[0].bias) bias = std::numeric_limits<std::int32_t>::min() + 128 * 1024;
+  for (auto& m : p.layers[0].multipliers) m = std::numeric_limits<std::int32_t>::max();
+  const Encoder encoder(p.info, p.layers, p.dims, p.scale);
+  CHECK(encoder.multiply_adds() == 1024 * 256);
+  const std::vector<std::uint8_t> descriptor(128, 255);
+  std::vector<std::int8_t> code(256);
+  encoder.encode({descriptor.data(), 1, 128}, {code.data(), 1, 256});
+  CHECK(code == std::vector<std::int8_t>(256, -1));  // -2^31 (2^31 - 1) / 2^62, rounded
+
+  CHECK(refused([&] { encoder.encode({descriptor.data(), 2, 64}, {code.data(), 2, 128}); },
+                "descriptors have 64 bytes, encoder 'tiny' takes 128"));
+  CHECK(refused([&] { encoder.encode({descriptor.data(), 1, 128}, {code.data(), 0, 256}); },
+                "as many rows"));
+  CHECK(refused([&] { encoder.encode({descriptor.data(), 1, 128}, {code.data(), 1, 255}); },
+                "gives 256 dimensions, not 255"));
+  CHECK(refused([&] { encoder.encode({descriptor.data(), 1, 128}, {code.data(), 1, 256}, 0); },
+                "threads must be at least 1"));
+}
+
+void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
+  CHECK(refused([] { PrototypeMap(nullptr); }, "needs an encoder"));
+  CHECK(refused([&] { PrototypeMap(encoder, 7); }, "no codes of 7 dimensions"));
+  CHECK(refused([&] { PrototypeMap(encoder, 6, 7); }, "look_bits must be 0 to 6, not 7"));
+
+  PrototypeMap map(encoder);
+  const auto codes = codes_of(2);
+  const std::vector<std::uint8_t> descriptors(2 * encoder->bytes());
+  for (const std::int64_t id : {std::int64_t{-1}, std::numeric_limits<std::int64_t>::min()}) {
+    const Ids ids = {0, id};
+    CHECK(refused([&] { map.add_codes(ids, view(codes)); }, "is negative"));
+    CHECK(refused([&] { map.add(ids, {descriptors.data(), 2, encoder->bytes()}); }, "is negative"));
+  }
+  CHECK(refused([&] { map.add_codes(Ids{1}, view(codes)); }, "1 landmark ids for 2 codes"));
+  CHECK(refused([&] { map.add(Ids{1}, {descriptors.data(), 2, encoder->bytes()}); },
+                "1 landmark ids for 2 descriptors"));
+  CHECK(refused([&] { map.add_codes(Ids{1, 2}, {codes.data(), 2, 11}); }, "codes have 11"));
+  auto low = codes;
+  low[5] = -128;
+  CHECK(refused([&] { map.add_codes(Ids{1, 2}, view(low)); }, "one is -128"));
+  CHECK(map.size() == 0);
+
+  map.add_codes(Ids{0, kMostId}, view(codes));
+  CHECK(map.ids() == Ids{0, kMostId});
+  CHECK(search(map, codes, 3) == Ids{0, kMostId, -1, kMostId, 0, -1});
+  CHECK(check::throws<UnknownLandmark>([&] { map.counts(Ids{-1}); }, "landmark -1"));
+  std::vector<float> mean(kDim);
+  CHECK(refused([&] { map.prototypes(Ids{0}, {mean.data(), 1, kDim - 1}); }, "landmarks x dim"));
+
+  CHECK(refused([&] { search(map, codes, 0); }, "k must be at least 1"));
+  Ids ids(2);
+  std::vector<float> distances(2);
+  const auto with = [&](const SearchOptions& options, std::size_t rows = 2) {
+    map.search_codes(view(codes), options, {ids.data(), rows, 1}, {distances.data(), 2, 1});
+  };
+  SearchOptions options;
+  CHECK(refused([&] { with(options, 1); }, "queries x k"));
+  options.threads = 0;
+  CHECK(refused([&] { with(options); }, "threads must be at least 1"));
+  options = {};
+  for (const float d : {-1.0f, NAN}) {
+    options.max_distance = d;
+    CHECK(refused([&] { with(options); }, "max_distance"));
+  }
+  options = {};
+  for (const float ratio : {0.0f, 1.01f, NAN}) {
+    options.ratio = ratio;
+    CHECK(refused([&] { with(options); }, "ratio must be above 0"));
+  }
+  CHECK(refused(
+      [&] {
+        map.search_codes({codes.data(), 2, 6}, {}, {ids.data(), 2, 1}, {distances.data(), 2, 1});
+      },
+      "queries have 6 dimensions"));
+}
+
+// A landmark that a batch names twice is changed twice.
+void test_duplicates(const std::shared_ptr<const Encoder>& encoder) {
+  const auto codes = codes_of(4);
+  PrototypeMap map(encoder), reference(encoder);
+  map.add_codes(Ids{5, 5, 5, 9}, view(codes));
+  for (std::size_t i = 0; i < 4; ++i) {
+    reference.add_codes(Ids{i == 3 ? 9 : 5}, {&codes[i * kDim], 1, kDim});
+  }
+  std::vector<float> a(kDim), b(kDim);
+  map.prototypes(Ids{5}, {a.data(), 1, kDim});
+  reference.prototypes(Ids{5}, {b.data(), 1, kDim});
+  CHECK(a == b);
+  CHECK(map.counts(Ids{5, 5, 9}) == std::vector<std::uint32_t>{3, 3, 1});
+
+  const std::vector<Position> positions = {{1, 2, 3}, {4, 5, 6}};
+  map.set_positions(Ids{5, 5}, positions);
+  CHECK(map.positions(Ids{5})[0] == positions[1]);
+
+  CHECK(refused([&] { map.remove_codes(Ids{9, 9}, {codes.data(), 2, kDim}); },
+                "has 1 observations, 2 cannot be removed"));
+  CHECK(refused([&] { map.remove_codes(Ids{5}, {codes.data(), 0, kDim}); }, "1 landmark ids"));
+  CHECK(check::throws<UnknownLandmark>([&] { map.remove_codes(Ids{7}, {codes.data(), 1, kDim}); },
+                                       "landmark 7"));
+  const std::vector<std::int8_t> other(kDim, 127);
+  map.add_codes(Ids{20, 20}, {codes.data(), 2, kDim});
+  auto impossible = codes;
+  for (std::size_t d = 0; d < kDim; ++d)
+    impossible[d] = codes[d] + codes[kDim + d] > 0 ? -127 : 127;
+  CHECK(refused([&] { map.remove_codes(Ids{20}, {impossible.data(), 1, kDim}); }, "never added"));
+  CHECK(map.counts(Ids{5, 9, 20}) == std::vector<std::uint32_t>{3, 1, 2});
+  map.remove_codes(Ids{5, 5}, {codes.data(), 2, kDim});
+  CHECK(map.counts(Ids{5}) == std::vector<std::uint32_t>{1});
+
+  map.add_codes(Ids{30, 31, 32, 33}, view(codes));
+  CHECK(refused([&] { map.merge(Ids{30}, Ids{30}); }, "into itself"));
+  CHECK(refused([&] { map.merge(Ids{30, 32}, Ids{31, 31}); }, "31 was merged into another"));
+  CHECK(refused([&] { map.merge(Ids{30, 31}, Ids{31, 32}); }, "31 was merged into another"));
+  CHECK(refused([&] { map.merge(Ids{30}, Ids{}); }, "1 landmark ids for 0 sources"));
+  map.merge(Ids{30, 30}, Ids{31, 32});
+  CHECK(map.counts(Ids{30}) == std::vector<std::uint32_t>{3});
+  map.discard(Ids{33, 33, 30});
+  CHECK(map.ids() == Ids{5, 9, 20});
+
+  PrototypeMap looks(encoder, 0, 2);
+  looks.add_codes(Ids{1}, {codes.data(), 1, kDim});
+  std::vector<std::int8_t> turned(codes.begin(), codes.begin() + kDim);
+  for (auto& v : turned) v = static_cast<std::int8_t>(v > 0 ? -1 : 1);
+  CHECK(refused([&] { looks.remove_codes(Ids{1}, view(turned)); }, "never added"));
+  CHECK(refused([&] { looks.remove_codes(Ids{1, 1}, {codes.data(), 0, kDim}); }, "2 landmark ids"));
+}
+
+void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::path& path) {
+  PrototypeMap map(encoder);
+  map.add_codes(Ids{1, 2}, view(codes_of(2)));
+  for (const Position& p : {Position{kNaN, 0, 0}, Position{0, kInfinity, 0},
+                            Position{0, 0, -kInfinity}, Position{kNaN, kNaN, kInfinity}}) {
+    CHECK(refused([&] { map.set_positions(Ids{2}, std::span(&p, 1)); },
+                  "position of landmark 2 is not finite"));
+  }
+  const Position far = {1e300, 0, 0}, near = {-1e300, 0, 0}, none = {kNaN, kNaN, kNaN};
+  map.set_positions(Ids{1}, std::span(&far, 1));
+  map.set_positions(Ids{2}, std::span(&near, 1));
+  map.save(path);
+  CHECK(PrototypeMap::load(path).positions(Ids{1, 2}) == (std::vector{far, near}));
+  CHECK(refused([&] { map.seal(path); }, "too far apart"));
+  map.set_positions(Ids{2}, std::span(&none, 1));
+  map.seal(path);
+  const SealedMap sealed(path);
+  CHECK(sealed.positions(Ids{1})[0] == far);
+  CHECK(std::isnan(sealed.positions(Ids{2})[0][1]));
+}
+
+// Whatever can be done with a map can be done with one of no landmarks, and with one of one.
+void test_small_maps(const std::shared_ptr<const Encoder>& encoder, const fs::path& folder) {
+  const auto queries = codes_of(2, 7);
+  for (const std::size_t look_bits : {0, 3}) {
+    for (const std::size_t n : {0, 1}) {
+      PrototypeMap map(encoder, 0, look_bits);
+      const auto codes = codes_of(n);
+      const Ids ids(n, kMostId);
+      map.add_codes(ids, view(codes));
+      map.add({}, {nullptr, 0, encoder->bytes()});
+      map.remove_codes({}, {nullptr, 0, kDim});
+      map.merge({}, {});
+      map.discard({});
+      map.set_positions({}, {});
+      PrototypeMap other(encoder, 0, look_bits);
+      other.update(map);
+      map.update(PrototypeMap(encoder, 0, look_bits));
+      const Ids expected = n == 0 ? Ids{-1, -1, -1, -1} : Ids{kMostId, -1, kMostId, -1};
+      map.save(folder / "open");
+      verify_file(folder / "open");
+      for (const PrototypeMap& m : {std::cref(map), std::cref(other)}) {
+        CHECK(m.size() == n && m.ids() == ids && m.prototype_count() == n);
+        CHECK(search(m, queries, 2) == expected);
+      }
+      const PrototypeMap read = PrototypeMap::load(folder / "open");
+      CHECK(read.ids() == ids && search(read, queries, 2) == expected);
+      for (const int bits : {8, 4}) {
+        map.seal(folder / "sealed", bits, 1.0);
+        verify_file(folder / "sealed");
+        const SealedMap sealed(folder / "sealed");
+        CHECK(sealed.ids() == ids && search(sealed, queries, 2) == expected);
+        CHECK(sealed.counts(ids).size() == n && sealed.positions(ids).size() == n);
+      }
+      CHECK(search(map, {}, 2).empty());
+      CHECK(refused([&] { map.seal(folder / "sealed", 8, 0.99); }, "at least 1 prototype"));
+      CHECK(refused([&] { map.seal(folder / "sealed", 8, kNaN); }, "at least 1 prototype"));
+      map.remove_codes(ids, view(codes));
+      CHECK(map.size() == 0);
+    }
+  }
+}
+
+void test_update(const std::shared_ptr<const Encoder>& encoder) {
+  PrototypeMap map(encoder);
+  CHECK(refused([&] { map.update(map); }, "joined to itself"));
+  CHECK(refused([&] { map.update(PrototypeMap(encoder, 6)); }, "dimensions cannot be joined"));
+  CHECK(refused([&] { map.update(PrototypeMap(test::random_encoder(64, 12, 9))); },
+                "different encoders"));
+  CHECK(refused([&] { map.update(PrototypeMap(encoder, 12, 1)); }, "0 and 1 look bits"));
+}
+
+// Sections of a file as a stranger may write them.
+class File {
+ public:
+  explicit File(const fs::path& path) {
+    const MappedFile mapped(path);
+    const ContainerReader reader(mapped.bytes(), "file");
+    kind_ = reader.kind();
+    for (const auto& [name, size] : reader.sections()) {
+      const Bytes bytes = reader.read(name);
+      sections_.emplace_back(name, std::vector(bytes.begin(), bytes.end()));
+    }
+  }
+  std::vector<std::byte>& operator[](const std::string& name) {
+    for (auto& [key, bytes] : sections_) {
+      if (key == name) return bytes;
+    }
+    return sections_.emplace_back(name, std::vector<std::byte>{}).second;
+  }
+  template <typename T>
+  File&& set(const std::string& name, std::size_t at, T value) && {
+    std::memcpy(&(*this)[name].at(at), &value, sizeof(value));
+    return std::move(*this);
+  }
+  File&& resize(const std::string& name, std::size_t size) && {
+    (*this)[name].resize(size);
+    return std::move(*this);
+  }
+  File&& drop(const std::string& name) && {
+    std::erase_if(sections_, [&](const auto& s) { return s.first == name; });
+    return std::move(*this);
+  }
+  // What opening says of it, or nothing.
+  std::string error() const {
+    ContainerWriter writer(kind_, 2);
+    for (const auto& [name, bytes] : sections_) writer.add(name, Bytes(bytes));
+    const auto bytes = writer.serialize();
+    // At a multiple of 64, as a mapped file is.
+    std::vector<std::byte> room(bytes.size() + 64);
+    void* start = room.data();
+    std::size_t space = room.size();
+    std::align(64, bytes.size(), start, space);
+    std::memcpy(start, bytes.data(), bytes.size());
+    const Bytes aligned(static_cast<const std::byte*>(start), bytes.size());
+    try {
+      if (kind_ == FileKind::encoder) {
+        Encoder::parse(aligned, "file");
+      } else if (kind_ == FileKind::open_map) {
+        PrototypeMap::parse(aligned, "file");
+      } else {
+        SealedMap(aligned, "file");
+      }
+    } catch (const FileError& error) {
+      return error.what();
+    }
+    return "";
+  }
+
+ private:
+  FileKind kind_;
+  std::vector<std::pair<std::string, std::vector<std::byte>>> sections_;
+};
+
+void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& folder) {
+  const fs::path open = folder / "open", sealed = folder / "sealed", model = folder / "model";
+  PrototypeMap map(encoder, 0, 2);
+  const auto codes = codes_of(30);
+  Ids ids;
+  for (std::int64_t i = 0; i < 30; ++i) ids.push_back(10 * (i / 3));
+  map.add_codes(ids, view(codes));
+  const Position p = {1, 2, 3};
+  map.set_positions(Ids{0}, std::span(&p, 1));
+  map.save(open);
+  map.seal(sealed, 4);
+  encoder->save(model);
+  CHECK(File(open).error().empty() && File(sealed).error().empty() && File(model).error().empty());
+
+  const auto says = [](const File& file, const std::string& part) {
+    const bool found = !part.empty() && file.error().find(part) != std::string::npos;
+    if (!found) std::printf("message was: %s\n", file.error().c_str());
+    return found;
+  };
+  for (const fs::path& path : {open, sealed}) {
+    CHECK(says(File(path).set("shape", 0, std::uint64_t{1} << 32), "more landmarks than a map"));
+    CHECK(says(File(path).set("shape", 0, std::uint64_t{UINT32_MAX}), "section"));
+    CHECK(says(File(path).set("shape", 0, UINT64_MAX), "more landmarks than a map"));
+    CHECK(says(File(path).set("shape", 8, std::uint64_t{7}), "dimension does not fit"));
+    CHECK(says(File(path).set("shape", 16, kInfinity), "origin is not finite"));
+    CHECK(says(File(path).resize("shape", 39), "'shape' is shorter"));
+    CHECK(says(File(path).resize("shape", 41), "'shape' is longer"));
+    CHECK(says(File(path).set("ids", 0, std::int64_t{-1}), "negative landmark id"));
+    CHECK(says(File(path).set("ids", 8, std::int64_t{0}), "do not ascend"));
+    CHECK(says(File(path).drop("encoder"), "lacks the section 'encoder'"));
+    CHECK(says(File(path).drop("counts"), "lacks the section 'counts'"));
+    CHECK(says(File(path).resize("encoder", 10), "encoder: not a Protomark file"));
+  }
+  CHECK(says(File(open).set("lookbits", 0, std::uint32_t{13}), "13 bits, not 1 to 12"));
+  CHECK(says(File(open).set("lookbits", 0, std::uint32_t{0}), "0 bits"));
+  CHECK(says(File(open).set("rows", 0, std::uint32_t{0}), "landmark without prototypes"));
+  CHECK(says(File(open).set("rows", 0, UINT32_MAX), "more prototypes than a map can hold"));
+  CHECK(says(File(open).set("looks", 0, std::uint16_t{4}), "do not ascend"));
+  CHECK(says(File(open).set("counts", 0, std::uint8_t{0}), "impossible prototype"));
+  CHECK(says(File(open).set("sums", 0, std::int16_t{32767}), "impossible prototype"));
+  CHECK(says(File(open).set("position", 0, kNaN), "no finite position"));
+  CHECK(says(File(open).set("position", 8, kInfinity), "no finite position"));
+  CHECK(says(File(sealed).set("rows", 0, std::uint8_t{0}), "landmark without prototypes"));
+  CHECK(says(File(sealed).set("levels", 0, std::uint32_t{3}), "3 bits a number"));
+  CHECK(says(File(sealed).set("levels", 4, std::uint32_t{9}), "half-step"));
+  CHECK(says(File(sealed).set("levels", 4, std::uint32_t{0}), "half-step"));
+  CHECK(says(File(sealed).resize("protos", 64), "'protos' has the wrong size"));
+  CHECK(says(File(sealed).resize("position", 13), "'position' has the wrong size"));
+  CHECK(says(File(sealed).drop("protos"), "lacks the section 'protos'"));
+  CHECK(says(File(model).set("network", 0, -1.0f), "scale must be positive"));
+  CHECK(says(File(model).set("network", 4, std::uint32_t{257}), "too many dims"));
+  CHECK(says(File(model).set("network", 16, std::uint32_t{17}), "too many layers"));
+  CHECK(says(File(model).set("network", 20, std::uint32_t{4097}), "a layer is too wide"));
+  CHECK(says(File(model).set("info", 0, UINT32_MAX), "'info' is shorter"));
+  // A section that nobody knows is skipped.
+  CHECK(File(open).resize("later", 100).error().empty());
+  CHECK(File(sealed).resize("later", 100).error().empty());
+
+  CHECK(check::throws<FileError>([&] { map_kind(model); }, "it holds an encoder"));
+  CHECK(file_sections(model).size() == 2 && file_sections(model)[0].first == "info");
+  std::vector<std::byte> bytes(65);
+  CHECK(refused([&] { SealedMap(std::span(bytes).subspan(1), "x"); }, "multiple of 64"));
+}
+
+void test_hamming() {
+  const std::vector<std::uint8_t> rows(4 * 8);
+  const Descriptors database{rows.data(), 4, 8}, queries{rows.data(), 2, 8};
+  Ids ids(4);
+  std::vector<std::int32_t> distances(4);
+  const MatrixView<std::int64_t> found{ids.data(), 2, 2};
+  const MatrixView<std::int32_t> far{distances.data(), 2, 2};
+  CHECK(refused([&] { hamming_search({rows.data(), 2, 0}, {rows.data(), 2, 0}, {}, found, far); },
+                "1 to 4096 bytes"));
+  CHECK(refused([&] { hamming_search(queries, database, {}, {ids.data(), 2, 0}, far); },
+                "k must be at least 1"));
+  CHECK(refused([&] { hamming_search(queries, database, {}, {ids.data(), 1, 2}, far); },
+                "queries x k"));
+  HammingOptions options;
+  options.max_distance = -1;
+  CHECK(refused([&] { hamming_search(queries, database, options, found, far); }, "max_distance"));
+  const Ids three = {1, 2, 3}, negative = {1, 2, 3, -4}, repeated = {7, 7, 5, 7};
+  CHECK(refused([&] { hamming_search(queries, database, three, {}, found, far); },
+                "4 rows, landmarks has 3"));
+  CHECK(refused([&] { hamming_search(queries, database, negative, {}, found, far); }, "negative"));
+  hamming_search(queries, database, repeated, {}, found, far);
+  CHECK(ids == Ids{5, 7, 5, 7});
+  hamming_search(queries, {rows.data(), 0, 8}, {}, found, far);
+  CHECK(ids == Ids{-1, -1, -1, -1} && distances[0] == 65);
+}
+
+}  // namespace
+
+int main() {
+  const fs::path folder =
+      fs::temp_directory_path() / ("protomark_limits_" + std::to_string(::getpid()));
+  fs::create_directory(folder);
+  const auto encoder = test::random_encoder();
+  test_encoder();
+  test_ids_and_codes(encoder);
+  test_duplicates(encoder);
+  test_positions(encoder, folder / "map");
+  test_small_maps(encoder, folder);
+  test_update(encoder);
+  test_claims(encoder, folder);
+  test_hamming();
+  fs::remove_all(folder);
+  return check::result();
+}

@@ -1,0 +1,1 @@
+"""Protomark's speed, its peers' and the machine's ceilings, in one run."""

@@ -1,0 +1,128 @@
+"""FAISS: exact, graphs, inverted lists."""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any
+
+import faiss
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.bench.peers.index import Index, K, Search, doubling
+
+_TRAINED_ON = 64  # rows a cell
+
+
+def flat(rows: NDArray[np.int8], queries: NDArray[np.int8]) -> Search:
+    """IndexFlatL2, float32."""
+    index = faiss.IndexFlatL2(rows.shape[1])
+    index.add(rows.astype(np.float32))
+    return _search(index, queries.astype(np.float32))
+
+
+def binary_flat(rows: NDArray[np.uint8], queries: NDArray[np.uint8]) -> Search:
+    """IndexBinaryFlat, Hamming distance of packed bits."""
+    index = faiss.IndexBinaryFlat(8 * rows.shape[1])
+    index.add(rows)
+    return _search(index, queries)
+
+
+def hnsw(
+    rows: NDArray[np.int8], queries: NDArray[np.int8], threads: int, build_threads: int
+) -> Index:
+    """Graph over float32 rows."""
+    index = faiss.IndexHNSWFlat(rows.shape[1], 16)
+    index.hnsw.efConstruction = 64
+    _add(index, rows, build_threads, threads)
+    asked = queries.astype(np.float32)
+
+    def prepare(ef: int) -> Search:
+        index.hnsw.efSearch = ef
+        return _search(index, asked)
+
+    return Index(
+        prepare, [doubling(8, 2048)], _bytes(index), "efSearch", "M = 16, efConstruction = 64"
+    )
+
+
+def scalar_quantizer(
+    rows: NDArray[np.int8], queries: NDArray[np.int8], threads: int, build_threads: int
+) -> Index:
+    """Inverted lists of 8 bits a dimension."""
+    cells = _cells(len(rows))
+    index = faiss.IndexIVFScalarQuantizer(
+        faiss.IndexFlatL2(rows.shape[1]),
+        rows.shape[1],
+        cells,
+        faiss.ScalarQuantizer.QT_8bit,
+        faiss.METRIC_L2,
+    )
+    _add(index, rows, build_threads, threads)
+    asked = queries.astype(np.float32)
+
+    def prepare(probes: int) -> Search:
+        index.nprobe = probes
+        return _search(index, asked)
+
+    return Index(prepare, [doubling(1, cells)], _bytes(index), "probes", f"{cells:,} cells")
+
+
+def product_quantizer(
+    rows: NDArray[np.int8], queries: NDArray[np.int8], threads: int, build_threads: int
+) -> Index:
+    """Inverted lists of 4-bit product codes (fast scan), refined by 8 bits a dimension."""
+    cells, dim = _cells(len(rows)), rows.shape[1]
+    base = faiss.IndexIVFPQFastScan(faiss.IndexFlatL2(dim), dim, cells, dim // 2, 4)
+    refine = faiss.IndexScalarQuantizer(dim, faiss.ScalarQuantizer.QT_8bit, faiss.METRIC_L2)
+    index = faiss.IndexRefine(base, refine)
+    _add(index, rows, build_threads, threads)
+    asked = queries.astype(np.float32)
+
+    def prepare(setting: tuple[int, int]) -> Search:
+        base.nprobe, index.k_factor = setting
+        return _search(index, asked)
+
+    lines = [[(probes, factor) for probes in doubling(1, cells)] for factor in (4, 16, 64)]
+    note = f"{cells:,} cells, PQ{dim // 2}x4fs, refined by SQ8"
+    return Index(prepare, lines, _bytes(base) + _bytes(refine), "probes and factor", note)
+
+
+def _search(index: Any, queries: NDArray[Any]) -> Search:
+    def run(n: int) -> NDArray[np.int64]:
+        found: NDArray[np.int64] = index.search(queries[:n], K)[1][:, 0]
+        return found
+
+    return run
+
+
+def _add(index: Any, rows: NDArray[np.int8], build_threads: int, threads: int) -> None:
+    faiss.omp_set_num_threads(build_threads)
+    try:
+        if not index.is_trained:
+            step = max(len(rows) // (_TRAINED_ON * _cells(len(rows))), 1)
+            index.train(rows[::step].astype(np.float32))
+        for begin in range(0, len(rows), 1 << 20):
+            index.add(rows[begin : begin + (1 << 20)].astype(np.float32))
+    finally:
+        faiss.omp_set_num_threads(threads)
+
+
+def _cells(n: int) -> int:
+    """Four times the root, as FAISS's guide has it for up to a million rows."""
+    return max(min(int(4 * sqrt(n)), n // _TRAINED_ON), 1)
+
+
+def _bytes(index: Any) -> int:
+    writer = _Counter()
+    faiss.write_index(index, faiss.PyCallbackIOWriter(writer.write))
+    return writer.size
+
+
+class _Counter:
+    """Counts bytes instead of keeping them."""
+
+    size = 0
+
+    def write(self, data: bytes) -> None:
+        self.size += len(data)

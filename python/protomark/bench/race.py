@@ -1,0 +1,107 @@
+"""Contenders taking turns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from protomark.bench.results import Timing
+
+Advance = Callable[[str], None]
+
+
+@dataclass
+class Contender:
+    """Who takes part in a race.
+
+    Attributes:
+        name: who.
+        run: does the work for the number of units it is given, from the start of the data.
+        ours: whether it is Protomark's.
+        least: fewest units that are worth timing.
+        facts, note: as in `Timing`.
+    """
+
+    name: str
+    run: Callable[[int], object]
+    ours: bool = False
+    least: int = 1
+    facts: dict[str, float] = field(default_factory=dict)
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How much time a race may take.
+
+    Attributes:
+        rounds: how often each contender runs.
+        shortest: seconds that a turn takes at least; quick work is done several times in it.
+        longest: seconds that a turn takes at most, by doing fewer units, about.
+    """
+
+    rounds: int = 7
+    shortest: float = 0.05
+    longest: float = 2.0
+
+
+def race(
+    contenders: Sequence[Contender],
+    units: int,
+    pace: Pace,
+    advance: Advance = lambda _: None,
+) -> list[Timing]:
+    """Time contenders in turns: each runs once in every round, so that all meet the same machine.
+
+    Args:
+        contenders: who takes part.
+        units: how many units the work has; a contender that is too slow does fewer in a turn.
+        pace: rounds and time.
+        advance: called with a contender's name before each of its turns (and its warm-up).
+    """
+    plans = []
+    for contender in contenders:
+        advance(contender.name)
+        plans.append(_plan(contender, units, pace))
+    seconds: list[list[float]] = [[] for _ in contenders]
+    for _ in range(pace.rounds):
+        for contender, (count, repeats), times in zip(contenders, plans, seconds, strict=True):
+            advance(contender.name)
+            times.append(_turn(contender, count, repeats) / count)
+    return [
+        Timing(
+            contender.name,
+            contender.ours,
+            times,
+            count,
+            dict(contender.facts),
+            contender.note,
+        )
+        for contender, (count, _), times in zip(contenders, plans, seconds, strict=True)
+    ]
+
+
+def turns(contenders: int, pace: Pace) -> int:
+    """How often `race` calls `advance` for so many contenders."""
+    return contenders * (pace.rounds + 1)
+
+
+def _plan(contender: Contender, units: int, pace: Pace) -> tuple[int, int]:
+    """Units of a call, and calls in a turn, found by a warm-up."""
+    least = min(contender.least, units)
+    _turn(contender, least, 1)
+    each = _turn(contender, least, 1) / least
+    count = min(units, max(least, int(pace.longest / each))) if each > 0 else units
+    repeats = max(1, round(pace.shortest / max(each * count, 1e-9)))
+    return count, min(repeats, 1000)
+
+
+def _turn(contender: Contender, count: int, repeats: int) -> float:
+    """Seconds of one call: the quickest of `repeats`."""
+    best = float("inf")
+    for _ in range(repeats):
+        began = time.perf_counter()
+        contender.run(count)
+        best = min(best, time.perf_counter() - began)
+    return best

@@ -1,0 +1,250 @@
+"""Approximate search: every index at the fastest setting that finds enough."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import protomark as pm
+from protomark.bench import ours
+from protomark.bench.machine import lacks
+from protomark.bench.peers import installed
+from protomark.bench.peers.index import Index, Search
+from protomark.bench.progress import Bar
+from protomark.bench.race import Contender, race, turns
+from protomark.bench.results import Contest, Results
+from protomark.bench.tuning import Trial, tune
+from protomark.bench.workload import Workload
+
+GOALS = (0.95, 0.98, 0.99)
+BYTES = 1_200  # of a landmark in all indexes together, about
+
+
+@dataclass
+class _Entrant:
+    """An index to build, and how far its answers are from the queries.
+
+    Attributes:
+        name: who.
+        build: makes the index.
+        right: (q,) answers -> whether each is as near as the exact one.
+        least: fewest queries to time.
+        own: whether it is Protomark's.
+        note: beside the index's own.
+    """
+
+    name: str
+    build: Callable[[], Index]
+    right: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+    least: int = 64
+    own: bool = False
+    note: str = ""
+
+
+def run(workload: Workload, results: Results, bar: Bar) -> None:
+    """At every size: build, tune to recall@1 of 0.95, 0.98 and 0.99, then race at each."""
+    settings = workload.settings
+    bar.begin("approximate", len(settings.approximate) * (9 + len(GOALS) * turns(9, settings.pace)))
+    for n in settings.approximate:
+        reason = lacks(n * BYTES)
+        if reason:
+            results.skipped.append(f"approximate, {n:,} landmarks: {reason}")
+            continue
+        queries = workload.queries(n, settings.queries)
+        codes = workload.codes(queries)
+        scene = workload.map(n)
+        fields: dict[float, list[Contender]] = {
+            goal: [_exact(scene, codes, settings.threads)] for goal in GOALS
+        }
+        for entrant in _entrants(workload, results, n, queries, codes, scene):
+            bar.advance(f"{n:,} landmarks, {entrant.name}")
+            try:
+                tuned = _tuned(entrant, n, settings.queries, settings.tuned_on)
+            except Exception as error:  # whatever a peer raises: the others go on
+                results.skipped.append(f"{entrant.name}, {n:,} landmarks: failed ({error})")
+                continue
+            for goal, contender in tuned:
+                if contender is not None:
+                    fields[goal].append(contender)
+                else:
+                    results.skipped.append(
+                        f"{entrant.name}, {n:,} landmarks: no setting reaches a recall of {goal}"
+                    )
+        for goal, field in fields.items():
+            results.contests.append(
+                Contest(
+                    "approximate",
+                    f"recall@1 of at least {goal}, {n:,} landmarks",
+                    "query",
+                    settings.threads,
+                    n,
+                    recall=goal,
+                    timings=race(field, settings.queries, settings.pace, bar.advance),
+                )
+            )
+
+
+def _exact(scene: pm.PrototypeMap, codes: NDArray[np.int8], threads: int) -> Contender:
+    return Contender(
+        "Protomark, exact",
+        lambda q: scene.search_codes(codes[:q], k=2, threads=threads),
+        ours=True,
+        least=64,
+        facts={"recall": 1.0, "bytes": codes.shape[1] + 1},
+    )
+
+
+def _entrants(
+    workload: Workload,
+    results: Results,
+    n: int,
+    queries: NDArray[np.uint8],
+    codes: NDArray[np.int8],
+    scene: pm.PrototypeMap,
+) -> list[_Entrant]:
+    settings = workload.settings
+    threads, build_threads = settings.threads, settings.build_threads
+    rows = workload.prototypes(n)
+    exact, _ = scene.search_codes(codes, k=1, threads=build_threads)
+    near = partial(_as_near, rows, codes, _squared(rows, codes, exact[:, 0]))
+    found: list[_Entrant] = []
+
+    def enter(name: str, build: Any, graph: bool = False) -> None:
+        if graph and n > settings.graphs:
+            results.skipped.append(f"{name}, {n:,} landmarks: builds long, only with --full")
+            return
+        found.append(_Entrant(name, lambda: build(rows, codes, threads, build_threads), near))
+
+    if hasattr(scene, "build_index"):
+        build = partial(ours.cells, workload, n, codes, threads, build_threads)
+        found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
+    if installed("faiss"):
+        from protomark.bench.peers import faiss_indexes
+
+        enter("FAISS HNSW", faiss_indexes.hnsw, graph=True)
+        enter("FAISS IVF, PQ fast scan", faiss_indexes.product_quantizer)
+        enter("FAISS IVF, SQ8", faiss_indexes.scalar_quantizer)
+    if installed("hnswlib"):
+        from protomark.bench.peers import hnswlib_index
+
+        enter("hnswlib", hnswlib_index.hnsw)
+    if installed("usearch"):
+        from protomark.bench.peers import usearch_index
+
+        enter("USearch int8", usearch_index.hnsw_i8, graph=True)
+        enter("USearch float32", usearch_index.hnsw_f32, graph=True)
+    if installed("cv2"):
+        from protomark.bench.peers import opencv_matchers
+
+        enter("OpenCV FLANN kd-trees", opencv_matchers.kd_trees)
+        if n <= settings.hashed:
+            found.append(_hashed(workload, n, queries))
+        else:
+            results.skipped.append(
+                f"OpenCV FLANN LSH, {n:,} landmarks: only up to {settings.hashed:,}"
+            )
+    return found
+
+
+def _hashed(workload: Workload, n: int, queries: NDArray[np.uint8]) -> _Entrant:
+    """FLANN's LSH, on all bits, against the exact answer among bits."""
+    from protomark.bench.peers import opencv_matchers
+
+    threads, build_threads = workload.settings.threads, workload.settings.build_threads
+    rows = workload.grown.descriptors(n)
+    _, distances = pm.hamming_search(queries, rows, k=1, threads=build_threads)
+    return _Entrant(
+        "OpenCV FLANN LSH on bits",
+        lambda: opencv_matchers.lsh(rows, queries, threads, build_threads),
+        partial(_as_near_in_bits, rows, queries, distances[:, 0]),
+        least=16,
+        note="all descriptors, against the nearest of them; ",
+    )
+
+
+def _tuned(
+    entrant: _Entrant, n: int, queries: int, seconds: float
+) -> list[tuple[float, Contender | None]]:
+    """Build it, and find its setting for each goal."""
+    began = time.perf_counter()
+    index = entrant.build()
+    built = time.perf_counter() - began
+    trials = tune(
+        index.lines,
+        lambda setting: _trial(index.prepare(setting), entrant, queries, seconds),
+        GOALS,
+    )
+    return [(goal, _contender(entrant, index, trials[goal], n, built)) for goal in GOALS]
+
+
+def _contender(
+    entrant: _Entrant, index: Index, trial: Trial[Any] | None, n: int, built: float
+) -> Contender | None:
+    if trial is None:
+        return None
+    facts = {"recall": trial.recall, "bytes": index.bytes / n, "build": built}
+    if index.more is not None:
+        facts["more"] = index.more
+    return Contender(
+        entrant.name,
+        # Prepared anew at each call: an index has one setting at a time, and serves every goal.
+        lambda q: index.prepare(trial.setting)(q),
+        ours=entrant.own,
+        least=entrant.least,
+        facts=facts,
+        note=f"{entrant.note}{index.note}; {index.setting} {trial.setting}",
+    )
+
+
+def _trial(search: Search, entrant: _Entrant, queries: int, seconds: float) -> tuple[float, float]:
+    """Recall and seconds of a query, over as many queries as the time allows."""
+    few = min(entrant.least, queries)
+    began = time.perf_counter()
+    search(few)
+    each = (time.perf_counter() - began) / few
+    count = min(queries, max(few, int(seconds / each)))
+    began = time.perf_counter()
+    answers = search(count)
+    each = (time.perf_counter() - began) / count
+    return float(entrant.right(answers).mean()), each
+
+
+def _squared(
+    rows: NDArray[np.int8], codes: NDArray[np.int8], answers: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Squared distance of each query to its answer."""
+    difference = rows[answers].astype(np.int64) - codes[: len(answers)]
+    result: NDArray[np.int64] = (difference * difference).sum(axis=1)
+    return result
+
+
+def _as_near(
+    rows: NDArray[np.int8],
+    codes: NDArray[np.int8],
+    exact: NDArray[np.int64],
+    answers: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    known = _known(rows, answers)
+    return known & (_squared(rows, codes, np.where(known, answers, 0)) <= exact[: len(answers)])
+
+
+def _as_near_in_bits(
+    rows: NDArray[np.uint8],
+    queries: NDArray[np.uint8],
+    exact: NDArray[np.int32],
+    answers: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    known = _known(rows, answers)
+    different = np.unpackbits(rows[np.where(known, answers, 0)] ^ queries[: len(answers)], axis=1)
+    return known & (different.sum(axis=1) <= exact[: len(answers)])
+
+
+def _known(rows: NDArray[np.generic], answers: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which answers are rows: peers say in several ways that they found nothing."""
+    return (answers >= 0) & (answers < len(rows))

@@ -1,0 +1,99 @@
+"""Time and memory as a map grows."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.bench.grown import map_of
+from protomark.bench.machine import allocated_bytes, lacks
+from protomark.bench.peers.index import K
+from protomark.bench.progress import Bar
+from protomark.bench.race import Contender, race
+from protomark.bench.results import Results
+from protomark.bench.settings import Settings
+from protomark.bench.workload import Workload
+
+RECALL = 0.98
+OPEN_BYTES = 200  # of a landmark of an open map with its index, at most, about
+
+
+def run(workload: Workload, results: Results, bar: Bar) -> None:
+    """Open maps of every size, searched exactly and approximately."""
+    settings = workload.settings
+    bar.begin("growth", 3 * len(settings.growth))
+    for n in settings.growth:
+        reason = lacks(n * OPEN_BYTES)
+        if reason:
+            results.skipped.append(f"growth, {n:,} landmarks: {reason}")
+            continue
+        bar.advance(f"{n:,} landmarks")
+        codes = workload.codes(workload.queries(n, settings.queries))
+        rows = workload.prototypes(n)
+        before = allocated_bytes()
+        scene: Any = map_of(workload.encoder, rows)
+        scene.search_codes(codes[:1], k=K)
+        used = _since(before)
+
+        bar.advance(f"{n:,} landmarks, exact")
+        results.growth.append(
+            _point(
+                n,
+                "exact",
+                _seconds(scene, codes, settings),
+                used,
+                recall=1.0,
+                threads=settings.threads,
+            )
+        )
+        if not hasattr(scene, "build_index"):
+            continue
+        bar.advance(f"{n:,} landmarks, approximate")
+        exact = scene.search_codes(codes, k=1, threads=settings.build_threads)[1]
+        began = time.perf_counter()
+        scene.build_index(threads=settings.build_threads)
+        built = time.perf_counter() - began
+        found = scene.search_codes(codes, k=1, threads=settings.build_threads, recall=RECALL)[1]
+        recall = _recall(found, exact)
+        results.growth.append(
+            _point(
+                n,
+                "approximate",
+                _seconds(scene, codes, settings, recall=RECALL),
+                _since(before),
+                recall=recall,
+                build=built,
+                threads=settings.threads,
+            )
+        )
+
+
+def _seconds(scene: Any, codes: NDArray[np.int8], settings: Settings, **how: float) -> float:
+    """Of a query, by search in this way."""
+
+    def search(q: int) -> None:
+        scene.search_codes(codes[:q], k=K, threads=settings.threads, **how)
+
+    entrant = Contender("search", search, least=64)
+    return race([entrant], settings.queries, replace(settings.pace, rounds=3))[0].median
+
+
+def _point(
+    n: int, method: str, seconds: float, memory: int | None, **facts: float
+) -> dict[str, Any]:
+    """Memory is of the open map: what the process has allocated since, in bytes a landmark."""
+    each = None if memory is None else memory / n
+    return {"landmarks": n, "method": method, "seconds": seconds, "bytes": each, **facts}
+
+
+def _since(before: int | None) -> int | None:
+    now = allocated_bytes()
+    return None if before is None or now is None else max(now - before, 0)
+
+
+def _recall(found: NDArray[np.float32], exact: NDArray[np.float32]) -> float:
+    return float((found[:, 0] <= exact[:, 0]).mean())

@@ -1,0 +1,101 @@
+"""What a bench is asked to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from protomark.bench.race import Pace
+
+SECTIONS = ("encode", "search", "hamming", "approximate", "frame", "add", "growth", "large")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Sizes and time.
+
+    Attributes:
+        sections: what to measure.
+        threads: of every contender, where a section does not say otherwise.
+        build_threads: to build indexes and data with, which is not compared.
+        dim: length of a code.
+        pace: of races.
+        encoded: descriptors of a whole set.
+        queries: of every search.
+        tuned_on: seconds that a trial of a setting may take.
+        exact: landmarks of exact searches.
+        approximate: landmarks of approximate searches.
+        hashed: most landmarks whose bits go into FLANN's LSH.
+        graphs: most landmarks for which every graph is built; beyond it only one.
+        map: landmarks of the map of the sections frame and add.
+        growth: landmarks of the maps along the curve.
+        large: landmarks of the largest map, 0 for none.
+        scratch: folder for maps that are sealed and thrown away.
+    """
+
+    sections: tuple[str, ...] = SECTIONS
+    threads: int = 1
+    build_threads: int = 1
+    dim: int = 32
+    pace: Pace = field(default_factory=Pace)
+    encoded: int = 20_000
+    queries: int = 1_000
+    tuned_on: float = 3.0
+    exact: tuple[int, ...] = (10_000, 100_000, 1_000_000)
+    approximate: tuple[int, ...] = (100_000, 1_000_000)
+    hashed: int = 100_000
+    graphs: int = 100_000
+    map: int = 1_000_000
+    growth: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+    large: int = 0
+    scratch: Path = Path()
+
+
+def choose(
+    *,
+    sections: tuple[str, ...],
+    threads: int,
+    build_threads: int,
+    full: bool,
+    quick: bool,
+    scratch: Path,
+) -> Settings:
+    """The settings of `--full`, of `--quick` (a few seconds, for tests), or of neither.
+
+    Raises:
+        ValueError: a section is unknown, or both are asked for.
+    """
+    unknown = [name for name in sections if name not in SECTIONS]
+    if unknown:
+        raise ValueError(f"--only {unknown[0]}: no such section ({', '.join(SECTIONS)})")
+    if full and quick:
+        raise ValueError("give --full or --quick, not both")
+    default = Settings(
+        sections=sections or SECTIONS,
+        threads=threads,
+        build_threads=build_threads,
+        scratch=scratch,
+    )
+    if quick:
+        return replace(
+            default,
+            pace=Pace(rounds=3, shortest=0, longest=0.05),
+            encoded=2_000,
+            queries=100,
+            tuned_on=0.2,
+            exact=(1_000, 3_000),
+            approximate=(3_000,),
+            map=3_000,
+            growth=(1_000, 3_000),
+            large=3_000,
+        )
+    if full:
+        return replace(
+            default,
+            approximate=(100_000, 1_000_000, 10_000_000),
+            hashed=1_000_000,
+            graphs=1_000_000,
+            growth=(*default.growth, 3_000_000, 10_000_000),
+            large=100_000_000,
+        )
+    return default

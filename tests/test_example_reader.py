@@ -1,0 +1,83 @@
+"""The reader that docs/format.md alone is enough for, against the core."""
+
+from __future__ import annotations
+
+import runpy
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import protomark as pm
+from conftest import random_descriptors, rounded
+
+READER: dict[str, Any] = runpy.run_path(
+    str(Path(__file__).parents[1] / "examples" / "02_read_map_without_protomark.py")
+)
+
+
+def scene(encoder: pm.Encoder, dim: int, look_bits: int, step: int) -> pm.PrototypeMap:
+    scene = pm.PrototypeMap(encoder, dim=dim, look_bits=look_bits)
+    ids = np.random.default_rng(0).integers(0, 100, 600) * step
+    scene.add(ids, random_descriptors(600))
+    some = scene.ids[::2]
+    scene.set_positions(some, np.random.default_rng(1).normal(5e5, 10, (len(some), 3)))
+    return scene
+
+
+def test_the_same_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
+    encoder.save(tmp_path / "x.pme")
+    read = READER["Encoder"]((tmp_path / "x.pme").read_bytes())
+    descriptors = random_descriptors(200)
+    assert read.dims == encoder.dims
+    for dim in encoder.dims:
+        np.testing.assert_array_equal(
+            read.encode(descriptors, dim), encoder.encode(descriptors, dim)
+        )
+
+
+@pytest.mark.parametrize("look_bits", [0, 4])
+@pytest.mark.parametrize("dim", [5, 12])
+@pytest.mark.parametrize("kind", ["open", "sealed", "4 bits", "joined"])
+def test_the_same_answers(
+    kind: str, dim: int, look_bits: int, encoder: pm.Encoder, tmp_path: Path
+) -> None:
+    built = scene(encoder, dim, look_bits, step=7 if dim == 5 else 1)
+    path = tmp_path / "map.pmk"
+    {
+        "open": built.save,
+        "sealed": built.seal,
+        "4 bits": partial(built.seal, bits=4),
+        "joined": partial(built.seal, prototypes=1.5),
+    }[kind](path)
+    ours, theirs = pm.open(path), READER["Map"](path.read_bytes())
+    ids = ours.ids
+    np.testing.assert_array_equal(theirs.ids, ids)
+    np.testing.assert_array_equal(theirs.positions, ours.positions(ids))
+    assert len(theirs.prototypes) == ours.prototype_count
+    for landmark in ids[:20]:
+        np.testing.assert_array_equal(
+            theirs.prototypes[theirs.landmarks == landmark], rounded(ours.looks(landmark))
+        )
+    observations = np.minimum(ours.counts(ids), 255)
+    if kind == "open":
+        counts = [theirs.counts[theirs.landmarks == i].sum() for i in ids]
+        np.testing.assert_array_equal(counts, observations)
+    else:
+        np.testing.assert_array_equal(theirs.counts, observations)
+    queries = random_descriptors(300, seed=9)
+    for a, b in zip(theirs.search(queries), ours.search(queries, k=1), strict=True):
+        np.testing.assert_array_equal(a, b[:, 0])
+
+
+def test_broken_files_are_refused(encoder: pm.Encoder, tmp_path: Path) -> None:
+    scene(encoder, 12, 0, 1).save(tmp_path / "map.pmk")
+    data = (tmp_path / "map.pmk").read_bytes()
+    last = len(data.rstrip(b"\0")) - 1
+    for broken in (b"", b"PK\x03\x04" * 50, data[:-64], data[:40] + b"x" + data[41:]):
+        with pytest.raises(ValueError, match=r"not a Protomark file|cut off|checksum"):
+            READER["Map"](broken)
+    with pytest.raises(ValueError, match="checksum"):
+        READER["Map"](data[:last] + bytes([data[last] ^ 1]) + data[last + 1 :])

@@ -1,0 +1,80 @@
+"""Thousands of broken model and map files: refused by name, or read without harm."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import protomark as pm
+from conftest import random_descriptors
+from mutation import SEED, bounded, mutated_container
+
+FILES = 1500
+
+
+def scene(encoder: pm.Encoder, look_bits: int) -> pm.PrototypeMap:
+    scene = pm.PrototypeMap(encoder, look_bits=look_bits)
+    scene.add(np.random.default_rng(0).integers(0, 30, 120) * 7, random_descriptors(120))
+    scene.set_positions(scene.ids[::2], np.ones((len(scene.ids[::2]), 3)))
+    return scene
+
+
+def read_map(path: Path) -> None:
+    read = pm.open(path)
+    ids = read.ids
+    assert len(ids) == len(read)
+    found, distances = read.search(random_descriptors(3, read.encoder.bits))
+    assert np.isin(found[found >= 0], ids).all()
+    assert found.shape == distances.shape
+    read.counts(ids)
+    read.prototype(ids)
+    positions = read.positions(ids)
+    assert not np.isinf(positions).any()
+    for landmark in ids[:5]:
+        read.looks(landmark)
+
+
+def read_model(path: Path) -> None:
+    encoder = pm.Encoder.load(path)
+    codes = encoder.encode(random_descriptors(3, encoder.bits))
+    assert codes.min() >= -127
+
+
+@pytest.mark.parametrize(
+    "kind", ["model", "open", "open with looks", "sealed", "sealed, 4 bits, several prototypes"]
+)
+def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
+    print(f"PROTOMARK_SEED={SEED}")
+    rng = np.random.default_rng(SEED)
+    path = tmp_path / "file"
+    {
+        "model": encoder.save,
+        "open": scene(encoder, 0).save,
+        "open with looks": scene(encoder, 3).save,
+        "sealed": scene(encoder, 0).seal,
+        "sealed, 4 bits, several prototypes": partial(scene(encoder, 3).seal, bits=4),
+    }[kind](path)
+    whole = path.read_bytes()
+    read = read_model if kind == "model" else read_map
+    read(path)
+    refused = 0
+    with bounded():
+        for _ in range(FILES):
+            path.unlink()  # never in place: another map may have it mapped
+            path.write_bytes(mutated_container(whole, rng))
+            unnamed = False
+            try:
+                read(path)
+            except pm.FileError as error:
+                unnamed = not str(error).startswith(f"{path}: ")
+                refused += 1
+            assert not unnamed
+            for check in (pm.verify_file, pm.file_sections):
+                with suppress(pm.FileError):
+                    check(path)
+    print(f"{refused} of {FILES} refused")
+    assert FILES / 4 < refused < FILES

@@ -1,0 +1,276 @@
+"""Kill savers, limit files and fill disks: what was saved is there, old or new, whole.
+
+    python tests/torture/run.py --kills 600
+
+A child process saves three states of a file in turn and says when each save has returned. It is
+killed (SIGKILL) at a random moment, and the file must then hold the state that was saved last or
+the one after it, byte for byte. Killing a process does not lose what the system has already taken
+over; that everything is synced before it is renamed is tested in core/tests/test_durability.cpp.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+import protomark as pm
+from protomark import sample
+from protomark.tracks import Tracks
+
+Save = Callable[[Path], object]
+LEFT_BEHIND = re.compile(r"target\.\d+|\.target\.[0-9a-f]{8}")
+
+
+@dataclass
+class Case:
+    """Three states of one kind of file, and how each is saved."""
+
+    name: str
+    saves: list[Save]
+    tracks: bool = False
+    contents: list[bytes] = field(default_factory=list)
+    seconds: float = 0
+
+    def holds(self, path: Path, state: int) -> bool:
+        """Whether a file is whole and of this state."""
+        if self.tracks:  # safetensors writes its metadata in any order
+            return Tracks.load(path).info["state"] == state
+        pm.verify_file(path)
+        return path.read_bytes() == self.contents[state]
+
+    def prepare(self, folder: Path) -> None:
+        begin = time.monotonic()
+        for save in self.saves:
+            save(folder / "target")
+            self.contents.append((folder / "target").read_bytes())
+        self.seconds = (time.monotonic() - begin) / len(self.saves)
+        (folder / "target").unlink()
+        assert len(set(self.contents)) == len(self.contents)
+
+
+def scene(landmarks: int, look_bits: int, rng: np.random.Generator) -> pm.PrototypeMap:
+    encoder = pm.Encoder.load("freak")
+    result = pm.PrototypeMap(encoder, dim=16, look_bits=look_bits)
+    for begin in range(0, landmarks, 1 << 20):
+        ids = 3 * np.arange(begin, min(landmarks, begin + (1 << 20)))
+        for _ in range(2):
+            codes = rng.integers(-127, 128, (len(ids), 16), dtype=np.int8)
+            result.add_codes(ids, codes)
+    some = result.ids[::2]
+    result.set_positions(some, rng.normal(0, 100, (len(some), 3)))
+    return result
+
+
+def cases(large: int, seed: int) -> list[Case]:
+    rng = np.random.default_rng(seed)
+    if large:
+        maps = [scene(large + i, 0, rng) for i in range(3)]
+        return [
+            Case(f"open map, {large} landmarks", [m.save for m in maps]),
+            Case(f"sealed map, {large} landmarks", [partial(m.seal, bits=4) for m in maps]),
+        ]
+    small = [scene(100 + i, 0, rng) for i in range(3)]
+    middle = [scene(20_000 + i, 4, rng) for i in range(3)]
+    tracks = sample.load()
+    described = [replace(tracks, info={"state": i}) for i in range(3)]
+    encoders = [pm.Encoder.load(name) for name in ("freak", "orb", "brisk")]
+    return [
+        Case("open map, 100 landmarks", [m.save for m in small]),
+        Case("open map, 20,000 landmarks with looks", [m.save for m in middle]),
+        Case("sealed map, 100 landmarks", [m.seal for m in small]),
+        Case(
+            "sealed map, 20,000 landmarks, 4 bits, looks joined",
+            [partial(m.seal, bits=4, prototypes=1.5) for m in middle],
+        ),
+        Case("encoder", [e.save for e in encoders]),
+        Case("tracks", [t.save for t in described], tracks=True),
+    ]
+
+
+def left_behind(folder: Path) -> list[Path]:
+    """Files beside the target; only those that a killed save may leave."""
+    found = [p for p in folder.iterdir() if p.name != "target"]
+    for path in found:
+        assert LEFT_BEHIND.fullmatch(path.name), f"{path} was left behind"
+    return found
+
+
+def kill_once(case: Case, folder: Path, delay: float) -> str:
+    """Kill a saver after `delay` seconds; whether the old or the new state is there."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            for save in case.saves * 1000:
+                save(folder / "target")
+                os.write(writing, b".")
+        finally:
+            os._exit(1)
+    os.close(writing)
+    time.sleep(delay)
+    os.kill(child, signal.SIGKILL)
+    status = os.waitpid(child, 0)[1]
+    assert os.WIFSIGNALED(status), "the saver ended by itself"
+    saved = 0
+    while block := os.read(reading, 1 << 16):
+        saved += len(block)
+    os.close(reading)
+    target = folder / "target"
+    if not target.exists():
+        assert saved == 0, "a saved file is gone"
+        return "old"
+    if saved > 0 and case.holds(target, (saved - 1) % len(case.saves)):
+        return "old"
+    assert case.holds(target, saved % len(case.saves)), "neither the old nor the new file"
+    return "new"
+
+
+def kills(case: Case, folder: Path, n: int, rng: random.Random) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for _ in range(n):
+        counts[kill_once(case, folder, rng.uniform(0, 2.5 * case.seconds))] += 1
+        counts["within a save"] += bool(left_behind(folder))
+        for path in folder.iterdir():
+            path.unlink()
+    return counts
+
+
+def refused(case: Case, folder: Path, prepare: Callable[[], object], cause: str) -> bool:
+    """Save over state 0 under a limit; True where the limit was met and all was as it must be.
+
+    The child has the limit, so that this process keeps its own.
+    """
+    target = folder / "target"
+    child = os.fork()
+    if child == 0:
+        code = 3
+        try:
+            prepare()
+            case.saves[1](target)
+            code = 2
+        except OSError as error:
+            code = 0 if cause in str(error) else 1
+            if code:
+                os.write(2, f"{error}\n".encode())
+        finally:
+            os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in (0, 2), f"the saver ended with {code}"
+    assert not left_behind(folder), "a failed save left a file behind"
+    assert case.holds(target, 0 if code == 0 else 1), "neither the old nor the new file"
+    return code == 0
+
+
+def limit_file_size(size: int) -> None:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+
+def file_limits(case: Case, folder: Path, n: int, rng: random.Random) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    case.saves[0](folder / "target")
+    for _ in range(n):
+        size = rng.randrange(len(case.contents[1]))
+        met = refused(case, folder, partial(limit_file_size, size), "File too large")
+        assert met, f"{size} bytes were enough"
+        counts["old"] += 1
+    return counts
+
+
+@contextmanager
+def small_disk(size: int) -> Iterator[Path | None]:
+    """A disk in memory of `size` bytes, or None where this process may not make one."""
+    folder = Path(tempfile.mkdtemp(prefix="protomark_disk_"))
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    mounted = subprocess.run(mount, capture_output=True).returncode == 0
+    try:
+        yield folder if mounted else None
+    finally:
+        if mounted:
+            subprocess.run(["umount", str(folder)], check=True)
+        folder.rmdir()
+
+
+def full_disks(case: Case, n: int, rng: random.Random) -> Counter[str] | None:
+    counts: Counter[str] = Counter()
+    size = len(case.contents[0]) + len(case.contents[1]) + (1 << 20)
+    with small_disk(size) as folder:
+        if folder is None:
+            return None
+        scratch = folder / "scene"
+        scratch.mkdir()
+        for _ in range(n):
+            case.saves[0](scratch / "target")
+            left = rng.randrange(len(case.contents[1]))
+            with (folder / "ballast").open("wb") as ballast:
+                os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(folder).free - left)
+            met = refused(case, scratch, lambda: None, "No space left on device")
+            counts["old" if met else "fitted"] += 1
+            (folder / "ballast").unlink()
+    return counts
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=600, help="over all kinds of files")
+    parser.add_argument("--limits", type=int, default=300, help="file size limits, over all")
+    parser.add_argument("--full", type=int, default=300, help="full disks, over all")
+    parser.add_argument("--large", type=int, default=0, help="one map of so many landmarks only")
+    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--folder", type=Path, help="where to save; default: the system's")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    seed = args.seed if args.seed is not None else random.SystemRandom().randrange(2**32)
+    print(f"seed {seed}")
+    rng = random.Random(seed)
+    results: dict[str, dict[str, dict[str, int] | None]] = {}
+    all_cases = cases(args.large, seed)
+    for i, case in enumerate(all_cases):
+
+        def share(total: int, i: int = i) -> int:
+            return total * (i + 1) // len(all_cases) - total * i // len(all_cases)
+
+        with tempfile.TemporaryDirectory(prefix="protomark_torture_", dir=args.folder) as name:
+            folder = Path(name)
+            case.prepare(folder)
+            killed = kills(case, folder, share(args.kills), rng)
+            limited = file_limits(case, folder, share(args.limits), rng)
+        full = full_disks(case, share(args.full), rng)
+        results[case.name] = {"kills": killed, "file size limits": limited, "full disks": full}
+        print(
+            f"{case.name} ({len(case.contents[0]):,} bytes, {1000 * case.seconds:.0f} ms a save): "
+            f"{killed['old'] + killed['new']} kills, {killed['within a save']} of them within a "
+            f"save, {killed['old']} old, {killed['new']} new; "
+            f"{limited['old']} file size limits: all old; "
+            + (
+                "full disks: not run, no right to mount a tmpfs"
+                if full is None
+                else f"{full['old']} full disks: all old, {full['fitted']} had room: new"
+            ),
+            flush=True,
+        )
+        case.contents.clear()
+    print(f"{args.kills} kills: every file old or new, whole")
+    if args.json:
+        args.json.write_text(json.dumps({"seed": seed, "cases": results}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
