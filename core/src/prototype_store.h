@@ -3,7 +3,10 @@
 
 #include <cstddef>
 #include <cstdint>
+<<<<<<< HEAD
 #include <cstdlib>
+=======
+>>>>>>> cells
 #include <mutex>
 #include <span>
 #include <vector>
