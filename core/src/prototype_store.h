@@ -3,10 +3,6 @@
 
 #include <cstddef>
 #include <cstdint>
-<<<<<<< HEAD
-#include <cstdlib>
-=======
->>>>>>> cells
 #include <mutex>
 #include <span>
 #include <vector>
