@@ -423,7 +423,8 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(File(model).set("info", 0, UINT32_MAX), "'info' is shorter"));
   for (const float x : {INFINITY, NAN}) {
     File(sealed).set("position", 4, x).with_bytes([](Bytes bytes) {
-      for (const double y : SealedMap(bytes, "file").positions(Ids{0})[0]) CHECK(std::isnan(y));
+      const Position read = SealedMap(bytes, "file").positions(Ids{0})[0];
+      CHECK(std::isnan(read[0]) && std::isnan(read[1]) && std::isnan(read[2]));
     });
   }
   // A section that nobody knows is skipped.
