@@ -8,7 +8,7 @@ JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-python test-cpp test-arm sanitize coverage fuzz torture check format clean
+.PHONY: help demo test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads coverage fuzz torture check format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make test      run the tests (C++ and Python)"

@@ -331,26 +331,31 @@ class File {
     std::erase_if(sections_, [&](const auto& s) { return s.first == name; });
     return std::move(*this);
   }
-  // What opening says of it, or nothing.
-  std::string error() const {
+  // Calls f with its bytes, at a multiple of 64 as a mapped file's are.
+  template <typename F>
+  void with_bytes(const F& f) const {
     ContainerWriter writer(kind_, 2);
     for (const auto& [name, bytes] : sections_) writer.add(name, Bytes(bytes));
     const auto bytes = writer.serialize();
-    // At a multiple of 64, as a mapped file is.
     std::vector<std::byte> room(bytes.size() + 64);
     void* start = room.data();
     std::size_t space = room.size();
     std::align(64, bytes.size(), start, space);
     std::memcpy(start, bytes.data(), bytes.size());
-    const Bytes aligned(static_cast<const std::byte*>(start), bytes.size());
+    f(Bytes(static_cast<const std::byte*>(start), bytes.size()));
+  }
+  // What opening says of it, or nothing.
+  std::string error() const {
     try {
-      if (kind_ == FileKind::encoder) {
-        Encoder::parse(aligned, "file");
-      } else if (kind_ == FileKind::open_map) {
-        PrototypeMap::parse(aligned, "file");
-      } else {
-        SealedMap(aligned, "file");
-      }
+      with_bytes([&](Bytes bytes) {
+        if (kind_ == FileKind::encoder) {
+          Encoder::parse(bytes, "file");
+        } else if (kind_ == FileKind::open_map) {
+          PrototypeMap::parse(bytes, "file");
+        } else {
+          SealedMap(bytes, "file");
+        }
+      });
     } catch (const FileError& error) {
       return error.what();
     }
@@ -416,6 +421,12 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(File(model).set("network", 16, std::uint32_t{17}), "too many layers"));
   CHECK(says(File(model).set("network", 20, std::uint32_t{4097}), "a layer is too wide"));
   CHECK(says(File(model).set("info", 0, UINT32_MAX), "'info' is shorter"));
+  for (const float x : {INFINITY, NAN}) {
+    File(sealed).set("position", 4, x).with_bytes([](Bytes bytes) {
+      const Position read = SealedMap(bytes, "file").positions(Ids{0})[0];
+      CHECK(std::isnan(read[0]) && std::isnan(read[1]) && std::isnan(read[2]));
+    });
+  }
   // A section that nobody knows is skipped.
   CHECK(File(open).resize("later", 100).error().empty());
   CHECK(File(sealed).resize("later", 100).error().empty());
