@@ -11,12 +11,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   try {
     const SealedMap map(input.bytes(), "input");
     EXPECT(map.prototype_count() >= map.size());
-    // With 8 bits nobody has checked that padding is zero, which counts, and that codes are -127 to
-    // 127, so kernels may differ.
-    bool exact = map.code_bits() == 4 || map.dim() % 4 == 0;
-    for (const std::int64_t id : map.ids()) {
-      for (const auto& look : map.looks(id)) exact &= std::ranges::count(look, -128.0f) == 0;
-    }
+    // With 8 bits nobody has checked that padding is zero, which counts.
+    const bool exact = map.code_bits() == 4 || map.dim() % 4 == 0;
     fuzz::search_map(map, [&](std::int64_t id) { return map.looks(id); }, exact);
     const auto ids = fuzz::first_ids(map.ids());
     std::vector<float> means(ids.size() * map.dim());

@@ -27,8 +27,8 @@ class Cells {
   Cells(std::vector<std::int8_t> centroids, std::size_t dim);
   // As many cells by Lloyd's k-means, in integers; at most as many as codes.
   static Cells learn(Codes codes, std::size_t cells, int threads);
-  // Where the caller names no number: cells for that many prototypes, few enough that the index of a
-  // sealed map takes at most 4 bytes for each of them.
+  // Where the caller names no number: cells for that many prototypes, few enough that the index of
+  // a sealed map takes at most 4 bytes for each of them.
   static std::size_t number_for(std::size_t prototypes, std::size_t dim);
   // Prototypes that suffice to learn as many cells.
   static std::size_t sample_for(std::size_t cells) { return 48 * cells; }

@@ -5,6 +5,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "large_vector.h"
+
 namespace protomark {
 
 // Open addressing with linear probing, at most two thirds full, no tombstones.
@@ -13,7 +15,7 @@ class IdIndex {
   static constexpr std::uint32_t kNone = UINT32_MAX;
 
   // The row of `id`, or kNone. `ids` is the array that rows point into.
-  std::uint32_t find(const std::vector<std::int64_t>& ids, std::int64_t id) const {
+  std::uint32_t find(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
     if (slots_.empty()) return kNone;
     for (std::size_t s = home(id);; s = next(s)) {
       if (slots_[s] == kNone || ids[slots_[s]] == id) return slots_[s];
@@ -24,21 +26,21 @@ class IdIndex {
   void prefetch_slot(std::int64_t id) const {
     if (!slots_.empty()) __builtin_prefetch(&slots_[home(id)]);
   }
-  void prefetch_id(const std::vector<std::int64_t>& ids, std::int64_t id) const {
+  void prefetch_id(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
     if (slots_.empty()) return;
     const std::uint32_t row = slots_[home(id)];
     if (row != kNone) __builtin_prefetch(&ids[row]);
   }
 
   // Takes a row whose id is not there yet.
-  void insert(const std::vector<std::int64_t>& ids, std::uint32_t row) {
+  void insert(const LargeVector<std::int64_t>& ids, std::uint32_t row) {
     if (3 * (used_ + 1) > 2 * slots_.size()) grow(ids);
     place(ids, row);
     ++used_;
   }
 
   // Changes the row of an id that is there.
-  void move(const std::vector<std::int64_t>& ids, std::int64_t id, std::uint32_t to) {
+  void move(const LargeVector<std::int64_t>& ids, std::int64_t id, std::uint32_t to) {
     slots_[slot_of(ids, id)] = to;
   }
 
@@ -50,7 +52,7 @@ class IdIndex {
   }
 
   // Removes an id that is there; `ids` must still hold it.
-  void erase(const std::vector<std::int64_t>& ids, std::int64_t id) {
+  void erase(const LargeVector<std::int64_t>& ids, std::int64_t id) {
     std::size_t hole = slot_of(ids, id);
     // Close the gap: whatever follows without a break and may stand in the hole moves back.
     for (std::size_t s = next(hole); slots_[s] != kNone; s = next(s)) {
@@ -76,27 +78,27 @@ class IdIndex {
     return static_cast<std::size_t>(x ^ (x >> 31)) & mask();
   }
 
-  std::size_t slot_of(const std::vector<std::int64_t>& ids, std::int64_t id) const {
+  std::size_t slot_of(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
     std::size_t s = home(id);
     while (ids[slots_[s]] != id) s = next(s);
     return s;
   }
 
-  void place(const std::vector<std::int64_t>& ids, std::uint32_t row) {
+  void place(const LargeVector<std::int64_t>& ids, std::uint32_t row) {
     std::size_t s = home(ids[row]);
     while (slots_[s] != kNone) s = next(s);
     slots_[s] = row;
   }
 
-  void grow(const std::vector<std::int64_t>& ids) {
-    const std::vector<std::uint32_t> old = std::move(slots_);
+  void grow(const LargeVector<std::int64_t>& ids) {
+    const LargeVector<std::uint32_t> old = std::move(slots_);
     slots_.assign(old.empty() ? 16 : 2 * old.size(), kNone);
     for (const std::uint32_t row : old) {
       if (row != kNone) place(ids, row);
     }
   }
 
-  std::vector<std::uint32_t> slots_;
+  LargeVector<std::uint32_t> slots_;
   std::size_t used_ = 0;
 };
 

@@ -56,9 +56,9 @@ ProbeRanks measure_ranks(
 
 std::size_t probes_for(const ProbeRanks& ranks, double recall, std::size_t cells) {
   if (recall >= 1 || ranks.empty()) return cells;
-  // A share of n test queries is uncertain by so much: one standard error.
+  // A share of n test queries is uncertain: two standard errors on top.
   const auto n = static_cast<double>(ranks.size());
-  const double enough = n * recall + std::sqrt(n * recall * (1 - recall));
+  const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
   if (enough > n) return cells;
   return ranks[static_cast<std::size_t>(std::ceil(enough)) - 1];
 }

@@ -441,11 +441,12 @@ void PrototypeStore::set_cells(Cells cells, int threads) {
 namespace {
 
 // Elements of `size` values go from one place to another one.
-template <typename T>
-void move_elements(std::vector<T>& v, std::size_t size, const std::vector<std::uint32_t>& from,
-                   const std::vector<std::uint32_t>& to, std::size_t places, const T& padding) {
+template <typename Vector>
+void move_elements(Vector& v, std::size_t size, const std::vector<std::uint32_t>& from,
+                   const std::vector<std::uint32_t>& to, std::size_t places,
+                   const typename Vector::value_type& padding) {
   if (v.empty()) return;
-  std::vector<T> moved(places * size, padding);
+  Vector moved(places * size, padding);
   for (std::size_t i = 0; i < from.size(); ++i) {
     std::copy_n(&v[from[i] * size], size, &moved[to[i] * size]);
   }
@@ -465,7 +466,7 @@ void PrototypeStore::rearrange(const std::vector<std::uint32_t>& rows,
   for (std::uint32_t c = 0; c < cells; ++c) {
     for (std::size_t i = 0; i < order.rows[c]; ++i) blocks.append(c);
   }
-  std::vector<CodeVector> packed(packed_size(end, dim_) / sizeof(CodeVector));
+  LargeVector<CodeVector> packed(packed_size(end, dim_) / sizeof(CodeVector));
   auto* codes = reinterpret_cast<std::int8_t*>(packed.data());
   for (std::size_t i = 0; i < rows.size(); ++i) {
     for (std::size_t d = 0; d < dim_; d += 4) {

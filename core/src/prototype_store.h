@@ -11,6 +11,7 @@
 #include "cells.h"
 #include "fair_shared_mutex.h"
 #include "id_index.h"
+#include "large_vector.h"
 #include "probe_ranks.h"
 #include "protomark/prototypes.h"
 
@@ -33,7 +34,7 @@ class PrototypeStore {
   std::size_t landmarks() const { return look_bits_ == 0 ? rows_ : ids_.size(); }
   std::size_t rows() const { return rows_; }
   // Of each landmark number, -1 where there is no landmark.
-  const std::vector<std::int64_t>& ids() const { return ids_; }
+  const LargeVector<std::int64_t>& ids() const { return ids_; }
   // Row numbers are below.
   std::size_t places() const { return blocks_.blocks() * kPackedRows; }
   bool is_row(std::size_t place) const {
@@ -138,15 +139,15 @@ class PrototypeStore {
   std::size_t look_bits_;
   std::size_t rows_ = 0;
 
-  std::vector<std::int64_t> ids_;
+  LargeVector<std::int64_t> ids_;
   std::vector<Position> positions_;
   IdIndex index_;
   std::vector<std::uint32_t> heads_;  // first row; empty without looks
 
   // By place.
-  std::vector<std::int16_t> sums_;  // rows x dim
+  LargeVector<std::int16_t> sums_;  // rows x dim
   std::vector<std::uint8_t> counts_;
-  std::vector<CodeVector> packed_;     // rounded means, see PackedPrototypes
+  LargeVector<CodeVector> packed_;     // rounded means, see PackedPrototypes
   std::vector<std::uint16_t> looks_;   // empty without looks
   std::vector<std::uint32_t> owners_;  // landmark of a row; empty without looks
   std::vector<std::uint32_t> next_;    // row of the same landmark; empty without looks

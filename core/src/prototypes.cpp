@@ -18,7 +18,7 @@ namespace protomark {
 namespace {
 
 // Descriptors that are encoded and added at a time, to bound the memory for their codes.
-constexpr std::size_t kEncodeChunk = 1 << 16;
+constexpr std::size_t kEncodeChunk = 1 << 13;
 
 void check_pairs(std::size_t landmarks, std::size_t rows, const char* what) {
   if (landmarks != rows) {

@@ -8,7 +8,7 @@
 int main() {
   using protomark::IdIndex;
   protomark::test::Random random(3);
-  std::vector<std::int64_t> ids;
+  protomark::LargeVector<std::int64_t> ids;
   IdIndex index;
   std::unordered_map<std::int64_t, std::uint32_t> expected;
   for (int step = 0; step < 200000; ++step) {

@@ -177,7 +177,7 @@ std::vector<kernels::Hit> expected_hits(const std::vector<std::vector<std::int32
 void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, std::size_t blocks,
                    std::size_t n, int style) {
   const std::size_t rows = 16 * blocks;
-  const auto packed = values<std::int8_t>(random, rows * dim, style, -127, 127);
+  const auto packed = values<std::int8_t>(random, rows * dim, style, -128, 127);
   const auto queries = values<std::uint8_t>(random, n * dim, random.integer(0, 2), 1, 255);
   std::vector<std::vector<std::int32_t>> distances(n, std::vector<std::int32_t>(rows));
   for (std::size_t q = 0; q < n; ++q) {

@@ -1,0 +1,52 @@
+// Arrays that are read at random: large ones stand in large pages, so that most reads do not have
+// to look up a page as well, and all of them begin at a cache line.
+#pragma once
+
+#include <cstddef>
+#include <new>
+#include <vector>
+
+#ifdef __linux__
+#include <sys/mman.h>
+#endif
+
+namespace protomark {
+
+template <typename T>
+struct LargePageAllocator {
+  using value_type = T;
+
+  LargePageAllocator() = default;
+  template <typename U>
+  LargePageAllocator(const LargePageAllocator<U>&) {}  // NOLINT: allocators convert
+
+  T* allocate(std::size_t n) {
+    if (n > SIZE_MAX / sizeof(T)) throw std::bad_array_new_length();
+    const std::size_t size = n * sizeof(T);
+    void* memory = ::operator new(size, alignment(size));
+#ifdef __linux__
+    // Advice: where it is not taken, the pages are small.
+    if (size >= kLarge) madvise(memory, size, MADV_HUGEPAGE);
+#endif
+    return static_cast<T*>(memory);
+  }
+  void deallocate(T* memory, std::size_t n) { ::operator delete(memory, alignment(n * sizeof(T))); }
+
+  template <typename U>
+  bool operator==(const LargePageAllocator<U>&) const {
+    return true;
+  }
+
+ private:
+  static constexpr std::size_t kPage = std::size_t{1} << 21, kLarge = 4 * kPage;
+  static constexpr std::size_t kCacheLine = 64;
+
+  static std::align_val_t alignment(std::size_t size) {
+    return std::align_val_t{size >= kLarge ? kPage : kCacheLine};
+  }
+};
+
+template <typename T>
+using LargeVector = std::vector<T, LargePageAllocator<T>>;
+
+}  // namespace protomark
