@@ -570,7 +570,7 @@ def bench(
 
     All contenders take turns in one run, on the same data and as many threads; ratios come with
     their spread, and beside the machine's own ceilings. Peers that are not installed are left out:
-    `pip install protomark[bench]`. Ctrl-C ends the run and keeps what is measured.
+    `pip install protomark\\[bench]`. Ctrl-C ends the run and keeps what is measured.
     docs/benchmarks.md holds a whole run.
     """
     import tempfile
