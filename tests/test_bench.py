@@ -321,6 +321,9 @@ def test_sizes_of_maps_may_be_chosen(tmp_path: Path) -> None:
     common = {"sections": (), "threads": 1, "build_threads": 1, "full": False, "quick": False}
     chosen = choose(**common, scratch=tmp_path, landmarks=(500, 20, 500))  # type: ignore[arg-type]
     assert chosen.exact == chosen.approximate == chosen.growth == (20, 500)
+    assert chosen.large == 0
+    common["sections"] = ("large",)
+    assert choose(**common, scratch=tmp_path, landmarks=(20, 500)).large == 500  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="--landmarks 0"):
         choose(**common, scratch=tmp_path, landmarks=(0,))  # type: ignore[arg-type]
 

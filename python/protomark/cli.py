@@ -553,8 +553,8 @@ def bench(
     landmarks: Annotated[
         str,
         typer.Option(
-            help="Sizes of the maps that are searched (search, hamming, approximate, growth), for "
-            "example 10000,1000000, in place of the usual ones."
+            help="Sizes of the maps that are searched (search, hamming, approximate, growth; of large "
+            "the last one), for example 10000,1000000, in place of the usual ones."
         ),
     ] = "",
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,

@@ -74,7 +74,8 @@ def choose(
     if not landmarks:
         return chosen
     sizes = tuple(sorted(set(landmarks)))
-    return replace(chosen, exact=sizes, approximate=sizes, growth=sizes)
+    large = sizes[-1] if "large" in sections else chosen.large
+    return replace(chosen, exact=sizes, approximate=sizes, growth=sizes, large=large)
 
 
 def _of_scale(
