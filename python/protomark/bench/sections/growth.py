@@ -69,6 +69,7 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
                 threads=settings.threads,
             )
         )
+        del scene, rows  # what is freed later would be missing from the next map's memory
 
 
 def _seconds(
