@@ -15,7 +15,7 @@ import protomark as pm
 from protomark.bench import ours
 from protomark.bench.machine import lacks
 from protomark.bench.peers import installed
-from protomark.bench.peers.index import Index, Search
+from protomark.bench.peers.index import Builder, Index, Search
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race, turns
 from protomark.bench.results import Contest, Results
@@ -23,7 +23,10 @@ from protomark.bench.tuning import Trial, tune
 from protomark.bench.workload import Workload
 
 GOALS = (0.95, 0.98, 0.99)
-BYTES = 1_200  # of a landmark in all indexes together, about
+# Of a landmark, about: all indexes together but graphs; a graph while it is built.
+BYTES, GRAPH_BYTES = 1_000, 500
+QUERIES = 200  # that recall is measured on, unless they take over `_PATIENCE` times a trial's time
+_PATIENCE = 4
 
 
 @dataclass
@@ -35,7 +38,9 @@ class _Entrant:
         build: makes the index.
         right: (q,) answers -> whether each is as near as the exact one.
         least: fewest queries to time.
+        memory: bytes a landmark that must be free beside `BYTES` while it is built.
         own: whether it is Protomark's.
+        comparable: whether it searches what the others search.
         note: beside the index's own.
     """
 
@@ -43,14 +48,18 @@ class _Entrant:
     build: Callable[[], Index]
     right: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
     least: int = 64
+    memory: int = 0
     own: bool = False
+    comparable: bool = True
     note: str = ""
 
 
 def run(workload: Workload, results: Results, bar: Bar) -> None:
     """At every size: build, tune to recall@1 of 0.95, 0.98 and 0.99, then race at each."""
     settings = workload.settings
-    bar.begin("approximate", len(settings.approximate) * (9 + len(GOALS) * turns(9, settings.pace)))
+    bar.begin(
+        "approximate", len(settings.approximate) * (10 + len(GOALS) * turns(11, settings.pace))
+    )
     for n in settings.approximate:
         reason = lacks(n * BYTES)
         if reason:
@@ -64,6 +73,10 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         }
         for entrant in _entrants(workload, results, n, queries, codes, scene):
             bar.advance(f"{n:,} landmarks, {entrant.name}")
+            reason = lacks(n * entrant.memory)
+            if reason:
+                results.skipped.append(f"{entrant.name}, {n:,} landmarks: {reason}")
+                continue
             try:
                 tuned = _tuned(entrant, n, settings.queries, settings.tuned_on)
             except Exception as error:  # whatever a peer raises: the others go on
@@ -115,29 +128,38 @@ def _entrants(
     near = partial(_as_near, rows, codes, _squared(rows, codes, exact[:, 0]))
     found: list[_Entrant] = []
 
-    def enter(name: str, build: Any, graph: bool = False) -> None:
-        if graph and n > settings.graphs:
-            results.skipped.append(f"{name}, {n:,} landmarks: builds long, only with --full")
-            return
-        found.append(_Entrant(name, lambda: build(rows, codes, threads, build_threads), near))
+    def enter(name: str, build: Builder, memory: int = 0) -> None:
+        entrant = _Entrant(name, lambda: build(rows, codes, threads, build_threads), near)
+        entrant.memory = memory
+        found.append(entrant)
+
+    def enter_graph(name: str, build: Builder) -> None:
+        if n <= settings.graphs:
+            enter(name, build, GRAPH_BYTES)
+        else:
+            results.skipped.append(
+                f"{name}, {n:,} landmarks: builds long; `--landmarks {n}` races it"
+            )
 
     build = partial(ours.cells, workload, n, codes, threads, build_threads)
     found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
     if installed("faiss"):
         from protomark.bench.peers import faiss_indexes
 
-        enter("FAISS HNSW", faiss_indexes.hnsw, graph=True)
-        enter("FAISS IVF, PQ fast scan", faiss_indexes.product_quantizer)
+        enter_graph("FAISS HNSW", faiss_indexes.hnsw)
+        for parts in (settings.dim // 2, settings.dim):
+            quantizer = partial(faiss_indexes.product_quantizer, parts=parts)
+            enter(f"FAISS IVF, PQ{parts} fast scan", quantizer)
         enter("FAISS IVF, SQ8", faiss_indexes.scalar_quantizer)
     if installed("hnswlib"):
         from protomark.bench.peers import hnswlib_index
 
-        enter("hnswlib", hnswlib_index.hnsw)
+        enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
     if installed("usearch"):
         from protomark.bench.peers import usearch_index
 
-        enter("USearch int8", usearch_index.hnsw_i8, graph=True)
-        enter("USearch float32", usearch_index.hnsw_f32, graph=True)
+        enter_graph("USearch int8", usearch_index.hnsw_i8)
+        enter_graph("USearch float32", usearch_index.hnsw_f32)
     if installed("cv2"):
         from protomark.bench.peers import opencv_matchers
 
@@ -163,6 +185,7 @@ def _hashed(workload: Workload, n: int, queries: NDArray[np.uint8]) -> _Entrant:
         lambda: opencv_matchers.lsh(rows, queries, threads, build_threads),
         partial(_as_near_in_bits, rows, queries, distances[:, 0]),
         least=16,
+        comparable=False,
         note="all descriptors, against the nearest of them; ",
     )
 
@@ -187,7 +210,12 @@ def _contender(
 ) -> Contender | None:
     if trial is None:
         return None
-    facts = {"recall": trial.recall, "bytes": index.bytes / n, "build": built}
+    facts = {
+        "recall": trial.recall,
+        "asked": trial.queries,
+        "bytes": index.bytes / n,
+        "build": built,
+    }
     if index.more is not None:
         facts["more"] = index.more
     return Contender(
@@ -196,22 +224,26 @@ def _contender(
         lambda q: index.prepare(trial.setting)(q),
         ours=entrant.own,
         least=entrant.least,
+        comparable=entrant.comparable,
         facts=facts,
         note=f"{entrant.note}{index.note}; {index.setting} {trial.setting}",
     )
 
 
-def _trial(search: Search, entrant: _Entrant, queries: int, seconds: float) -> tuple[float, float]:
-    """Recall and seconds of a query, over as many queries as the time allows."""
+def _trial(
+    search: Search, entrant: _Entrant, queries: int, seconds: float
+) -> tuple[float, float, int]:
+    """Recall, seconds of a query, and queries asked: as many as the time allows."""
     few = min(entrant.least, queries)
     began = time.perf_counter()
     search(few)
     each = (time.perf_counter() - began) / few
-    count = min(queries, max(few, int(seconds / each)))
+    affordable = min(QUERIES, int(_PATIENCE * seconds / each))
+    count = min(queries, max(few, affordable, int(seconds / each)))
     began = time.perf_counter()
     answers = search(count)
     each = (time.perf_counter() - began) / count
-    return float(entrant.right(answers).mean()), each
+    return float(entrant.right(answers).mean()), each, count
 
 
 def _squared(
