@@ -442,13 +442,14 @@ def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     results = Results.load(tmp_path / "bench.json")
     sections = {contest.section for contest in results.contests}
-    assert sections == {"encode", "search", "hamming", "approximate", "frame", "add"}
+    assert sections == {"encode", "search", "hamming", "approximate", "real", "frame", "add"}
     for contest in results.contests:
         assert contest.ours is not None
         for timing in contest.timings:
             assert len(timing.seconds) == 3
             assert min(timing.seconds) > 0
             assert timing.facts.get("recall", 1.0) >= (contest.recall or 0.0)
+    assert not any("failed" in note for note in results.skipped), results.skipped
     assert {point["landmarks"] for point in results.growth} == {1_000, 3_000}
     assert results.large["8 bits: recall"] >= 0.95
     assert results.large["4 bits: file bytes"] < results.large["8 bits: file bytes"]

@@ -42,6 +42,11 @@ _SECTIONS = {
         "number of threads. What searches other rows than prototypes has no ratio. Peers that "
         "were not raced, or do not find enough, are listed at the end.",
     ),
+    "real": (
+        "Approximate search of real landmarks",
+        "The same with the tracks' own landmarks, none grown; queries are their observations that "
+        "no prototype holds.",
+    ),
     "frame": ("A whole frame", "One call of `search` with descriptors and a ratio."),
     "add": ("Adding observations", "Random landmarks, all in the map; beside encoding alone."),
 }

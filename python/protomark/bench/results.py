@@ -56,7 +56,7 @@ class Contest:
     """Contenders that did the same work in the same rounds.
 
     Attributes:
-        section: encode, search, hamming, approximate, frame, add or growth.
+        section: encode, search, hamming, approximate, real, frame or add.
         title: what was done.
         unit: what `seconds` are for: a descriptor, a query, a frame.
         threads: of every contender.
