@@ -240,7 +240,17 @@ void PrototypeMap::update(const PrototypeMap& other) {
                                 std::to_string(other.look_bits()) +
                                 " look bits cannot be joined: build both with the same");
   }
-  const std::scoped_lock lock(store_->mutex, other.store_->mutex);
+  // Both wait for their turn, in one order for all pairs of maps, so that no two updates wait for
+  // each other.
+  std::unique_lock own(store_->mutex, std::defer_lock);
+  std::shared_lock others(other.store_->mutex, std::defer_lock);
+  if (std::less<>{}(store_.get(), other.store_.get())) {
+    own.lock();
+    others.lock();
+  } else {
+    others.lock();
+    own.lock();
+  }
   const Store& from = *other.store_;
   for (std::uint32_t i = 0; i < from.places(); ++i) {
     if (!from.is_row(i)) continue;
