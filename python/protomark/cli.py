@@ -553,8 +553,8 @@ def bench(
     landmarks: Annotated[
         str,
         typer.Option(
-            help="Sizes of the maps that are searched (search, hamming, approximate, growth; of large "
-            "the last one), for example 10000,1000000, in place of the usual ones."
+            help="Sizes of the maps that are searched (search, hamming, approximate, growth; of "
+            "large the last one), for example 10000,1000000, in place of the usual ones."
         ),
     ] = "",
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
@@ -566,11 +566,11 @@ def bench(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Measure speed beside PyTorch, ONNX Runtime, FAISS, OpenCV, hnswlib and USearch.
+    r"""Measure speed beside PyTorch, ONNX Runtime, FAISS, OpenCV, hnswlib and USearch.
 
     All contenders take turns in one run, on the same data and as many threads; ratios come with
     their spread, and beside the machine's own ceilings. Peers that are not installed are left out:
-    `pip install protomark\\[bench]`. Ctrl-C ends the run and keeps what is measured.
+    `pip install protomark\[bench]`. Ctrl-C ends the run and keeps what is measured.
     docs/benchmarks.md holds a whole run.
     """
     import tempfile
