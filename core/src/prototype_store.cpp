@@ -297,11 +297,15 @@ std::vector<std::uint32_t> PrototypeStore::sorted_rows(std::uint32_t landmark) c
   return result;
 }
 
+void PrototypeStore::rounded(std::uint32_t row, std::int8_t* to) const {
+  for (std::size_t d = 0; d < dim_; d += 4) {
+    std::copy_n(packed() + packed_index(row, d, dim_), std::min<std::size_t>(4, dim_ - d), to + d);
+  }
+}
+
 std::vector<std::int8_t> PrototypeStore::rounded(std::span<const std::uint32_t> rows) const {
   std::vector<std::int8_t> result(rows.size() * dim_);
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    for (std::size_t d = 0; d < dim_; ++d) result[i * dim_ + d] = rounded(rows[i], d);
-  }
+  for (std::size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
   return result;
 }
 
