@@ -33,8 +33,8 @@ constexpr std::uint32_t kPadding = UINT32_MAX;
 class BlockPacker {
  public:
   BlockPacker(const SealedRows& rows, int half_step) : rows_(&rows), half_step_(half_step) {
-    for (int value = -128; value < 128 && half_step_ != 0; ++value) {
-      quantized_[static_cast<std::size_t>(value + 128)] = quantize4(value, half_step_);
+    for (std::size_t i = 0; i < quantized_.size() && half_step_ != 0; ++i) {
+      quantized_[i] = quantize4(static_cast<int>(i) - 128, half_step_);
     }
   }
 
@@ -67,7 +67,7 @@ class BlockPacker {
 
  private:
   std::uint8_t u(std::int8_t code) const {
-    return quantized_[static_cast<std::size_t>(code + 128)];
+    return quantized_[static_cast<std::uint8_t>(code + 128)];
   }
 
   const SealedRows* rows_;
