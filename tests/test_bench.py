@@ -14,9 +14,9 @@ import pytest
 
 import protomark as pm
 from protomark import _ceilings, sample
-from protomark.bench import command, peers, report
+from protomark.bench import command, machine, peers, report
 from protomark.bench.grown import Grown, map_of, prototypes_of, rounded_means
-from protomark.bench.machine import allocated_bytes
+from protomark.bench.machine import allocated_bytes, last_level_cache
 from protomark.bench.peers.network import bits_of, float_layers, selu
 from protomark.bench.race import Contender, Pace, race
 from protomark.bench.real import Observations
@@ -131,12 +131,13 @@ def test_tuner_takes_the_fastest_setting_that_finds_enough() -> None:
     seconds = {1: 1.0, 2: 2.0, 3: 3.0, 4: 4.0, 11: 1.5, 12: 9.0}
     asked = []
 
-    def measure(setting: int) -> tuple[float, float]:
+    def measure(setting: int) -> tuple[float, float, int]:
         asked.append(setting)
-        return recall[setting], seconds[setting]
+        return recall[setting], seconds[setting], 100 + setting
 
     best = tune([[1, 2, 3, 4], [11, 12]], measure, (0.95, 0.99, 0.999))
     assert [trial and trial.setting for trial in best.values()] == [11, 3, 4]
+    assert [trial and trial.queries for trial in best.values()] == [111, 103, 104]
     asked.clear()
     best = tune([[1, 2, 3, 4]], measure, (0.95, 0.99))
     assert [trial and trial.setting for trial in best.values()] == [2, 3]
@@ -151,6 +152,19 @@ def test_contenders_take_turns() -> None:
     assert turns[-6:] == ["a", "b"] * 3
     assert [len(timing.seconds) for timing in timings] == [3, 3]
     assert [timing.units for timing in timings] == [10, 10]
+
+
+def test_a_turn_is_the_median_of_its_repetitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    # The warm-up, its timing, then turns of three calls: one quick, one slow.
+    lengths = iter([9.0, 1.0, 0.5, 7.0, 2.0, 3.0, 0.1, 3.0])
+
+    def work(_: int) -> None:
+        clock[0] += next(lengths)
+
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    (timing,) = race([Contender("any", work)], 1, Pace(rounds=2, shortest=3.0, longest=1.0))
+    assert timing.seconds == [2.0, 3.0]
 
 
 def test_slow_contenders_do_fewer_units() -> None:
@@ -252,7 +266,7 @@ def test_other_sizes_meet_and_miss_nothing(fixed: Results) -> None:
 def test_report_says_what_was_measured(fixed: Results, tmp_path: Path) -> None:
     text = command.write_report(fixed, tmp_path).read_text()
     assert "| PyTorch float | 3 µs | 3 (2 to 4) | 50 |" in text
-    assert "ours at 60 % of the vector ceiling" in text
+    assert "ours worth 60 % of the vector ceiling" in text
     assert "| IVF | 0.500 | 0.600 |" in text
     assert "hnswlib: not installed" in text
     for name in ("ratios.svg", "growth.svg"):
@@ -291,8 +305,13 @@ def test_ceilings_are_named_by_instruction_set() -> None:
     rates = _ceilings.multiply_adds(0.01)
     assert all(rate > 1e9 for rate in rates.values())
     assert set(rates) <= {"avx2", "avx512", "amx", "neon"}
+    assert _ceilings.read_bytes(5_000, 0.01) > 1e8
     with pytest.raises(ValueError, match="at least"):
         _ceilings.read_bytes(8)
+
+
+def test_last_level_cache_is_one_of_this_machine() -> None:
+    assert 1 << 15 <= last_level_cache() < 1 << 33
 
 
 def test_allocated_memory_counts_what_a_map_holds() -> None:
@@ -321,6 +340,7 @@ def test_sizes_of_maps_may_be_chosen(tmp_path: Path) -> None:
     common = {"sections": (), "threads": 1, "build_threads": 1, "full": False, "quick": False}
     chosen = choose(**common, scratch=tmp_path, landmarks=(500, 20, 500))  # type: ignore[arg-type]
     assert chosen.exact == chosen.approximate == chosen.growth == (20, 500)
+    assert chosen.graphs == 500
     assert chosen.large == 0
     common["sections"] = ("large",)
     assert choose(**common, scratch=tmp_path, landmarks=(20, 500)).large == 500  # type: ignore[arg-type]
@@ -333,7 +353,8 @@ def test_runs_are_joined_only_where_machine_and_data_are_the_same() -> None:
         contest = Contest(
             "search", f"{landmarks} landmarks", "query", 1, landmarks, work={"bytes": 1}
         )
-        return Results(machine={"CPU": cpu}, contests=[contest], command=f"bench {landmarks}")
+        facts = {**machine.describe(), "CPU": cpu}
+        return Results(machine=facts, contests=[contest], command=f"bench {landmarks}")
 
     results = run(10)
     results.extend(run(10))
@@ -342,6 +363,59 @@ def test_runs_are_joined_only_where_machine_and_data_are_the_same() -> None:
     assert results.command.split("\n    ") == ["bench 10", "bench 10", "bench 20"]
     with pytest.raises(ValueError, match="two machines"):
         results.extend(run(30, cpu="b"))
+    other = run(30)
+    other.machine["instruction set in use"] = "another"
+    with pytest.raises(ValueError, match="two machines"):
+        results.extend(other)
+
+
+def test_joined_curves_are_in_order_and_without_twins() -> None:
+    def run(*sizes: int, seconds: float = 1.0) -> Results:
+        points = [
+            {"landmarks": n, "method": method, "seconds": seconds * n, "bytes": None, "recall": 1.0}
+            for n in sizes
+            for method in ("exact", "approximate")
+        ]
+        return Results(growth=points)
+
+    results = run(1_000, 10_000)
+    results.extend(run(100, 10_000, seconds=5.0))
+    assert [(p["landmarks"], p["method"]) for p in results.growth] == [
+        (n, method) for n in (100, 1_000, 10_000) for method in ("exact", "approximate")
+    ]
+    assert [p["seconds"] for p in results.growth[::2]] == [500.0, 1_000.0, 10_000.0]
+    assert all(row.what.startswith(("exact", "approximate")) for row in outcomes(results))
+    assert outcomes(run(1_000)) == outcomes(Results(growth=run(1_000).growth * 2)) == []
+
+
+def test_other_work_has_no_ratio(fixed: Results, tmp_path: Path) -> None:
+    contest = fixed.contests[-1]
+    contest.timings.append(Timing("LSH on bits", False, [9e-6] * 3, 50, comparable=False))
+    assert contest.ratio(contest.timings[-1]) is None
+    text = command.write_report(fixed, tmp_path).read_text()
+    assert "| LSH on bits | 9 µs | – | 50 |" in text
+    assert "LSH" not in (tmp_path / "ratios.svg").read_text()
+
+
+def test_approximate_target_names_the_peers_raced(fixed: Results) -> None:
+    fixed.contests = [
+        replace(
+            fixed.contests[-1],
+            landmarks=10_000_000,
+            recall=0.98,
+            timings=[
+                Timing("Protomark, approximate", True, [1e-6], 100),
+                Timing("LSH on bits", False, [1e-7], 100, comparable=False),
+                Timing("hnswlib", False, [3e-6], 100),
+                Timing("FAISS IVF, SQ8", False, [2e-6], 100),
+            ],
+        )
+    ]
+    row = next(row for row in outcomes(fixed) if "raced" in row.peer)
+    assert row.met
+    assert row.peer == (
+        "FAISS IVF, SQ8: 2 µs, the fastest of the peers raced: hnswlib, FAISS IVF, SQ8"
+    )
 
 
 def test_ctrl_c_keeps_what_is_measured(
@@ -368,13 +442,14 @@ def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     results = Results.load(tmp_path / "bench.json")
     sections = {contest.section for contest in results.contests}
-    assert sections == {"encode", "search", "hamming", "approximate", "frame", "add"}
+    assert sections == {"encode", "search", "hamming", "approximate", "real", "frame", "add"}
     for contest in results.contests:
         assert contest.ours is not None
         for timing in contest.timings:
             assert len(timing.seconds) == 3
             assert min(timing.seconds) > 0
             assert timing.facts.get("recall", 1.0) >= (contest.recall or 0.0)
+    assert not any("failed" in note for note in results.skipped), results.skipped
     assert {point["landmarks"] for point in results.growth} == {1_000, 3_000}
     assert results.large["8 bits: recall"] >= 0.95
     assert results.large["4 bits: file bytes"] < results.large["8 bits: file bytes"]

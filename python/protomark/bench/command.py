@@ -43,7 +43,7 @@ _COSTS = {
     "encode": 30.0,
     "search": 60.0,
     "hamming": 150.0,
-    "approximate": 480.0,
+    "approximate": 700.0,
     "frame": 10.0,
     "add": 10.0,
     "growth": 60.0,

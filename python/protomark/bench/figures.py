@@ -37,7 +37,10 @@ def draw_ratios(results: Results) -> Figure | None:
         (contest, peer)
         for contest in results.contests
         for peer in contest.timings
-        if not peer.ours and contest.section != "add" and contest.recall in (None, RECALL)
+        if not peer.ours
+        and peer.comparable
+        and contest.section != "add"
+        and contest.recall in (None, RECALL)
     ]
     if not bars:
         return None

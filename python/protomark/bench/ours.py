@@ -17,10 +17,14 @@ APPROXIMATE = "Protomark, approximate"
 
 
 def cells(
-    workload: Workload, n: int, codes: NDArray[np.int8], threads: int, build_threads: int
+    workload: Workload,
+    rows: NDArray[np.int8],
+    codes: NDArray[np.int8],
+    threads: int,
+    build_threads: int,
 ) -> Index:
     """Inverted lists over the map's own cells; setting: cells searched."""
-    scene = map_of(workload.encoder, workload.prototypes(n))
+    scene = map_of(workload.encoder, rows)
     plain = _sealed_bytes(scene, workload.settings.scratch)
     scene.build_index(threads=build_threads)
     count = scene.index_cells
@@ -39,7 +43,7 @@ def cells(
         indexed,
         "probes",
         f"{count:,} cells",
-        more=(indexed - plain) / n,
+        more=(indexed - plain) / len(rows),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 
 from protomark.bench.results import Timing
 
@@ -20,13 +21,14 @@ class Contender:
         run: does the work for the number of units it is given, from the start of the data.
         ours: whether it is Protomark's.
         least: fewest units that are worth timing.
-        facts, note: as in `Timing`.
+        comparable, facts, note: as in `Timing`.
     """
 
     name: str
     run: Callable[[int], object]
     ours: bool = False
     least: int = 1
+    comparable: bool = True
     facts: dict[str, float] = field(default_factory=dict)
     note: str = ""
 
@@ -77,6 +79,7 @@ def race(
             count,
             dict(contender.facts),
             contender.note,
+            contender.comparable,
         )
         for contender, (count, _), times in zip(contenders, plans, seconds, strict=True)
     ]
@@ -98,10 +101,10 @@ def _plan(contender: Contender, units: int, pace: Pace) -> tuple[int, int]:
 
 
 def _turn(contender: Contender, count: int, repeats: int) -> float:
-    """Seconds of one call: the quickest of `repeats`."""
-    best = float("inf")
+    """Seconds of one call: median of `repeats`."""
+    seconds = []
     for _ in range(repeats):
         began = time.perf_counter()
         contender.run(count)
-        best = min(best, time.perf_counter() - began)
-    return best
+        seconds.append(time.perf_counter() - began)
+    return median(seconds)

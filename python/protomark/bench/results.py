@@ -25,6 +25,7 @@ class Timing:
         units: how many units one call had; fewer where a contender is slow.
         facts: what else was measured, such as recall, bytes a landmark or building time.
         note: what a reader should know.
+        comparable: whether its work is that of the others, so that a ratio means something.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Timing:
     units: int
     facts: dict[str, float] = field(default_factory=dict)
     note: str = ""
+    comparable: bool = True
 
     @property
     def median(self) -> float:
@@ -54,7 +56,7 @@ class Contest:
     """Contenders that did the same work in the same rounds.
 
     Attributes:
-        section: encode, search, hamming, approximate, frame, add or growth.
+        section: encode, search, hamming, approximate, real, frame or add.
         title: what was done.
         unit: what `seconds` are for: a descriptor, a query, a frame.
         threads: of every contender.
@@ -80,9 +82,9 @@ class Contest:
         return min(own, key=lambda timing: timing.median, default=None)
 
     def ratio(self, peer: Timing, to: Timing | None = None) -> Ratio | None:
-        """Times as fast as the peer that ours is (or `to`), round by round."""
+        """Times as fast as the peer that ours is (or `to`), round by round; None without sense."""
         ours = to or self.ours
-        if ours is None or peer is ours:
+        if ours is None or peer is ours or not peer.comparable:
             return None
         ratios = [b / a for a, b in zip(ours.seconds, peer.seconds, strict=True)]
         return Ratio(median(ratios), min(ratios), max(ratios))
@@ -122,7 +124,7 @@ class Results:
         Raises:
             ValueError: it was another machine, or data of another kind.
         """
-        for name in ("CPU", "instruction set"):
+        for name in ("CPU", "instruction set in use"):
             if self.machine.get(name) != later.machine.get(name):
                 raise ValueError(f"runs of two machines: {name} {later.machine.get(name)}")
         if self.data != later.data:
@@ -132,7 +134,8 @@ class Results:
             if (contest.section, contest.title, contest.threads, contest.recall) not in known:
                 contest.work = {}
                 self.contests.append(contest)
-        self.growth += later.growth
+        curve = {(p["landmarks"], p["method"]): p for p in later.growth + self.growth}
+        self.growth = sorted(curve.values(), key=lambda p: (p["landmarks"], p["method"] != "exact"))
         self.large |= later.large
         self.skipped += [note for note in later.skipped if note not in self.skipped]
         self.interrupted |= later.interrupted

@@ -26,7 +26,7 @@ class Settings:
         exact: landmarks of exact searches.
         approximate: landmarks of approximate searches.
         hashed: most landmarks whose bits go into FLANN's LSH.
-        graphs: most landmarks for which every graph is built; beyond it only one.
+        graphs: most landmarks for which every graph is built, memory allowing; beyond it only one.
         map: landmarks of the map of the sections frame and add.
         growth: landmarks of the maps along the curve.
         large: landmarks of the largest map, 0 for none.
@@ -75,7 +75,9 @@ def choose(
         return chosen
     sizes = tuple(sorted(set(landmarks)))
     large = sizes[-1] if "large" in sections else chosen.large
-    return replace(chosen, exact=sizes, approximate=sizes, growth=sizes, large=large)
+    return replace(
+        chosen, exact=sizes, approximate=sizes, growth=sizes, graphs=sizes[-1], large=large
+    )
 
 
 def _of_scale(

@@ -11,16 +11,24 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class Trial(Generic[S]):
-    """A setting, the share of queries whose nearest it finds, and seconds of a query."""
+    """What a setting comes to.
+
+    Attributes:
+        setting: tried.
+        recall: share of queries whose nearest it finds.
+        seconds: of a query.
+        queries: that recall was measured on.
+    """
 
     setting: S
     recall: float
     seconds: float
+    queries: int
 
 
 def tune(
     lines: Iterable[Sequence[S]],
-    measure: Callable[[S], tuple[float, float]],
+    measure: Callable[[S], tuple[float, float, int]],
     goals: Sequence[float],
 ) -> dict[float, Trial[S] | None]:
     """The fastest setting for each least recall, None where none reaches it.
@@ -28,7 +36,7 @@ def tune(
     Args:
         lines: settings, in lines along which recall and time grow; a line is left as soon as it
             reaches the highest goal, or takes ten times what already reaches it.
-        measure: gives recall and seconds of a setting.
+        measure: gives recall, seconds and queries of a setting.
         goals: least recalls.
     """
     trials: list[Trial[S]] = []

@@ -12,9 +12,9 @@ from protomark.bench.peers.index import Index, K, Search, doubling
 def hnsw(
     rows: NDArray[np.int8], queries: NDArray[np.int8], threads: int, build_threads: int
 ) -> Index:
-    """M = 16, efConstruction = 64."""
+    """M = 16, efConstruction = 200, both its defaults."""
     index = hnswlib.Index(space="l2", dim=rows.shape[1])
-    index.init_index(max_elements=len(rows), M=16, ef_construction=64, random_seed=0)
+    index.init_index(max_elements=len(rows), M=16, ef_construction=200, random_seed=0)
     for begin in range(0, len(rows), 1 << 20):
         index.add_items(rows[begin : begin + (1 << 20)].astype(np.float32), None, build_threads)
     asked = queries.astype(np.float32)
@@ -33,5 +33,5 @@ def hnsw(
         [doubling(8, 2048)],
         index.index_file_size(),
         "efSearch",
-        "M = 16, efConstruction = 64",
+        "M = 16, efConstruction = 200",
     )

@@ -28,7 +28,10 @@ def hnsw_f32(
 def _hnsw(
     rows: NDArray[Any], queries: NDArray[Any], threads: int, build_threads: int, dtype: str
 ) -> Index:
-    index = Graph(ndim=rows.shape[1], metric="l2sq", dtype=dtype, connectivity=16, expansion_add=64)
+    # As thorough as the other graphs; USearch's own default is 128.
+    index = Graph(
+        ndim=rows.shape[1], metric="l2sq", dtype=dtype, connectivity=16, expansion_add=200
+    )
     index.add(np.arange(len(rows), dtype=np.uint64), rows, threads=build_threads)
 
     def prepare(ef: int) -> Search:
@@ -45,5 +48,5 @@ def _hnsw(
         [doubling(8, 2048)],
         int(index.serialized_length),
         "expansion_search",
-        "connectivity = 16, expansion_add = 64",
+        "connectivity = 16, expansion_add = 200",
     )

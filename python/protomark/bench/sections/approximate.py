@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.bench import ours
+from protomark.bench.grown import map_of, prototypes_of
 from protomark.bench.machine import lacks
 from protomark.bench.peers import installed
-from protomark.bench.peers.index import Index, Search
+from protomark.bench.peers.index import Builder, Index, Search
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race, turns
 from protomark.bench.results import Contest, Results
@@ -23,7 +24,32 @@ from protomark.bench.tuning import Trial, tune
 from protomark.bench.workload import Workload
 
 GOALS = (0.95, 0.98, 0.99)
-BYTES = 1_200  # of a landmark in all indexes together, about
+# Of a landmark, about: all indexes together but graphs; a graph while it is built.
+BYTES, GRAPH_BYTES = 1_000, 500
+QUERIES = 200  # that recall is measured on, unless they take over `_PATIENCE` times a trial's time
+_PATIENCE = 4
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """What is searched.
+
+    Attributes:
+        section, title: of its contests.
+        rows: (n, dim) prototypes.
+        queries: (q, bits / 8) descriptors.
+        codes: (q, dim), the same encoded.
+        scene: an open map of the rows.
+        descriptors: makes all descriptors of the landmarks.
+    """
+
+    section: str
+    title: str
+    rows: NDArray[np.int8]
+    queries: NDArray[np.uint8]
+    codes: NDArray[np.int8]
+    scene: pm.PrototypeMap
+    descriptors: Callable[[], NDArray[np.uint8]]
 
 
 @dataclass
@@ -35,7 +61,9 @@ class _Entrant:
         build: makes the index.
         right: (q,) answers -> whether each is as near as the exact one.
         least: fewest queries to time.
+        memory: bytes a landmark that must be free beside `BYTES` while it is built.
         own: whether it is Protomark's.
+        comparable: whether it searches what the others search.
         note: beside the index's own.
     """
 
@@ -43,51 +71,98 @@ class _Entrant:
     build: Callable[[], Index]
     right: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
     least: int = 64
+    memory: int = 0
     own: bool = False
+    comparable: bool = True
     note: str = ""
 
 
 def run(workload: Workload, results: Results, bar: Bar) -> None:
-    """At every size: build, tune to recall@1 of 0.95, 0.98 and 0.99, then race at each."""
+    """Real landmarks, and grown ones of every size."""
     settings = workload.settings
-    bar.begin("approximate", len(settings.approximate) * (9 + len(GOALS) * turns(9, settings.pace)))
+    races = len(settings.approximate) + 1
+    bar.begin("approximate", races * (10 + len(GOALS) * turns(11, settings.pace)))
+    reason = lacks(len(workload.real) * BYTES)
+    if reason:
+        results.skipped.append(f"real landmarks: {reason}")
+    else:
+        _contests(workload, results, bar, _real(workload))
     for n in settings.approximate:
         reason = lacks(n * BYTES)
         if reason:
             results.skipped.append(f"approximate, {n:,} landmarks: {reason}")
             continue
-        queries = workload.queries(n, settings.queries)
-        codes = workload.codes(queries)
-        scene = workload.map(n)
-        fields: dict[float, list[Contender]] = {
-            goal: [_exact(scene, codes, settings.threads)] for goal in GOALS
-        }
-        for entrant in _entrants(workload, results, n, queries, codes, scene):
-            bar.advance(f"{n:,} landmarks, {entrant.name}")
-            try:
-                tuned = _tuned(entrant, n, settings.queries, settings.tuned_on)
-            except Exception as error:  # whatever a peer raises: the others go on
-                results.skipped.append(f"{entrant.name}, {n:,} landmarks: failed ({error})")
-                continue
-            for goal, contender in tuned:
-                if contender is not None:
-                    fields[goal].append(contender)
-                else:
-                    results.skipped.append(
-                        f"{entrant.name}, {n:,} landmarks: no setting reaches a recall of {goal}"
-                    )
-        for goal, field in fields.items():
-            results.contests.append(
-                Contest(
-                    "approximate",
-                    f"recall@1 of at least {goal}, {n:,} landmarks",
-                    "query",
-                    settings.threads,
-                    n,
-                    recall=goal,
-                    timings=race(field, settings.queries, settings.pace, bar.advance),
+        _contests(workload, results, bar, _grown(workload, n))
+
+
+def _real(workload: Workload) -> _Ground:
+    """All landmarks of the tracks; queries are observations kept out."""
+    real, settings = workload.real, workload.settings
+    n = len(real)
+    rows = prototypes_of(real, workload.encoder, settings.dim, settings.build_threads)
+    asked = np.random.default_rng(7).choice(n, min(settings.queries, n), replace=False)
+    queries = real.queries(asked)
+    return _Ground(
+        "real",
+        f"{n:,} real landmarks",
+        rows,
+        queries,
+        workload.codes(queries),
+        map_of(workload.encoder, rows),
+        lambda: real.descriptors[real.map_rows],
+    )
+
+
+def _grown(workload: Workload, n: int) -> _Ground:
+    queries = workload.queries(n, workload.settings.queries)
+    return _Ground(
+        "approximate",
+        f"{n:,} landmarks",
+        workload.prototypes(n),
+        queries,
+        workload.codes(queries),
+        workload.map(n),
+        lambda: workload.grown.descriptors(n),
+    )
+
+
+def _contests(workload: Workload, results: Results, bar: Bar, ground: _Ground) -> None:
+    """Build, tune to recall@1 of 0.95, 0.98 and 0.99, then race at each."""
+    settings = workload.settings
+    n, asked = len(ground.rows), len(ground.queries)
+    fields: dict[float, list[Contender]] = {
+        goal: [_exact(ground.scene, ground.codes, settings.threads)] for goal in GOALS
+    }
+    for entrant in _entrants(workload, results, ground):
+        bar.advance(f"{ground.title}, {entrant.name}")
+        reason = lacks(n * entrant.memory)
+        if reason:
+            results.skipped.append(f"{entrant.name}, {ground.title}: {reason}")
+            continue
+        try:
+            tuned = _tuned(entrant, n, asked, settings.tuned_on)
+        except Exception as error:  # whatever a peer raises: the others go on
+            results.skipped.append(f"{entrant.name}, {ground.title}: failed ({error})")
+            continue
+        for goal, contender in tuned:
+            if contender is not None:
+                fields[goal].append(contender)
+            else:
+                results.skipped.append(
+                    f"{entrant.name}, {ground.title}: no setting reaches a recall of {goal}"
                 )
+    for goal, field in fields.items():
+        results.contests.append(
+            Contest(
+                ground.section,
+                f"recall@1 of at least {goal}, {ground.title}",
+                "query",
+                settings.threads,
+                n,
+                recall=goal,
+                timings=race(field, asked, settings.pace, bar.advance),
             )
+        )
 
 
 def _exact(scene: pm.PrototypeMap, codes: NDArray[np.int8], threads: int) -> Contender:
@@ -103,66 +178,73 @@ def _exact(scene: pm.PrototypeMap, codes: NDArray[np.int8], threads: int) -> Con
 def _entrants(
     workload: Workload,
     results: Results,
-    n: int,
-    queries: NDArray[np.uint8],
-    codes: NDArray[np.int8],
-    scene: pm.PrototypeMap,
+    ground: _Ground,
 ) -> list[_Entrant]:
     settings = workload.settings
     threads, build_threads = settings.threads, settings.build_threads
-    rows = workload.prototypes(n)
-    exact, _ = scene.search_codes(codes, k=1, threads=build_threads)
+    rows, codes, n = ground.rows, ground.codes, len(ground.rows)
+    exact, _ = ground.scene.search_codes(codes, k=1, threads=build_threads)
     near = partial(_as_near, rows, codes, _squared(rows, codes, exact[:, 0]))
     found: list[_Entrant] = []
 
-    def enter(name: str, build: Any, graph: bool = False) -> None:
-        if graph and n > settings.graphs:
-            results.skipped.append(f"{name}, {n:,} landmarks: builds long, only with --full")
-            return
-        found.append(_Entrant(name, lambda: build(rows, codes, threads, build_threads), near))
+    def enter(name: str, build: Builder, memory: int = 0) -> None:
+        entrant = _Entrant(name, lambda: build(rows, codes, threads, build_threads), near)
+        entrant.memory = memory
+        found.append(entrant)
 
-    build = partial(ours.cells, workload, n, codes, threads, build_threads)
+    def enter_graph(name: str, build: Builder) -> None:
+        if n <= settings.graphs:
+            enter(name, build, GRAPH_BYTES)
+        else:
+            results.skipped.append(
+                f"{name}, {ground.title}: builds long; `--landmarks {n}` races it"
+            )
+
+    build = partial(ours.cells, workload, rows, codes, threads, build_threads)
     found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
     if installed("faiss"):
         from protomark.bench.peers import faiss_indexes
 
-        enter("FAISS HNSW", faiss_indexes.hnsw, graph=True)
-        enter("FAISS IVF, PQ fast scan", faiss_indexes.product_quantizer)
+        enter_graph("FAISS HNSW", faiss_indexes.hnsw)
+        for parts in (settings.dim // 2, settings.dim):
+            quantizer = partial(faiss_indexes.product_quantizer, parts=parts)
+            enter(f"FAISS IVF, PQ{parts} fast scan", quantizer)
         enter("FAISS IVF, SQ8", faiss_indexes.scalar_quantizer)
     if installed("hnswlib"):
         from protomark.bench.peers import hnswlib_index
 
-        enter("hnswlib", hnswlib_index.hnsw)
+        enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
     if installed("usearch"):
         from protomark.bench.peers import usearch_index
 
-        enter("USearch int8", usearch_index.hnsw_i8, graph=True)
-        enter("USearch float32", usearch_index.hnsw_f32, graph=True)
+        enter_graph("USearch int8", usearch_index.hnsw_i8)
+        enter_graph("USearch float32", usearch_index.hnsw_f32)
     if installed("cv2"):
         from protomark.bench.peers import opencv_matchers
 
         enter("OpenCV FLANN kd-trees", opencv_matchers.kd_trees)
         if n <= settings.hashed:
-            found.append(_hashed(workload, n, queries))
+            found.append(_hashed(workload, ground))
         else:
             results.skipped.append(
-                f"OpenCV FLANN LSH, {n:,} landmarks: only up to {settings.hashed:,}"
+                f"OpenCV FLANN LSH, {ground.title}: only up to {settings.hashed:,}"
             )
     return found
 
 
-def _hashed(workload: Workload, n: int, queries: NDArray[np.uint8]) -> _Entrant:
+def _hashed(workload: Workload, ground: _Ground) -> _Entrant:
     """FLANN's LSH, on all bits, against the exact answer among bits."""
     from protomark.bench.peers import opencv_matchers
 
     threads, build_threads = workload.settings.threads, workload.settings.build_threads
-    rows = workload.grown.descriptors(n)
+    rows, queries = ground.descriptors(), ground.queries
     _, distances = pm.hamming_search(queries, rows, k=1, threads=build_threads)
     return _Entrant(
         "OpenCV FLANN LSH on bits",
         lambda: opencv_matchers.lsh(rows, queries, threads, build_threads),
         partial(_as_near_in_bits, rows, queries, distances[:, 0]),
         least=16,
+        comparable=False,
         note="all descriptors, against the nearest of them; ",
     )
 
@@ -187,7 +269,12 @@ def _contender(
 ) -> Contender | None:
     if trial is None:
         return None
-    facts = {"recall": trial.recall, "bytes": index.bytes / n, "build": built}
+    facts = {
+        "recall": trial.recall,
+        "asked": trial.queries,
+        "bytes": index.bytes / n,
+        "build": built,
+    }
     if index.more is not None:
         facts["more"] = index.more
     return Contender(
@@ -196,22 +283,26 @@ def _contender(
         lambda q: index.prepare(trial.setting)(q),
         ours=entrant.own,
         least=entrant.least,
+        comparable=entrant.comparable,
         facts=facts,
         note=f"{entrant.note}{index.note}; {index.setting} {trial.setting}",
     )
 
 
-def _trial(search: Search, entrant: _Entrant, queries: int, seconds: float) -> tuple[float, float]:
-    """Recall and seconds of a query, over as many queries as the time allows."""
+def _trial(
+    search: Search, entrant: _Entrant, queries: int, seconds: float
+) -> tuple[float, float, int]:
+    """Recall, seconds of a query, and queries asked: as many as the time allows."""
     few = min(entrant.least, queries)
     began = time.perf_counter()
     search(few)
     each = (time.perf_counter() - began) / few
-    count = min(queries, max(few, int(seconds / each)))
+    affordable = min(QUERIES, int(_PATIENCE * seconds / each))
+    count = min(queries, max(few, affordable, int(seconds / each)))
     began = time.perf_counter()
     answers = search(count)
     each = (time.perf_counter() - began) / count
-    return float(entrant.right(answers).mean()), each
+    return float(entrant.right(answers).mean()), each, count
 
 
 def _squared(
