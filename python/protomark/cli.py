@@ -557,6 +557,9 @@ def bench(
             "large the last one), for example 10000,1000000, in place of the usual ones."
         ),
     ] = "",
+    graphs: Annotated[
+        bool, typer.Option(help="Also indexes that are graphs: on large maps they build for hours.")
+    ] = True,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
     scratch: Annotated[
         Path | None,
@@ -589,9 +592,11 @@ def bench(
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
         landmarks=_numbers("--landmarks", landmarks),
+        graphs=graphs,
     )
     flags = [f"--only {only}"] if only else []
     flags += [f"--landmarks {landmarks}"] if landmarks else []
+    flags += [] if graphs else ["--no-graphs"]
     flags += ["--full"] if full else ["--quick"] if quick else []
     flags += [f"--threads {threads}"] if threads != 1 else []
     repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])

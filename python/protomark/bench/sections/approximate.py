@@ -213,7 +213,10 @@ def _entrants(
     if installed("hnswlib"):
         from protomark.bench.peers import hnswlib_index
 
-        enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
+        if settings.graphs > 0:
+            enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
+        else:
+            results.skipped.append(f"hnswlib, {ground.title}: --no-graphs")
     if installed("usearch"):
         from protomark.bench.peers import usearch_index
 
