@@ -15,6 +15,8 @@ namespace {
 
 // Blocks that are compared with all queries of a cell at a time.
 constexpr std::size_t kChunkBlocks = 32;
+// Queries that go through the cells together.
+constexpr std::size_t kQueries = 1 << 14;
 
 // The queries of each cell that has any.
 struct Probe {
@@ -86,6 +88,16 @@ void search_chunks(const Prototypes& prototypes, const CellView& cells, const Ch
                    MatrixView<float> distances) {
   check_search(prototypes.dim, queries, options, ids, distances);
   probes = std::min(probes, cells.cells());
+  // Of more queries the cells would take much memory.
+  if (queries.rows > kQueries) {
+    for (std::size_t q = 0; q < queries.rows; q += kQueries) {
+      const std::size_t n = std::min(kQueries, queries.rows - q);
+      search_chunks(prototypes, cells, chunk, centroids, probes,
+                    {queries.row(q), n, queries.columns}, options, {ids.row(q), n, ids.columns},
+                    {distances.row(q), n, distances.columns});
+    }
+    return;
+  }
   const std::vector<std::uint32_t> nearest =
       nearest_cells(centroids, queries, probes, options.threads);
 

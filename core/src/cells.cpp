@@ -150,9 +150,16 @@ Cells::Cells(std::vector<std::int8_t> centroids, std::size_t dim)
   };
   const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
   const CellOrder order(assign(group_centroids), groups);
-  group_centroids_.codes = pack_codes({group_centroids.data(), groups, dim_});
-  group_sizes_ = order.rows;
-  group_blocks_ = order.first_blocks;
+  // A group that is nearest to no centroid, as centroids of a broken file might have, is left out.
+  std::vector<std::int8_t> kept;
+  for (std::size_t g = 0; g < groups; ++g) {
+    if (order.rows[g] == 0) continue;
+    kept.insert(kept.end(), &group_centroids[g * dim_], &group_centroids[g * dim_] + dim_);
+    group_sizes_.push_back(order.rows[g]);
+    group_blocks_.push_back(order.first_blocks[g]);
+  }
+  group_blocks_.push_back(order.first_blocks.back());
+  group_centroids_.codes = pack_codes({kept.data(), group_sizes_.size(), dim_});
   const std::size_t places = order.first_blocks.back() * kPackedRows;
   std::vector<std::int8_t> grouped(places * dim_, 0);
   cell_of_.assign(places, 0);

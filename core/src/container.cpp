@@ -11,6 +11,7 @@
 #include <cerrno>
 #include <cstring>
 #include <random>
+#include <stdexcept>
 
 #include "crc32.h"
 #include "protomark/error.h"
@@ -88,6 +89,10 @@ class TemporaryFile {
     }
   }
 
+  void seek(std::size_t offset) {
+    if (::lseek(descriptor_, static_cast<off_t>(offset), SEEK_SET) < 0) fail();
+  }
+
   void commit() {
     if (::fsync(descriptor_) != 0) fail();
     const int descriptor = std::exchange(descriptor_, -1);
@@ -136,26 +141,43 @@ const char* describe(FileKind kind) {
 }
 
 void ContainerWriter::add(std::string name, Bytes bytes) {
-  sections_.push_back({std::move(name), {}, bytes});
+  add(std::move(name), bytes.size(), [bytes](const Sink& sink) { sink(bytes); });
 }
 
 void ContainerWriter::add(std::string name, std::vector<std::byte> bytes) {
-  Section section{std::move(name), std::move(bytes), {}};
-  section.bytes = section.owned;
-  sections_.push_back(std::move(section));
+  const std::size_t size = bytes.size();
+  add(std::move(name), size, [owned = std::move(bytes)](const Sink& sink) { sink(owned); });
 }
 
-void ContainerWriter::emit(const std::function<void(Bytes)>& sink) const {
+void ContainerWriter::add(std::string name, std::size_t size, Produce produce) {
+  sections_.push_back({std::move(name), size, std::move(produce)});
+}
+
+std::size_t ContainerWriter::head_size() const {
+  return align(sizeof(Header) + sections_.size() * sizeof(Entry));
+}
+
+std::vector<std::byte> ContainerWriter::emit(const Sink& sink) const {
+  constexpr std::array<std::byte, kAlignment> zeros{};
   std::vector<Entry> table;
-  std::uint64_t offset = align(sizeof(Header) + sections_.size() * sizeof(Entry));
+  std::uint64_t offset = head_size();
   for (const Section& section : sections_) {
     Entry entry{};
     std::memcpy(entry.name, section.name.data(), std::min<std::size_t>(8, section.name.size()));
     entry.offset = offset;
-    entry.size = section.bytes.size();
-    entry.crc = crc32(section.bytes);
+    section.produce([&](Bytes bytes) {
+      entry.crc = crc32(bytes, entry.crc);
+      entry.size += bytes.size();
+      sink(bytes);
+    });
+    if (entry.size != section.size) {
+      throw std::logic_error("section '" + section.name + "' has " + std::to_string(entry.size) +
+                             " bytes, not " + std::to_string(section.size));
+    }
     table.push_back(entry);
-    offset = align(offset + entry.size);
+    const std::uint64_t end = offset + entry.size;
+    offset = align(end);
+    sink(Bytes(zeros).first(offset - end));
   }
   Header header{};
   std::memcpy(header.magic, kMagic, sizeof(kMagic));
@@ -165,31 +187,28 @@ void ContainerWriter::emit(const std::function<void(Bytes)>& sink) const {
   header.sections = static_cast<std::uint32_t>(sections_.size());
   header.crc = crc32(std::as_bytes(std::span(table)), crc32(as_bytes(header)));
 
-  constexpr std::array<std::byte, kAlignment> zeros{};
-  std::uint64_t written = 0;
-  const auto put = [&](Bytes bytes) {
-    sink(bytes);
-    written += bytes.size();
-  };
-  const auto pad = [&] { put(Bytes(zeros).first(align(written) - written)); };
-  put(as_bytes(header));
-  put(std::as_bytes(std::span(table)));
-  pad();
-  for (const Section& section : sections_) {
-    put(section.bytes);
-    pad();
+  std::vector<std::byte> head(head_size());
+  std::memcpy(head.data(), &header, sizeof(header));
+  if (!table.empty()) {
+    std::memcpy(head.data() + sizeof(header), table.data(), table.size() * sizeof(Entry));
   }
+  return head;
 }
 
 std::vector<std::byte> ContainerWriter::serialize() const {
-  std::vector<std::byte> result;
-  emit([&](Bytes bytes) { result.insert(result.end(), bytes.begin(), bytes.end()); });
+  std::vector<std::byte> result(head_size());
+  const auto head =
+      emit([&](Bytes bytes) { result.insert(result.end(), bytes.begin(), bytes.end()); });
+  std::copy(head.begin(), head.end(), result.begin());
   return result;
 }
 
 void ContainerWriter::write(const std::filesystem::path& path) const {
   TemporaryFile file(path);
-  emit([&](Bytes bytes) { file.write(bytes); });
+  file.seek(head_size());
+  const auto head = emit([&](Bytes bytes) { file.write(bytes); });
+  file.seek(0);
+  file.write(head);
   file.commit();
 }
 

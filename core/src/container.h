@@ -9,6 +9,7 @@
 // Everything is little-endian. docs/format.md says what each kind holds.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <filesystem>
@@ -28,9 +29,14 @@ const char* describe(FileKind kind);
 
 using Bytes = std::span<const std::byte>;
 
-// Sections in memory that belong to somebody else, to be written as one file.
+// Sections to be written as one file. They are in memory and belong to somebody else, or come into
+// being piece by piece while the file is written.
 class ContainerWriter {
  public:
+  using Sink = std::function<void(Bytes)>;
+  // Hands the bytes of a section to the sink, from the first to the last.
+  using Produce = std::function<void(const Sink&)>;
+
   // `version` is the oldest format that has all that the file holds (docs/format.md), so that a
   // reader which knows less refuses it, and older ones go on reading everything else.
   explicit ContainerWriter(FileKind kind, std::uint32_t version = 1)
@@ -40,18 +46,24 @@ class ContainerWriter {
   void add(std::string name, Bytes bytes);
   // Takes the bytes over.
   void add(std::string name, std::vector<std::byte> bytes);
+  // `produce` is called each time that the file is written, and must then give `size` bytes.
+  void add(std::string name, std::size_t size, Produce produce);
 
   std::vector<std::byte> serialize() const;
-  // Writes the file as write_file does, without a copy of the sections.
+  // Writes the file as write_file does, without a copy of the sections. What a producer throws
+  // passes through, and the old file is still there.
   void write(const std::filesystem::path& path) const;
 
  private:
   struct Section {
     std::string name;
-    std::vector<std::byte> owned;
-    Bytes bytes;
+    std::size_t size;
+    Produce produce;
   };
-  void emit(const std::function<void(Bytes)>& sink) const;
+  // Where the sections begin.
+  std::size_t head_size() const;
+  // Hands the sections to `sink` and returns what stands before them, which has their checksums.
+  std::vector<std::byte> emit(const Sink& sink) const;
 
   FileKind kind_;
   std::uint32_t version_;
@@ -157,6 +169,23 @@ class SectionReader {
   std::string section_;
   Bytes rest_;
 };
+
+// A section of n elements of `width` values each. `fill(i, to)` gives the values of element i.
+template <typename T, typename Fill>
+void add_values(ContainerWriter& file, std::string name, std::size_t n, std::size_t width,
+                Fill fill) {
+  constexpr std::size_t kPiece = 1 << 18;  // bytes
+  const std::size_t element = width * sizeof(T);
+  file.add(std::move(name), n * element, [=](const ContainerWriter::Sink& sink) {
+    const std::size_t some = std::min(n, std::max<std::size_t>(1, kPiece / element));
+    std::vector<T> values(some * width);
+    for (std::size_t first = 0; first < n; first += some) {
+      const std::size_t end = std::min(n, first + some);
+      for (std::size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
+      sink(std::as_bytes(std::span(values)).first((end - first) * element));
+    }
+  });
+}
 
 // Collects plain values for a section.
 class SectionWriter {

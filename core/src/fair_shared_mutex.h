@@ -21,13 +21,6 @@ class FairSharedMutex {
     mutex_.lock_shared();
     leave();
   }
-  bool try_lock() {
-    std::uint32_t ticket = serving_.load();
-    if (!next_.compare_exchange_strong(ticket, ticket + 1)) return false;
-    const bool locked = mutex_.try_lock();
-    leave();
-    return locked;
-  }
   void unlock() { mutex_.unlock(); }
   void unlock_shared() { mutex_.unlock_shared(); }
 

@@ -91,8 +91,8 @@ class IdIndex {
   }
 
   void grow(const LargeVector<std::int64_t>& ids) {
-    const LargeVector<std::uint32_t> old = std::move(slots_);
-    slots_.assign(old.empty() ? 16 : 2 * old.size(), kNone);
+    LargeVector<std::uint32_t> old(slots_.empty() ? 16 : 2 * slots_.size(), kNone);
+    old.swap(slots_);
     for (const std::uint32_t row : old) {
       if (row != kNone) place(ids, row);
     }

@@ -339,9 +339,13 @@ void SealedMap::search_codes(Codes queries, const SearchOptions& options,
     }
     const PackedPrototypes centroids{
         reinterpret_cast<const std::int8_t*>(c.packed_centroids.data()), c.index_cells(), dim()};
-    search_cells(prototypes, CellView(c.cell_rows, c.first_blocks), centroids,
-                 options.recall ? this->probes(*options.recall) : *probes, queries, exact(options),
-                 ids, distances);
+    const std::size_t searched = options.recall ? this->probes(*options.recall) : *probes;
+    if (searched >= c.index_cells()) {
+      protomark::search(prototypes, queries, exact(options), ids, distances);
+      return;
+    }
+    search_cells(prototypes, CellView(c.cell_rows, c.first_blocks), centroids, searched, queries,
+                 exact(options), ids, distances);
   };
   if (c.code_bits == 4) {
     run(c.prototypes4);

@@ -61,10 +61,14 @@ void PrototypeMap::search_codes(Codes queries, const SearchOptions& options,
     protomark::search(store_->view(), queries, options, ids, distances);
     return;
   }
-  search_cells(
-      store_->view(), CellView(store_->blocks()), store_->cells().packed(),
-      options.recall ? probes_for(store_->ranks(options.threads), *options.recall, cells) : *probes,
-      queries, exact(options), ids, distances);
+  const std::size_t searched =
+      options.recall ? probes_for(store_->ranks(options.threads), *options.recall, cells) : *probes;
+  if (searched >= cells) {
+    protomark::search(store_->view(), queries, exact(options), ids, distances);
+    return;
+  }
+  search_cells(store_->view(), CellView(store_->blocks()), store_->cells().packed(), searched,
+               queries, exact(options), ids, distances);
 }
 
 ProbeRanks PrototypeMap::Store::ranks(int threads) const {

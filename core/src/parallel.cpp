@@ -2,6 +2,7 @@
 
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <deque>
@@ -12,6 +13,9 @@
 
 namespace protomark {
 namespace {
+
+// Threads stay once they are started, so that a slip in a number must not start thousands.
+constexpr std::size_t kMaxThreads = 256;
 
 // Whether this thread runs a task.
 thread_local bool inside_task = false;
@@ -103,7 +107,7 @@ Pool& pool() {
 
 void run_tasks(int threads, std::size_t n, const std::function<void(std::size_t)>& task) {
   if (threads < 1) throw std::invalid_argument("threads must be at least 1");
-  const std::size_t workers = std::min(static_cast<std::size_t>(threads), n);
+  const std::size_t workers = std::min({static_cast<std::size_t>(threads), n, kMaxThreads});
   if (workers <= 1 || inside_task) {
     for (std::size_t i = 0; i < n; ++i) task(i);
     return;

@@ -142,6 +142,7 @@ void PrototypeStore::resize_rows(std::size_t places) {
 
 // Room for a row at the end of a cell.
 std::uint32_t PrototypeStore::take_place(std::uint32_t cell) {
+  if (places() + kPackedRows > kNone) throw std::length_error("a map holds under 2^32 prototypes");
   make_room_for_row();
   const std::uint32_t row = blocks_.append(cell);
   if (places() != counts_.size()) resize_rows(places());
@@ -296,11 +297,15 @@ std::vector<std::uint32_t> PrototypeStore::sorted_rows(std::uint32_t landmark) c
   return result;
 }
 
+void PrototypeStore::rounded(std::uint32_t row, std::int8_t* to) const {
+  for (std::size_t d = 0; d < dim_; d += 4) {
+    std::copy_n(packed() + packed_index(row, d, dim_), std::min<std::size_t>(4, dim_ - d), to + d);
+  }
+}
+
 std::vector<std::int8_t> PrototypeStore::rounded(std::span<const std::uint32_t> rows) const {
   std::vector<std::int8_t> result(rows.size() * dim_);
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    for (std::size_t d = 0; d < dim_; ++d) result[i * dim_ + d] = rounded(rows[i], d);
-  }
+  for (std::size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
   return result;
 }
 
@@ -348,11 +353,21 @@ void PrototypeStore::prefetch_rounded(std::uint32_t row) const {
   }
 }
 
+namespace {
+
+// Half of a sum, of which `count` observations are left: a mean of 127 stays one, although half of
+// an odd count is rounded down.
+std::int16_t half(int sum, int count) {
+  return static_cast<std::int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
+}
+
+}  // namespace
+
 void PrototypeStore::add(std::uint32_t row, const std::int8_t* code) {
   std::int16_t* s = sum(row);
   if (counts_[row] == PrototypeMap::kMaxCount) {
-    for (std::size_t d = 0; d < dim_; ++d) s[d] = static_cast<std::int16_t>(s[d] / 2);
     counts_[row] /= 2;
+    for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], counts_[row]);
   }
   for (std::size_t d = 0; d < dim_; ++d) s[d] = static_cast<std::int16_t>(s[d] + code[d]);
   ++counts_[row];
@@ -360,13 +375,13 @@ void PrototypeStore::add(std::uint32_t row, const std::int8_t* code) {
 
 void PrototypeStore::join(std::uint32_t row, const std::int16_t* other, int other_count) {
   const int n = counts_[row] + other_count;
-  const int halvings = n > PrototypeMap::kMaxCount ? 1 : 0;  // 255 + 255 needs one at most
+  const bool halved = n > PrototypeMap::kMaxCount;  // once is enough for 255 + 255
+  counts_[row] = static_cast<std::uint8_t>(halved ? n / 2 : n);
   std::int16_t* s = sum(row);
   for (std::size_t d = 0; d < dim_; ++d) {
     const int total = s[d] + other[d];
-    s[d] = static_cast<std::int16_t>(halvings != 0 ? total / 2 : total);
+    s[d] = halved ? half(total, counts_[row]) : static_cast<std::int16_t>(total);
   }
-  counts_[row] = static_cast<std::uint8_t>(n >> halvings);
   refresh(row);
 }
 
@@ -440,18 +455,32 @@ void PrototypeStore::set_cells(Cells cells, int threads) {
 
 namespace {
 
-// Elements of `size` values go from one place to another one.
+// Elements of `size` values that are to go from one place to another one. The room is taken first,
+// and not touched until they go, so that they do all or, where memory runs out, none, and take no
+// more than twice the largest array's.
 template <typename Vector>
-void move_elements(Vector& v, std::size_t size, const std::vector<std::uint32_t>& from,
-                   const std::vector<std::uint32_t>& to, std::size_t places,
-                   const typename Vector::value_type& padding) {
-  if (v.empty()) return;
-  Vector moved(places * size, padding);
-  for (std::size_t i = 0; i < from.size(); ++i) {
-    std::copy_n(&v[from[i] * size], size, &moved[to[i] * size]);
+class MovedElements {
+ public:
+  MovedElements(Vector& v, std::size_t size, std::size_t places,
+                const typename Vector::value_type& padding)
+      : from_(v), size_(size), places_(v.empty() ? 0 : places), padding_(padding) {
+    to_.reserve(places_ * size_);
   }
-  v = std::move(moved);
-}
+
+  void move(const std::vector<std::uint32_t>& from, const std::vector<std::uint32_t>& to) {
+    to_.resize(places_ * size_, padding_);
+    for (std::size_t i = 0; places_ != 0 && i < from.size(); ++i) {
+      std::copy_n(&from_[from[i] * size_], size_, &to_[to[i] * size_]);
+    }
+    from_ = std::move(to_);
+  }
+
+ private:
+  Vector& from_;
+  Vector to_;
+  std::size_t size_, places_;
+  typename Vector::value_type padding_;
+};
 
 }  // namespace
 
@@ -466,7 +495,19 @@ void PrototypeStore::rearrange(const std::vector<std::uint32_t>& rows,
   for (std::uint32_t c = 0; c < cells; ++c) {
     for (std::size_t i = 0; i < order.rows[c]; ++i) blocks.append(c);
   }
+  std::vector<std::uint32_t> number(places(), kNone);
+  for (std::size_t i = 0; i < rows.size(); ++i) number[rows[i]] = to[i];
+  MovedElements sums(sums_, dim_, end, std::int16_t{0});
+  MovedElements counts(counts_, 1, end, std::uint8_t{0});
+  const std::size_t landmarks = look_bits_ == 0 ? end : 0;
+  MovedElements ids(ids_, 1, landmarks, std::int64_t{-1});
+  MovedElements positions(positions_, 1, landmarks, kNowhere);
+  MovedElements looks(looks_, 1, end, std::uint16_t{0});
+  MovedElements owners(owners_, 1, end, std::uint32_t{kNone});
+  MovedElements next(next_, 1, end, std::uint32_t{kNone});
   LargeVector<CodeVector> packed(packed_size(end, dim_) / sizeof(CodeVector));
+
+  // From here on nothing asks for memory.
   auto* codes = reinterpret_cast<std::int8_t*>(packed.data());
   for (std::size_t i = 0; i < rows.size(); ++i) {
     for (std::size_t d = 0; d < dim_; d += 4) {
@@ -474,22 +515,19 @@ void PrototypeStore::rearrange(const std::vector<std::uint32_t>& rows,
                   this->packed() + packed_index(rows[i], d, dim_), 4);
     }
   }
-  std::vector<std::uint32_t> number(places(), kNone);
-  for (std::size_t i = 0; i < rows.size(); ++i) number[rows[i]] = to[i];
-
-  move_elements(sums_, dim_, rows, to, end, std::int16_t{0});
-  move_elements(counts_, 1, rows, to, end, std::uint8_t{0});
   packed_ = std::move(packed);
   blocks_ = std::move(blocks);
+  sums.move(rows, to);
+  counts.move(rows, to);
   if (look_bits_ == 0) {
-    move_elements(ids_, 1, rows, to, end, std::int64_t{-1});
-    move_elements(positions_, 1, rows, to, end, kNowhere);
+    ids.move(rows, to);
+    positions.move(rows, to);
     index_.renumber(number);
     return;
   }
-  move_elements(looks_, 1, rows, to, end, std::uint16_t{0});
-  move_elements(owners_, 1, rows, to, end, std::uint32_t{kNone});
-  move_elements(next_, 1, rows, to, end, std::uint32_t{kNone});
+  looks.move(rows, to);
+  owners.move(rows, to);
+  next.move(rows, to);
   for (auto* links : {&heads_, &next_}) {
     for (std::uint32_t& row : *links) {
       if (row != kNone) row = number[row];

@@ -88,6 +88,8 @@ class PrototypeStore {
   std::int8_t rounded(std::uint32_t row, std::size_t d) const {
     return packed()[packed_index(row, d, dim_)];
   }
+  // The rounded prototype of a row.
+  void rounded(std::uint32_t row, std::int8_t* to) const;
   // The rounded prototypes of some rows, (rows x dim).
   std::vector<std::int8_t> rounded(std::span<const std::uint32_t> rows) const;
 

@@ -240,7 +240,17 @@ void PrototypeMap::update(const PrototypeMap& other) {
                                 std::to_string(other.look_bits()) +
                                 " look bits cannot be joined: build both with the same");
   }
-  const std::scoped_lock lock(store_->mutex, other.store_->mutex);
+  // Both wait for their turn, in one order for all pairs of maps, so that no two updates wait for
+  // each other.
+  std::unique_lock own(store_->mutex, std::defer_lock);
+  std::shared_lock others(other.store_->mutex, std::defer_lock);
+  if (std::less<>{}(store_.get(), other.store_.get())) {
+    own.lock();
+    others.lock();
+  } else {
+    others.lock();
+    own.lock();
+  }
   const Store& from = *other.store_;
   for (std::uint32_t i = 0; i < from.places(); ++i) {
     if (!from.is_row(i)) continue;
@@ -328,45 +338,40 @@ void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
 
 void PrototypeMap::save(const std::filesystem::path& path) const {
   const std::shared_lock lock(store_->mutex);
-  const auto landmarks = store_->sorted_landmarks();
-  const std::size_t n = landmarks.size(), m = store_->rows();
   const bool with_looks = look_bits() != 0;
-  std::vector<std::int64_t> ids;
-  std::vector<std::uint32_t> rows_of;
-  std::vector<Position> positions;
-  ids.reserve(n);
-  for (const std::uint32_t landmark : landmarks) {
-    ids.push_back(store_->ids()[landmark]);
-    if (!store_->positions().empty()) positions.push_back(store_->position(landmark));
-    if (with_looks) rows_of.push_back(static_cast<std::uint32_t>(store_->rows_of(landmark)));
-  }
-  // A map whose positions were all taken away equals one that never had any.
-  if (std::all_of(positions.begin(), positions.end(), is_nowhere)) positions.clear();
-  std::vector<std::uint16_t> looks;
-  std::vector<std::uint8_t> counts;
-  std::vector<std::int16_t> sums;
-  counts.reserve(m);
-  sums.reserve(m * dim_);
-  for (const std::uint32_t row : store_->sorted_rows()) {
-    if (with_looks) looks.push_back(store_->look(row));
-    counts.push_back(store_->count(row));
-    sums.insert(sums.end(), store_->sum(row), store_->sum(row) + dim_);
-  }
-
+  const auto landmarks = store_->sorted_landmarks();
+  // Without looks a row is a landmark.
+  const auto looks = with_looks ? store_->sorted_rows() : std::vector<std::uint32_t>();
+  const auto& rows = with_looks ? looks : landmarks;
+  const std::size_t n = landmarks.size(), m = rows.size();
   const std::vector<std::int8_t>& cells = store_->cells().centroids();
 
   ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
-  file.add(section::kIds, std::as_bytes(std::span(ids)));
+  add_values<std::int64_t>(file, section::kIds, n, 1, [&](std::size_t i, std::int64_t* to) {
+    *to = store_->ids()[landmarks[i]];
+  });
   if (with_looks) {
     file.add(section::kLookBits, write_look_bits(look_bits()));
-    file.add(section::kRows, std::as_bytes(std::span(rows_of)));
-    file.add(section::kLooks, std::as_bytes(std::span(looks)));
+    add_values<std::uint32_t>(file, section::kRows, n, 1, [&](std::size_t i, std::uint32_t* to) {
+      *to = static_cast<std::uint32_t>(store_->rows_of(landmarks[i]));
+    });
+    add_values<std::uint16_t>(file, section::kLooks, m, 1, [&](std::size_t i, std::uint16_t* to) {
+      *to = store_->look(rows[i]);
+    });
   }
-  file.add(section::kCounts, std::as_bytes(std::span(counts)));
-  file.add(section::kSums, std::as_bytes(std::span(sums)));
-  if (!positions.empty()) file.add(section::kPositions, std::as_bytes(std::span(positions)));
+  add_values<std::uint8_t>(file, section::kCounts, m, 1,
+                           [&](std::size_t i, std::uint8_t* to) { *to = store_->count(rows[i]); });
+  add_values<std::int16_t>(file, section::kSums, m, dim_, [&](std::size_t i, std::int16_t* to) {
+    std::copy_n(store_->sum(rows[i]), dim_, to);
+  });
+  // A map whose positions were all taken away equals one that never had any.
+  if (!std::all_of(store_->positions().begin(), store_->positions().end(), is_nowhere)) {
+    add_values<Position>(file, section::kPositions, n, 1, [&](std::size_t i, Position* to) {
+      *to = store_->position(landmarks[i]);
+    });
+  }
   if (!cells.empty()) file.add(section::kCells, std::as_bytes(std::span(cells)));
   file.write(path);
 }

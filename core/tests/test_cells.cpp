@@ -277,12 +277,12 @@ void histories(std::size_t look_bits) {
   check_exact(with, search(without, queries, 3), queries);
 }
 
-void sealed(std::size_t look_bits, int bits, std::optional<double> prototypes) {
+void sealed(std::size_t look_bits, int bits, std::optional<double> prototypes,
+            std::size_t n = 5000) {
   const auto encoder = test::random_encoder();
   test::Random random(8);
   PrototypeMap with(encoder, kDim, look_bits), without(encoder, kDim, look_bits);
-  const std::size_t n = 5000;
-  const auto landmarks = random.integers<std::int64_t>(n, 0, 1500);
+  const auto landmarks = random.integers<std::int64_t>(n, 0, static_cast<std::int64_t>(n / 10 * 3));
   const auto codes = clumped(random, n);
   for (PrototypeMap* map : {&with, &without}) map->add_codes(landmarks, {codes.data(), n, kDim});
   with.build_index(30);
@@ -371,6 +371,9 @@ int main() {
   sealed(5, 8, std::nullopt);
   sealed(5, 8, 1.5);
   sealed(5, 4, 2.0);
+  // More than are sealed at a time.
+  sealed(0, 8, std::nullopt, 250'000);
+  sealed(5, 8, std::nullopt, 100'000);
   errors();
   return check::result();
 }

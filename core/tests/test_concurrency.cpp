@@ -172,6 +172,25 @@ void test_updates_of_each_other() {
   }
 }
 
+// An update comes to an end while both maps are searched all the time.
+void test_updates_while_both_are_searched() {
+  const auto encoder = test::random_encoder();
+  test::Random random(10);
+  const Observations a = observations(random, 3000, 0), b = observations(random, 3000, 1000);
+  const auto codes = random.integers<std::int8_t>(kQueries * kDim, -127, 127);
+  PrototypeMap left(encoder), right(encoder);
+  left.add_codes(a.ids, a.view());
+  right.add_codes(b.ids, b.view());
+  std::vector<std::jthread> searchers;
+  for (const PrototypeMap* map : {&left, &left, &right, &right}) {
+    searchers.emplace_back([&, map](const std::stop_token& stop) {
+      while (!stop.stop_requested()) ask(*map, {codes.data(), kQueries, kDim}, 1);
+    });
+  }
+  for (int round = 0; round < 20; ++round) left.update(right);
+  CHECK(left.size() == 200 + right.size());
+}
+
 }  // namespace
 
 int main() {
@@ -182,6 +201,7 @@ int main() {
     test_searches_while_a_writer_changes(look_bits, folder);
   }
   test_updates_of_each_other();
+  test_updates_while_both_are_searched();
   fs::remove_all(folder);
   return check::result();
 }

@@ -12,6 +12,7 @@
 #include <iterator>
 
 #include "check.h"
+#include "container.h"
 #include "protomark/error.h"
 #include "protomark/prototypes.h"
 #include "random.h"
@@ -89,6 +90,39 @@ PrototypeMap map_of(std::size_t landmarks) {
   return map;
 }
 
+// Sections that come into being while they are written.
+void pieces(const fs::path& path) {
+  const auto values = test::Random(4).integers<std::int32_t>(300'000, -1000, 1000);
+  ContainerWriter whole(FileKind::encoder), pieced(FileKind::encoder);
+  const auto add = [&](ContainerWriter& file) {
+    add_values<std::int32_t>(file, "none", 0, 3, [](std::size_t, std::int32_t*) {});
+    add_values<std::int32_t>(
+        file, "values", values.size() / 3, 3,
+        [&](std::size_t i, std::int32_t* to) { std::copy_n(&values[3 * i], 3, to); });
+  };
+  whole.add("none", Bytes());
+  whole.add("values", std::as_bytes(std::span(values)));
+  add(pieced);
+  CHECK(pieced.serialize() == whole.serialize());
+  pieced.write(path);
+  const auto old_bytes = read(path);
+  CHECK(std::ranges::equal(std::as_bytes(std::span(old_bytes)), whole.serialize()));
+
+  // Whatever goes wrong in one, the old file stays.
+  add_values<std::int32_t>(pieced, "broken", 1, 1, [](std::size_t, std::int32_t*) {
+    throw std::invalid_argument("no such value");
+  });
+  CHECK(check::throws<std::invalid_argument>([&] { pieced.write(path); }, "no such value"));
+  CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
+  for (const std::size_t size : {3u, 5u}) {
+    ContainerWriter other(FileKind::encoder);
+    other.add("four", size, [](const auto& sink) { sink(std::vector<std::byte>(4)); });
+    CHECK(check::throws<std::logic_error>([&] { other.write(path); }, "has 4 bytes, not"));
+    CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
+  }
+  fs::remove(path);
+}
+
 }  // namespace
 
 int main() {
@@ -96,6 +130,7 @@ int main() {
       fs::temp_directory_path() / ("protomark_durability_" + std::to_string(::getpid()));
   fs::create_directory(folder);
   const fs::path path = folder / "map.pmk";
+  pieces(path);
   const PrototypeMap old_map = map_of(50), new_map = map_of(100);
 
   disk = {};

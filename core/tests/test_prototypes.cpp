@@ -1,6 +1,9 @@
 #include "protomark/prototypes.h"
 
+#include <unistd.h>
+
 #include <cmath>
+#include <filesystem>
 #include <thread>
 
 #include "check.h"
@@ -61,6 +64,28 @@ int main() {
   map.prototypes(known, {a.data(), known.size(), dim});
   shared.prototypes(known, {b.data(), known.size(), dim});
   CHECK(a == b);
+
+  // Codes at their limit, more than a count holds: the mean stays where it is, and files are valid.
+  for (const int value : {127, -127}) {
+    for (const std::size_t times : {255, 256, 384, 1000}) {
+      const std::vector<std::int64_t> same(times, 7);
+      const std::vector<std::int8_t> extreme(times * dim, static_cast<std::int8_t>(value));
+      PrototypeMap full(encoder), twice(encoder);
+      full.add_codes(same, {extreme.data(), times, dim});
+      twice.add_codes(same, {extreme.data(), times, dim});
+      twice.update(full);
+      for (const PrototypeMap* one : {&full, &twice}) {
+        std::vector<float> mean(dim);
+        one->prototypes(std::span(&same[0], 1), {mean.data(), 1, dim});
+        CHECK(mean == std::vector<float>(dim, static_cast<float>(value)));
+        const auto file = std::filesystem::temp_directory_path() /
+                          ("protomark_extreme_" + std::to_string(::getpid()) + ".pmk");
+        one->save(file);
+        CHECK(PrototypeMap::load(file).size() == 1);
+        std::filesystem::remove(file);
+      }
+    }
+  }
 
   map.remove_codes(ids, all);
   CHECK(map.size() == 0);

@@ -553,10 +553,13 @@ def bench(
     landmarks: Annotated[
         str,
         typer.Option(
-            help="Sizes of the maps that are searched (search, hamming, approximate, growth; of large "
-            "the last one), for example 10000,1000000, in place of the usual ones."
+            help="Sizes of the maps that are searched (search, hamming, approximate, growth; of "
+            "large the last one), for example 10000,1000000, in place of the usual ones."
         ),
     ] = "",
+    graphs: Annotated[
+        bool, typer.Option(help="Also indexes that are graphs: on large maps they build for hours.")
+    ] = True,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
     scratch: Annotated[
         Path | None,
@@ -566,11 +569,11 @@ def bench(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Measure speed beside PyTorch, ONNX Runtime, FAISS, OpenCV, hnswlib and USearch.
+    r"""Measure speed beside PyTorch, ONNX Runtime, FAISS, OpenCV, hnswlib and USearch.
 
     All contenders take turns in one run, on the same data and as many threads; ratios come with
     their spread, and beside the machine's own ceilings. Peers that are not installed are left out:
-    `pip install protomark\\[bench]`. Ctrl-C ends the run and keeps what is measured.
+    `pip install protomark\[bench]`. Ctrl-C ends the run and keeps what is measured.
     docs/benchmarks.md holds a whole run.
     """
     import tempfile
@@ -589,9 +592,11 @@ def bench(
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
         landmarks=_numbers("--landmarks", landmarks),
+        graphs=graphs,
     )
     flags = [f"--only {only}"] if only else []
     flags += [f"--landmarks {landmarks}"] if landmarks else []
+    flags += [] if graphs else ["--no-graphs"]
     flags += ["--full"] if full else ["--quick"] if quick else []
     flags += [f"--threads {threads}"] if threads != 1 else []
     repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])

@@ -35,8 +35,9 @@ struct Look {
 // own. That depends on the observation alone, so all of the above holds for each look. A landmark
 // is then as far away as the nearest of its looks.
 //
-// n goes to 255. Before one more is added, sum and n are halved (toward zero), so that an old
-// landmark forgets slowly; from then on its observations cannot be taken back exactly.
+// n goes to 255. Before one more is added, sum and n are halved (toward zero, the mean never beyond
+// 127), so that an old landmark forgets slowly; from then on its observations cannot be taken back
+// exactly.
 //
 // Search compares codes with prototypes rounded to int8, halves away from zero.
 //

@@ -26,7 +26,8 @@ class Settings:
         exact: landmarks of exact searches.
         approximate: landmarks of approximate searches.
         hashed: most landmarks whose bits go into FLANN's LSH.
-        graphs: most grown landmarks for which every graph is built; beyond it only one.
+        graphs: most grown landmarks for which every graph is built, memory allowing; beyond it only
+            one, with 0 none, and none of real ones.
         map: landmarks of the map of the sections frame and add.
         growth: landmarks of the maps along the curve.
         large: landmarks of the largest map, 0 for none.
@@ -60,15 +61,19 @@ def choose(
     quick: bool,
     scratch: Path,
     landmarks: tuple[int, ...] = (),
+    graphs: bool = True,
 ) -> Settings:
     """The settings of `--full`, of `--quick` (a few seconds, for tests), or of neither.
 
-    `landmarks` are sizes of the maps that are searched, in place of these settings' own.
+    `landmarks` are sizes of the maps that are searched, in place of these settings' own; without
+    `graphs` no graph is built.
 
     Raises:
         ValueError: a section is unknown, both are asked for, or a map has no landmark.
     """
     chosen = _of_scale(sections, threads, build_threads, full, quick, scratch)
+    if not graphs:
+        chosen = replace(chosen, graphs=0)
     if any(n < 1 for n in landmarks):
         raise ValueError(f"--landmarks {min(landmarks)}: a map needs at least 1")
     if not landmarks:
@@ -76,7 +81,12 @@ def choose(
     sizes = tuple(sorted(set(landmarks)))
     large = sizes[-1] if "large" in sections else chosen.large
     return replace(
-        chosen, exact=sizes, approximate=sizes, growth=sizes, graphs=sizes[-1], large=large
+        chosen,
+        exact=sizes,
+        approximate=sizes,
+        growth=sizes,
+        graphs=sizes[-1] if graphs else 0,
+        large=large,
     )
 
 

@@ -193,7 +193,9 @@ def _entrants(
         found.append(entrant)
 
     def enter_graph(name: str, build: Builder) -> None:
-        if ground.section == "real" or n <= settings.graphs:
+        if settings.graphs == 0:
+            results.skipped.append(f"{name}, {ground.title}: --no-graphs")
+        elif ground.section == "real" or n <= settings.graphs:
             enter(name, build, GRAPH_BYTES)
         else:
             results.skipped.append(
@@ -213,7 +215,10 @@ def _entrants(
     if installed("hnswlib"):
         from protomark.bench.peers import hnswlib_index
 
-        enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
+        if settings.graphs == 0:
+            results.skipped.append(f"hnswlib, {ground.title}: --no-graphs")
+        else:
+            enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
     if installed("usearch"):
         from protomark.bench.peers import usearch_index
 
