@@ -82,8 +82,8 @@ ProbeRanks PrototypeMap::Store::ranks(int threads) const {
     own.push_back(ids()[landmark_of(sorted[i])]);
   }
   const std::vector<std::int8_t> codes = rounded(rows);
-  const Codes queries{codes.data(), rows.size(), dim()};
-  const auto search_two = [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+  const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids,
+                              MatrixView<float> distances) {
     SearchOptions options;
     options.threads = threads;
     protomark::search(view(), queries, options, ids, distances);
@@ -103,7 +103,8 @@ ProbeRanks PrototypeMap::Store::ranks(int threads) const {
     }
     return cell;
   };
-  ranks_ = measure_ranks(queries, own, cells().centroids(), search_two, cell_of);
+  ranks_ = measure_ranks({codes.data(), rows.size(), dim()}, own, cells().centroids(), search_two,
+                         cell_of);
   ranks_changes_ = changes();
   return ranks_;
 }

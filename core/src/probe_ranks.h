@@ -20,13 +20,18 @@ using ProbeRanks = std::vector<std::uint32_t>;
 inline constexpr std::size_t kTestQueries = 2048;
 std::vector<std::size_t> test_rows(std::size_t rows);
 
-// Test queries are prototypes of the map itself, and what they look for is the nearest prototype of
-// another landmark: own[i] is the landmark of query i. `search_two` finds the two nearest landmarks
-// exactly, `cell_of` the cell of the prototype of a landmark that is nearest to a query.
-ProbeRanks measure_ranks(
-    Codes queries, const std::vector<std::int64_t>& own, const std::vector<std::int8_t>& centroids,
-    const std::function<void(MatrixView<std::int64_t>, MatrixView<float>)>& search_two,
-    const std::function<std::uint32_t(std::int64_t landmark, const std::int8_t* query)>& cell_of);
+// Finds the two nearest landmarks of each query exactly.
+using SearchTwo = std::function<void(Codes, MatrixView<std::int64_t>, MatrixView<float>)>;
+// The cell of the prototype of a landmark that is nearest to a query.
+using CellOf = std::function<std::uint32_t(std::int64_t landmark, const std::int8_t* query)>;
+
+// Test queries are of two kinds: prototypes of the map itself, which look for the nearest prototype
+// of another landmark (own[i] is the landmark of prototype i), as keypoints do whose landmark is
+// not in the map; and codes as far from these prototypes as observations are, which look for any,
+// and in a dense map find it harder. The greater rank of each share counts.
+ProbeRanks measure_ranks(Codes prototypes, const std::vector<std::int64_t>& own,
+                         const std::vector<std::int8_t>& centroids, const SearchTwo& search_two,
+                         const CellOf& cell_of);
 
 // Cells to search for a recall above 0 and at most 1; all of them for 1.
 std::size_t probes_for(const ProbeRanks& ranks, double recall, std::size_t cells);

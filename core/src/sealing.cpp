@@ -146,7 +146,6 @@ ProbeRanks ranks(const SealedRows& rows, const BlockPacker& packer, const Cells&
     rows.code(tests[i], &codes[i * dim]);
     own.push_back(static_cast<std::int64_t>(rows.landmark_of(tests[i])));
   }
-  const Codes queries{codes.data(), own.size(), dim};
 
   struct Nearest {
     std::int32_t distance = INT32_MAX;
@@ -167,7 +166,7 @@ ProbeRanks ranks(const SealedRows& rows, const BlockPacker& packer, const Cells&
     }
     return result;
   };
-  const auto search_two = [&](MatrixView<std::int64_t> ids, MatrixView<float>) {
+  const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float>) {
     std::vector<std::int32_t> distances(2 * queries.rows);
     std::vector<TopK> best;
     for (std::size_t q = 0; q < queries.rows; ++q) {
@@ -181,7 +180,8 @@ ProbeRanks ranks(const SealedRows& rows, const BlockPacker& packer, const Cells&
   const auto cell_of = [&](std::int64_t landmark, const std::int8_t* query) {
     return rows.cell_of(nearest_row(landmark, query).row);
   };
-  return measure_ranks(queries, own, cells.centroids(), search_two, cell_of);
+  return measure_ranks({codes.data(), own.size(), dim}, own, cells.centroids(), search_two,
+                       cell_of);
 }
 
 Occurrences occurrences(const SealedRows& rows) {
