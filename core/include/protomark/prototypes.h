@@ -104,8 +104,9 @@ class PrototypeMap {
   // Number of cells; 0: there is no index.
   std::size_t index_cells() const;
   // Cells that are searched for a recall above 0 and at most 1, as measured on the map: prototypes
-  // of landmarks are searched for among those of all others. Measured once and again when a tenth
-  // of the map has changed. Throws std::invalid_argument for another recall, and without an index.
+  // of landmarks are searched for among those of all others, and codes as far from them as
+  // observations are among all (docs/index.md). Measured once and again when a tenth of the map has
+  // changed. Throws std::invalid_argument for another recall, and without an index.
   std::size_t probes(double recall, int threads = 1) const;
 
   // See protomark/search.h.
