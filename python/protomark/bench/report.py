@@ -56,8 +56,9 @@ def markdown(results: Results, plots: Sequence[str] = ()) -> str:
     """The whole report; `plots` are names of pictures beside it."""
     parts = [
         "# Benchmarks",
-        "Protomark beside its peers, and the ceilings of the machine: one run, the same data, the "
-        "same number of threads. To repeat it (docs/tracks.md says where tracks come from):",
+        f"Protomark beside its peers, and the ceilings of the machine: {_runs(results)}, the same "
+        "data, the same number of threads. To repeat it (docs/tracks.md says where tracks come "
+        "from):",
         f"    pip install protomark[bench]\n    {results.command}",
         "## Targets",
         "Ratios are how many times as fast ours is: median of the rounds, least to greatest in "
@@ -206,6 +207,12 @@ def ceilings(results: Results) -> list[str]:
         else f"int8 multiply-adds, {name}: {rate / 1e9:,.0f} × 10⁹ a second"
         for name, rate in results.ceilings.items()
     ]
+
+
+def _runs(results: Results) -> str:
+    """How often it was measured: results may be joined."""
+    runs = 1 + results.command.count("\n")
+    return "one run" if runs == 1 else f"{runs} runs on one machine, each contest within one"
 
 
 def plural(unit: str) -> str:
