@@ -29,9 +29,9 @@ std::vector<std::size_t> test_rows(std::size_t rows) {
 
 namespace {
 
-// Codes as far from these as observations are from the prototypes of their landmarks: the difference
-// of two others has twice the variance of all, 0.4 of it 0.32 times; observations of the encoders
-// that ship have 0.2 to 0.5 times.
+// Codes as far from these as observations are from the prototypes of their landmarks: the
+// difference of two others has twice the variance of all, 0.4 of it 0.32 times; observations of the
+// encoders that ship have 0.2 to 0.5 times.
 std::vector<std::int8_t> like_observations(Codes codes) {
   std::vector<std::int8_t> result(codes.rows * codes.columns);
   for (std::size_t i = 0; i < codes.rows; ++i) {
