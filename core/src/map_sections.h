@@ -27,6 +27,9 @@ inline constexpr char kCells[] = "cells";         // int8, centroids, cells x di
 inline constexpr char kCellRows[] = "cellrows";   // sealed, with cells: uint32, rows of each
 inline constexpr char kOrder[] = "order";         // ... landmark of each place (bit_numbers.h)
 inline constexpr char kProbes[] = "probes";       // ... uint32, ProbeRanks
+inline constexpr char kBase[] = "base";           // journal, fold: identity of a map file
+inline constexpr char kChain[] = "chain";         // commit, fold: what stands before it
+inline constexpr char kGone[] = "gone";           // commit: int64, ids of landmarks that went
 inline constexpr char kPositions[] = "position";  // open: 3 x float64; sealed: 3 x float32
 }  // namespace section
 

@@ -3,14 +3,17 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <mutex>
 #include <span>
 #include <vector>
 
 #include "cell_blocks.h"
 #include "cells.h"
+#include "changes.h"
 #include "fair_shared_mutex.h"
 #include "id_index.h"
+#include "journal.h"
 #include "large_vector.h"
 #include "probe_ranks.h"
 #include "protomark/prototypes.h"
@@ -77,7 +80,9 @@ class PrototypeStore {
 
   // Landmarks by id, and rows by id and then look.
   std::vector<std::uint32_t> sorted_landmarks() const;
-  std::vector<std::uint32_t> sorted_rows() const;
+  std::vector<std::uint32_t> sorted_rows() const { return sorted_rows(sorted_landmarks()); }
+  // Rows of some landmarks, in their order and then by look.
+  std::vector<std::uint32_t> sorted_rows(std::span<const std::uint32_t> landmarks) const;
   // Rows of one landmark by look.
   std::vector<std::uint32_t> sorted_rows(std::uint32_t landmark) const;
 
@@ -109,6 +114,11 @@ class PrototypeStore {
   void settle(int threads);
   // A number that grows with each row that came, changed or went while there was an index.
   std::size_t changes() const { return changes_; }
+
+  // Notes from now on what changes. Only whoever commits takes the notes, no change going on.
+  void track_changes() { uncommitted_ = std::make_unique<Changes>(); }
+  void forget_changes() { uncommitted_.reset(); }
+  Changes& uncommitted() const { return *uncommitted_; }
 
   void set_position(std::uint32_t landmark, const Position& position);
   Position position(std::uint32_t landmark) const;
@@ -158,6 +168,7 @@ class PrototypeStore {
   Cells cells_;
   std::vector<Key> unsettled_;
   std::size_t changes_ = 0;
+  std::unique_ptr<Changes> uncommitted_;  // nullptr: nobody commits
 };
 
 // What users do not see of an open map.
@@ -167,6 +178,9 @@ struct PrototypeMap::Store : PrototypeStore {
   ProbeRanks ranks(int threads) const;
 
   mutable FairSharedMutex mutex;
+  // Of the journal; taken before the other one.
+  std::mutex journal_mutex;
+  std::unique_ptr<Journal> journal;  // nullptr: there is none
 
  private:
   mutable std::mutex ranks_mutex_;

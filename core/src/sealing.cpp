@@ -16,6 +16,7 @@
 #include "bit_numbers.h"
 #include "cells.h"
 #include "container.h"
+#include "journal.h"
 #include "map_sections.h"
 #include "probe_ranks.h"
 #include "prototype_store.h"
@@ -240,6 +241,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
     throw std::invalid_argument("a map is sealed with at least 1 prototype a landmark, not " +
                                 std::to_string(*prototypes));
   }
+  const JournalGuard guard(path);
   const std::shared_lock lock(store_->mutex);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();

@@ -118,6 +118,7 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "bytes_per_landmark_for_matching": None if code_bits is None else matching,
         "bytes": path.stat().st_size,
         "bytes_by_section": sections,
+        "journal": pm.file_journal(path),
         "encoder": _encoder_facts(scene.encoder),
     }
 

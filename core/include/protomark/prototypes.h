@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <filesystem>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <span>
@@ -17,6 +18,12 @@
 #include "protomark/search.h"
 
 namespace protomark {
+
+class Changes;
+class ContainerReader;
+class ContainerWriter;
+class Journal;
+class JournalContent;
 
 using Position = std::array<double, 3>;
 
@@ -116,11 +123,30 @@ class PrototypeMap {
                     MatrixView<float> distances) const;
 
   // Writes the map, landmarks by ascending id, so that equal maps (of equal cells) give equal
-  // files. Whole or not at all. Throws FileError.
+  // files. Whole or not at all. Onto the file that it was loaded from with a journal: compacts.
+  // Throws FileError, also where another map may commit to `path` or has, which would be lost.
   void save(const std::filesystem::path& path) const;
-  static PrototypeMap load(const std::filesystem::path& path);
-  // Reads and checks the bytes of a map file; `name` is what errors call them.
-  static PrototypeMap parse(std::span<const std::byte> bytes, const std::string& name);
+  // Reads a map file and what was committed to the journal beside it. With `journal` the map is the
+  // one that may commit to it until it is closed or gone; nobody else can at the same time. Throws
+  // FileError.
+  static PrototypeMap load(const std::filesystem::path& path, bool journal = false);
+  // Reads and checks the bytes of a map file and of its journal; `name` is what errors call them.
+  static PrototypeMap parse(std::span<const std::byte> bytes, const std::string& name,
+                            std::span<const std::byte> journal = {});
+
+  // The journal is a file beside the map file, <path>.journal (docs/format.md).
+  bool has_journal() const;
+  // Makes all changes up to here last, at a cost that grows with the number of landmarks that
+  // changed: when it has returned, the map file and its journal give this map, whatever happens.
+  // Returns the bytes written; nothing is where nothing changed. Throws FileError, and then the map
+  // in memory is as before and one may commit again; std::invalid_argument without a journal, as
+  // does compact.
+  std::size_t commit();
+  // Writes the map file anew, as save does, and empties the journal. Whatever happens, the two of
+  // them give this map or what was committed last. Throws FileError.
+  void compact();
+  // Gives the journal back, and what was not committed stays in memory only.
+  void close();
   // Writes a sealed map (protomark/map_file.h) whose prototypes have 8 or 4 bits a number. With 8
   // it gives the same answers; with 4 numbers are rounded to 16 levels that fit this map best,
   // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
@@ -134,6 +160,16 @@ class PrototypeMap {
 
  private:
   struct Store;
+
+  static PrototypeMap read(const ContainerReader& file, const JournalContent& journal);
+  static PrototypeMap load_with_journal(const std::filesystem::path& path);
+  // Writes the map file; `before` is called with its identity before it takes its place.
+  void write(const std::filesystem::path& path,
+             const std::function<void(const std::string&)>& before) const;
+  // The rest of a commit's record.
+  std::vector<std::byte> serialize(ContainerWriter& record, const Changes& changes) const;
+  Journal& journal() const;
+  void fold() const;
 
   std::shared_ptr<const Encoder> encoder_;
   std::size_t dim_;
