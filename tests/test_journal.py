@@ -110,11 +110,7 @@ def test_any_history_equals_that_of_a_map_without_a_journal(
     for step in script:
         match step:
             case "commit" | "compact" | "save":
-                {
-                    "commit": scene.commit,
-                    "compact": scene.compact,
-                    "save": lambda: scene.save(path),
-                }[step]()
+                scene.save(path) if step == "save" else getattr(scene, step)()
                 done += since
                 since = []
                 committed = state(plain, folder)
