@@ -27,6 +27,7 @@ bool ids_are_numbers(std::size_t n, std::int64_t last);
 
 class LandmarkIds {
  public:
+  LandmarkIds() = default;
   // Checks everything but rests, which are checked when they are read. `file` must outlive this.
   // Throws FileError.
   LandmarkIds(const ContainerReader& file, std::size_t n);
@@ -45,8 +46,8 @@ class LandmarkIds {
   std::uint64_t end_of(std::size_t b) const;
   void check_blocks() const;
 
-  const ContainerReader* file_;
-  std::size_t n_;
+  const ContainerReader* file_ = nullptr;
+  std::size_t n_ = 0;
   std::span<const std::int64_t> plain_;  // of versions before 4
   std::span<const IdBlock> blocks_;
   std::span<const std::uint64_t> words_;

@@ -99,7 +99,7 @@ struct SealedMap::Content {
     }
     prototypes.landmarks = prototypes4.landmarks = landmarks;
     counts = map<std::uint8_t>(section::kCounts, n);
-    ids.emplace(file, n);
+    ids = LandmarkIds(file, n);
     if (!file.map_if_there(section::kPositions)) return;
     if (file.map_if_there(section::kSteps)) {
       grid = PositionGrid(shape.origin, read_steps(file, shape.origin));
@@ -254,7 +254,7 @@ struct SealedMap::Content {
   mutable std::vector<std::uint32_t> places;  // of each row
 
   const std::uint8_t* counts = nullptr;
-  std::optional<LandmarkIds> ids;
+  LandmarkIds ids;
   const std::array<float, 3>* positions = nullptr;
   const PositionGrid::Cell* position_cells = nullptr;  // and with them
   PositionGrid grid;
@@ -295,13 +295,13 @@ std::optional<Position> SealedMap::position_error() const {
   return Position{step[0] / 2, step[1] / 2, step[2] / 2};
 }
 
-std::vector<std::int64_t> SealedMap::ids() const { return content_->ids->all(); }
+std::vector<std::int64_t> SealedMap::ids() const { return content_->ids.all(); }
 
 std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmarks) const {
   std::vector<std::uint32_t> result;
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) {
-    result.push_back(content_->counts[content_->ids->find(id)]);
+    result.push_back(content_->counts[content_->ids.find(id)]);
   }
   return result;
 }
@@ -311,7 +311,7 @@ void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<f
     throw std::invalid_argument("means must be landmarks x dim");
   }
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const auto [first, end] = content_->rows_at(content_->ids->find(landmarks[i]));
+    const auto [first, end] = content_->rows_at(content_->ids.find(landmarks[i]));
     for (std::size_t d = 0; d < dim(); ++d) {
       int sum = 0;
       for (std::size_t row = first; row < end; ++row) sum += content_->prototype(row, d);
@@ -321,7 +321,7 @@ void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<f
 }
 
 std::vector<std::vector<float>> SealedMap::looks(std::int64_t landmark) const {
-  const auto [first, end] = content_->rows_at(content_->ids->find(landmark));
+  const auto [first, end] = content_->rows_at(content_->ids.find(landmark));
   std::vector<std::vector<float>> result;
   for (std::size_t row = first; row < end; ++row) {
     std::vector<float>& look = result.emplace_back(dim());
@@ -336,7 +336,7 @@ std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmar
   std::vector<Position> result;
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) {
-    result.push_back(content_->position(content_->ids->find(id)));
+    result.push_back(content_->position(content_->ids.find(id)));
   }
   return result;
 }
@@ -379,9 +379,9 @@ void SealedMap::search_codes(Codes queries, const SearchOptions& options,
     run(c.prototypes);
   }
   // Ids ascend as numbers do, so that these decide between equals as ids would.
-  if (c.ids->are_numbers()) return;
+  if (c.ids.are_numbers()) return;
   for (std::int64_t& id : std::span(ids.data, ids.rows * ids.columns)) {
-    if (id >= 0) id = (*c.ids)[static_cast<std::size_t>(id)];
+    if (id >= 0) id = c.ids[static_cast<std::size_t>(id)];
   }
 }
 
