@@ -166,6 +166,7 @@ struct PrototypeMap::Store : PrototypeStore {
   // As measured on the map, now or when it was much the same.
   ProbeRanks ranks(int threads) const;
 
+  Metadata metadata;
   mutable FairSharedMutex mutex;
 
  private:

@@ -13,6 +13,7 @@
 #include "map_sections.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
+#include "summary_builder.h"
 
 namespace protomark {
 namespace {
@@ -252,6 +253,7 @@ void PrototypeMap::update(const PrototypeMap& other) {
     own.lock();
   }
   const Store& from = *other.store_;
+  Metadata metadata = joined(store_->metadata, from.metadata);
   for (std::uint32_t i = 0; i < from.places(); ++i) {
     if (!from.is_row(i)) continue;
     const std::int64_t id = from.ids()[from.landmark_of(i)];
@@ -263,6 +265,18 @@ void PrototypeMap::update(const PrototypeMap& other) {
     const std::uint32_t landmark = store_->at(from.ids()[i]);
     if (is_nowhere(store_->position(landmark))) store_->set_position(landmark, from.position(i));
   }
+  store_->metadata = std::move(metadata);
+}
+
+Metadata PrototypeMap::metadata() const {
+  const std::shared_lock lock(store_->mutex);
+  return store_->metadata;
+}
+
+void PrototypeMap::set_metadata(Metadata metadata) {
+  check_metadata(metadata);
+  const std::unique_lock lock(store_->mutex);
+  store_->metadata = std::move(metadata);
 }
 
 void PrototypeMap::set_positions(std::span<const std::int64_t> landmarks,
@@ -297,6 +311,16 @@ std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> la
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) result.push_back(store_->observations(store_->at(id)));
   return result;
+}
+
+MapSummary PrototypeMap::summary() const {
+  const std::shared_lock lock(store_->mutex);
+  SummaryBuilder result;
+  for (std::uint32_t i = 0; i < store_->ids().size(); ++i) {
+    if (store_->ids()[i] < 0) continue;
+    result.add(store_->observations(i), store_->position(i));
+  }
+  return result.take();
 }
 
 void PrototypeMap::prototypes(std::span<const std::int64_t> landmarks,
@@ -349,6 +373,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
+  add_metadata(file, store_->metadata);
   add_values<std::int64_t>(file, section::kIds, n, 1, [&](std::size_t i, std::int64_t* to) {
     *to = store_->ids()[landmarks[i]];
   });
@@ -407,6 +432,7 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
 
   PrototypeMap map(std::move(encoder), dim, look_bits);
   Store& store = *map.store_;
+  store.metadata = read_metadata(file);
   store.reserve(n, m);
   for (std::size_t i = 0, next = 0; i < n; ++i) {
     const std::uint32_t landmark = store.create_landmark(ids[i]);
