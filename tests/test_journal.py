@@ -68,6 +68,7 @@ changes = st.one_of(
     st.builds(lambda a, x: ("position", a, x), some, st.sampled_from([0.25, np.nan])),
     st.builds(lambda seed: ("update", seed), seeds),
     st.builds(lambda cells: ("index", cells), st.integers(0, 3)),
+    st.builds(lambda text: ("metadata", text), st.sampled_from(["", "ENU, metres"])),
 )
 
 
@@ -89,6 +90,8 @@ def apply(scene: pm.PrototypeMap, change: Any) -> None:
                 scene.set_positions([landmark], [[x, x, x]])
             case "update", seed:
                 joined(seed, scene.encoder, scene.look_bits)(scene)
+            case "metadata", text:
+                scene.metadata = {"frame": text} if text else {}
             case "index", cells:
                 scene.build_index(cells) if cells else scene.drop_index()
 

@@ -20,6 +20,7 @@ def scene(encoder: pm.Encoder, look_bits: int) -> pm.PrototypeMap:
     scene = pm.PrototypeMap(encoder, look_bits=look_bits)
     scene.add(np.random.default_rng(0).integers(0, 30, 120) * 7, random_descriptors(120))
     scene.set_positions(scene.ids[::2], np.ones((len(scene.ids[::2]), 3)))
+    scene.metadata = {"created": "2026-11-23T03:39:41Z", "frame": "ENU, metres", "x": "é"}
     return scene
 
 
@@ -32,6 +33,8 @@ def read_map(path: Path) -> None:
     assert found.shape == distances.shape
     read.counts(ids)
     read.prototype(ids)
+    assert all(name for name in read.metadata)
+    assert read.summary()["landmarks_with_position"] <= len(read)
     positions = read.positions(ids)
     assert not np.isinf(positions).any()
     for landmark in ids[:5]:
@@ -45,7 +48,15 @@ def read_model(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", ["model", "open", "open with looks", "sealed", "sealed, 4 bits, several prototypes"]
+    "kind",
+    [
+        "model",
+        "open",
+        "open with looks",
+        "sealed",
+        "sealed, 16-bit positions",
+        "sealed, 4 bits, several prototypes",
+    ],
 )
 def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
     print(f"PROTOMARK_SEED={SEED}")
@@ -56,6 +67,7 @@ def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_pa
         "open": scene(encoder, 0).save,
         "open with looks": scene(encoder, 3).save,
         "sealed": scene(encoder, 0).seal,
+        "sealed, 16-bit positions": partial(scene(encoder, 0).seal, position_bits=16),
         "sealed, 4 bits, several prototypes": partial(scene(encoder, 3).seal, bits=4),
     }[kind](path)
     whole = path.read_bytes()

@@ -11,7 +11,7 @@ namespace protomark {
 
 class Changes {
  public:
-  bool empty() const { return !cells && ids_.empty() && !incomplete_; }
+  bool empty() const { return !cells && !metadata && ids_.empty() && !incomplete_; }
   // Of landmarks that came, changed or went, each once, in no order.
   const LargeVector<std::int64_t>& ids() const { return ids_; }
   // Memory ran out, and some ids are missing.
@@ -35,10 +35,12 @@ class Changes {
   void insert(const Changes& other) noexcept {
     for (const std::int64_t id : other.ids_) insert(id);
     cells = cells || other.cells;
+    metadata = metadata || other.metadata;
     incomplete_ = incomplete_ || other.incomplete_;
   }
 
   bool cells = false;  // the centroids
+  bool metadata = false;
 
  private:
   LargeVector<std::int64_t> ids_;

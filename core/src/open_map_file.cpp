@@ -45,6 +45,7 @@ void PrototypeMap::write(const std::filesystem::path& path,
   ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : look_bits() != 0 ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape(landmarks.shape()));
+  add_metadata(file, store_->metadata);
   landmarks.add_to(file);
   if (!cells.empty()) file.add(section::kCells, std::as_bytes(std::span(cells)));
   file.write(path, before);
@@ -70,11 +71,14 @@ PrototypeMap PrototypeMap::read(const ContainerReader& file, const JournalConten
   const MapShape shape = read_shape(file, *encoder);
   PrototypeMap map(encoder, shape.dim, read_look_bits(file, shape.dim));
   Store& store = *map.store_;
+  store.metadata = read_metadata(file);
   read_landmarks(file, shape, store);
   std::vector<std::int8_t> cells = read_cells(file, shape.dim);
   for (const auto& [bytes, offset] : journal.commits(file.identity())) {
     const std::string name = journal.name() + ": record at byte " + std::to_string(offset);
-    apply(ContainerReader(bytes, name), *encoder, store, cells);
+    const ContainerReader commit(bytes, name);
+    apply(commit, *encoder, store, cells);
+    if (commit.map_if_there(section::kMetadata)) store.metadata = read_metadata(commit);
   }
   if (!cells.empty()) store.set_cells({std::move(cells), shape.dim}, 1);
   return map;
@@ -165,6 +169,11 @@ std::vector<std::byte> PrototypeMap::serialize(ContainerWriter& file,
   file.add(section::kShape, write_shape(landmarks.shape()));
   if (!gone.empty()) file.add(section::kGone, std::as_bytes(std::span(gone)));
   landmarks.add_to(file);
+  if (changes.metadata) {
+    // Nothing, where all is gone; absent it would mean that it is as before.
+    store_->metadata.empty() ? file.add(section::kMetadata, Bytes())
+                             : add_metadata(file, store_->metadata);
+  }
   if (changes.cells) {
     file.add(section::kCells, std::as_bytes(std::span(store_->cells().centroids())));
   }

@@ -6,6 +6,7 @@
 #include <memory>
 #include <mutex>
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "cell_blocks.h"
@@ -117,6 +118,7 @@ class PrototypeStore {
 
   // Notes from now on what changes. Only whoever commits takes the notes, no change going on.
   void track_changes() { uncommitted_ = std::make_unique<Changes>(); }
+  bool tracks_changes() const { return uncommitted_ != nullptr; }
   void forget_changes() { uncommitted_.reset(); }
   Changes& uncommitted() const { return *uncommitted_; }
 
@@ -177,6 +179,11 @@ struct PrototypeMap::Store : PrototypeStore {
   // As measured on the map, now or when it was much the same.
   ProbeRanks ranks(int threads) const;
 
+  void set_metadata(Metadata texts) {
+    if (tracks_changes()) uncommitted().metadata |= texts != metadata;
+    metadata = std::move(texts);
+  }
+  Metadata metadata;
   mutable FairSharedMutex mutex;
   // Of the journal; taken before the other one.
   std::mutex journal_mutex;

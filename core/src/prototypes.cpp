@@ -9,8 +9,10 @@
 #include <string>
 #include <unordered_map>
 
+#include "map_sections.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
+#include "summary_builder.h"
 
 namespace protomark {
 namespace {
@@ -250,6 +252,7 @@ void PrototypeMap::update(const PrototypeMap& other) {
     own.lock();
   }
   const Store& from = *other.store_;
+  Metadata metadata = joined(store_->metadata, from.metadata);
   for (std::uint32_t i = 0; i < from.places(); ++i) {
     if (!from.is_row(i)) continue;
     const std::int64_t id = from.ids()[from.landmark_of(i)];
@@ -261,6 +264,18 @@ void PrototypeMap::update(const PrototypeMap& other) {
     const std::uint32_t landmark = store_->at(from.ids()[i]);
     if (is_nowhere(store_->position(landmark))) store_->set_position(landmark, from.position(i));
   }
+  store_->set_metadata(std::move(metadata));
+}
+
+Metadata PrototypeMap::metadata() const {
+  const std::shared_lock lock(store_->mutex);
+  return store_->metadata;
+}
+
+void PrototypeMap::set_metadata(Metadata metadata) {
+  check_metadata(metadata);
+  const std::unique_lock lock(store_->mutex);
+  store_->set_metadata(std::move(metadata));
 }
 
 void PrototypeMap::set_positions(std::span<const std::int64_t> landmarks,
@@ -295,6 +310,16 @@ std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> la
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) result.push_back(store_->observations(store_->at(id)));
   return result;
+}
+
+MapSummary PrototypeMap::summary() const {
+  const std::shared_lock lock(store_->mutex);
+  SummaryBuilder result;
+  for (std::uint32_t i = 0; i < store_->ids().size(); ++i) {
+    if (store_->ids()[i] < 0) continue;
+    result.add(store_->observations(i), store_->position(i));
+  }
+  return result.take();
 }
 
 void PrototypeMap::prototypes(std::span<const std::int64_t> landmarks,

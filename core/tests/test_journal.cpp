@@ -67,7 +67,7 @@ void change(PrototypeMap& map, test::Random& random) {
         random.integer(0, static_cast<std::int64_t>(ids.size()) - 1))];
   };
   const auto seed = static_cast<std::uint32_t>(random.integer(0, 1 << 20));
-  switch (ids.size() < 5 ? 0 : random.integer(0, 9)) {
+  switch (ids.size() < 5 ? 0 : random.integer(0, 10)) {
     case 0:
       return add(map, seed, 300);  // some are halved
     case 1:
@@ -96,6 +96,8 @@ void change(PrototypeMap& map, test::Random& random) {
       return map.build_index(static_cast<std::size_t>(random.integer(1, 4)));
     case 7:
       return map.drop_index();
+    case 8:
+      return map.set_metadata(seed % 3 == 0 ? Metadata() : Metadata{{"n", std::to_string(seed)}});
     default:
       return add(map, seed);
   }
