@@ -763,21 +763,36 @@ Returns:
   m.def("instruction_set", &instruction_set,
         "The instruction set in use, for example avx512; the environment variable PROTOMARK_ISA "
         "chooses another one. All give the same bytes.");
+  const auto check_map = [](const auto& map, const Path& path, const Encoder* encoder,
+                            const std::optional<std::string>& descriptor) {
+    if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
+    if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
+  };
+  // What can commit is an open map, which type checkers are told.
   m.def(
       "open",
-      [](const Path& path, bool journal, const Encoder* encoder,
-         const std::optional<std::string>& descriptor) {
-        const auto check = [&](const auto& map) {
-          if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
-          if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
-        };
-        if (journal || map_kind(path) == MapKind::open) {
-          PrototypeMap map = PrototypeMap::load(path, journal);
-          check(map);
+      [check_map](const Path& path, bool journal, const Encoder* encoder,
+                  const std::optional<std::string>& descriptor) {
+        if (!journal) throw nb::next_overload();
+        PrototypeMap map = PrototypeMap::load(path, true);
+        check_map(map, path, encoder, descriptor);
+        return map;
+      },
+      "path"_a, nb::kw_only(), "journal"_a, "encoder"_a.none() = nb::none(),
+      "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, journal: Literal[True], "
+              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap"));
+  m.def(
+      "open",
+      [check_map](const Path& path, bool, const Encoder* encoder,
+                  const std::optional<std::string>& descriptor) -> nb::object {
+        if (map_kind(path) == MapKind::open) {
+          PrototypeMap map = PrototypeMap::load(path);
+          check_map(map, path, encoder, descriptor);
           return nb::cast(std::move(map));
         }
         SealedMap map(path);
-        check(map);
+        check_map(map, path, encoder, descriptor);
         return nb::cast(std::move(map));
       },
       "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import subprocess
@@ -380,3 +381,63 @@ def test_broken_journals_are_refused_or_read(look_bits: int, tmp_path: Path) -> 
                     check(path)
     print(f"{refused} of {FILES} refused")
     assert FILES / 4 < refused < FILES
+
+
+def landmarks_in(parts: dict[str, bytes], look_bits: int) -> dict[int, Any]:
+    """Of a map or a commit: looks, counts, sums and position of each landmark."""
+    n, dim = (int(v) for v in np.frombuffer(parts["shape"], "<u8", 2))
+    ids = np.frombuffer(parts["ids"], "<i8").tolist()
+    rows = np.frombuffer(parts["rows"], "<u4") if look_bits else np.ones(n, int)
+    ends = np.cumsum(rows)[:-1]
+    counts = np.frombuffer(parts["counts"], np.uint8)
+    looks = np.frombuffer(parts["looks"], "<u2") if look_bits else np.zeros(len(counts))
+    sums = np.frombuffer(parts["sums"], "<i2").reshape(len(counts), dim)
+    positions = np.full((n, 3), np.nan)
+    if "position" in parts:
+        positions = np.frombuffer(parts["position"], "<f8").reshape(n, 3)
+    values = [np.split(array, ends) if n else [] for array in (looks, counts, sums)]
+    return {
+        i: ([v.tolist() for v in one], positions[k].tolist())
+        for k, (i, one) in enumerate(zip(ids, zip(*values, strict=True), strict=True))
+    }
+
+
+def replayed(base: bytes, journal: bytes, look_bits: int) -> dict[int, Any]:
+    """The landmarks of a map and its journal, from docs/format.md alone."""
+    size = 64 + 32 * int.from_bytes(base[24:28], "little")
+    identity = hashlib.sha256(base[:size]).hexdigest().encode()
+    landmarks = landmarks_in(dict(sections(base)), look_bits)
+    head, *records = containers(journal)
+    kinds = [part[12] for part in (head, *records)]
+    assert kinds[0] == 4
+    names = [dict(sections(part)).get("base") for part in (head, *records)]
+    last = max(i for i, name in enumerate(names) if name == identity)
+    previous = head
+    for number, record in enumerate(records, 1):
+        parts = dict(sections(record))
+        chain = number.to_bytes(8, "little") + previous[28:32] + bytes(4)
+        assert parts["chain"] == chain
+        previous = record
+        if number <= last or record[12] != 5:
+            continue
+        for gone in np.frombuffer(parts.get("gone", b""), "<i8").tolist():
+            landmarks.pop(gone, None)
+        landmarks |= landmarks_in(parts, look_bits)
+    return landmarks
+
+
+@pytest.mark.parametrize("look_bits", [0, 3])
+def test_a_reader_can_be_written_from_the_format(look_bits: int, tmp_path: Path) -> None:
+    path = tmp_path / "scene.pmk"
+    scene = begin(path, balanced_encoder(), look_bits)
+    for seed in range(12):
+        observe(scene, seed, 10)
+        if seed % 3 == 1:
+            scene.discard(scene.ids[:2])
+            scene.set_positions(scene.ids[:2], np.full((2, 3), seed))
+        scene.commit()
+        if seed == 5:
+            scene.compact()
+        whole = dict(sections(state(scene, tmp_path)))
+        found = replayed(path.read_bytes(), journal_of(path).read_bytes(), look_bits)
+        assert repr(sorted(found.items())) == repr(sorted(landmarks_in(whole, look_bits).items()))
