@@ -240,7 +240,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
     throw std::invalid_argument("a map is sealed with at least 1 prototype a landmark, not " +
                                 std::to_string(*prototypes));
   }
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();
   const std::size_t n = landmarks.size();
