@@ -1,6 +1,7 @@
 // An open map as a file, and the journal beside it.
 #include <algorithm>
 #include <mutex>
+#include <shared_mutex>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -61,7 +62,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
     }
   }
   const JournalGuard guard(path);
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   write(path, {});
 }
 
@@ -80,7 +81,7 @@ PrototypeMap PrototypeMap::read(const ContainerReader& file, const JournalConten
     apply(commit, *encoder, store, cells);
     if (commit.map_if_there(section::kMetadata)) store.metadata = read_metadata(commit);
   }
-  if (!cells.empty()) store.set_cells({std::move(cells), shape.dim}, 1);
+  if (!cells.empty()) store.replace(store.with_cells({std::move(cells), shape.dim}, 1));
   return map;
 }
 
@@ -130,7 +131,7 @@ std::size_t PrototypeMap::commit() {
   Changes changes;
   {
     // What is to be written is copied, so that nobody waits for the disk.
-    const std::shared_lock lock(store_->mutex);
+    const std::shared_lock changing(store_->changing);
     Changes& uncommitted = store_->uncommitted();
     if (uncommitted.empty()) return 0;
     if (!uncommitted.incomplete()) {
@@ -145,7 +146,7 @@ std::size_t PrototypeMap::commit() {
   try {
     journal.append(record);
   } catch (...) {
-    const std::unique_lock lock(store_->mutex);
+    const std::unique_lock changing(store_->changing);
     store_->uncommitted().insert(changes);
     throw;
   }
@@ -189,7 +190,7 @@ void PrototypeMap::fold() const {
   Journal& journal = this->journal();
   std::string identity;
   {
-    const std::shared_lock lock(store_->mutex);
+    const std::shared_lock changing(store_->changing);
     write(journal.map(), [&](const std::string& written) {
       journal.fold(written);
       identity = written;
@@ -201,7 +202,7 @@ void PrototypeMap::fold() const {
 
 void PrototypeMap::close() {
   const std::scoped_lock own(store_->journal_mutex);
-  const std::unique_lock lock(store_->mutex);
+  const std::unique_lock changing(store_->changing);
   store_->forget_changes();
   store_->journal.reset();
 }

@@ -249,7 +249,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
                                 std::to_string(position_bits));
   }
   const JournalGuard guard(path);
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();
   const std::size_t n = landmarks.size();
