@@ -10,6 +10,7 @@
 #include <cerrno>
 #include <cstring>
 #include <fstream>
+#include <optional>
 #include <sstream>
 #include <utility>
 
@@ -184,8 +185,8 @@ std::string read_identity(const std::filesystem::path& path) {
 JournaledFile::JournaledFile(const std::filesystem::path& map) {
   const auto path = journal_path(map);
   do {  // the map may be compacted between the two
-    mapped_.emplace(map);
-    file_.emplace(mapped_->bytes(), map.string());
+    mapped_ = std::make_unique<MappedFile>(map);
+    file_ = std::make_unique<ContainerReader>(mapped_->bytes(), map.string());
     bytes_ = read_journal(path);
   } while (read_identity(map) != file_->identity());
   journal_ = JournalContent(bytes_, path.string());

@@ -10,7 +10,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <filesystem>
-#include <optional>
+#include <memory>
 #include <span>
 #include <string>
 #include <vector>
@@ -82,8 +82,8 @@ class JournaledFile {
   const JournalContent& journal() const { return journal_; }
 
  private:
-  std::optional<MappedFile> mapped_;
-  std::optional<ContainerReader> file_;
+  std::unique_ptr<const MappedFile> mapped_;
+  std::unique_ptr<const ContainerReader> file_;
   std::vector<std::byte> bytes_;
   JournalContent journal_;
 };
