@@ -636,7 +636,7 @@ def bench(
         str,
         typer.Option(
             help="Sections, for example encode,search; of encode, search, hamming, approximate, "
-            "frame, add, growth and large. By default all."
+            "real, frame, add, growth and large. By default all."
         ),
     ] = "",
     full: Annotated[
