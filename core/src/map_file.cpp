@@ -146,6 +146,7 @@ struct SealedMap::Content {
     centroids = read_cells(file, shape.dim);
     const std::size_t cells = centroids.size() / shape.dim;
     packed_centroids = pack_codes({centroids.data(), cells, shape.dim});
+    file.read(section::kCellRows);  // for its checksum
     cell_rows = {map<std::uint32_t>(section::kCellRows, cells), cells};
     first_blocks.push_back(0);
     std::uint64_t all = 0;
