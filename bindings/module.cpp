@@ -26,6 +26,15 @@ namespace protomark::python {
 namespace {
 
 using Path = std::filesystem::path;
+// For whatever may wait for another thread, or for a disk: others run Python meanwhile.
+using ReleaseGil = nb::call_guard<nb::gil_scoped_release>;
+
+// What `work` returns, the GIL released while it runs.
+template <typename Work>
+auto without_gil(const Work& work) {
+  const nb::gil_scoped_release release;
+  return work();
+}
 
 SearchOptions search_options(std::optional<float> max_distance, std::optional<float> ratio,
                              int threads, std::optional<double> recall,
@@ -99,7 +108,7 @@ template <typename Map>
 nb::object prototype(const Map& map, nb::object landmark_ids) {
   const auto l = landmarks(landmark_ids);
   NewMatrix<float> means(l.shape(0), map.dim());
-  map.prototypes(view(l), means.view());
+  without_gil([&] { map.prototypes(view(l), means.view()); });
   return means.release();
 }
 
@@ -118,11 +127,13 @@ nb::object stacked(const std::vector<std::vector<float>>& rows, std::size_t colu
   return result.release();
 }
 
-// ", 3 prototypes" where there are more than landmarks.
+// "2 landmarks", and ", 3 prototypes" where there are more.
 template <typename Map>
-std::string describe_prototypes(const Map& map) {
-  if (map.prototype_count() == map.size()) return "";
-  return ", " + std::to_string(map.prototype_count()) + " prototypes";
+std::string describe_size(const Map& map) {
+  const nb::gil_scoped_release release;
+  const std::size_t landmarks = map.size(), prototypes = map.prototype_count();
+  return std::to_string(landmarks) + " landmarks" +
+         (prototypes == landmarks ? "" : ", " + std::to_string(prototypes) + " prototypes");
 }
 
 nb::object from_metadata(const Metadata& metadata) {
@@ -167,15 +178,15 @@ nb::dict from_summary(const MapSummary& summary) {
 // What open and sealed maps have in common.
 template <typename Map>
 void bind_reading(nb::class_<Map>& map) {
-  map.def("__len__", &Map::size)
+  map.def("__len__", &Map::size, ReleaseGil())
       .def_prop_ro("encoder", &Map::encoder, "The encoder of this map.")
       .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
-      .def_prop_ro("prototype_count", &Map::prototype_count,
+      .def_prop_ro("prototype_count", &Map::prototype_count, ReleaseGil(),
                    "Number of prototypes: one a landmark, or one for each of its looks.")
-      .def_prop_ro("index_cells", &Map::index_cells,
+      .def_prop_ro("index_cells", &Map::index_cells, ReleaseGil(),
                    "Number of cells of the index; 0: there is none.")
       .def_prop_ro(
-          "ids", [](const Map& m) { return new_vector(m.ids()); },
+          "ids", [](const Map& m) { return new_vector(without_gil([&] { return m.ids(); })); },
           nb::sig("def ids(self) -> NDArray[numpy.int64]"),
           "All landmark ids, ascending, (n,) int64.")
       .def(
@@ -188,7 +199,8 @@ void bind_reading(nb::class_<Map>& map) {
       .def(
           "positions",
           [](const Map& m, nb::object ids) {
-            return from_positions(m.positions(view(landmarks(ids))));
+            const auto l = landmarks(ids);
+            return from_positions(without_gil([&] { return m.positions(view(l)); }));
           },
           "landmark_ids"_a,
           nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
@@ -304,6 +316,7 @@ void bind_encoder(nb::module_& m) {
                              std::move(data),
                              std::move(licence),
                              {notes.begin(), notes.end()}};
+            const nb::gil_scoped_release release;
             new (self) Encoder(std::move(info), std::move(built), std::move(dims), scale);
           },
           "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
@@ -328,7 +341,8 @@ Raises:
           [](nb::object source) {
             const nb::object path =
                 nb::module_::import_("protomark.models").attr("resolve")(source);
-            return Encoder::load(nb::cast<Path>(path));
+            const auto file = nb::cast<Path>(path);
+            return without_gil([&] { return Encoder::load(file); });
           },
           "source"_a, nb::sig("def load(source: str | os.PathLike[str]) -> Encoder"),
           R"(Load an encoder by the name of one that ships ("freak", "orb") or the path of a model file.
@@ -336,7 +350,7 @@ Raises:
 Raises:
     FileNotFoundError: there is no such model.
     FileError: the file is not a model.)")
-      .def("save", &Encoder::save, "path"_a,
+      .def("save", &Encoder::save, "path"_a, ReleaseGil(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the model file, whole or not at all. Raises FileError.")
       .def(
@@ -448,7 +462,8 @@ Raises:
       .def(
           "counts",
           [](const PrototypeMap& m, nb::object ids) {
-            return counts(m.counts(view(landmarks(ids))), m.look_bits() == 0);
+            const auto l = landmarks(ids);
+            return counts(without_gil([&] { return m.counts(view(l)); }), m.look_bits() == 0);
           },
           "landmark_ids"_a,
           nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8] | "
@@ -459,7 +474,8 @@ Raises:
           "looks",
           [](const PrototypeMap& m, std::int64_t id) {
             std::vector<std::vector<float>> means;
-            for (Look& look : m.looks(id)) means.push_back(std::move(look.mean));
+            auto looks = without_gil([&] { return m.looks(id); });
+            for (Look& look : looks) means.push_back(std::move(look.mean));
             return stacked(means, m.dim());
           },
           "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
@@ -469,7 +485,7 @@ Raises:
           "look_counts",
           [](const PrototypeMap& m, std::int64_t id) {
             std::vector<std::uint8_t> result;
-            for (const Look& look : m.looks(id)) {
+            for (const Look& look : without_gil([&] { return m.looks(id); })) {
               result.push_back(static_cast<std::uint8_t>(look.count));
             }
             return new_vector(std::move(result));
@@ -544,11 +560,92 @@ Raises:
           },
           "landmark_ids"_a, nb::sig("def discard(self, landmark_ids: ArrayLike) -> None"),
           "Forget landmarks. Raises KeyError for an unknown id.")
-      .def("update", &PrototypeMap::update, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
-           "Join another map of the same encoder, dim and look_bits: landmarks that both have are "
-           "summed, the rest taken over. Metadata under names that this map lacks is taken over, "
-           "and \"created\" becomes the earlier. Raises ValueError where encoder, dim or look_bits "
-           "differ.")
+      .def(
+          "update",
+          [](PrototypeMap& self, const PrototypeMap& other, std::optional<nb::object> into,
+             std::optional<nb::object> source) {
+            if (into.has_value() != source.has_value()) {
+              throw nb::value_error("into and source go together");
+            }
+            const nb::object none = nb::make_tuple();
+            const auto a = landmarks(into.value_or(none));
+            const auto b = landmarks(source.value_or(none));
+            const nb::gil_scoped_release release;
+            self.update(other, view(a), view(b));
+          },
+          "other"_a, "into"_a = nb::none(), "source"_a = nb::none(),
+          nb::sig("def update(self, other: PrototypeMap, into: ArrayLike | None = None, "
+                  "source: ArrayLike | None = None) -> None"),
+          R"(Join another map, exactly as if its observations had been added here.
+
+Landmarks of one id are one landmark: those that both maps have are summed, the rest taken over.
+Where the other map numbers its landmarks differently, say how:
+`scene.update(other, into=ours, source=theirs)`. All of them under new ids:
+`scene.update(other, into=other.ids + scene.ids[-1] + 1, source=other.ids)`.
+
+Args:
+    other: a map of the same encoder, dim and look_bits; it does not change.
+    into: (n,) int64, ids in this map, known or new; several landmarks of the other map may become
+        the same one.
+    source: (n,) int64, their ids in the other map, each once. Landmarks that are not named keep
+        their ids.
+
+A landmark keeps its position, or takes the other one's where it has none; of several those with
+the smallest id there. Metadata under names that this map lacks is taken over, and "created" becomes
+the earlier.
+
+Raises:
+    KeyError: a source is not in the other map.
+    ValueError: encoder, dim or look_bits differ, a source is named twice, or an id of `into` is
+        negative. Nothing is changed then.)")
+      .def(
+          "split",
+          [](const PrototypeMap& self, nb::object ids) {
+            const auto boundaries = landmarks(ids);
+            return without_gil([&] { return self.split(view(boundaries)); });
+          },
+          "ids"_a, nb::sig("def split(self, ids: ArrayLike) -> list[PrototypeMap]"),
+          R"(Parts by id, as open maps of their own.
+
+Args:
+    ids: ascending ids at which a new part begins: `split([10, 20])` gives the landmarks below 10,
+        those from 10 to 19, and those from 20 on.
+
+Parts have all that this map knows of their landmarks, but no index. An empty map that is updated
+with all of them, in any order, gives the same file as this one without its index. Together they
+take as much memory.
+
+Raises:
+    ValueError: ids do not ascend.)")
+      .def(
+          "split",
+          [](const PrototypeMap& self, double cell_size) {
+            std::vector<MapPart> parts = without_gil([&] { return self.split(cell_size); });
+            nb::dict result;
+            for (MapPart& part : parts) {
+              nb::object cell = nb::none();
+              if (part.cell) {
+                cell = nb::make_tuple((*part.cell)[0], (*part.cell)[1], (*part.cell)[2]);
+              }
+              result[cell] = nb::cast(std::move(part.map));
+            }
+            return result;
+          },
+          nb::kw_only(), "cell_size"_a,
+          nb::sig("def split(self, *, cell_size: float) -> dict[tuple[int, int, int] | None, "
+                  "PrototypeMap]"),
+          R"(Parts by space, as open maps of their own.
+
+Args:
+    cell_size: edge of the cubes into which space is cut, in the unit of the positions.
+
+Returns:
+    A map for each cube (i, j, k) that has landmarks, those whose coordinates are from i to i + 1
+    times cell_size and so on, ascending; and under None one of the landmarks without a position,
+    where there are any.
+
+Raises:
+    ValueError: cell_size is not above 0, or too small for the map's extent.)")
       .def(
           "set_positions",
           [](PrototypeMap& self, nb::object ids, nb::object positions) {
@@ -563,7 +660,7 @@ Raises:
           "an "
           "unknown id.")
       .def("build_index", &PrototypeMap::build_index, "cells"_a = nb::none(), "threads"_a = 1,
-           nb::call_guard<nb::gil_scoped_release>(),
+           ReleaseGil(),
            nb::sig("def build_index(self, cells: int | None = None, threads: int = 1) -> None"),
            R"(Learn coarse cells from the map's prototypes, for search with recall or probes.
 
@@ -575,16 +672,15 @@ Args:
 
 Raises:
     ValueError: cells is none of these, or the map is empty.)")
-      .def("drop_index", &PrototypeMap::drop_index, nb::call_guard<nb::gil_scoped_release>(),
+      .def("drop_index", &PrototypeMap::drop_index, ReleaseGil(),
            nb::sig("def drop_index(self) -> None"), "Forget the cells.")
-      .def("probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1,
-           nb::call_guard<nb::gil_scoped_release>(),
+      .def("probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1, ReleaseGil(),
            nb::sig("def probes(self, recall: float, threads: int = 1) -> int"),
            "Number of cells that are searched for a recall in (0, 1], as measured on the map: the "
            "nearest landmark to a landmark's prototype, itself left out, is in one of them that "
            "often. Measured once, and again when a tenth of the map has changed. Raises ValueError "
            "for another recall, and without an index.")
-      .def("save", &PrototypeMap::save, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+      .def("save", &PrototypeMap::save, "path"_a, ReleaseGil(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the map, whole or not at all. Raises FileError.")
       .def(
@@ -617,9 +713,9 @@ Raises:
     ValueError: bits is neither 8 nor 4, prototypes is below 1, position_bits is neither 32 nor 16,
         or positions are further than 3.4e38 from their middle.)")
       .def("__repr__", [](const PrototypeMap& self) {
-        return "<protomark.PrototypeMap: " + std::to_string(self.size()) + " landmarks" +
-               describe_prototypes(self) + ", " + std::to_string(self.dim()) +
-               " dimensions, encoder '" + self.encoder()->info().name + "'>";
+        return "<protomark.PrototypeMap: " + describe_size(self) + ", " +
+               std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
+               "'>";
       });
 }
 
@@ -632,7 +728,8 @@ void bind_sealed_map(nb::module_& m) {
   map.def(
          "counts",
          [](const SealedMap& m, nb::object ids) {
-           return counts(m.counts(view(landmarks(ids))), true);
+           const auto l = landmarks(ids);
+           return counts(without_gil([&] { return m.counts(view(l)); }), true);
          },
          "landmark_ids"_a,
          nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8]"),
@@ -640,11 +737,13 @@ void bind_sealed_map(nb::module_& m) {
          "id that is not in the map.")
       .def(
           "looks",
-          [](const SealedMap& m, std::int64_t id) { return stacked(m.looks(id), m.dim()); },
+          [](const SealedMap& m, std::int64_t id) {
+            return stacked(without_gil([&] { return m.looks(id); }), m.dim());
+          },
           "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
           "Prototypes of one landmark, (r, dim) float32, in code units, with an index in no "
           "particular order. Raises KeyError for an id that is not in the map.")
-      .def("probes", &SealedMap::probes, "recall"_a,
+      .def("probes", &SealedMap::probes, "recall"_a, ReleaseGil(),
            nb::sig("def probes(self, recall: float) -> int"),
            "Number of cells that are searched for a recall in (0, 1], as measured when the map was "
            "sealed. Raises ValueError for another recall, and without an index.");
@@ -668,9 +767,8 @@ void bind_sealed_map(nb::module_& m) {
   map.def_prop_ro("code_bits", &SealedMap::code_bits,
                   "Bits of a prototype's number: 8, or 4 where the map was sealed so.");
   map.def("__repr__", [](const SealedMap& self) {
-    return "<protomark.SealedMap: " + std::to_string(self.size()) + " landmarks" +
-           describe_prototypes(self) + ", " + std::to_string(self.dim()) + " dimensions" +
-           (self.code_bits() == 8 ? "" : " of 4 bits") + ", encoder '" +
+    return "<protomark.SealedMap: " + describe_size(self) + ", " + std::to_string(self.dim()) +
+           " dimensions" + (self.code_bits() == 8 ? "" : " of 4 bits") + ", encoder '" +
            self.encoder()->info().name + "'>";
   });
 }
@@ -723,17 +821,18 @@ Returns:
         "chooses another one. All give the same bytes.");
   m.def(
       "open",
-      [](const Path& path, const Encoder* encoder, const std::optional<std::string>& descriptor) {
+      [](const Path& path, const Encoder* encoder,
+         const std::optional<std::string>& descriptor) -> nb::object {
         const auto check = [&](const auto& map) {
           if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
           if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
         };
-        if (map_kind(path) == MapKind::open) {
-          PrototypeMap map = PrototypeMap::load(path);
+        if (without_gil([&] { return map_kind(path); }) == MapKind::open) {
+          PrototypeMap map = without_gil([&] { return PrototypeMap::load(path); });
           check(map);
           return nb::cast(std::move(map));
         }
-        SealedMap map(path);
+        SealedMap map = without_gil([&] { return SealedMap(path); });
         check(map);
         return nb::cast(std::move(map));
       },
@@ -753,10 +852,10 @@ Args:
 Raises:
     FileError: the file is no map, or broken.
     ValueError: the map is of another encoder or descriptor.)");
-  m.def("file_sections", &file_sections, "path"_a,
+  m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
         nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");
-  m.def("verify_file", &verify_file, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+  m.def("verify_file", &verify_file, "path"_a, ReleaseGil(),
         nb::sig("def verify_file(path: str | os.PathLike[str]) -> None"),
         "Check every checksum of a model or map file. Raises FileError.");
 }

@@ -1,4 +1,5 @@
 // Writes small valid files for the fuzzer to start from: seeds FOLDER makes FOLDER/<target>/.
+#include <algorithm>
 #include <cstdio>
 #include <filesystem>
 #include <limits>
@@ -74,6 +75,11 @@ int main(int argc, char** argv) try {
         map.seal(folder / "sealed_map" / name);
         map.seal(folder / "sealed_map" / (name + ".4"), 4, std::nullopt, 16);
         map.seal(folder / "sealed_map" / (name + ".1"), 8, 1.5);
+        if (landmarks == 0) continue;
+        map.build_index(std::min<std::size_t>(landmarks, 4));
+        map.save(folder / "open_map" / (name + ".cells"));
+        map.seal(folder / "sealed_map" / (name + ".cells"));
+        map.seal(folder / "sealed_map" / (name + ".4.cells"), 4);
       }
     }
   }

@@ -247,7 +247,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
     throw std::invalid_argument("positions are sealed with 32 or 16 bits a coordinate, not " +
                                 std::to_string(position_bits));
   }
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();
   const std::size_t n = landmarks.size();
