@@ -55,7 +55,7 @@ sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
 CORE_TESTS := $(addprefix tests/test_,encoder.py example_reader.py files.py four_bit_maps.py \
-  hamming.py limits.py looks.py map_file.py mutated_maps.py prototypes.py)
+  hamming.py journal.py limits.py looks.py map_file.py mutated_maps.py prototypes.py)
 sanitize: sanitize-memory sanitize-threads .venv-sanitize/installed
 	LD_PRELOAD="$(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)" \
 	ASAN_OPTIONS=detect_leaks=0 .venv-sanitize/bin/python -m pytest -p no:cacheprovider $(CORE_TESTS)

@@ -725,7 +725,9 @@ Raises:
           },
           "type"_a.none(), "value"_a.none(), "traceback"_a.none(),
           nb::sig("def __exit__(self, type: object, value: object, traceback: object) -> None"),
-          "Commit where the block ended without an exception, and close.")
+          "Commit where the block ended without an exception, and close. Where committing fails, "
+          "the map "
+          "stays open, so that one may try again.")
       .def(
           "seal",
           [](const PrototypeMap& self, const Path& path, int bits, std::optional<double> prototypes,
