@@ -79,7 +79,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         return looks;
       });
       map.positions(map.ids());
-      go_on(map, base, input.bytes());
+      // Files take the longest by far.
+      if (size / 64 % 8 == 0) go_on(map, base, input.bytes());
     } catch (const FileError&) {
     }
   }
