@@ -136,6 +136,40 @@ std::string describe_size(const Map& map) {
          (prototypes == landmarks ? "" : ", " + std::to_string(prototypes) + " prototypes");
 }
 
+nb::object from_metadata(const Metadata& metadata) {
+  nb::dict texts;
+  for (const auto& [name, text] : metadata) texts[nb::str(name.c_str(), name.size())] = text;
+  return nb::module_::import_("types").attr("MappingProxyType")(texts);
+}
+
+Metadata to_metadata(nb::handle object) {
+  Metadata result;
+  const nb::object texts = nb::module_::import_("builtins").attr("dict")(object);
+  for (const auto& [name, text] : nb::cast<nb::dict>(texts)) {
+    if (!nb::isinstance<nb::str>(name) || !nb::isinstance<nb::str>(text)) {
+      throw nb::type_error(("metadata: names and texts must be str, not " +
+                            std::string(nb::repr(name).c_str()) + ": " + nb::repr(text).c_str())
+                               .c_str());
+    }
+    result.emplace(nb::cast<std::string>(name), nb::cast<std::string>(text));
+  }
+  return result;
+}
+
+nb::dict from_summary(const MapSummary& summary) {
+  nb::dict result;
+  result["observations"] = summary.observations;
+  const auto& counts = summary.landmarks_by_count;
+  result["count_histogram"] = new_vector(std::vector<std::int64_t>(counts.begin(), counts.end()));
+  result["landmarks_with_position"] = summary.placed;
+  if (summary.placed != 0) {
+    result["extent"] = from_positions({summary.low, summary.high});
+  } else {
+    result["extent"] = nb::none();
+  }
+  return result;
+}
+
 // What open and sealed maps have in common.
 template <typename Map>
 void bind_reading(nb::class_<Map>& map) {
@@ -167,6 +201,24 @@ void bind_reading(nb::class_<Map>& map) {
           nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
           "World coordinates, (n, 3) float64, NaN where there are none. Raises KeyError for an id "
           "that is not in the map.")
+      .def(
+          "summary",
+          [](const Map& m) {
+            MapSummary summary;
+            {
+              const nb::gil_scoped_release release;
+              summary = m.summary();
+            }
+            return from_summary(summary);
+          },
+          nb::sig("def summary(self) -> dict[str, Any]"),
+          R"(The map at a glance, in one pass that keeps nothing in memory.
+
+Returns:
+    observations: their number, in a sealed map at most 255 of a landmark.
+    count_histogram: (256,) int64, landmarks with so many observations, the last one: or more.
+    landmarks_with_position: their number.
+    extent: (2, 3) float64, the lowest and highest coordinates; None where no landmark has any.)")
       .def("search", &search<Map>, "descriptors"_a, "k"_a = 2, "max_distance"_a = nb::none(),
            "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
            "probes"_a = nb::none(),
@@ -385,6 +437,28 @@ Args:
 Raises:
     ValueError: dim or look_bits is none of these.)");
   bind_reading(map);
+  map.def_prop_rw(
+      "metadata",
+      [](const PrototypeMap& m) {
+        return from_metadata(without_gil([&] { return m.metadata(); }));
+      },
+      [](PrototypeMap& m, nb::object metadata) {
+        Metadata texts = to_metadata(metadata);
+        const nb::gil_scoped_release release;
+        m.set_metadata(std::move(texts));
+      },
+      nb::for_getter(nb::sig("def metadata(self) -> MappingProxyType[str, str]")),
+      nb::for_setter(nb::sig("def metadata(self, metadata: Mapping[str, str], /) -> None")),
+      R"(What the map says of itself: texts by name. A view; assign to change it:
+
+    scene.metadata = scene.metadata | {"frame": "ENU, metres", "robot": "atlas-2"}
+
+Names are free but for two: "frame" is the coordinate frame of the positions and their unit,
+"created" is when the map was begun, "2026-11-23T03:39:41Z". A new map says nothing.
+
+Raises:
+    TypeError: a name or text is no str.
+    ValueError: "created" is no such time, or something is beyond the limits (docs/limits.md).)");
   map.def_prop_ro("look_bits", &PrototypeMap::look_bits,
                   "Signs that tell the looks of a landmark apart; 0: it has one prototype.")
       .def(
@@ -519,7 +593,8 @@ Args:
         their ids.
 
 A landmark keeps its position, or takes the other one's where it has none; of several those with
-the smallest id there.
+the smallest id there. Metadata under names that this map lacks is taken over, and "created" becomes
+the earlier.
 
 Raises:
     KeyError: a source is not in the other map.
@@ -612,15 +687,15 @@ Raises:
            "Write the map, whole or not at all. Raises FileError.")
       .def(
           "seal",
-          [](const PrototypeMap& self, const Path& path, int bits,
-             std::optional<double> prototypes) {
+          [](const PrototypeMap& self, const Path& path, int bits, std::optional<double> prototypes,
+             int position_bits) {
             const nb::gil_scoped_release release;
-            self.seal(path, bits, prototypes);
+            self.seal(path, bits, prototypes, position_bits);
             return SealedMap(path);
           },
-          "path"_a, "bits"_a = 8, "prototypes"_a = nb::none(),
+          "path"_a, "bits"_a = 8, "prototypes"_a = nb::none(), "position_bits"_a = 32,
           nb::sig("def seal(self, path: str | os.PathLike[str], bits: int = 8, prototypes: float | "
-                  "None = None) -> SealedMap"),
+                  "None = None, position_bits: int = 32) -> SealedMap"),
           R"(Write a sealed map, whole or not at all, and open it.
 
 Args:
@@ -631,10 +706,14 @@ Args:
         of a landmark are joined, over the whole map those first whose joining adds least to the
         squared distances of observations to their prototypes (Ward's criterion), until it fits.
         None: every look is kept (of one landmark at most 255).
+    position_bits: bits of a coordinate. With 32, positions are floats relative to the middle of the
+        map; with 16 they take half the bytes, as whole steps along each axis of the box around
+        them, 65534 from end to end (position_error).
 
 Raises:
     FileError: the file cannot be written.
-    ValueError: bits is neither 8 nor 4, or prototypes is below 1.)")
+    ValueError: bits is neither 8 nor 4, prototypes is below 1, position_bits is neither 32 nor 16,
+        or positions are further than 3.4e38 from their middle.)")
       .def("__repr__", [](const PrototypeMap& self) {
         return "<protomark.PrototypeMap: " + describe_size(self) + ", " +
                std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
@@ -670,6 +749,23 @@ void bind_sealed_map(nb::module_& m) {
            nb::sig("def probes(self, recall: float) -> int"),
            "Number of cells that are searched for a recall in (0, 1], as measured when the map was "
            "sealed. Raises ValueError for another recall, and without an index.");
+  map.def_prop_ro(
+      "metadata", [](const SealedMap& m) { return from_metadata(m.metadata()); },
+      nb::sig("def metadata(self) -> MappingProxyType[str, str]"),
+      "What the map says of itself: texts by name, as in the open map that was sealed.");
+  map.def_prop_ro("position_bits", &SealedMap::position_bits,
+                  "Bits of a position's coordinate: 32 or 16, 0 where no landmark has a position.")
+      .def_prop_ro(
+          "position_error",
+          [](const SealedMap& m) -> nb::object {
+            const auto error = m.position_error();
+            if (!error) return nb::none();
+            return new_vector(std::vector<double>(error->begin(), error->end()));
+          },
+          nb::sig("def position_error(self) -> NDArray[numpy.float64] | None"),
+          "With 16-bit positions, how far they may be from those of the open map along each axis, "
+          "(3,) float64: half a step. None otherwise: float32 are relative to the middle of the "
+          "map.");
   map.def_prop_ro("code_bits", &SealedMap::code_bits,
                   "Bits of a prototype's number: 8, or 4 where the map was sealed so.");
   map.def("__repr__", [](const SealedMap& self) {
@@ -727,14 +823,36 @@ Returns:
         "chooses another one. All give the same bytes.");
   m.def(
       "open",
-      [](const Path& path) -> nb::object {
+      [](const Path& path, const Encoder* encoder, const std::optional<std::string>& descriptor) {
+        const auto check = [&](const auto& map) {
+          if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
+          if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
+        };
         if (without_gil([&] { return map_kind(path); }) == MapKind::open) {
-          return nb::cast(without_gil([&] { return PrototypeMap::load(path); }));
+          PrototypeMap map = without_gil([&] { return PrototypeMap::load(path); });
+          check(map);
+          return nb::cast(std::move(map));
         }
-        return nb::cast(without_gil([&] { return SealedMap(path); }));
+        SealedMap map = without_gil([&] { return SealedMap(path); });
+        check(map);
+        return nb::cast(std::move(map));
       },
-      "path"_a, nb::sig("def open(path: str | os.PathLike[str]) -> PrototypeMap | SealedMap"),
-      "Open a map file: an open map is read, a sealed one mapped. Raises FileError.");
+      "path"_a, nb::kw_only(), "encoder"_a.none() = nb::none(), "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, encoder: Encoder | None = None, "
+              "descriptor: str | None = None) -> PrototypeMap | SealedMap"),
+      R"(Open a map file: an open map is read, a sealed one mapped.
+
+A map encodes descriptors itself, with the encoder that it was built with. Where they are encoded
+elsewhere, or come from a detector that the map has not seen, say what you have:
+
+Args:
+    path: the map file.
+    encoder: the map must have been made with this encoder, or one of equal identity.
+    descriptor: the map must be one of this descriptor, for example "orb".
+
+Raises:
+    FileError: the file is no map, or broken.
+    ValueError: the map is of another encoder or descriptor.)");
   m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
         nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");

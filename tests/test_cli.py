@@ -105,15 +105,15 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert isinstance(pm.open(scene), pm.SealedMap)
-    assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "21"
+    assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "19.00"
 
     build = ["build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model]
     done = protomark(*build, "--sealed", "--code-bits", 4, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
-    # The ids are 0, 1, 2 and 7, so they are kept: 12 dimensions in two
-    # words of 8, a count and 8 bytes.
-    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 8)
+    # 12 dimensions in two words of 8, a count, and ids, which are 0, 1, 2 and 7: a block of 16
+    # bytes and a word of 8 for all four.
+    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 24 / 4)
     assert row(done.stdout, "code bits").split()[-1] == "4"
     done = protomark(*build, "--code-bits", 4)
     assert (done.returncode, done.stderr.strip()) == (
@@ -133,7 +133,7 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert (facts["prototypes"], facts["prototypes_per_landmark"]) == (6, 1.5)
-    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 12 + 2 + 8
+    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 12 + 2 + 6
     assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
     for options, message in (
         (["--prototypes", 2], "is for sealed maps: add --sealed"),

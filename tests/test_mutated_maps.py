@@ -22,6 +22,7 @@ def scene(encoder: pm.Encoder, look_bits: int, cells: int = 0) -> pm.PrototypeMa
     scene.set_positions(scene.ids[::2], np.ones((len(scene.ids[::2]), 3)))
     if cells:
         scene.build_index(cells)
+    scene.metadata = {"created": "2026-11-23T03:39:41Z", "frame": "ENU, metres", "x": "é"}
     return scene
 
 
@@ -38,6 +39,8 @@ def read_map(path: Path) -> None:
             assert np.isin(found[found >= 0], ids).all()
     read.counts(ids)
     read.prototype(ids)
+    assert all(name for name in read.metadata)
+    assert read.summary()["landmarks_with_position"] <= len(read)
     positions = read.positions(ids)
     assert not np.isinf(positions).any()
     for landmark in ids[:5]:
@@ -53,8 +56,9 @@ def read_model(path: Path) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        *("model", "open", "open with looks", "open with an index"),
-        *("sealed", "sealed, 4 bits, several prototypes", "sealed with an index"),
+        *("model", "open", "open with looks", "open with an index", "sealed"),
+        *("sealed, 16-bit positions", "sealed, 4 bits, several prototypes"),
+        "sealed with an index",
     ],
 )
 def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -68,6 +72,7 @@ def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_pa
         "open with an index": scene(encoder, 3, cells=5).save,
         "sealed": scene(encoder, 0).seal,
         "sealed with an index": scene(encoder, 3, cells=5).seal,
+        "sealed, 16-bit positions": partial(scene(encoder, 0).seal, position_bits=16),
         "sealed, 4 bits, several prototypes": partial(scene(encoder, 3).seal, bits=4),
     }[kind](path)
     whole = path.read_bytes()

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "protomark/error.h"
+#include "map_sections.h"
 #include "prototype_store.h"
 
 namespace protomark {
@@ -79,6 +80,7 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
                                   " of the other map is named twice");
     }
   }
+  Metadata metadata = joined(store_->metadata, from.metadata);
   if (!from.positions().empty()) store_->make_room_for_positions();
   // By id, so that the result does not depend on how the other map came about.
   const std::vector<std::uint32_t> landmarks = from.sorted_landmarks();
@@ -107,6 +109,8 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
     }
     store_->settle(1);
   }
+  const std::unique_lock lock(store_->mutex);
+  store_->metadata = std::move(metadata);
 }
 
 PrototypeMap PrototypeMap::part(std::span<const std::uint32_t> landmarks) const {
@@ -122,6 +126,7 @@ PrototypeMap PrototypeMap::part(std::span<const std::uint32_t> landmarks) const 
     }
     to.set_position(own, store_->position(landmark));
   }
+  to.metadata = store_->metadata;
   return result;
 }
 

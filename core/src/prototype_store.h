@@ -206,6 +206,7 @@ struct PrototypeMap::Store : PrototypeStore {
   std::shared_ptr<const MeasuredRanks> ranks(std::shared_lock<FairSharedMutex>& lock, double recall,
                                              int threads) const;
 
+  Metadata metadata;
   mutable FairSharedMutex changing, mutex;
 
  private:

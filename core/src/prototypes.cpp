@@ -12,6 +12,7 @@
 #include "map_sections.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
+#include "summary_builder.h"
 
 namespace protomark {
 namespace {
@@ -238,6 +239,18 @@ void PrototypeMap::discard(std::span<const std::int64_t> landmarks) {
   });
 }
 
+Metadata PrototypeMap::metadata() const {
+  const std::shared_lock lock(store_->mutex);
+  return store_->metadata;
+}
+
+void PrototypeMap::set_metadata(Metadata metadata) {
+  check_metadata(metadata);
+  const std::unique_lock changing(store_->changing);
+  const std::unique_lock lock(store_->mutex);
+  store_->metadata = std::move(metadata);
+}
+
 void PrototypeMap::set_positions(std::span<const std::int64_t> landmarks,
                                  std::span<const Position> positions) {
   check_pairs(landmarks.size(), positions.size(), "positions");
@@ -275,6 +288,16 @@ std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> la
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) result.push_back(store_->observations(store_->at(id)));
   return result;
+}
+
+MapSummary PrototypeMap::summary() const {
+  const std::shared_lock changing(store_->changing);
+  SummaryBuilder result;
+  for (std::uint32_t i = 0; i < store_->ids().size(); ++i) {
+    if (store_->ids()[i] < 0) continue;
+    result.add(store_->observations(i), store_->position(i));
+  }
+  return result.take();
 }
 
 void PrototypeMap::prototypes(std::span<const std::int64_t> landmarks,
@@ -327,6 +350,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
+  add_metadata(file, store_->metadata);
   add_values<std::int64_t>(file, section::kIds, n, 1, [&](std::size_t i, std::int64_t* to) {
     *to = store_->ids()[landmarks[i]];
   });
@@ -385,6 +409,7 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
 
   PrototypeMap map(std::move(encoder), dim, look_bits);
   Store& store = *map.store_;
+  store.metadata = read_metadata(file);
   store.reserve(n, m);
   for (std::size_t i = 0, next = 0; i < n; ++i) {
     const std::uint32_t landmark = store.create_landmark(ids[i]);

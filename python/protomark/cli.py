@@ -291,6 +291,28 @@ def build(
             help="For cameras that do not roll: encode the keypoints' angles and sizes, too.",
         ),
     ] = False,
+    position_bits: Annotated[
+        int,
+        typer.Option(
+            help="Bits of a sealed position's coordinate: 32, or 16 for half the bytes, exact to a "
+            "131068th of the map's extent."
+        ),
+    ] = 32,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Coordinate frame of the positions and their unit, for the map's metadata: 'ENU, "
+            "metres', 'COLMAP, no scale', 'map (REP 105), metres'."
+        ),
+    ] = None,
+    metadata: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=TEXT",
+            help="What else the map shall say of itself; may be repeated. 'created' is now, or "
+            "SOURCE_DATE_EPOCH where that is set.",
+        ),
+    ] = None,
     threads: Annotated[int, typer.Option(help="CPU threads.")] = 1,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the facts to this file.")
@@ -300,8 +322,10 @@ def build(
     from protomark.build import build_file
     from protomark.evaluation.command import check_outputs
     from protomark.info import describe, show
+    from protomark.metadata import command_metadata
 
     check_outputs(output, json_file)
+    texts = command_metadata(frame, metadata or [])
     build_file(
         tracks,
         output,
@@ -315,6 +339,8 @@ def build(
         look_bits=look_bits,
         prototypes=prototypes,
         index=index,
+        metadata=texts,
+        position_bits=position_bits,
     )
     facts = describe(output)
     _write_json(json_file, facts)

@@ -13,7 +13,9 @@
 #include <vector>
 
 #include "protomark/encoder.h"
+#include "protomark/map_summary.h"
 #include "protomark/matrix_view.h"
+#include "protomark/metadata.h"
 #include "protomark/search.h"
 
 namespace protomark {
@@ -88,7 +90,8 @@ class PrototypeMap {
   // Joins another map of the same encoder, dim and look_bits, as if its observations had been added
   // here. Its landmark source[i] is landmark into[i] of this map, known or new; the others keep
   // their ids, and landmarks of one id are one landmark. Several that become one are summed look by
-  // look, by ascending id there; positions as in merge. The other map does not change. Throws
+  // look, by ascending id there; positions as in merge. Metadata under names that this map lacks is
+  // taken over; "created" becomes the earlier. The other map does not change. Throws
   // UnknownLandmark for a source that it does not have, and std::invalid_argument for one that is
   // named twice and for negative ids.
   void update(const PrototypeMap& other, std::span<const std::int64_t> into = {},
@@ -109,10 +112,14 @@ class PrototypeMap {
   void set_positions(std::span<const std::int64_t> landmarks, std::span<const Position> positions);
   // NaN where there is none.
   std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
+  // What the map says of itself; a new map says nothing. Throws std::invalid_argument (metadata.h).
+  Metadata metadata() const;
+  void set_metadata(Metadata metadata);
   // Observations of each landmark, over all its looks.
   std::vector<std::uint32_t> counts(std::span<const std::int64_t> landmarks) const;
   // Means over all looks, (landmarks x dim), in code units.
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
+  MapSummary summary() const;
   // The looks of one landmark, by ascending sign bits.
   std::vector<Look> looks(std::int64_t landmark) const;
 
@@ -147,11 +154,13 @@ class PrototypeMap {
   // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
   // average over the map, at least 1: looks of a landmark are joined, those first whose joining
   // adds least to the squared distances of all observations to their prototypes (Ward's criterion),
-  // until the map fits. One landmark keeps at most 255 looks. An index goes along. Throws
-  // FileError, and std::invalid_argument for other `bits` and `prototypes` and for positions
-  // further than 3.4e38 from their middle.
+  // until the map fits. One landmark keeps at most 255 looks. Positions have 32 bits a coordinate,
+  // as floats relative to their middle, or 16, as whole steps along each axis of the box around
+  // them, 65534 from end to end: half a step is the largest error. An index and metadata go along.
+  // Throws FileError, and std::invalid_argument for other `bits`, `prototypes` and `position_bits`
+  // and for positions further than 3.4e38 from their middle.
   void seal(const std::filesystem::path& path, int bits = 8,
-            std::optional<double> prototypes = std::nullopt) const;
+            std::optional<double> prototypes = std::nullopt, int position_bits = 32) const;
 
  private:
   struct Store;
