@@ -65,14 +65,14 @@ runtime-memory := libasan.so
 runtime-threads := libtsan.so
 sanitize-python-memory sanitize-python-threads: sanitize-python-%: build/sanitize-python/%/installed
 	LD_PRELOAD="$(call library,$(runtime-$*)) $(call library,libstdc++.so)" \
-	ASAN_OPTIONS=detect_leaks=0 TSAN_OPTIONS=suppressions=$(abspath tests/tsan.supp) \
+	ASAN_OPTIONS=detect_leaks=0 \
 	PYTHONPATH=$(dir $<)packages \
 	  .venv-sanitize/bin/python -m pytest -p no:cacheprovider $(CORE_TESTS)
 
-# Without what the package needs beside NumPy: the core's tests do not.
+# Without most of what the package needs: the core's tests do not.
 build/sanitize-python/%/installed: $(SOURCES) .venv-sanitize/tools
 	.venv-sanitize/bin/pip install --quiet -c constraints.txt scikit-build-core nanobind numpy \
-	  hypothesis pytest
+	  safetensors rich typer hypothesis pytest
 	.venv-sanitize/bin/pip install --quiet --upgrade --target $(@D)/packages \
 	  --no-deps --no-build-isolation . -C build-dir=$(@D)/build -C cmake.build-type= \
 	  -C cmake.define.PROTOMARK_BUILD_STUBS=OFF -C cmake.define.CMAKE_CXX_FLAGS="$($*)"
