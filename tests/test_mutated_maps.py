@@ -20,9 +20,9 @@ def scene(encoder: pm.Encoder, look_bits: int, cells: int = 0) -> pm.PrototypeMa
     scene = pm.PrototypeMap(encoder, look_bits=look_bits)
     scene.add(np.random.default_rng(0).integers(0, 30, 120) * 7, random_descriptors(120))
     scene.set_positions(scene.ids[::2], np.ones((len(scene.ids[::2]), 3)))
+    scene.metadata = {"created": "2026-11-23T03:39:41Z", "frame": "ENU, metres", "x": "é"}
     if cells:
         scene.build_index(cells)
-    scene.metadata = {"created": "2026-11-23T03:39:41Z", "frame": "ENU, metres", "x": "é"}
     return scene
 
 
@@ -56,9 +56,10 @@ def read_model(path: Path) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        *("model", "open", "open with looks", "open with an index", "sealed"),
-        *("sealed, 16-bit positions", "sealed, 4 bits, several prototypes"),
-        "sealed with an index",
+        "model",
+        *("open", "open with looks", "open with an index"),
+        *("sealed", "sealed, 16-bit positions", "sealed with an index"),
+        "sealed, 4 bits, several prototypes",
     ],
 )
 def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -71,8 +72,8 @@ def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_pa
         "open with looks": scene(encoder, 3).save,
         "open with an index": scene(encoder, 3, cells=5).save,
         "sealed": scene(encoder, 0).seal,
-        "sealed with an index": scene(encoder, 3, cells=5).seal,
         "sealed, 16-bit positions": partial(scene(encoder, 0).seal, position_bits=16),
+        "sealed with an index": scene(encoder, 3, cells=5).seal,
         "sealed, 4 bits, several prototypes": partial(scene(encoder, 3).seal, bits=4),
     }[kind](path)
     whole = path.read_bytes()

@@ -12,9 +12,9 @@
 #include <utility>
 #include <vector>
 
-#include "protomark/error.h"
 #include "map_sections.h"
 #include "prototype_store.h"
+#include "protomark/error.h"
 
 namespace protomark {
 namespace {
@@ -116,6 +116,7 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
 PrototypeMap PrototypeMap::part(std::span<const std::uint32_t> landmarks) const {
   PrototypeMap result(encoder_, dim_, look_bits());
   Store& to = *result.store_;
+  to.metadata = store_->metadata;
   std::size_t rows = 0;
   for (const std::uint32_t landmark : landmarks) rows += store_->rows_of(landmark);
   to.reserve(landmarks.size(), rows);
@@ -126,7 +127,6 @@ PrototypeMap PrototypeMap::part(std::span<const std::uint32_t> landmarks) const 
     }
     to.set_position(own, store_->position(landmark));
   }
-  to.metadata = store_->metadata;
   return result;
 }
 

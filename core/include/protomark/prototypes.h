@@ -91,7 +91,7 @@ class PrototypeMap {
   // here. Its landmark source[i] is landmark into[i] of this map, known or new; the others keep
   // their ids, and landmarks of one id are one landmark. Several that become one are summed look by
   // look, by ascending id there; positions as in merge. Metadata under names that this map lacks is
-  // taken over; "created" becomes the earlier. The other map does not change. Throws
+  // taken over, and "created" becomes the earlier. The other map does not change. Throws
   // UnknownLandmark for a source that it does not have, and std::invalid_argument for one that is
   // named twice and for negative ids.
   void update(const PrototypeMap& other, std::span<const std::int64_t> into = {},
