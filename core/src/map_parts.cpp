@@ -13,8 +13,8 @@
 #include <vector>
 
 #include "map_sections.h"
-#include "prototype_store.h"
 #include "protomark/error.h"
+#include "prototype_store.h"
 
 namespace protomark {
 namespace {
