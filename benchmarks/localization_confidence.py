@@ -86,7 +86,7 @@ def localize(localizer: Localizer, frame: Frame) -> Localization:
 def collect(loaded: dict[str, Tracks], encoder: pm.Encoder, dim: int, stride: int) -> list[Case]:
     """Every frame in every map."""
     cases = []
-    for name, tracks in track(loaded.items(), "maps", len(loaded)):
+    for name, tracks in track(loaded.items(), f"maps of {dim} numbers", len(loaded)):
         for kind, rows, asked in own_maps(tracks):
             kept = np.zeros(len(tracks.keypoints), bool)
             kept[rows] = True
@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tracks", type=Path, nargs="+")
     parser.add_argument("--encoder", help="by default the one of the tracks' descriptor")
-    parser.add_argument("--dim", type=int, default=32)
+    parser.add_argument("--dims", default="32", help="lengths of codes, for example 16,32")
     parser.add_argument("--stride", type=int, default=1, help="every so many frames")
     parser.add_argument("--fit", default="", help="sequences to fit weights to")
     parser.add_argument("--json", type=Path)
@@ -154,14 +154,15 @@ def main() -> None:
     encoder = pm.Encoder.load(asked.encoder or next(iter(loaded.values())).descriptor)
     if encoder.descriptor.endswith(SUFFIX):
         loaded = {name: upright_tracks(tracks) for name, tracks in loaded.items()}
-    cases = collect(loaded, encoder, asked.dim, asked.stride)
+    dims = [int(dim) for dim in asked.dims.split(",")]
+    cases = [case for dim in dims for case in collect(loaded, encoder, dim, asked.stride)]
     table = rows(cases)
     for row in table:
         print(
             f"{row['map']:10} {row['kind']:6} {row['frames']:6} frames, {row['right']:5} right; "
             f"believed right {row['believed_right']}, wrong {row['believed_wrong']}"
         )
-    facts: dict[str, Any] = {"encoder": encoder.name, "dim": asked.dim, "rows": table}
+    facts: dict[str, Any] = {"encoder": encoder.name, "dims": dims, "rows": table}
     if asked.fit:
         names = asked.fit.split(",")
         weights = fit_weights([c for c in cases if c.scene in names and c.frames in names])

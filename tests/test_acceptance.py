@@ -107,7 +107,7 @@ def test_what_ships_is_calibrated_and_as_its_card_says(name: str) -> None:
         assert test_sequence not in encoder.notes["acceptance_data"]
     for dim in encoder.dims:
         near, far = encoder.acceptance(dim).probability([[1.0, 100.0], [99.0, 100.0]])
-        assert near > 0.9
+        assert near > 0.8
         assert far < 0.3
 
 
