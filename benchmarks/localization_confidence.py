@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -169,8 +169,7 @@ def main() -> None:
         facts["weights"] = [float(f"{w:.4g}") for w in weights]
         print("weights fitted to", asked.fit, facts["weights"])
     if asked.json:
-        facts["cases"] = [asdict(case) for case in cases]
-        asked.json.write_text(json.dumps(facts) + "\n")
+        asked.json.write_text(json.dumps(facts, indent=1) + "\n")
 
 
 if __name__ == "__main__":

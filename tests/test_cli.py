@@ -57,7 +57,10 @@ def model(encoder: pm.Encoder, tmp_path: Path) -> Path:
 def test_help_lists_the_commands() -> None:
     done = protomark("--help")
     assert done.returncode == 0
-    for command in ("demo", "tracks", "build", "info", "train", "evaluate", "reproduce", "bench"):
+    for command in (
+        *("demo", "tracks", "build", "info", "localize", "train", "calibrate", "evaluate"),
+        *("reproduce", "bench"),
+    ):
         assert command in done.stdout
         assert protomark(command, "--help").returncode == 0
     assert protomark("--version").stdout.strip() == f"protomark {pm.__version__}"
