@@ -51,13 +51,19 @@ def ratio(distances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def rules(acceptance: Acceptance) -> dict[str, Rule]:
     """All that are compared, by name."""
-    found: dict[str, Rule] = {}
-    for least in PROBABILITIES:
-        found[f"probability {least}"] = lambda d, p=least: (acceptance.probability(d), p)
-    for most in RATIOS:
-        found[f"ratio {most}"] = lambda d, r=most: (ratio(d), 1 - r)
-    found["clearest quarter"] = lambda d: (ratio(d), float(np.quantile(ratio(d), 0.75)))
-    return found
+
+    def by_probability(least: float) -> Rule:
+        return lambda distances: (acceptance.probability(distances), least)
+
+    def by_ratio(most: float) -> Rule:
+        return lambda distances: (ratio(distances), 1 - most)
+
+    def quarter(distances: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        return ratio(distances), float(np.quantile(ratio(distances), 0.75))
+
+    found = {f"probability {least}": by_probability(least) for least in PROBABILITIES}
+    found |= {f"ratio {most}": by_ratio(most) for most in RATIOS}
+    return found | {"clearest quarter": quarter}
 
 
 def parts(tracks: Tracks) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
