@@ -24,6 +24,7 @@ from protomark.evaluation.pose import Frame, scene_depth
 from protomark.evaluation.protocol import split
 from protomark.localization import Localization, Localizer, PosePrior
 from protomark.localization.absolute_pose import centre, pose_error
+from protomark.localization.cameras import camera_of_exif
 from protomark.localization.halves import calibrated, localize_halves, medoids, prototypes
 from protomark.tracks import Tracks
 from protomark.tracks.command import make_tracks
@@ -274,6 +275,25 @@ def test_without_a_camera(query: Path) -> None:
     assert facts["localized"] == 3
     for image in facts["each"]:
         assert image["focal_length"] == pytest.approx(300, rel=0.1)
+
+
+def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x8769] = {0xA405: 34}  # focal length of 35 mm film, by the image's diagonal 43.3 mm
+    with Image.open(query / "images" / "1.png") as image:
+        image.save(query / "exif.jpg", quality=98, exif=exif)
+    camera = camera_of_exif(query / "exif.jpg")
+    assert camera is not None
+    assert camera.params[0] == pytest.approx(34 / 43.27 * 400, rel=0.01)
+    assert camera_of_exif(query / "images" / "1.png") is None
+    done = run(
+        query / "scene.pmk", query / "exif.jpg", "-o", query / "o", "--json", query / "f.json"
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    (image,) = json.loads((query / "f.json").read_text())["each"]
+    assert image["focal_length"] == pytest.approx(300, rel=0.1)
 
 
 @pytest.mark.parametrize(
