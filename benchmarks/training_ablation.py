@@ -99,6 +99,7 @@ INPUTS = (
     replace(_PLAIN, name="octave", inputs=("octave",)),
     replace(_PLAIN, name="response and octave", inputs=("response", "octave")),
     replace(_PLAIN, name="size", inputs=("size",)),
+    replace(_PLAIN, name="angle and size (upright)", upright=True),
     replace(_PLAIN, name="second-order term, weight 0.1", second_order=0.1),
     replace(_PLAIN, name="second-order term, weight 1", second_order=1.0),
 )
