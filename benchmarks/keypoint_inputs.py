@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.sized import size_bits
 from protomark.tracks.file import Tracks
-from protomark.upright import upright_descriptors
 
 _STEPS = 32  # of a response's rank
 _OCTAVES = 8
@@ -37,16 +37,10 @@ def octave_bits(tracks: Tracks) -> NDArray[np.uint8]:
     return np.packbits(tracks.octaves[:, None] > np.arange(_OCTAVES), axis=1, bitorder="little")
 
 
-def size_bits(tracks: Tracks) -> NDArray[np.uint8]:
-    """(n, 4) uint8: the size as `protomark.upright_descriptors` codes it, without the angle."""
-    nothing = np.zeros((len(tracks.sizes), 0), np.uint8)
-    return upright_descriptors(nothing, np.full(len(nothing), -1.0), tracks.sizes)[:, 4:]
-
-
 INPUTS: dict[str, Callable[[Tracks], NDArray[np.uint8]]] = {
     "response": response_bits,
     "octave": octave_bits,
-    "size": size_bits,
+    "size": lambda tracks: np.packbits(size_bits(tracks.sizes), axis=1, bitorder="little"),
 }
 
 

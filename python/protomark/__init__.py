@@ -21,6 +21,7 @@ from protomark._core import (
     verify_file,
 )
 from protomark.errors import FileError
+from protomark.sized import sized_descriptors
 from protomark.upright import upright_descriptors
 
 __version__ = _version("protomark")
@@ -35,6 +36,7 @@ __all__ = [
     "hamming_search",
     "instruction_set",
     "open",
+    "sized_descriptors",
     "upright_descriptors",
     "verify_file",
 ]
