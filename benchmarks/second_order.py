@@ -1,6 +1,6 @@
 """Second-order similarity as a further term of the loss: tried, not shipped.
 
-`training_ablation.py --study inputs` measures it.
+`training_ablation.py` measures it.
 """
 
 from __future__ import annotations

@@ -82,6 +82,8 @@ RECIPE = (
     Variant("batches of mined negatives", "objective", mined=1.0),
     Variant("half of a batch mined negatives", "objective", mined=0.5),
     Variant("average-precision loss", "objective", average_precision=True),
+    Variant("second-order term, weight 0.1", "objective", second_order=0.1),
+    Variant("second-order term, weight 1", "objective", second_order=1.0),
     Variant("32 alone", "nesting", {"dims": (32,)}),
     Variant("linear", "capacity", {"hidden": ()}),
     Variant("256 hidden units", "capacity", {"hidden": (256,)}),
@@ -99,9 +101,6 @@ INPUTS = (
     replace(_PLAIN, name="octave", inputs=("octave",)),
     replace(_PLAIN, name="response and octave", inputs=("response", "octave")),
     replace(_PLAIN, name="size", inputs=("size",)),
-    replace(_PLAIN, name="angle and size (upright)", upright=True),
-    replace(_PLAIN, name="second-order term, weight 0.1", second_order=0.1),
-    replace(_PLAIN, name="second-order term, weight 1", second_order=1.0),
 )
 STUDIES = {"recipe": RECIPE, "inputs": INPUTS}
 
