@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,6 +17,7 @@ from protomark.cli import app
 from protomark.evaluation.results import load_json
 from protomark.sized import BYTES, sized_descriptors, sized_tracks
 from protomark.upright import upright_descriptors
+from training_scene import scene
 
 runner = CliRunner()
 
@@ -102,3 +106,26 @@ def test_upright_and_sized_together_are_refused(tmp_path, encoder):
     assert isinstance(done.exception, ValueError)
     assert "give --upright or --sized" in str(done.exception)
     assert not (tmp_path / "s.pmk").exists()
+
+
+def test_training_learns_from_sizes_and_the_card_says_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("learned", "picking")):
+        tracks = scene(seed=seed)
+        own = np.random.default_rng(seed).uniform(8, 200, len(tracks.landmark_ids))
+        tracks.sizes = own[tracks.landmark_of_keypoint].astype(np.float32)
+        tracks.save(f"{name}.safetensors")
+    words = ["train", "learned.safetensors", "picking.safetensors", "--dims", "8"]
+    words += ["--steps", "60", "--batch", "200", "--threads", "1"]
+    found = {}
+    for further in ([], ["--sized"]):
+        done = runner.invoke(app, [*words, *further, "--json", "card.json"])
+        assert done.exit_code == 0, done.output
+        (figures,) = json.loads(Path("card.json").read_text())["figures"]
+        found[tuple(further)] = figures["integer_precision"]["8"], figures["unaggregated"]
+    # The baselines beside it are those of the plain descriptors.
+    assert found["--sized",][1] == found[()][1]
+    assert found["--sized",][0] > found[()][0] + 0.1
+    encoder = pm.Encoder.load("synthetic-sized.pme")
+    assert (encoder.descriptor, encoder.bits) == ("synthetic-sized", 160)
+    assert "-o synthetic-sized.pme --sized --dims 8" in Path("synthetic-sized.md").read_text()
