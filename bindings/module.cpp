@@ -143,6 +143,11 @@ nb::object from_metadata(const Metadata& metadata) {
 }
 
 Metadata to_metadata(nb::handle object) {
+  // Raises UnicodeEncodeError for surrogates, which are no UTF-8.
+  const auto utf8 = [](nb::handle text) {
+    const auto bytes = nb::cast<nb::bytes>(text.attr("encode")());
+    return std::string(bytes.c_str(), bytes.size());
+  };
   Metadata result;
   const nb::object texts = nb::module_::import_("builtins").attr("dict")(object);
   for (const auto& [name, text] : nb::cast<nb::dict>(texts)) {
@@ -151,7 +156,7 @@ Metadata to_metadata(nb::handle object) {
                             std::string(nb::repr(name).c_str()) + ": " + nb::repr(text).c_str())
                                .c_str());
     }
-    result.emplace(nb::cast<std::string>(name), nb::cast<std::string>(text));
+    result.emplace(utf8(name), utf8(text));
   }
   return result;
 }

@@ -55,6 +55,8 @@ def test_it_is_assigned(scene: pm.PrototypeMap) -> None:
         ({1: "x"}, TypeError, "names and texts must be str, not 1: 'x'"),
         ({"x": None}, TypeError, "not 'x': None"),
         ({"created": "yesterday"}, ValueError, "must be a time in UTC .* not 'yesterday'"),
+        ({"x": "\ud800"}, ValueError, "surrogates not allowed"),
+        (3, TypeError, "not iterable"),
         ({"": "x"}, ValueError, "a name has 1 to 128 bytes, not 0"),
         ({"x": "ü" * 40_000}, ValueError, "'x' has 80000 bytes, at most 65536"),
         ({str(i): "" for i in range(257)}, ValueError, "at most 256 names, not 257"),

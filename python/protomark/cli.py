@@ -446,12 +446,14 @@ def info(
 ) -> None:
     """Say what a file holds."""
     from protomark import verify_file
+    from protomark.console import progress_console
     from protomark.info import describe, show
 
-    facts = describe(file)
-    if verify and facts["kind"] != "tracks":
-        verify_file(file)
-        facts["checksums"] = "all right"
+    with progress_console.status(f"Reading {file.name}"):
+        facts = describe(file)
+        if verify and facts["kind"] != "tracks":
+            verify_file(file)
+            facts["checksums"] = "all right"
     _write_json(json_file, facts)
     show(facts)
 
@@ -661,7 +663,7 @@ def bench(
         str,
         typer.Option(
             help="Sections, for example encode,search; of encode, search, hamming, approximate, "
-            "frame, add, growth and large. By default all."
+            "real, frame, add, growth and large. By default all."
         ),
     ] = "",
     full: Annotated[

@@ -142,6 +142,8 @@ def show(facts: dict[str, Any]) -> None:
     from protomark.console import console
 
     table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")
     for key, value in facts.items():
         if value is None:
             continue
