@@ -182,12 +182,12 @@ def _open_video(path: Path) -> Any:
     import cv2
 
     # OpenCV and FFmpeg print what they think of a broken file; our sentence says it.
-    level = cv2.getLogLevel()  # type: ignore[attr-defined]
-    cv2.setLogLevel(0)  # type: ignore[attr-defined]
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
     try:
         video = cv2.VideoCapture(str(path))
     finally:
-        cv2.setLogLevel(level)  # type: ignore[attr-defined]
+        cv2.utils.logging.setLogLevel(level)
     if not video.isOpened():
         raise ValueError(
             f"{path}: not a video that OpenCV can decode; convert it, for example with "
