@@ -81,6 +81,10 @@ def make_map(request: Request) -> dict[str, Any]:
         Interrupted: Ctrl-C was pressed; the map so far is written, and `resume` goes on with it.
         FileNotFoundError, FileExistsError, ValueError: what is asked for cannot be done.
     """
+    if request.view:
+        from protomark.mapping.view import find_rerun
+
+        find_rerun()
     source = open_source(request.images, request.every)
     _check_output(request)
     poses = read_poses(request.poses) if request.poses else None

@@ -91,7 +91,7 @@ class Video:
         wanted = [p.index for p in self._forward(start, only, decode=False)]
         for last in range(len(wanted), 0, -_CHUNK):
             chunk = set(wanted[max(0, last - _CHUNK) : last])
-            yield from [p for p in self._forward(start, only, chunk)][::-1]
+            yield from reversed(list(self._forward(start, only, chunk)))
 
     def _forward(
         self,
