@@ -36,7 +36,8 @@ _FIRST_GLOBAL = 6
 # A map this young that loses its second next frame was begun wrongly.
 _YOUNG = 4
 _YOUNG_LOSSES = 3
-# A lost frame is looked for in the whole map; predictions older than this are none.
+# A pose under which less of what is in view is seen is held against one from the whole map.
+_DOUBTFUL = 0.3
 _LOOP_EVERY = 3
 _LOOP_SCALE = 8.0
 
@@ -241,9 +242,12 @@ class Mapper:
         found = None
         if predicted is not None:
             found = self.tracker.track(sighting, predicted)
-        if found is None:
+        if found is None or found.share < _DOUBTFUL:
+            # A wrong prediction may have led to a wrong pose.
             rough = self.tracker.relocalize(sighting)
-            found = self.tracker.settle(sighting, rough.pose) if rough else None
+            other = self.tracker.settle(sighting, rough.pose) if rough else None
+            if found is None or (other and len(other.matches) > len(found.matches)):
+                found = other
         return found
 
     def _predict(self, sighting: Sighting) -> Array | None:
