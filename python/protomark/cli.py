@@ -364,7 +364,7 @@ def map_(
         typer.Option(
             "--descriptor", "-d", help="freak, orb, brisk, akaze, latch, beblid or teblid."
         ),
-    ] = "freak",
+    ] = "akaze",
     camera: Annotated[
         str | None,
         typer.Option(
