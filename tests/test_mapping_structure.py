@@ -12,6 +12,7 @@ from protomark.mapping import loop, merging
 from protomark.mapping.adjustment import adjust, adjust_global
 from protomark.mapping.culling import cull
 from protomark.mapping.memory import Descriptors
+from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Frame, Structure
 from protomark.mapping.triangulation import remember
 from protomark.tracks.colmap import rays
@@ -190,3 +191,21 @@ def test_landmarks_without_a_place_in_the_solver_follow_their_frames(
     adjust(structure, list(range(2, 8)), [0, 1], iterations=50)
     errors = structure.errors(structure.observations())
     assert np.median(errors) < max(2 * noise, 0.01)
+
+
+def test_prediction_goes_on_as_the_camera_moved_on_either_side() -> None:
+    structure, _ = scene()
+    turn = cv2.Rodrigues(np.array([0.01, 0.04, -0.02]))[0]
+    motion = np.vstack([np.column_stack([turn, [0.1, -0.02, 0.05]]), [0, 0, 0, 1]])
+    pose = np.eye(4)
+    for frame in structure.frames:
+        frame.pose = pose[:3]
+        pose = motion @ pose
+    np.testing.assert_allclose(predict(structure.frames, 8, 1), pose[:3], atol=1e-12)
+    backward = (np.linalg.inv(motion))[:3]
+    np.testing.assert_allclose(predict(structure.frames, -1, 1), backward, atol=1e-12)
+    inside = [frame for frame in structure.frames if frame.index != 4]
+    np.testing.assert_allclose(predict(inside, 4, 1), structure.frames[4].pose, atol=1e-12)
+    np.testing.assert_array_equal(predict(structure.frames[:1], 2, 1), np.eye(3, 4))
+    assert predict(structure.frames, 20, 1) is None
+    assert predict(structure.frames, 8, 2) is None

@@ -16,6 +16,7 @@ from protomark.mapping.keyframes import is_keyframe
 from protomark.mapping.memory import Memory, make_memory
 from protomark.mapping.merging import merge
 from protomark.mapping.pose import refine_pose
+from protomark.mapping.prediction import predict
 from protomark.mapping.settings import Settings
 from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Frame, Structure
@@ -238,7 +239,7 @@ class Mapper:
         self._take_up(sighting, found, entry)
 
     def _find(self, sighting: Sighting) -> Tracked | None:
-        predicted = self._predict(sighting)
+        predicted = predict(self.structure.frames, sighting.index, sighting.camera_id)
         found = None
         if predicted is not None:
             found = self.tracker.track(sighting, predicted)
@@ -249,21 +250,6 @@ class Mapper:
             if found is None or (other and len(other.matches) > len(found.matches)):
                 found = other
         return found
-
-    def _predict(self, sighting: Sighting) -> Array | None:
-        """The pose if the camera goes on as it did between the two frames beside, if there are."""
-        by_index = {f.index: f for f in self.structure.frames if f.camera_id == self.camera_id}
-        for step in (1, 2, 3):
-            for way in (-step, step):
-                last = by_index.get(sighting.index + way)
-                if last is None:
-                    continue
-                before = by_index.get(sighting.index + 2 * way)
-                if before is None:
-                    return last.pose
-                motion = last.pose @ np.linalg.inv(np.vstack([before.pose, [0, 0, 0, 1]]))
-                return np.asarray(motion @ np.vstack([last.pose, [0, 0, 0, 1]]))
-        return None
 
     def _place(self, sighting: Sighting, pose: Array, entry: Entry) -> None:
         """A frame whose pose is given."""
