@@ -443,8 +443,15 @@ Raises:
     ValueError: dim or look_bits is none of these.)");
   bind_reading(map);
   map.def_prop_rw(
-      "metadata", [](const PrototypeMap& m) { return from_metadata(m.metadata()); },
-      [](PrototypeMap& m, nb::object metadata) { m.set_metadata(to_metadata(metadata)); },
+      "metadata",
+      [](const PrototypeMap& m) {
+        return from_metadata(without_gil([&] { return m.metadata(); }));
+      },
+      [](PrototypeMap& m, nb::object metadata) {
+        Metadata texts = to_metadata(metadata);
+        const nb::gil_scoped_release release;
+        m.set_metadata(std::move(texts));
+      },
       nb::for_getter(nb::sig("def metadata(self) -> MappingProxyType[str, str]")),
       nb::for_setter(nb::sig("def metadata(self, metadata: Mapping[str, str], /) -> None")),
       R"(What the map says of itself: texts by name. A view; assign to change it:

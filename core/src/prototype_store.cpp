@@ -565,12 +565,16 @@ Position PrototypeStore::position(std::uint32_t landmark) const {
   return positions_.empty() ? kNowhere : positions_[landmark];
 }
 
-void PrototypeMap::Store::add_piece(std::span<const std::int64_t> landmarks, Codes codes,
-                                    int threads) {
-  make_room(landmarks, landmarks.size());
-  const std::unique_lock lock(mutex);
-  add(landmarks, codes);
-  settle(threads);
+void PrototypeMap::Store::add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes,
+                                        int threads) {
+  for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
+    const std::size_t n = std::min(kPiece, codes.rows - begin);
+    const auto piece = landmarks.subspan(begin, n);
+    make_room(piece, n);
+    const std::unique_lock lock(mutex);
+    add(piece, {codes.row(begin), n, codes.columns});
+    settle(threads);
+  }
 }
 
 void PrototypeMap::Store::make_room(std::span<const std::int64_t> landmarks, std::size_t rows) {

@@ -181,7 +181,7 @@ class PrototypeStore {
 // searches and short questions share `mutex`. Who needs both takes `changing` first.
 struct PrototypeMap::Store : PrototypeStore {
   // Observations or landmarks of a change that searches wait for.
-  static constexpr std::size_t kPiece = 1 << 13;
+  static constexpr std::size_t kPiece = 1 << 11;
 
   using PrototypeStore::PrototypeStore;
 
@@ -195,7 +195,7 @@ struct PrototypeMap::Store : PrototypeStore {
       settle(1);
     }
   }
-  void add_piece(std::span<const std::int64_t> landmarks, Codes codes, int threads);
+  void add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes, int threads);
   void make_room(std::span<const std::int64_t> landmarks, std::size_t rows);
   void make_room_for_positions();
   void replace(PrototypeStore other);

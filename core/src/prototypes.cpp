@@ -17,6 +17,9 @@
 namespace protomark {
 namespace {
 
+// Descriptors that are encoded at a time, to bound the memory for their codes.
+constexpr std::size_t kEncodeChunk = 1 << 13;
+
 void check_pairs(std::size_t landmarks, std::size_t rows, const char* what) {
   if (landmarks != rows) {
     throw std::invalid_argument(std::to_string(landmarks) + " landmark ids for " +
@@ -97,14 +100,14 @@ void PrototypeMap::add(std::span<const std::int64_t> landmarks, Descriptors desc
                        int threads) {
   check_pairs(landmarks.size(), descriptors.rows, "descriptors");
   check_new_ids(landmarks);
-  std::vector<std::int8_t> buffer(std::min(descriptors.rows, Store::kPiece) * dim_);
+  std::vector<std::int8_t> buffer(std::min(descriptors.rows, kEncodeChunk) * dim_);
   const std::unique_lock changing(store_->changing);
   // Even no observation at all is checked for its length.
-  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += Store::kPiece) {
-    const std::size_t n = std::min(Store::kPiece, descriptors.rows - begin);
-    const MatrixView<std::int8_t> codes{buffer.data(), n, dim_};
-    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, codes, threads);
-    store_->add_piece(landmarks.subspan(begin, n), {buffer.data(), n, dim_}, threads);
+  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += kEncodeChunk) {
+    const std::size_t n = std::min(kEncodeChunk, descriptors.rows - begin);
+    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, {buffer.data(), n, dim_},
+                     threads);
+    store_->add_in_pieces(landmarks.subspan(begin, n), {buffer.data(), n, dim_}, threads);
   }
 }
 
@@ -113,10 +116,7 @@ void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes code
   check_codes(codes, dim_);
   check_new_ids(landmarks);
   const std::unique_lock changing(store_->changing);
-  for (std::size_t begin = 0; begin < codes.rows; begin += Store::kPiece) {
-    const std::size_t n = std::min(Store::kPiece, codes.rows - begin);
-    store_->add_piece(landmarks.subspan(begin, n), {codes.row(begin), n, dim_}, 1);
-  }
+  store_->add_in_pieces(landmarks, codes, 1);
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors descriptors,
@@ -291,7 +291,7 @@ std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> la
 }
 
 MapSummary PrototypeMap::summary() const {
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   SummaryBuilder result;
   for (std::uint32_t i = 0; i < store_->ids().size(); ++i) {
     if (store_->ids()[i] < 0) continue;

@@ -191,9 +191,10 @@ void test_updates_while_both_are_searched() {
   CHECK(left.size() == 200 + right.size());
 }
 
-// A change of more than a piece shows piece by piece to searches, and whole to files.
+// A change of more than a piece (PrototypeMap::Store::kPiece) shows piece by piece to searches, and
+// whole to files.
 void test_large_changes_show_in_pieces(const fs::path& folder) {
-  constexpr std::size_t kPiece = 8192, kAll = 3 * kPiece + 1000;
+  constexpr std::size_t kPiece = 2048, kAll = 9 * kPiece + 1000;
   const auto encoder = test::random_encoder();
   std::vector<std::int64_t> ids(kAll);
   std::iota(ids.begin(), ids.end(), 1);
@@ -233,7 +234,7 @@ void test_large_changes_show_in_pieces(const fs::path& folder) {
 void test_searches_while_an_index_is_built() {
   const auto encoder = test::random_encoder();
   test::Random random(12);
-  const Observations some = observations(random, 4000, 0);
+  const Observations some = observations(random, 2000, 0);
   const auto codes = random.integers<std::int8_t>(kQueries * kDim, -127, 127);
   const Codes queries{codes.data(), kQueries, kDim};
   PrototypeMap map(encoder);

@@ -48,7 +48,7 @@ struct MapPart;
 // Every function either does all it was asked or throws and changes nothing (memory that runs out
 // aside). Calls from several threads are safe. Changes exclude each other, and save, seal, split
 // and the map that update reads. A search sees the map between two changes or, of a change of more
-// than 8192 observations or landmarks, between two pieces of that size: it never waits for longer
+// than 2048 observations or landmarks, between two pieces of that size: it never waits for longer
 // than one of them takes and searches that began before it (docs/sharing.md).
 class PrototypeMap {
  public:
