@@ -56,7 +56,8 @@ sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
 CORE_TESTS := $(addprefix tests/test_,encoder.py example_reader.py files.py four_bit_maps.py \
-  hamming.py index.py limits.py looks.py map_file.py mutated_maps.py prototypes.py sharing.py)
+  hamming.py index.py journal.py limits.py looks.py map_file.py mutated_maps.py prototypes.py \
+  sharing.py)
 sanitize: sanitize-memory sanitize-threads sanitize-python-memory sanitize-python-threads
 
 # Python itself was built without them, so the sanitizer's library has to come first.

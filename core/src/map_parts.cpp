@@ -110,7 +110,7 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
     store_->settle(1);
   }
   const std::unique_lock lock(store_->mutex);
-  store_->metadata = std::move(metadata);
+  store_->set_metadata(std::move(metadata));
 }
 
 PrototypeMap PrototypeMap::part(std::span<const std::uint32_t> landmarks) const {
