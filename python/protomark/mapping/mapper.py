@@ -34,7 +34,7 @@ _LOCAL_ITERATIONS = 8
 # The whole map is adjusted whenever it has grown by this factor.
 _GROWTH = 1.5
 _FIRST_GLOBAL = 6
-# A map this young that loses its second next frame was begun wrongly.
+# A map with fewer keyframes that loses this many frames in a row was begun wrongly.
 _YOUNG = 4
 _YOUNG_LOSSES = 3
 # A pose under which less of what is in view is seen is held against one from the whole map.
@@ -128,6 +128,7 @@ class Mapper:
                 self._place(sighting, picture.pose, entry)
             elif self.structure.frames:
                 self._track(sighting, entry)
+                self._doubt(entry)
             else:
                 self._initialise(sighting, entry)
         if not again:
@@ -198,6 +199,7 @@ class Mapper:
             f"{second.name}: the map begins, with {first.name} and this frame"
         )
         self.initialiser.waiting = []
+        self.lost_in_row = 0
         return None
 
     def _give_up(self, entry: Entry, reason: str) -> None:
@@ -232,11 +234,15 @@ class Mapper:
         if found is None:
             self.lost_in_row += 1
             entry.outcome = "not found in the map: too few matches agree on a pose"
-            if len(self.structure.keyframes()) < _YOUNG and self.lost_in_row >= _YOUNG_LOSSES:
-                self._give_up(entry, "the map was lost when it had just begun")
             return
         self.lost_in_row = 0
         self._take_up(sighting, found, entry)
+
+    def _doubt(self, entry: Entry) -> None:
+        """A map that loses the camera when it has just begun was begun wrongly."""
+        young = len(self.structure.keyframes()) < _YOUNG and not self.looking_again
+        if young and self.lost_in_row >= _YOUNG_LOSSES:
+            self._give_up(entry, "the map was lost when it had just begun")
 
     def _find(self, sighting: Sighting) -> Tracked | None:
         predicted = predict(self.structure.frames, sighting.index, sighting.camera_id)
