@@ -398,6 +398,22 @@ Returns:
             return std::map<std::string, std::string>(e.info().notes.begin(), e.info().notes.end());
           },
           "Whatever else the model says of itself.")
+      .def(
+          "acceptance",
+          [](nb::object self, nb::object dim) {
+            return nb::module_::import_("protomark.acceptance")
+                .attr("Acceptance")
+                .attr("of")(self, dim);
+          },
+          "dim"_a = nb::none(),
+          nb::sig("def acceptance(self, dim: int | None = None) -> Acceptance"),
+          R"(How likely a match is right, by the distances to the two nearest landmarks.
+
+Args:
+    dim: length of a code, one of `dims`; None: the full length.
+
+Raises:
+    ValueError: the encoder was not calibrated for codes of this length.)")
       .def_prop_ro(
           "layers",
           [](const Encoder& e) {

@@ -169,6 +169,13 @@ def train(
             "--upright", help="For cameras that do not roll: learn from angles and sizes, too."
         ),
     ] = False,
+    sized: Annotated[
+        bool,
+        typer.Option(
+            "--sized",
+            help="For places seen from like distances again: learn from the keypoints' sizes, too.",
+        ),
+    ] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     threads: Annotated[
         int, typer.Option(help="CPU threads, 0 for one a core; take 1 on a busy machine.")
@@ -198,6 +205,7 @@ def train(
         raise ModuleNotFoundError(
             "training needs PyTorch, which is not installed: pip install protomark[train]"
         ) from None
+    from protomark.inputs import chosen
     from protomark.training.command import (
         default_output,
         explain_interruption,
@@ -217,7 +225,8 @@ def train(
     data_licences = dict(entry.split("=", 1) for entry in data_licence or [])
     options = Options(dims=parsed, steps=steps, landmarks=batch, seed=seed)
     learned, picking = hold_out(tracks, validation or [])
-    output = output or default_output(learned[0], resume, upright)
+    inputs = chosen(upright, sized)
+    output = output or default_output(learned[0], resume, inputs)
     try:
         card = train_encoder(
             learned,
@@ -226,7 +235,7 @@ def train(
             options,
             report=report or [],
             resume=resume,
-            upright=upright,
+            inputs=inputs,
             name=name,
             licence=licence,
             data_licences=data_licences,
@@ -291,6 +300,13 @@ def build(
             help="For cameras that do not roll: encode the keypoints' angles and sizes, too.",
         ),
     ] = False,
+    sized: Annotated[
+        bool,
+        typer.Option(
+            "--sized",
+            help="For places seen from like distances again: encode the keypoints' sizes, too.",
+        ),
+    ] = False,
     position_bits: Annotated[
         int,
         typer.Option(
@@ -322,6 +338,7 @@ def build(
     from protomark.build import build_file
     from protomark.evaluation.command import check_outputs
     from protomark.info import describe, show
+    from protomark.inputs import chosen
     from protomark.metadata import command_metadata
 
     check_outputs(output, json_file)
@@ -335,7 +352,7 @@ def build(
         sealed,
         threads,
         code_bits=code_bits,
-        upright=upright,
+        inputs=chosen(upright, sized),
         look_bits=look_bits,
         prototypes=prototypes,
         index=index,
@@ -469,6 +486,122 @@ def map_(
         raise typer.Exit(130) from None
     _write_json(json_file, figures)
     command.show(figures, scene)
+
+
+@app.command()
+def localize(
+    scene: Annotated[Path, typer.Argument(help="Map file (.pmk) whose landmarks have positions.")],
+    images: Annotated[list[Path], typer.Argument(help="Images, or folders of images.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Folder for images.txt, cameras.txt (COLMAP) and poses.csv."
+        ),
+    ] = Path("localized"),
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="A COLMAP cameras.txt, a folder with a COLMAP model, or a camera written out: "
+            "'PINHOLE 640 480 525 525 320 240'. By default the focal length comes from EXIF data, "
+            "or is estimated from matches."
+        ),
+    ] = None,
+    refine_focal_length: Annotated[
+        bool, typer.Option("--refine-focal-length", help="Refine it for each image.")
+    ] = False,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="True poses in the map's world, to measure recall: a COLMAP images.txt or model, "
+            "or a TUM trajectory whose time stamps are the images' names."
+        ),
+    ] = None,
+    priors: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rough poses, in the same formats: only landmarks that they make visible are "
+            "searched."
+        ),
+    ] = None,
+    prior_distance: Annotated[
+        float, typer.Option(help="How far off a rough pose may be, in the map's units.")
+    ] = 1.0,
+    prior_degrees: Annotated[
+        float, typer.Option(help="How far off its orientation may be, degrees.")
+    ] = 15.0,
+    min_confidence: Annotated[
+        float,
+        typer.Option(
+            min=0, max=1, help="Poses that are less likely to be right are only in poses.csv."
+        ),
+    ] = 0.9,
+    max_keypoints: Annotated[
+        int, typer.Option(min=4, help="Keypoints kept in an image, strongest first.")
+    ] = 2000,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads to encode and search.")] = 1,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file.")
+    ] = None,
+) -> None:
+    """Say where images were taken, in a map, with a confidence for each pose.
+
+    A map may be open or sealed; `protomark build` makes one from tracks. An image that cannot be
+    read or was taken elsewhere does not end the run. docs/localization.md says more.
+    """
+    from protomark.evaluation.command import check_outputs
+    from protomark.localization.command import Settings, localize_files, show
+
+    check_outputs(json_file)
+    results, interrupted = localize_files(
+        scene,
+        images,
+        output,
+        Settings(
+            camera=camera,
+            refine_focal_length=refine_focal_length,
+            true_poses=poses,
+            priors=priors,
+            prior_distance=prior_distance,
+            prior_degrees=prior_degrees,
+            min_confidence=min_confidence,
+            max_keypoints=max_keypoints,
+            threads=threads,
+        ),
+    )
+    _write_json(json_file, results.as_dict())
+    show(results, output)
+    if interrupted:
+        raise typer.Exit(130)
+
+
+@app.command()
+def calibrate(
+    model: Annotated[Path, typer.Argument(help="Model file (.pme) that `protomark train` wrote.")],
+    tracks: Annotated[
+        list[Path], typer.Argument(help="Tracks files, one a sequence, of the model's descriptor.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Model file to write; by default MODEL itself."),
+    ] = None,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file.")
+    ] = None,
+) -> None:
+    """Say in a model file which matches to accept, from frames whose landmarks are known.
+
+    `protomark train` does this by itself. The probability that a match is right, given the
+    distances to the two nearest landmarks, is fitted for each length of a code; the network stays
+    the same, and so do maps made with it. docs/localization.md says more.
+    """
+    from protomark.calibration import calibrate_file, show
+    from protomark.evaluation.command import check_outputs
+
+    check_outputs(output or model, json_file)
+    figures = calibrate_file(model, tracks, output or model, threads)
+    _write_json(json_file, {"figures": [f.as_dict() for f in figures]})
+    show(figures)
 
 
 @app.command()
@@ -610,6 +743,13 @@ def evaluate(
             "freak-upright); all other methods get the plain descriptors.",
         ),
     ] = False,
+    sized: Annotated[
+        bool,
+        typer.Option(
+            "--sized",
+            help="Give Protomark the keypoints' sizes, too (encoders such as freak-sized).",
+        ),
+    ] = False,
     methods: Annotated[
         str,
         typer.Option(
@@ -650,6 +790,7 @@ def evaluate(
     from protomark.evaluation import command
     from protomark.evaluation.run import Options
     from protomark.evaluation.threads import available_threads
+    from protomark.inputs import chosen
 
     command.check_plot(plot_file)
     command.check_outputs(json_file, markdown_file, plot_file)
@@ -661,7 +802,7 @@ def evaluate(
         encoders=encoder or [],
         methods=[name.strip() for name in methods.split(",") if name.strip()],
         discriminant_from=discriminant_from or [],
-        upright=upright,
+        inputs=chosen(upright, sized),
     )
     command.write(results, json_file, markdown_file, plot_file)
 
