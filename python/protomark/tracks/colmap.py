@@ -31,7 +31,15 @@ except ModuleNotFoundError:
         "reading COLMAP models needs pycolmap: pip install pycolmap"
     ) from None
 
-__all__ = ["Model", "find_model", "pycolmap", "quiet", "read_model", "read_reconstruction"]
+__all__ = [
+    "Model",
+    "find_model",
+    "pycolmap",
+    "quiet",
+    "read_cameras",
+    "read_model",
+    "read_reconstruction",
+]
 
 _FILES = ("cameras", "images")
 
@@ -148,6 +156,38 @@ def read_model(path: Path) -> Model:
             f"{path}: all cameras stand at the same place, so no landmark can be triangulated"
         )
     return model
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """Cameras of a COLMAP cameras.txt, or of a model's folder or any file in it.
+
+    Raises:
+        ValueError: a line is not a camera's, or the model is broken.
+    """
+    if path.is_dir() and (path / "cameras.txt").is_file():
+        path = path / "cameras.txt"
+    if path.suffix != ".txt":
+        folder = path if path.is_dir() else path.parent
+        return model_of(read_reconstruction(find_model(folder)), folder).cameras
+    cameras = {}
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            params = tuple(float(word) for word in words[4:])
+            camera = Camera(words[1], int(words[2]), int(words[3]), params)
+            ours = _camera(camera)
+            if not (np.isfinite(params).all() and ours.verify_params()):
+                raise ValueError
+            if not ours.mean_focal_length() > 0:
+                raise ValueError
+        except (ValueError, IndexError, KeyError, RuntimeError, OverflowError, TypeError):
+            raise ValueError(
+                f"{path}, line {number}: not a COLMAP camera (id, model, width, height, parameters)"
+            ) from None
+        cameras[int(words[0]) if words[0].isdigit() else number] = camera
+    return cameras
 
 
 def model_of(reconstruction: Any, path: Path) -> Model:

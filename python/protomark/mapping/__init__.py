@@ -1,0 +1,1 @@
+"""Incremental structure from motion whose map keeps prototypes in place of descriptors."""

@@ -1,0 +1,40 @@
+"""Where the time goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+STAGES = ("detect", "encode", "match", "triangulate", "adjust", "other")
+
+
+class Clock:
+    """Seconds by stage; stages may be nested, and then count for the inner one."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(STAGES, 0.0)
+        self._running = ["other"]
+        self._since = time.perf_counter()
+
+    def _book(self) -> None:
+        now = time.perf_counter()
+        self.seconds[self._running[-1]] += now - self._since
+        self._since = now
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """What runs inside counts as `name`."""
+        self._book()
+        self._running.append(name)
+        try:
+            yield
+        finally:
+            self._book()
+            self._running.pop()
+
+    def lap(self) -> dict[str, float]:
+        """Seconds by stage since the last lap."""
+        self._book()
+        out, self.seconds = self.seconds, dict.fromkeys(STAGES, 0.0)
+        return out

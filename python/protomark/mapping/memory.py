@@ -1,0 +1,407 @@
+"""What a map remembers of its landmarks' descriptors; the one place where this is chosen."""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import protomark as pm
+from protomark.acceptance import Acceptance
+
+if TYPE_CHECKING:
+    from protomark.mapping.settings import Settings
+
+# Rows that are no longer anyone's are dropped when they are this share of all.
+_DEAD_SHARE = 0.25
+_CHUNK = 256
+_SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
+
+
+class Memory(ABC):
+    """What is kept of descriptors, and how a new frame is matched with it.
+
+    A descriptor is encoded once for each frame; all other calls take the encoded form, which for
+    binary memories is the descriptor itself.
+
+    Attributes:
+        euclidean: whether distances are Euclidean, of codes, and not Hamming.
+    """
+
+    euclidean: bool
+
+    @abstractmethod
+    def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
+        """(n, bytes) uint8 -> (n, width), what is compared."""
+
+    @abstractmethod
+    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """Add observations: unknown ids are new landmarks."""
+
+    @abstractmethod
+    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """Take observations back that were added before, exactly."""
+
+    @abstractmethod
+    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """Join each source landmark to the one in `into`."""
+
+    @abstractmethod
+    def discard(self, ids: NDArray[np.int64]) -> None:
+        """Forget landmarks."""
+
+    @abstractmethod
+    def search(
+        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The two nearest landmarks of each, exactly: ids (q, 2), -1 for none, and distances.
+
+        Args:
+            encoded: (q, width).
+            threads: threads to search on; the result is the same.
+            among: landmarks to search, ascending; None: all.
+        """
+
+    @abstractmethod
+    def distances(
+        self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """(p,) distances between row `rows[i]` of `encoded` and landmark `ids[i]`."""
+
+    @abstractmethod
+    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of these landmarks it remembers."""
+
+    @property
+    @abstractmethod
+    def bytes(self) -> int:
+        """Bytes that matching needs for all landmarks, positions apart."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What beside a map file must be kept to go on later; empty for prototypes."""
+
+    @abstractmethod
+    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
+        """Take up what `arrays` gave and, for prototypes, the saved map."""
+
+
+class Prototypes(Memory):
+    """One prototype a landmark; descriptors are thrown away (the paper's method)."""
+
+    euclidean = True
+
+    def __init__(self, encoder: pm.Encoder, dim: int) -> None:
+        if dim not in encoder.dims:
+            raise ValueError(
+                f"--dim {dim}: encoder '{encoder.name}' has codes of "
+                f"{', '.join(map(str, encoder.dims))} dimensions"
+            )
+        self.encoder, self.dim = encoder, dim
+        self.map = pm.PrototypeMap(encoder, dim)
+        self.acceptance: Acceptance | None = None
+        with contextlib.suppress(ValueError):
+            self.acceptance = encoder.acceptance(dim)
+
+    def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
+        """See `Memory.encode`."""
+        return self.encoder.encode(descriptors, self.dim)
+
+    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """Eq. 1 and Eq. 2 of the paper."""
+        self.map.add_codes(ids, encoded)
+
+    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.remove`; a landmark halved at 255 observations may keep its share."""
+        try:
+            self.map.remove_codes(ids, encoded)
+        except ValueError:
+            for i in range(len(ids)):
+                with contextlib.suppress(ValueError):
+                    self.map.remove_codes(ids[i : i + 1], encoded[i : i + 1])
+
+    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge`."""
+        self.map.merge(into, source)
+
+    def discard(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.discard`."""
+        self.map.discard(ids)
+
+    def search(
+        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """See `Memory.search`."""
+        if among is None:
+            return self.map.search_codes(encoded, k=2, threads=threads)
+        # Sums of integers far below 2^24: exact in float32.
+        codes, places = encoded.astype(np.float32), self._rounded(among)
+        ids = np.full((len(codes), 2), -1, np.int64)
+        distances = np.full((len(codes), 2), np.inf, np.float32)
+        if not len(among):
+            return ids, distances
+        lengths = (places * places).sum(1)
+        for at in range(0, len(codes), _CHUNK):
+            some = codes[at : at + _CHUNK]
+            squares = (some * some).sum(1)[:, None] + lengths - 2 * some @ places.T
+            for k in range(min(2, len(among))):
+                best = np.argmin(squares, axis=1)
+                rows = np.arange(len(some))
+                ids[at : at + _CHUNK, k] = among[best]
+                distances[at : at + _CHUNK, k] = np.sqrt(squares[rows, best])
+                squares[rows, best] = np.inf
+        return ids, distances
+
+    def distances(
+        self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """See `Memory.distances`."""
+        if not len(rows):
+            return np.zeros(0, np.float32)
+        known, inverse = np.unique(ids, return_inverse=True)
+        difference = self._rounded(known)[inverse] - encoded[rows]
+        return np.sqrt(np.einsum("pd,pd->p", difference, difference), dtype=np.float32)
+
+    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See `Memory.known`."""
+        return np.isin(ids, self.map.ids)
+
+    def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Prototypes as search compares them: to integers, halves away from zero."""
+        means = self.map.prototype(ids)
+        return np.sign(means) * np.floor(np.abs(means) + np.float32(0.5))
+
+    @property
+    def bytes(self) -> int:
+        """A sealed map's: one byte a dimension and one for the count."""
+        return len(self.map) * (self.dim + 1)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """See `Memory.arrays`."""
+        return {}
+
+    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
+        """See `Memory.restore`."""
+        if scene is None:
+            raise ValueError("a memory of prototypes needs its map file")
+        if scene.dim != self.dim or scene.encoder.identity != self.encoder.identity:
+            raise ValueError("the map was made with another encoder or other dimensions")
+        self.map = scene
+
+
+class Descriptors(Memory):
+    """Every descriptor of every landmark, kept and searched: the traditional way."""
+
+    euclidean = False
+
+    def __init__(self, width: int) -> None:
+        self._descriptors = np.zeros((0, width), np.uint8)
+        self._owners = np.zeros(0, np.int64)
+        self._sorted: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
+
+    def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
+        """See `Memory.encode`."""
+        return descriptors
+
+    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.add`."""
+        self._sorted = None
+        self._descriptors = np.concatenate([self._descriptors, encoded])
+        self._owners = np.concatenate([self._owners, ids])
+
+    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.remove`."""
+        self._sorted = None
+        order = np.argsort(self._owners, kind="stable")
+        sorted_owners = self._owners[order]
+        first, last = (np.searchsorted(sorted_owners, ids, side) for side in ("left", "right"))
+        for owner, descriptor, a, b in zip(ids, encoded, first, last, strict=True):
+            rows = order[a:b]
+            same = (self._descriptors[rows] == descriptor).all(1) & (self._owners[rows] == owner)
+            if not same.any():
+                raise ValueError(f"landmark {owner} has no such observation")
+            self._owners[rows[np.argmax(same)]] = -1
+        self._compact()
+
+    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge`."""
+        self._sorted = None
+        order = np.argsort(source)
+        at = np.minimum(np.searchsorted(source[order], self._owners), max(len(source) - 1, 0))
+        if len(source):
+            hit = source[order][at] == self._owners
+            self._owners[hit] = into[order][at[hit]]
+
+    def discard(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.discard`."""
+        self._sorted = None
+        self._owners[np.isin(self._owners, ids)] = -1
+        self._compact()
+
+    def _compact(self) -> None:
+        alive = self._owners >= 0
+        if len(alive) and 1 - alive.mean() > _DEAD_SHARE:
+            self._owners, self._descriptors = self._owners[alive], self._descriptors[alive]
+
+    def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Owners (n,), ascending, and descriptors (n, bytes) that matching compares with."""
+        if self._sorted is None:
+            order = np.argsort(self._owners, kind="stable")
+            order = order[np.searchsorted(self._owners[order], 0) :]
+            self._sorted = self._owners[order], self._descriptors[order]
+        return self._sorted
+
+    def search(
+        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """See `Memory.search`."""
+        owners, descriptors = self.table()
+        if among is not None:
+            chosen = np.isin(owners, among)
+            owners, descriptors = owners[chosen], descriptors[chosen]
+        ids, distances = pm.hamming_search(
+            encoded, descriptors, k=2, landmarks=owners, threads=threads
+        )
+        return ids, np.where(ids >= 0, distances, np.inf).astype(np.float32)
+
+    def distances(
+        self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """See `Memory.distances`."""
+        if not len(rows):
+            return np.zeros(0, np.float32)
+        owners, descriptors = self.table()
+        first, last = (np.searchsorted(owners, ids, side) for side in ("left", "right"))
+        counts = last - first
+        starts = np.cumsum(counts) - counts
+        pair = np.repeat(np.arange(len(ids)), counts)
+        row = first[pair] + np.arange(len(pair)) - starts[pair]
+        bits = _set_bits(encoded[rows[pair]] ^ descriptors[row])
+        return np.minimum.reduceat(bits, starts).astype(np.float32)
+
+    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See `Memory.known`."""
+        return np.isin(ids, self._owners)
+
+    @property
+    def bytes(self) -> int:
+        """Each descriptor, with nothing for the landmark it is of."""
+        return int((self._owners >= 0).sum()) * int(self._descriptors.shape[1])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """See `Memory.arrays`."""
+        return {"memory_descriptors": self._descriptors, "memory_owners": self._owners}
+
+    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
+        """See `Memory.restore`."""
+        self._descriptors = arrays["memory_descriptors"]
+        self._owners = arrays["memory_owners"]
+        self._sorted = None
+
+
+class Medoids(Descriptors):
+    """Of each landmark the descriptor that is closest to its others, as ORB-SLAM matches.
+
+    The medoid follows new observations only if all descriptors stay, so they do; `bytes` counts
+    the medoids, which matching needs.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__(width)
+        self._medoids: dict[int, NDArray[np.uint8]] = {}
+        self._changed: set[int] = set()
+        self._chosen: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
+
+    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.add`."""
+        super().add(ids, encoded)
+        self._changed.update(ids.tolist())
+
+    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.remove`."""
+        super().remove(ids, encoded)
+        self._changed.update(ids.tolist())
+
+    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge`."""
+        super().merge(into, source)
+        self._changed.update(into.tolist(), source.tolist())
+
+    def discard(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.discard`."""
+        super().discard(ids)
+        self._changed.update(ids.tolist())
+
+    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
+        """See `Memory.restore`."""
+        super().restore(arrays, scene)
+        self._medoids.clear()
+        self._chosen = None
+        self._changed = set(self._owners[self._owners >= 0].tolist())
+
+    def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """See `Descriptors.table`."""
+        self._follow()
+        if self._chosen is None:
+            ids = np.array(sorted(self._medoids), np.int64)
+            rows = [self._medoids[i] for i in ids.tolist()]
+            width = self._descriptors.shape[1]
+            self._chosen = ids, np.array(rows, np.uint8).reshape(-1, width)
+        return self._chosen
+
+    def _follow(self) -> None:
+        from protomark.evaluation.methods.medoid import medoid
+        from protomark.evaluation.support import Support
+
+        if not self._changed:
+            return
+        self._chosen = None
+        changed = np.array(sorted(self._changed), np.int64)
+        self._changed.clear()
+        for i in changed.tolist():
+            self._medoids.pop(i, None)
+        rows = np.isin(self._owners, changed)
+        if rows.any():
+            found = medoid(Support(self._owners[rows], self._descriptors[rows]))
+            self._medoids.update(zip(found.landmarks.tolist(), found.descriptors, strict=True))
+
+    @property
+    def bytes(self) -> int:
+        """Medoids only."""
+        self._follow()
+        return len(self._medoids) * int(self._descriptors.shape[1])
+
+
+def _set_bits(values: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(n, bytes) uint8 -> (n,) how many bits are set."""
+    if hasattr(np, "bitwise_count"):
+        return np.asarray(np.bitwise_count(values).sum(1, dtype=np.int32))
+    return np.asarray(_SET_BITS[values].sum(1, dtype=np.int32))
+
+
+MEMORIES = ("prototypes", "medoids", "descriptors")
+
+
+def make_memory(settings: Settings) -> Memory:
+    """The memory that the settings ask for.
+
+    Raises:
+        ValueError: the encoder is for another descriptor, or lacks that number of dimensions.
+    """
+    from protomark.tracks.features import descriptor_kind
+
+    kind = descriptor_kind(settings.descriptor)
+    if settings.memory == "descriptors":
+        return Descriptors(kind.bytes)
+    if settings.memory == "medoids":
+        return Medoids(kind.bytes)
+    encoder = pm.Encoder.load(settings.encoder or kind.name)
+    if encoder.descriptor != kind.name or encoder.bits != kind.bits:
+        raise ValueError(
+            f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, "
+            f"not for {kind.name}"
+        )
+    return Prototypes(encoder, settings.dim)

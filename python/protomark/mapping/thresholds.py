@@ -1,0 +1,64 @@
+"""When a match between a keypoint and a landmark is accepted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.mapping.memory import Memory, Prototypes
+
+# As `protomark localize` accepts.
+_MIN_PROBABILITY = 0.2
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Bounds on the distance of a match.
+
+    Attributes:
+        ratio: nearest to second nearest landmark, where the whole map is searched by a memory that
+            was not calibrated.
+        guided_ratio: the same among landmarks that project near the keypoint.
+        max_distance: of a guided match, as a share of the distance that the frame's keypoints
+            typically (median) have to landmarks elsewhere.
+    """
+
+    ratio: float
+    guided_ratio: float
+    max_distance: float
+
+
+# A Hamming distance is a squared Euclidean one, so its ratios are squares.
+_EUCLIDEAN = Thresholds(ratio=0.85, guided_ratio=0.9, max_distance=0.75)
+_HAMMING = Thresholds(ratio=0.8, guided_ratio=0.85, max_distance=0.6)
+
+
+def thresholds(memory: Memory) -> Thresholds:
+    """The bounds that fit a memory's distances."""
+    return _EUCLIDEAN if memory.euclidean else _HAMMING
+
+
+def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Which nearest landmarks of the whole map are accepted, the clearest first.
+
+    Where the encoder was calibrated its probability decides, else the ratio of the two distances.
+
+    Args:
+        memory: what was searched.
+        distances: (q, 2) float32, to the two nearest landmarks.
+
+    Returns:
+        (k,) int64, rows of `distances`.
+    """
+    nearest, second = distances.T
+    if isinstance(memory, Prototypes) and memory.acceptance is not None:
+        doubt = 1 - memory.acceptance.probability(distances)
+        limit = 1 - _MIN_PROBABILITY
+    else:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            doubt = np.where(second > 0, nearest / second, 1.0)
+        limit = thresholds(memory).ratio
+    rows = np.flatnonzero(np.isfinite(nearest) & (doubt < limit))
+    return rows[np.lexsort((nearest[rows], doubt[rows]))]

@@ -1,0 +1,66 @@
+"""A room of three textured walls at different depths, walked past by a camera."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.tracks.colmap import rays
+from protomark.tracks.file import Camera
+from tracks_scene import PINHOLE
+
+# Depth of each wall (it stands parallel to the x axis and y axis), its extent in x, and its seed.
+_WALLS = ((3.0, (-4.0, 6.0), 3), (2.2, (-1.2, -0.3), 5), (1.8, (0.9, 1.7), 7))
+_SIDE = 10.0
+
+
+@cache
+def _paper(seed: int) -> NDArray[np.uint8]:
+    """Random triangles over each other: corners that look alike nowhere."""
+    rng = np.random.default_rng(seed)
+    paper = np.full((2000, 2000), 128, np.uint8)
+    for size in (300, 120, 60):
+        for _ in range(int(1.5 * (2000 / size) ** 2)):
+            corners = rng.uniform(0, 2000, 2) + rng.uniform(-size, size, (3, 2)) / 2
+            cv2.fillConvexPoly(paper, corners.astype(np.int32), int(rng.integers(0, 256)))
+    return paper
+
+
+def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
+    """(count, 3, 4) cam_from_world: sideways, a little up and down, turning a little."""
+    out = []
+    for i in range(count):
+        center = np.array([i * step - 0.5, 0.05 * np.sin(0.9 * i), 0.02 * i])
+        rotation = cv2.Rodrigues(np.array([0.0, 0.08 * np.sin(0.5 * i), 0.01 * i]))[0]
+        out.append(np.column_stack([rotation, -rotation @ center]))
+    return np.array(out)
+
+
+def show(pose: NDArray[np.float64], camera: Camera = PINHOLE, seed: int = 0) -> NDArray[np.uint8]:
+    """What a camera sees; another seed is another room."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    ray = rays(camera, np.column_stack([x.ravel(), y.ravel()]))
+    direction = np.column_stack([ray, np.ones(len(ray))]) @ pose[:, :3]
+    center = -pose[:, :3].T @ pose[:, 3]
+    picture = np.zeros((camera.height, camera.width), np.uint8)
+    for depth, (left, right), number in _WALLS:
+        hit = center + direction * ((depth - center[2]) / direction[:, 2])[:, None]
+        paper = _paper(number + seed)
+        at = ((hit[:, :2] + _SIDE / 2) / _SIDE * len(paper)).astype(np.float32)
+        at = at.reshape(camera.height, camera.width, 2)
+        wall = cv2.remap(paper, at[..., 0], at[..., 1], cv2.INTER_AREA)
+        inside = ((hit[:, 0] > left) & (hit[:, 0] < right)).reshape(picture.shape)
+        picture[inside] = wall[inside]
+    return picture
+
+
+def write_images(folder: Path, poses: NDArray[np.float64], seed: int = 0, first: int = 1) -> Path:
+    """img1.png, img2.png, ... in a folder that may be there already."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, pose in enumerate(poses, first):
+        cv2.imwrite(str(folder / f"img{i}.png"), show(pose, seed=seed))
+    return folder
