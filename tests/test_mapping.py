@@ -222,6 +222,22 @@ def test_black_blurred_and_broken_frames_are_named_and_cost_nothing_else(
     assert "keypoints" in reasons["img8.png"]
     assert "not a readable image" in reasons["img11.png"]
     assert "100x100 pixels" in reasons["img13.png"]
+    assert error_of(tmp_path / "scene", walk(COUNT)) < 0.01
+
+
+@pytest.mark.parametrize("missing", [(2, 3, 6, 9, 12), (4, 5, 9, 10), (5, 8, 11, 14)])
+def test_gaps_do_not_bend_the_map(missing: tuple[int, ...]) -> None:
+    poses = walk(COUNT)
+    mapper = Mapper(SETTINGS, PINHOLE)
+    for picture in pictures(poses):
+        if picture.index not in missing:
+            mapper.add(picture)
+    mapper.finish()
+    frames = mapper.structure.frames
+    assert len(frames) == COUNT - len(missing)
+    found = centre(np.array([frame.pose for frame in frames]))
+    true = centre(poses[[frame.index for frame in frames]])
+    assert trajectory_error(found, true).rmse < 0.01
 
 
 def test_a_second_scene_stays_out_and_is_named(images: Path, tmp_path: Path) -> None:

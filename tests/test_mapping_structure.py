@@ -12,6 +12,7 @@ from protomark.mapping import loop, merging
 from protomark.mapping.adjustment import adjust, adjust_global
 from protomark.mapping.culling import cull
 from protomark.mapping.memory import Descriptors
+from protomark.mapping.pose import refine_pose
 from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Frame, Structure
 from protomark.mapping.triangulation import remember
@@ -206,6 +207,46 @@ def test_prediction_goes_on_as_the_camera_moved_on_either_side() -> None:
     np.testing.assert_allclose(predict(structure.frames, -1, 1), backward, atol=1e-12)
     inside = [frame for frame in structure.frames if frame.index != 4]
     np.testing.assert_allclose(predict(inside, 4, 1), structure.frames[4].pose, atol=1e-12)
+    # Across gaps, where frames are missing before it or between the two that are nearest.
+    gaps = [frame for frame in structure.frames if frame.index in (1, 3, 6)]
+    for index in (0, 4, 5, 7):
+        wanted = structure.frames[index].pose
+        np.testing.assert_allclose(predict(gaps, index, 1), wanted, atol=1e-12)
     np.testing.assert_array_equal(predict(structure.frames[:1], 2, 1), np.eye(3, 4))
     assert predict(structure.frames, 20, 1) is None
     assert predict(structure.frames, 8, 2) is None
+
+
+def test_landmarks_are_less_certain_the_further_from_their_rays_they_are_seen() -> None:
+    structure, _ = scene()
+    structure.frames = structure.frames[:2]
+    structure.look_again()
+    ids = structure.ids
+    one, two = (frame.pose for frame in structure.frames)
+    # Along one of two rays that are an angle apart, it is half of that off their middle, and the
+    # depth's variance shows half as much as a keypoint's.
+    np.testing.assert_allclose(structure.certainty(one, ids), 2 / 3, rtol=1e-3)
+    middle = one.copy()
+    middle[:, 3] = -middle[:, :3] @ (centre(one) + centre(two)) / 2
+    assert (structure.certainty(middle, ids) > 0.999).all()
+    far = walk(8)[7]
+    assert (structure.certainty(far, ids) < 0.03).all()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_refined_pose_is_the_one_that_certain_landmarks_give(weighted: bool) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.6, -0.5, 2], [0.5, 0.5, 3], (POINTS, 3))
+    pose = walk(8)[3]
+    pixels = project(PINHOLE, pose, points)
+    weights = np.ones(POINTS)
+    if weighted:
+        # A third, on one side, has depths that all are wrong the same way.
+        wrong = np.argsort(points[:, 0])[: POINTS // 3]
+        points[wrong, 2] *= 1.2
+        weights[wrong] = 1e-6
+    start = pose.copy()
+    start[:, 3] += [0.02, -0.03, 0.05]
+    found, inliers = refine_pose(PINHOLE, pixels, points, start, 2.5, weights)
+    np.testing.assert_allclose(found, pose, atol=1e-4)
+    assert inliers.all()

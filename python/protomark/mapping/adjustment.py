@@ -190,7 +190,8 @@ def _take_over(
     present = set(np.unique(seen.frames).tolist())
     for i in moving:
         if i in present:
-            pose = np.asarray(reconstruction.images[i + 1].cam_from_world().matrix())
+            # In C order as after loading: the layout decides the last digits of what is made of it.
+            pose = np.ascontiguousarray(reconstruction.images[i + 1].cam_from_world().matrix())
             if np.isfinite(pose).all():
                 structure.frames[i].pose = pose
     for point in np.unique(seen.landmarks).tolist():

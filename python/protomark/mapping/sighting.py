@@ -42,7 +42,7 @@ class Sighting:
             name=self.name,
             time=self.time,
             camera_id=self.camera_id,
-            pose=pose,
+            pose=np.ascontiguousarray(pose),
             keypoints=self.keypoints,
             landmarks=np.full(len(self.keypoints), -1, np.int64),
             rays=self.rays,

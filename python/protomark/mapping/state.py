@@ -27,7 +27,7 @@ from protomark.tracks.colmap import rays
 from protomark.tracks.file import Camera
 
 STATE, CHECKPOINT = "state.safetensors", "checkpoint"
-_FORMAT, _VERSION = "protomark-mapping", "1"
+_FORMAT, _VERSION = "protomark-mapping", "2"
 
 
 def save_checkpoint(mapper: Mapper, scene: Path, facts: dict[str, Any]) -> None:
@@ -60,6 +60,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
     arrays: dict[str, NDArray[Any]] = {
         "positions": structure.positions,
         "directions": structure.directions,
+        "looks": structure.looks,
         "distances": structure.distances,
         "born": structure.born,
         "poses": np.array([f.pose for f in frames]).reshape(-1, 3, 4),
@@ -155,6 +156,7 @@ def _restore(mapper: Mapper, arrays: dict[str, NDArray[Any]], told: dict[str, An
     shapes: dict[str, tuple[int, ...]] = {
         "positions": (many, 3),
         "directions": (many, 3),
+        "looks": (many,),
         "distances": (many, 2),
     }
     shapes |= {"born": (many,), "poses": (len(told["frames"]), 3, 4)}
@@ -163,12 +165,13 @@ def _restore(mapper: Mapper, arrays: dict[str, NDArray[Any]], told: dict[str, An
             raise ValueError(f"{name} has shape {arrays[name].shape}, expected {shape}")
     if not many:
         raise ValueError("positions are missing")
-    types = {"born": "int64", "offsets": "int64", "landmarks": "int64"}
+    types = {"born": "int64", "looks": "int64", "offsets": "int64", "landmarks": "int64"}
     types |= {"keypoints": "float32", "descriptors": "uint8"}
     for name in {*shapes, *types}:
         if arrays[name].dtype != types.get(name, "float64"):
             raise ValueError(f"{name} is of type {arrays[name].dtype}")
     structure.positions, structure.directions = arrays["positions"], arrays["directions"]
+    structure.looks = arrays["looks"]
     structure.distances, structure.born = arrays["distances"], arrays["born"]
     offsets, keypoints = arrays["offsets"], arrays["keypoints"]
     count = len(told["frames"]) + len(told["waiting"])

@@ -114,6 +114,7 @@ class Structure:
         frames: frames with a pose.
         positions: (l, 3) float64, NaN for an id that is no landmark (any more).
         directions: (l, 3) float64, sum of unit vectors from the landmark to those who saw it.
+        looks: (l,) int64, how many vectors these are.
         distances: (l, 2) float64, least and largest distance from which it was seen.
         born: (l,) int64, number of frames when the landmark was made.
     """
@@ -122,6 +123,7 @@ class Structure:
     frames: list[Frame] = field(default_factory=list)
     positions: Array = field(default_factory=lambda: np.full((1, 3), np.nan))
     directions: Array = field(default_factory=lambda: np.zeros((1, 3)))
+    looks: Ids = field(default_factory=lambda: np.zeros(1, np.int64))
     distances: Array = field(default_factory=lambda: np.zeros((1, 2)))
     born: Ids = field(default_factory=lambda: np.zeros(1, np.int64))
 
@@ -153,6 +155,7 @@ class Structure:
         start, many = len(self.positions), len(positions)
         self.positions = np.concatenate([self.positions, positions])
         self.directions = np.concatenate([self.directions, np.zeros((many, 3))])
+        self.looks = np.concatenate([self.looks, np.zeros(many, np.int64)])
         self.distances = np.concatenate([self.distances, np.tile([np.inf, 0.0], (many, 1))])
         self.born = np.concatenate([self.born, np.full(many, len(self.frames), np.int64)])
         return np.arange(start, start + many)
@@ -166,12 +169,13 @@ class Structure:
         toward = centers - self.positions[ids]
         distance = np.linalg.norm(toward, axis=1)
         np.add.at(self.directions, ids, toward / np.maximum(distance, 1e-12)[:, None])
+        np.add.at(self.looks, ids, 1)
         np.minimum.at(self.distances[:, 0], ids, distance)
         np.maximum.at(self.distances[:, 1], ids, distance)
 
     def look_again(self) -> None:
         """Directions and distances anew, after poses and positions have moved."""
-        self.directions[:] = 0
+        self.directions[:], self.looks[:] = 0, 0
         self.distances[:] = np.inf, 0.0
         for frame in self.frames:
             self._look(centre(frame.pose)[None], frame.seen)
@@ -191,9 +195,28 @@ class Structure:
             seen = frame.landmarks >= 0
             frame.landmarks[seen] = target[frame.landmarks[seen]]
         self.directions[into] += self.directions[source]
+        self.looks[into] += self.looks[source]
         self.distances[into, 0] = np.minimum(self.distances[into, 0], self.distances[source, 0])
         self.distances[into, 1] = np.maximum(self.distances[into, 1], self.distances[source, 1])
         self.positions[source] = np.nan
+
+    def certainty(self, pose: Array, ids: Ids) -> Array:
+        """(n,) how much less certain than a keypoint it is where a pose sees landmarks, in (0, 1].
+
+        The variance of the one over that of both together. Rays that spread by an angle fix a
+        landmark as well as a keypoint where it is seen from between them; the further from them it
+        is looked at, the more of the error of its depth shows.
+        """
+        toward = centre(pose) - self.positions[ids]
+        toward /= np.maximum(np.linalg.norm(toward, axis=1), 1e-12)[:, None]
+        mean = self.directions[ids]
+        length = np.maximum(np.linalg.norm(mean, axis=1), 1e-12)
+        # Squares of small angles. Of many rays no more is taken for granted than of two that spread
+        # as much: those of frames that are no keyframes did not fix the landmark.
+        spread = 2 * (1 - length / np.maximum(self.looks[ids], 1))
+        off = 2 * (1 - (toward * mean).sum(1) / length)
+        spread = np.maximum(spread, 1e-12)
+        return np.asarray(2 * spread / (2 * spread + np.maximum(off, 0)))
 
     def visible(self, pose: Array, camera_id: int, margin: float = 0.0) -> tuple[Ids, Array]:
         """Landmarks (m,) that a camera at a pose may recognise, and where they project, pixels."""

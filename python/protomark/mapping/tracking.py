@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from protomark.mapping.memory import Memory
 from protomark.mapping.nearby import near_pairs
-from protomark.mapping.pose import absolute_pose, refine_pose
+from protomark.mapping.pose import absolute_pose, refine_pose, reprojection_error
 from protomark.mapping.structure import Array, Ids, Structure
 from protomark.mapping.thresholds import accepted, thresholds
 
 # Radii in which landmarks are looked for, as shares of the image's longer side: around where a
 # predicted pose puts them, and around where a pose found by RANSAC does.
 _PREDICTED_RADIUS = 0.06
-_FOUND_RADIUS = 0.012
+_FOUND_RADIUS = 0.02
+# A prediction off by more than this (median) leaves right matches outside of its radius.
+_FAR_OFF = 0.5 * _PREDICTED_RADIUS
 # Landmarks that project this close to each other (pixels) may be one, made twice: the ratio test
 # does not hold them against each other.
 _SAME_PLACE = 3.0
@@ -103,7 +105,20 @@ class Tracker:
     def track(self, query: Query, predicted: Array) -> Tracked | None:
         """The pose of a frame that should be near a predicted one."""
         found = self._solve(query, self.guided(query, predicted, _PREDICTED_RADIUS))
+        if found and self._cut_off(query, predicted, found):
+            # What is left on one side of the radius fits a wrong pose, too: look around that one.
+            found = self._solve(query, self.guided(query, found.pose, _PREDICTED_RADIUS))
         return self.settle(query, found.pose) if found else None
+
+    def _cut_off(self, query: Query, predicted: Array, found: Tracked) -> bool:
+        """Whether the prediction was so far off that its radius left out many right matches."""
+        off = reprojection_error(
+            self.structure.cameras[query.camera_id],
+            query.keypoints[found.matches.rows].astype(np.float64),
+            self.structure.positions[found.matches.ids],
+            predicted,
+        )
+        return bool(np.median(off) > self.structure.tolerance(query.camera_id, _FAR_OFF))
 
     def relocalize(self, query: Query, among: Ids | None = None) -> Tracked | None:
         """The pose of a frame that may be anywhere, by prototypes of the whole map alone.
@@ -126,7 +141,7 @@ class Tracker:
         matches = self.guided(query, pose, _FOUND_RADIUS, among)
         for _ in range(2):
             pose, inliers = self._refine(query, matches, pose)
-            matches = self.guided(query, pose, self.max_error * 1.5, among)
+            matches = self.guided(query, pose, _FOUND_RADIUS, among)
         pose, inliers = self._refine(query, matches, pose)
         visible = len(self.structure.visible(pose, query.camera_id)[0])
         share = float(inliers.sum()) / max(min(visible, len(query.keypoints)), 1)
@@ -198,6 +213,7 @@ class Tracker:
             self.structure.positions[matches.ids],
             pose,
             self.structure.tolerance(query.camera_id, self.max_error),
+            self.structure.certainty(pose, matches.ids),
         )
 
 
