@@ -166,6 +166,7 @@ class Descriptors(Memory):
     def __init__(self, width: int) -> None:
         self._descriptors = np.zeros((0, width), np.uint8)
         self._owners = np.zeros(0, np.int64)
+        self._sorted: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
 
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
         """See `Memory.encode`."""
@@ -175,6 +176,7 @@ class Descriptors(Memory):
         """See `Memory.add`."""
         self._descriptors = np.concatenate([self._descriptors, encoded])
         self._owners = np.concatenate([self._owners, ids])
+        self._sorted = None
 
     def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """See `Memory.remove`."""
@@ -193,6 +195,7 @@ class Descriptors(Memory):
         """See `Memory.merge`."""
         for a, b in zip(into, source, strict=True):
             self._owners[self._owners == b] = a
+        self._sorted = None
 
     def discard(self, ids: NDArray[np.int64]) -> None:
         """See `Memory.discard`."""
@@ -200,15 +203,18 @@ class Descriptors(Memory):
         self._compact()
 
     def _compact(self) -> None:
+        self._sorted = None
         alive = self._owners >= 0
         if len(alive) and 1 - alive.mean() > _DEAD_SHARE:
             self._owners, self._descriptors = self._owners[alive], self._descriptors[alive]
 
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Owners (n,), ascending, and descriptors (n, bytes) that matching compares with."""
-        order = np.argsort(self._owners, kind="stable")
-        order = order[np.searchsorted(self._owners[order], 0) :]
-        return self._owners[order], self._descriptors[order]
+        if self._sorted is None:
+            order = np.argsort(self._owners, kind="stable")
+            order = order[np.searchsorted(self._owners[order], 0) :]
+            self._sorted = self._owners[order], self._descriptors[order]
+        return self._sorted
 
     def search(
         self, encoded: NDArray[Any], threads: int = 1
@@ -252,6 +258,7 @@ class Descriptors(Memory):
         """See `Memory.restore`."""
         self._descriptors = arrays["memory_descriptors"]
         self._owners = arrays["memory_owners"]
+        self._sorted = None
 
 
 class Medoids(Descriptors):
@@ -295,10 +302,12 @@ class Medoids(Descriptors):
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """See `Descriptors.table`."""
         self._follow()
-        ids = np.array(sorted(self._medoids), np.int64)
-        width = self._descriptors.shape[1]
-        chosen = [self._medoids[i] for i in ids.tolist()]
-        return ids, np.array(chosen, np.uint8).reshape(-1, width)
+        if self._sorted is None:
+            ids = np.array(sorted(self._medoids), np.int64)
+            width = self._descriptors.shape[1]
+            chosen = [self._medoids[i] for i in ids.tolist()]
+            self._sorted = ids, np.array(chosen, np.uint8).reshape(-1, width)
+        return self._sorted
 
     def _follow(self) -> None:
         from protomark.evaluation.methods.medoid import medoid
