@@ -259,9 +259,10 @@ def _finish(mapper: Mapper, source: Folder | Video, prefix: str) -> None:
     with progress_bar() as bar:
         task = bar.add_task("look again, adjust", total=None)
 
-        def again(names: set[str]) -> Iterator[Picture]:
+        def again(names: set[str], backward: bool) -> Iterator[Picture]:
             wanted = {name.removeprefix(prefix) for name in names if name.startswith(prefix)}
-            return _pictures(source, prefix, None, source.pictures(only=wanted))
+            pictures = source.pictures(only=wanted, backward=backward)
+            return _pictures(source, prefix, None, pictures)
 
         mapper.finish(again, lambda done, total: bar.update(task, completed=done, total=total))
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import protomark as pm
+from protomark.mapping.pose import absolute_pose, reprojection_error
 from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Ids
 from protomark.tracks.colmap import focal_length
@@ -14,13 +15,18 @@ from protomark.tracks.file import Camera
 from protomark.tracks.geometry import depth_of_first, epipolar_error
 
 RATIO = 0.8
-# Fewest matches that must agree with the relative pose, and be far enough apart in angle.
+# Fewest matches that must agree with the relative pose.
 _MIN_MATCHES = 60
-_MIN_POINTS = 50
 # Median angle between the two rays of a match, degrees.
 _MIN_PARALLAX = 2.0
 # Where this share of matches is explained by a turn on the spot, there is no parallax.
 _MAX_TURNED = 0.5
+# Share of the landmarks that other frames see which must agree with a pose of that frame, within
+# half the largest error; and the lead over any other relative pose.
+_MIN_SUPPORT = 0.7
+_LEAD = 1.05
+_WITNESSES = 4
+_MIN_COMMON = 40
 _MAX_WAITING = 40
 
 
@@ -42,6 +48,9 @@ class TwoView:
 class Initialiser:
     """Collects frames until two of them show the scene from places far enough apart.
 
+    Two views of a plane fit two relative poses, and of little depth nearly so. Other frames that
+    wait tell which is right: landmarks of a wrong one do not fit where these saw them.
+
     Args:
         camera: camera of all frames.
         max_error: largest epipolar error in pixels.
@@ -51,6 +60,7 @@ class Initialiser:
         self.camera, self.max_error = camera, max_error
         self.waiting: list[Sighting] = []
         self.best_parallax = 0.0
+        self._focal = focal_length(camera)
 
     def push(self, sighting: Sighting) -> TwoView | None:
         """Try the new frame with those that wait, the oldest first; it then waits, too."""
@@ -59,44 +69,131 @@ class Initialiser:
             del self.waiting[0]
         last = len(self.waiting) - 1
         for first in range(last):
-            pose = self._relative_pose(self.waiting[first], sighting)
+            pose = self._relative_pose(first, last)
             if pose is not None:
                 return TwoView(first, last, pose)
         return None
 
-    def _relative_pose(self, first: Sighting, second: Sighting) -> Array | None:
-        import poselib
-
-        rows = match(first, second)
+    def _relative_pose(self, first: int, second: int) -> Array | None:
+        one, other = self.waiting[first], self.waiting[second]
+        rows = match(one, other)
         if len(rows) < _MIN_MATCHES:
             return None
-        a, b = rows[:, 0], rows[:, 1]
-        camera = self.camera.as_dict()
-        found, facts = poselib.estimate_relative_pose(
-            first.keypoints[a].astype(np.float64),
-            second.keypoints[b].astype(np.float64),
-            camera,
-            camera,
-            {"max_epipolar_error": self.max_error, "seed": 0, "max_iterations": 2000},
-            {},
-        )
+        candidates = self._candidates(one, other, rows)
+        if not candidates:
+            return None
+        witnesses = self._witnesses(first, second)
+        scores = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
+        best = int(np.argmax([support for support, _ in scores]))
+        support, share = scores[best]
+        if share < _MIN_SUPPORT or not self._is_wide(candidates[best], one, other, rows):
+            return None
+        for pose, (rival, _) in zip(candidates, scores, strict=True):
+            if support < _LEAD * rival and not _alike(pose, candidates[best]):
+                return None
+        return candidates[best]
+
+    def _candidates(self, one: Sighting, other: Sighting, rows: Ids) -> list[Array]:
+        """The relative pose that fits best, and those that the scene as a plane allows."""
+        import poselib
+
+        camera, focal = self.camera.as_dict(), self._focal
+        a, b = (s.keypoints[rows[:, k]].astype(np.float64) for k, s in enumerate((one, other)))
+        options = {"max_epipolar_error": self.max_error, "seed": 0, "max_iterations": 2000}
+        found, facts = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
         inliers = np.asarray(facts["inliers"], bool)
         if inliers.sum() < _MIN_MATCHES or inliers.mean() < 0.5:
-            return None
+            return []
+        ray_a, ray_b = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
         pose = np.asarray(found.Rt, np.float64)
-        ray_a, ray_b = first.rays[a[inliers]], second.rays[b[inliers]]
-        scale = focal_length(self.camera)
-        if _turned(pose[:, :3], ray_a, ray_b, 2 * self.max_error / scale) > _MAX_TURNED:
-            return None
-        depth, angle = depth_of_first(pose[:, :3], pose[:, 3], ray_a, ray_b)
-        good = depth > 0
-        good &= epipolar_error(pose[:, :3], pose[:, 3], ray_a, ray_b) * scale <= self.max_error
-        parallax = float(np.degrees(np.median(angle[good]))) if good.any() else 0.0
+        limit = 2 * self.max_error / focal
+        if _turned(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_TURNED:
+            return []
+        plane, facts = poselib.estimate_homography(
+            focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, "seed": 0}, {}
+        )
+        starts = [found]
+        if np.asarray(facts["inliers"], bool).sum() >= _MIN_COMMON:
+            scale = np.diag([focal, focal, 1.0])
+            normal = np.linalg.inv(scale) @ np.asarray(plane) @ scale
+            starts += poselib.motion_from_homography(normal)[0]
+        loss = {"loss_type": "CAUCHY", "loss_scale": 0.5 * self.max_error}
+        out = []
+        for start in starts:
+            refined, _ = poselib.refine_relative_pose(a, b, start, camera, camera, loss)
+            pose = np.asarray(refined.Rt, np.float64)
+            length = np.linalg.norm(pose[:, 3])
+            if not np.isfinite(pose).all() or length < 1e-9:
+                continue
+            pose[:, 3] /= length
+            good = self._good(pose, ray_a, ray_b)[0]
+            if good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
+                out.append(pose)
+        return out
+
+    def _is_wide(self, pose: Array, one: Sighting, other: Sighting, rows: Ids) -> bool:
+        """Whether matches are seen under wide enough angles."""
+        good, _, angle = self._good(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
+        parallax = float(np.degrees(np.median(angle[good])))
         self.best_parallax = max(self.best_parallax, parallax)
-        wide = good & (angle > np.radians(0.5 * _MIN_PARALLAX))
-        if wide.sum() < _MIN_POINTS or good.mean() < 0.8 or parallax < _MIN_PARALLAX:
-            return None
-        return pose
+        return parallax >= _MIN_PARALLAX
+
+    def _good(
+        self, pose: Array, ray_a: Array, ray_b: Array
+    ) -> tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], Array, Array]:
+        rotation, translation = pose[:, :3], pose[:, 3]
+        depth, angle = depth_of_first(rotation, translation, ray_a, ray_b)
+        error = epipolar_error(rotation, translation, ray_a, ray_b) * self._focal
+        in_second = np.column_stack([ray_a, np.ones(len(ray_a))]) @ rotation[2]
+        good = (depth > 0) & (depth * in_second + translation[2] > 0) & (error <= self.max_error)
+        return good, depth, angle
+
+    def _witnesses(self, first: int, second: int) -> list[tuple[Sighting, Ids]]:
+        """Other frames, rather those between, with their matches with the first one."""
+        between = list(range(first + 1, second))
+        near = sorted(set(range(second)) - {first, *between}, key=lambda i: abs(i - first))
+        at = np.linspace(0, len(between) - 1, min(_WITNESSES, len(between))).round().astype(int)
+        chosen = [between[k] for k in at] + near[: max(0, _WITNESSES - len(at))]
+        one = self.waiting[first]
+        return [(self.waiting[i], match(one, self.waiting[i])) for i in chosen]
+
+    def _support(
+        self,
+        one: Sighting,
+        other: Sighting,
+        rows: Ids,
+        pose: Array,
+        witnesses: list[tuple[Sighting, Ids]],
+    ) -> tuple[float, float]:
+        """How well landmarks of this relative pose fit what others saw, and which share fits.
+
+        The first counts each landmark as 1 less its squared error over the squared limit.
+        """
+        good, depth, _ = self._good(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
+        points = np.full((len(one.keypoints), 3), np.nan)
+        at = rows[good, 0]
+        points[at] = np.column_stack([one.rays[at], np.ones(len(at))]) * depth[good, None]
+        limit = 0.5 * self.max_error
+        fit, fitting, total = 0.0, 0, 0
+        for witness, pairs in witnesses:
+            known = np.isfinite(points[pairs[:, 0], 0])
+            if known.sum() < _MIN_COMMON:
+                continue
+            pixels = witness.keypoints[pairs[known, 1]].astype(np.float64)
+            seen = points[pairs[known, 0]]
+            total += len(seen)
+            found = absolute_pose(self.camera, pixels, seen, limit)
+            if found is not None:
+                error = reprojection_error(self.camera, pixels, seen, found[0])
+                fit += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
+                fitting += int((error <= limit).sum())
+        return fit, fitting / max(total, 1)
+
+
+def _alike(first: Array, second: Array) -> bool:
+    turn = np.linalg.norm(first[:, :3] - second[:, :3]) / np.sqrt(8)
+    way = float(first[:, 3] @ second[:, 3])
+    return bool(2 * np.degrees(np.arcsin(min(turn, 1.0))) < 1 and way > np.cos(np.radians(10)))
 
 
 def match(first: Sighting, second: Sighting) -> Ids:

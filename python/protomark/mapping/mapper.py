@@ -113,8 +113,10 @@ class Mapper:
     def add(self, picture: Picture) -> Entry:
         """Take up the next frame; says what became of it."""
         self.clock.lap()
-        entry = Entry(picture.index, picture.name, "")
-        self.history.entries[picture.name] = entry
+        entry = self.history.entries.get(picture.name)
+        again = entry is not None
+        if entry is None:
+            entry = self.history.entries[picture.name] = Entry(picture.index, picture.name, "")
         sighting = self._look(picture, entry)
         if sighting is not None:
             if self.settings.fixed_poses and picture.pose is None:
@@ -125,8 +127,10 @@ class Mapper:
                 self._track(sighting, entry)
             else:
                 self._initialise(sighting, entry)
-        self._measure(entry)
-        entry.seconds = self.clock.lap()
+        if not again:
+            self._measure(entry)
+        for stage, seconds in self.clock.lap().items():
+            entry.seconds[stage] = entry.seconds.get(stage, 0.0) + seconds
         return entry
 
     def _look(self, picture: Picture, entry: Entry) -> Sighting | None:
@@ -242,18 +246,19 @@ class Mapper:
         return found
 
     def _predict(self, sighting: Sighting) -> Array | None:
-        """The next pose if the camera goes on as it did between the last two frames."""
-        frames = self.structure.frames
-        near = [f for f in frames[-2:] if abs(f.index - sighting.index) <= 3]
-        if not near or near[-1] is not frames[-1]:
-            return None
-        last = frames[-1]
-        if len(near) < 2 or abs(frames[-2].index - last.index) != 1:
-            return last.pose
-        if sighting.index - last.index != last.index - frames[-2].index:
-            return last.pose
-        before = np.vstack([frames[-2].pose, [0, 0, 0, 1]])
-        return np.asarray((last.pose @ np.linalg.inv(before)) @ np.vstack([last.pose, [0, 0, 0, 1]]))
+        """The pose if the camera goes on as it did between the two frames beside, if there are."""
+        by_index = {f.index: f for f in self.structure.frames if f.camera_id == self.camera_id}
+        for step in (1, 2, 3):
+            for way in (-step, step):
+                last = by_index.get(sighting.index + way)
+                if last is None:
+                    continue
+                before = by_index.get(sighting.index + 2 * way)
+                if before is None:
+                    return last.pose
+                motion = last.pose @ np.linalg.inv(np.vstack([before.pose, [0, 0, 0, 1]]))
+                return np.asarray(motion @ np.vstack([last.pose, [0, 0, 0, 1]]))
+        return None
 
     def _place(self, sighting: Sighting, pose: Array, entry: Entry) -> None:
         """A frame whose pose is given."""
@@ -373,13 +378,14 @@ class Mapper:
 
     def finish(
         self,
-        again: Callable[[set[str]], Iterable[Picture]] | None = None,
+        again: Callable[[set[str], bool], Iterable[Picture]] | None = None,
         done: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
         """Look once more for frames that were not found, adjust everything, forget descriptors.
 
         Args:
-            again: gives the pictures of some names once more, in their order; None: no second look.
+            again: gives the pictures of some names once more, in their order or backward; None:
+                no second look.
             done: called with frames looked at again, and how many there are.
         """
         self.clock.lap()
@@ -401,21 +407,26 @@ class Mapper:
 
     def _second_looks(
         self,
-        again: Callable[[set[str]], Iterable[Picture]],
+        again: Callable[[set[str], bool], Iterable[Picture]],
         done: Callable[[int, int], None],
     ) -> None:
-        while True:
+        """Backward first: a frame that was not found yet often leads to one that was."""
+        fruitless = 0
+        backward = True
+        while fruitless < 2:
             missing = {
                 e.name
                 for e in self.history.entries.values()
                 if e.outcome != REGISTERED and e.keypoints >= _MIN_KEYPOINTS
             }
             found = 0
-            for number, picture in enumerate(again(missing), 1):
+            for number, picture in enumerate(again(missing, backward), 1):
                 found += self.add(picture).outcome == REGISTERED
                 done(number, len(missing))
-            if not found or found == len(missing):
+            if found == len(missing):
                 return
+            fruitless = 0 if found else fruitless + 1
+            backward = not backward
 
     def _measure(self, entry: Entry) -> None:
         structure = self.structure

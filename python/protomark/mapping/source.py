@@ -14,6 +14,7 @@ from protomark.mapping.mapper import Picture
 from protomark.tracks.colmap import natural_key
 from protomark.tracks.features import read_gray
 
+_CHUNK = 64
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 
 
@@ -34,9 +35,12 @@ class Folder:
     def __len__(self) -> int:
         return len(self.names)
 
-    def pictures(self, start: int = 0, only: set[str] | None = None) -> Iterator[Picture]:
-        """Pictures from a place on, or those of some names."""
-        for index in range(start, len(self.names)):
+    def pictures(
+        self, start: int = 0, only: set[str] | None = None, backward: bool = False
+    ) -> Iterator[Picture]:
+        """Pictures from a place on, or those of some names, or from the last to the first."""
+        places = range(start, len(self.names))
+        for index in reversed(places) if backward else places:
             name = self.names[index]
             if only is not None and name not in only:
                 continue
@@ -74,8 +78,28 @@ class Video:
     def __len__(self) -> int:
         return self.count
 
-    def pictures(self, start: int = 0, only: set[str] | None = None) -> Iterator[Picture]:
-        """Pictures from a place on, or those of some names."""
+    def pictures(
+        self, start: int = 0, only: set[str] | None = None, backward: bool = False
+    ) -> Iterator[Picture]:
+        """Pictures from a place on, or those of some names, or from the last to the first.
+
+        Backward decodes the video anew for each `_CHUNK` frames, which it holds in memory.
+        """
+        if not backward:
+            yield from self._forward(start, only)
+            return
+        wanted = [p.index for p in self._forward(start, only, decode=False)]
+        for last in range(len(wanted), 0, -_CHUNK):
+            chunk = set(wanted[max(0, last - _CHUNK) : last])
+            yield from [p for p in self._forward(start, only, chunk)][::-1]
+
+    def _forward(
+        self,
+        start: int,
+        only: set[str] | None,
+        chunk: set[int] | None = None,
+        decode: bool = True,
+    ) -> Iterator[Picture]:
         video = _open_video(self.path)
         try:
             place = 0
@@ -84,6 +108,11 @@ class Video:
                 name = f"{self.path.stem}-{place:06d}"
                 place += 1
                 if rest or index < start or (only is not None and name not in only):
+                    continue
+                if chunk is not None and index not in chunk:
+                    continue
+                if not decode:
+                    yield Picture(index, name, 0.0, None)
                     continue
                 fine, image = video.retrieve()
                 gray, trouble = (_gray(image), "") if fine else (None, "this frame does not decode")

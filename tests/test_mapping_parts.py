@@ -1,0 +1,230 @@
+import numpy as np
+import pytest
+from tracks_scene import PINHOLE
+
+import protomark as pm
+from protomark.mapping.camera import given_camera
+from protomark.mapping.given_poses import read_poses
+from protomark.mapping.memory import Descriptors, Medoids, Prototypes
+from protomark.mapping.nearby import near_pairs
+from protomark.mapping.outputs import quaternion_of
+from protomark.mapping.source import Folder, Video, open_source
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    return pm.Encoder.load("orb")
+
+
+def memories(encoder):
+    return [Prototypes(encoder, 16), Descriptors(32), Medoids(32)]
+
+
+@pytest.mark.parametrize("radius", [0.5, 3.0, 40.0])
+def test_near_pairs_are_all_pairs_within_the_radius(radius):
+    rng = np.random.default_rng(0)
+    first, second = rng.uniform(-5, 60, (70, 2)), rng.uniform(0, 50, (90, 2))
+    i, j = near_pairs(first, second, radius)
+    distance = np.linalg.norm(first[:, None] - second[None], axis=2)
+    want = np.argwhere(distance <= radius)
+    np.testing.assert_array_equal(np.column_stack([i, j]), want)
+
+
+def test_near_pairs_of_nothing():
+    i, j = near_pairs(np.zeros((0, 2)), np.zeros((3, 2)), 1.0)
+    assert len(i) == len(j) == 0
+
+
+def observations(seed=0, landmarks=12, each=5):
+    rng = np.random.default_rng(seed)
+    base = rng.integers(0, 256, (landmarks, 32), np.uint8)
+    ids = np.repeat(np.arange(1, landmarks + 1), each)
+    noise = (rng.random((len(ids), 256)) < 0.05).reshape(len(ids), 32, 8)
+    descriptors = base[ids - 1] ^ np.packbits(noise, axis=2)[:, :, 0]
+    return ids, descriptors
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_each_memory_finds_its_landmarks(encoder, which):
+    memory = memories(encoder)[which]
+    ids, descriptors = observations()
+    encoded = memory.encode(descriptors)
+    memory.add(ids[::2], encoded[::2])
+    found, distances = memory.search(encoded[1::2])
+    assert (found[:, 0] == ids[1::2]).mean() > 0.9
+    assert (distances[:, 0] <= distances[:, 1]).all()
+    rows = np.arange(len(found))
+    np.testing.assert_allclose(
+        memory.distances(encoded[1::2], rows, found[:, 0]), distances[:, 0], rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(encoder, which):
+    memory, rest = memories(encoder)[which], memories(encoder)[which]
+    ids, descriptors = observations()
+    encoded = memory.encode(descriptors)
+    memory.add(ids, encoded)
+    gone = np.zeros(len(ids), bool)
+    gone[[0, 7, 8, 21, 40]] = True
+    memory.remove(ids[gone], encoded[gone])
+    memory.merge(np.array([3, 5]), np.array([4, 6]))
+    memory.discard(np.array([1, 9]))
+    np.testing.assert_array_equal(memory.known(np.array([1, 2, 3, 4, 9])), [0, 1, 1, 0, 0])
+    ids = np.where(ids == 4, 3, np.where(ids == 6, 5, ids))
+    stays = ~gone & (ids != 1) & (ids != 9)
+    rest.add(ids[stays], encoded[stays])
+    for a, b in zip(memory.search(encoded), rest.search(encoded), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert memory.bytes == rest.bytes
+
+
+def test_bytes_that_matching_needs(encoder):
+    ids, descriptors = observations(landmarks=12, each=5)
+    sizes = []
+    for memory in memories(encoder):
+        memory.add(ids, memory.encode(descriptors))
+        sizes.append(memory.bytes)
+    assert sizes == [12 * 17, 12 * 5 * 32, 12 * 32]
+
+
+def test_prototypes_of_other_dimensions(encoder):
+    with pytest.raises(ValueError, match=r"--dim 17.*8, 16"):
+        Prototypes(encoder, 17)
+
+
+def test_camera_as_text(tmp_path):
+    camera = given_camera("PINHOLE:300,300,160,120", (320, 240))
+    assert camera == PINHOLE
+    file = tmp_path / "cameras.txt"
+    file.write_text("# a comment\n1 PINHOLE 320 240 300 300 160 120\n")
+    assert given_camera(str(file), (320, 240)) == PINHOLE
+    assert given_camera(str(tmp_path), (320, 240)) == PINHOLE
+
+
+@pytest.mark.parametrize(
+    ("content", "say"),
+    [
+        ("1 PINHOLE 640 480 300 300 160 120\n", "no cameras for images of 320x240"),
+        ("1 PINHOLE 320 240 300 300 160\n", "line 1: not a COLMAP camera"),
+        ("1 PINHOLE 320 240 0 0 160 120\n", "line 1: not a COLMAP camera"),
+        ("1 LENS 320 240 300 300 160 120\n", "line 1: not a COLMAP camera"),
+        ("1 PINHOLE 320 240 nan 300 160 120\n", "line 1: not a COLMAP camera"),
+        ("", "no cameras"),
+    ],
+)
+def test_camera_that_is_none(tmp_path, content, say):
+    file = tmp_path / "cameras.txt"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=say):
+        given_camera(str(file), (320, 240))
+
+
+def test_camera_parameters_that_do_not_fit():
+    with pytest.raises(ValueError, match="not the parameters of a PINHOLE camera"):
+        given_camera("PINHOLE:300,300", (320, 240))
+    with pytest.raises(FileNotFoundError, match=r"takes a COLMAP cameras\.txt"):
+        given_camera("no-such-file", (320, 240))
+
+
+def test_poses_as_tum_and_as_colmap_agree(tmp_path):
+    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    pose = np.column_stack([rotation, [1.0, 2, 3]])
+    w, x, y, z = quaternion_of(rotation)
+    colmap = tmp_path / "images.txt"
+    colmap.write_text(f"# images\n1 {w} {x} {y} {z} 1 2 3 1 a b.png\n\n")
+    np.testing.assert_allclose(read_poses(colmap).of("a b.png", 0.0), pose, atol=1e-12)
+    assert read_poses(colmap).of("c.png", 0.0) is None
+    place = -rotation.T @ pose[:, 3]
+    tum = tmp_path / "trajectory.txt"
+    lines = [f"{t} {place[0]} {place[1]} {place[2]} {-x} {-y} {-z} {w}" for t in (1.0, 2.0)]
+    tum.write_text("# time and pose\n" + "\n".join(lines) + "\n")
+    found = read_poses(tum)
+    np.testing.assert_allclose(found.of("any", 1.1), pose, atol=1e-12)
+    assert found.of("any", 3.0) is None
+
+
+@pytest.mark.parametrize(
+    ("content", "say"),
+    [
+        ("1 2 3\n", "neither a line"),
+        ("1 0 0 0 0 0 0 0\n", "quaternion"),
+        ("1 a 0 0 0 0 0 1\n", "no number"),
+        ("1 inf 0 0 0 0 0 1\n", "not finite"),
+        ("# nothing\n", "no poses"),
+    ],
+)
+def test_poses_that_are_none(tmp_path, content, say):
+    file = tmp_path / "poses.txt"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=say):
+        read_poses(file)
+
+
+def test_images_come_in_natural_order_and_know_their_times(tmp_path):
+    import cv2
+
+    for name in ("img10.png", "img2.png", "notes.txt"):
+        if name.endswith("png"):
+            cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
+        else:
+            (tmp_path / name).write_text("no image")
+    folder = open_source(tmp_path)
+    assert isinstance(folder, Folder)
+    assert folder.names == ["img2.png", "img10.png"]
+    assert folder.size() == (6, 4)
+    assert [p.name for p in folder.pictures(backward=True)] == ["img10.png", "img2.png"]
+    assert [p.name for p in folder.pictures(only={"img10.png"})] == ["img10.png"]
+    timed = tmp_path / "timed"
+    timed.mkdir()
+    for name in ("1305.25.png", "1305.75.png"):
+        cv2.imwrite(str(timed / name), np.zeros((4, 6), np.uint8))
+    assert [p.time for p in open_source(timed).pictures()] == [1305.25, 1305.75]
+
+
+def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 6), np.uint8))
+    (tmp_path / "b.png").write_bytes(b"no image")
+    pictures = list(open_source(tmp_path).pictures())
+    assert pictures[0].image is not None
+    assert pictures[1].image is None
+    assert "not a readable image" in pictures[1].trouble
+
+
+def video_of(path, frames):
+    import cv2
+
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
+    for value in frames:
+        writer.write(np.full((48, 64, 3), value, np.uint8))
+    writer.release()
+
+
+def test_a_video_frame_by_frame(tmp_path):
+    path = tmp_path / "walk.avi"
+    video_of(path, range(0, 200, 10))
+    video = open_source(path, every=2)
+    assert isinstance(video, Video)
+    pictures = list(video.pictures())
+    assert len(pictures) == len(video) == 10
+    np.testing.assert_allclose([p.time for p in pictures], np.arange(10) * 0.2)
+    assert [int(np.median(p.image)) for p in pictures] == pytest.approx(range(0, 200, 20), abs=3)
+    backward = list(video.pictures(backward=True))
+    assert [p.name for p in backward] == [p.name for p in pictures][::-1]
+    for a, b in zip(backward[::-1], pictures, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+    assert [p.index for p in video.pictures(7)] == [7, 8, 9]
+
+
+def test_a_file_that_is_no_video(tmp_path):
+    path = tmp_path / "walk.mp4"
+    path.write_bytes(b"\0" * 1000)
+    with pytest.raises(ValueError, match="not a video"):
+        open_source(path)
+    with pytest.raises(FileNotFoundError, match="no such folder of images"):
+        open_source(tmp_path / "nothing.mp4")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="no images"):
+        open_source(tmp_path / "empty")
