@@ -51,8 +51,8 @@ def run(
         mapper.add(picture)
         advance()
 
-    def again(names: set[str]) -> Iterable[Picture]:
-        return sequence.source.pictures(only=names)
+    def again(names: set[str], backward: bool) -> Iterable[Picture]:
+        return sequence.source.pictures(only=names, backward=backward)
 
     mapper.finish(again)
     wall = time.perf_counter() - began
