@@ -122,12 +122,11 @@ inline std::vector<Position> to_positions(nb::handle object) {
   return result;
 }
 
-inline nb::object from_positions(const std::vector<Position>& positions) {
-  NewMatrix<double> result(positions.size(), 3);
-  for (std::size_t i = 0; i < positions.size(); ++i) {
-    for (std::size_t j = 0; j < 3; ++j) result.view().row(i)[j] = positions[i][j];
-  }
-  return result.release();
+inline nb::object from_positions(std::vector<Position> positions) {
+  auto* held = new std::vector<Position>(std::move(positions));
+  nb::capsule owner(held, [](void* p) noexcept { delete static_cast<std::vector<Position>*>(p); });
+  auto* data = reinterpret_cast<double*>(held->data());
+  return nb::cast(nb::ndarray<nb::numpy, double, nb::ndim<2>>(data, {held->size(), 3}, owner));
 }
 
 }  // namespace protomark::python

@@ -26,6 +26,15 @@ namespace protomark::python {
 namespace {
 
 using Path = std::filesystem::path;
+// For whatever may wait for another thread, or for a disk: others run Python meanwhile.
+using ReleaseGil = nb::call_guard<nb::gil_scoped_release>;
+
+// What `work` returns, the GIL released while it runs.
+template <typename Work>
+auto without_gil(const Work& work) {
+  const nb::gil_scoped_release release;
+  return work();
+}
 
 SearchOptions search_options(std::optional<float> max_distance, std::optional<float> ratio,
                              int threads, std::optional<double> recall,
@@ -99,7 +108,7 @@ template <typename Map>
 nb::object prototype(const Map& map, nb::object landmark_ids) {
   const auto l = landmarks(landmark_ids);
   NewMatrix<float> means(l.shape(0), map.dim());
-  map.prototypes(view(l), means.view());
+  without_gil([&] { map.prototypes(view(l), means.view()); });
   return means.release();
 }
 
@@ -118,25 +127,66 @@ nb::object stacked(const std::vector<std::vector<float>>& rows, std::size_t colu
   return result.release();
 }
 
-// ", 3 prototypes" where there are more than landmarks.
+// "2 landmarks", and ", 3 prototypes" where there are more.
 template <typename Map>
-std::string describe_prototypes(const Map& map) {
-  if (map.prototype_count() == map.size()) return "";
-  return ", " + std::to_string(map.prototype_count()) + " prototypes";
+std::string describe_size(const Map& map) {
+  const nb::gil_scoped_release release;
+  const std::size_t landmarks = map.size(), prototypes = map.prototype_count();
+  return std::to_string(landmarks) + " landmarks" +
+         (prototypes == landmarks ? "" : ", " + std::to_string(prototypes) + " prototypes");
+}
+
+nb::object from_metadata(const Metadata& metadata) {
+  nb::dict texts;
+  for (const auto& [name, text] : metadata) texts[nb::str(name.c_str(), name.size())] = text;
+  return nb::module_::import_("types").attr("MappingProxyType")(texts);
+}
+
+Metadata to_metadata(nb::handle object) {
+  // Raises UnicodeEncodeError for surrogates, which are no UTF-8.
+  const auto utf8 = [](nb::handle text) {
+    const auto bytes = nb::cast<nb::bytes>(text.attr("encode")());
+    return std::string(bytes.c_str(), bytes.size());
+  };
+  Metadata result;
+  const nb::object texts = nb::module_::import_("builtins").attr("dict")(object);
+  for (const auto& [name, text] : nb::cast<nb::dict>(texts)) {
+    if (!nb::isinstance<nb::str>(name) || !nb::isinstance<nb::str>(text)) {
+      throw nb::type_error(("metadata: names and texts must be str, not " +
+                            std::string(nb::repr(name).c_str()) + ": " + nb::repr(text).c_str())
+                               .c_str());
+    }
+    result.emplace(utf8(name), utf8(text));
+  }
+  return result;
+}
+
+nb::dict from_summary(const MapSummary& summary) {
+  nb::dict result;
+  result["observations"] = summary.observations;
+  const auto& counts = summary.landmarks_by_count;
+  result["count_histogram"] = new_vector(std::vector<std::int64_t>(counts.begin(), counts.end()));
+  result["landmarks_with_position"] = summary.placed;
+  if (summary.placed != 0) {
+    result["extent"] = from_positions({summary.low, summary.high});
+  } else {
+    result["extent"] = nb::none();
+  }
+  return result;
 }
 
 // What open and sealed maps have in common.
 template <typename Map>
 void bind_reading(nb::class_<Map>& map) {
-  map.def("__len__", &Map::size)
+  map.def("__len__", &Map::size, ReleaseGil())
       .def_prop_ro("encoder", &Map::encoder, "The encoder of this map.")
       .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
-      .def_prop_ro("prototype_count", &Map::prototype_count,
+      .def_prop_ro("prototype_count", &Map::prototype_count, ReleaseGil(),
                    "Number of prototypes: one a landmark, or one for each of its looks.")
-      .def_prop_ro("index_cells", &Map::index_cells,
+      .def_prop_ro("index_cells", &Map::index_cells, ReleaseGil(),
                    "Number of cells of the index; 0: there is none.")
       .def_prop_ro(
-          "ids", [](const Map& m) { return new_vector(m.ids()); },
+          "ids", [](const Map& m) { return new_vector(without_gil([&] { return m.ids(); })); },
           nb::sig("def ids(self) -> NDArray[numpy.int64]"),
           "All landmark ids, ascending, (n,) int64.")
       .def(
@@ -149,12 +199,31 @@ void bind_reading(nb::class_<Map>& map) {
       .def(
           "positions",
           [](const Map& m, nb::object ids) {
-            return from_positions(m.positions(view(landmarks(ids))));
+            const auto l = landmarks(ids);
+            return from_positions(without_gil([&] { return m.positions(view(l)); }));
           },
           "landmark_ids"_a,
           nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
           "World coordinates, (n, 3) float64, NaN where there are none. Raises KeyError for an id "
           "that is not in the map.")
+      .def(
+          "summary",
+          [](const Map& m) {
+            MapSummary summary;
+            {
+              const nb::gil_scoped_release release;
+              summary = m.summary();
+            }
+            return from_summary(summary);
+          },
+          nb::sig("def summary(self) -> dict[str, Any]"),
+          R"(The map at a glance, in one pass that keeps nothing in memory.
+
+Returns:
+    observations: their number, in a sealed map at most 255 of a landmark.
+    count_histogram: (256,) int64, landmarks with so many observations, the last one: or more.
+    landmarks_with_position: their number.
+    extent: (2, 3) float64, the lowest and highest coordinates; None where no landmark has any.)")
       .def("search", &search<Map>, "descriptors"_a, "k"_a = 2, "max_distance"_a = nb::none(),
            "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
            "probes"_a = nb::none(),
@@ -247,6 +316,7 @@ void bind_encoder(nb::module_& m) {
                              std::move(data),
                              std::move(licence),
                              {notes.begin(), notes.end()}};
+            const nb::gil_scoped_release release;
             new (self) Encoder(std::move(info), std::move(built), std::move(dims), scale);
           },
           "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
@@ -271,7 +341,8 @@ Raises:
           [](nb::object source) {
             const nb::object path =
                 nb::module_::import_("protomark.models").attr("resolve")(source);
-            return Encoder::load(nb::cast<Path>(path));
+            const auto file = nb::cast<Path>(path);
+            return without_gil([&] { return Encoder::load(file); });
           },
           "source"_a, nb::sig("def load(source: str | os.PathLike[str]) -> Encoder"),
           R"(Load an encoder by the name of one that ships ("freak", "orb") or the path of a model file.
@@ -279,7 +350,7 @@ Raises:
 Raises:
     FileNotFoundError: there is no such model.
     FileError: the file is not a model.)")
-      .def("save", &Encoder::save, "path"_a,
+      .def("save", &Encoder::save, "path"_a, ReleaseGil(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the model file, whole or not at all. Raises FileError.")
       .def(
@@ -371,12 +442,28 @@ Args:
 Raises:
     ValueError: dim or look_bits is none of these.)");
   bind_reading(map);
+  map.def_prop_rw(
+      "metadata", [](const PrototypeMap& m) { return from_metadata(m.metadata()); },
+      [](PrototypeMap& m, nb::object metadata) { m.set_metadata(to_metadata(metadata)); },
+      nb::for_getter(nb::sig("def metadata(self) -> MappingProxyType[str, str]")),
+      nb::for_setter(nb::sig("def metadata(self, metadata: Mapping[str, str], /) -> None")),
+      R"(What the map says of itself: texts by name. A view; assign to change it:
+
+    scene.metadata = scene.metadata | {"frame": "ENU, metres", "robot": "atlas-2"}
+
+Names are free but for two: "frame" is the coordinate frame of the positions and their unit,
+"created" is when the map was begun, "2026-11-23T03:39:41Z". A new map says nothing.
+
+Raises:
+    TypeError: a name or text is no str.
+    ValueError: "created" is no such time, or something is beyond the limits (docs/limits.md).)");
   map.def_prop_ro("look_bits", &PrototypeMap::look_bits,
                   "Signs that tell the looks of a landmark apart; 0: it has one prototype.")
       .def(
           "counts",
           [](const PrototypeMap& m, nb::object ids) {
-            return counts(m.counts(view(landmarks(ids))), m.look_bits() == 0);
+            const auto l = landmarks(ids);
+            return counts(without_gil([&] { return m.counts(view(l)); }), m.look_bits() == 0);
           },
           "landmark_ids"_a,
           nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8] | "
@@ -387,7 +474,8 @@ Raises:
           "looks",
           [](const PrototypeMap& m, std::int64_t id) {
             std::vector<std::vector<float>> means;
-            for (Look& look : m.looks(id)) means.push_back(std::move(look.mean));
+            auto looks = without_gil([&] { return m.looks(id); });
+            for (Look& look : looks) means.push_back(std::move(look.mean));
             return stacked(means, m.dim());
           },
           "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
@@ -397,7 +485,7 @@ Raises:
           "look_counts",
           [](const PrototypeMap& m, std::int64_t id) {
             std::vector<std::uint8_t> result;
-            for (const Look& look : m.looks(id)) {
+            for (const Look& look : without_gil([&] { return m.looks(id); })) {
               result.push_back(static_cast<std::uint8_t>(look.count));
             }
             return new_vector(std::move(result));
@@ -472,9 +560,92 @@ Raises:
           },
           "landmark_ids"_a, nb::sig("def discard(self, landmark_ids: ArrayLike) -> None"),
           "Forget landmarks. Raises KeyError for an unknown id.")
-      .def("update", &PrototypeMap::update, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
-           "Join another map of the same encoder, dim and look_bits: landmarks that both have are "
-           "summed, the rest taken over. Raises ValueError where one of these differs.")
+      .def(
+          "update",
+          [](PrototypeMap& self, const PrototypeMap& other, std::optional<nb::object> into,
+             std::optional<nb::object> source) {
+            if (into.has_value() != source.has_value()) {
+              throw nb::value_error("into and source go together");
+            }
+            const nb::object none = nb::make_tuple();
+            const auto a = landmarks(into.value_or(none));
+            const auto b = landmarks(source.value_or(none));
+            const nb::gil_scoped_release release;
+            self.update(other, view(a), view(b));
+          },
+          "other"_a, "into"_a = nb::none(), "source"_a = nb::none(),
+          nb::sig("def update(self, other: PrototypeMap, into: ArrayLike | None = None, "
+                  "source: ArrayLike | None = None) -> None"),
+          R"(Join another map, exactly as if its observations had been added here.
+
+Landmarks of one id are one landmark: those that both maps have are summed, the rest taken over.
+Where the other map numbers its landmarks differently, say how:
+`scene.update(other, into=ours, source=theirs)`. All of them under new ids:
+`scene.update(other, into=other.ids + scene.ids[-1] + 1, source=other.ids)`.
+
+Args:
+    other: a map of the same encoder, dim and look_bits; it does not change.
+    into: (n,) int64, ids in this map, known or new; several landmarks of the other map may become
+        the same one.
+    source: (n,) int64, their ids in the other map, each once. Landmarks that are not named keep
+        their ids.
+
+A landmark keeps its position, or takes the other one's where it has none; of several those with
+the smallest id there. Metadata under names that this map lacks is taken over, and "created" becomes
+the earlier.
+
+Raises:
+    KeyError: a source is not in the other map.
+    ValueError: encoder, dim or look_bits differ, a source is named twice, or an id of `into` is
+        negative. Nothing is changed then.)")
+      .def(
+          "split",
+          [](const PrototypeMap& self, nb::object ids) {
+            const auto boundaries = landmarks(ids);
+            return without_gil([&] { return self.split(view(boundaries)); });
+          },
+          "ids"_a, nb::sig("def split(self, ids: ArrayLike) -> list[PrototypeMap]"),
+          R"(Parts by id, as open maps of their own.
+
+Args:
+    ids: ascending ids at which a new part begins: `split([10, 20])` gives the landmarks below 10,
+        those from 10 to 19, and those from 20 on.
+
+Parts have all that this map knows of their landmarks, but no index. An empty map that is updated
+with all of them, in any order, gives the same file as this one without its index. Together they
+take as much memory.
+
+Raises:
+    ValueError: ids do not ascend.)")
+      .def(
+          "split",
+          [](const PrototypeMap& self, double cell_size) {
+            std::vector<MapPart> parts = without_gil([&] { return self.split(cell_size); });
+            nb::dict result;
+            for (MapPart& part : parts) {
+              nb::object cell = nb::none();
+              if (part.cell) {
+                cell = nb::make_tuple((*part.cell)[0], (*part.cell)[1], (*part.cell)[2]);
+              }
+              result[cell] = nb::cast(std::move(part.map));
+            }
+            return result;
+          },
+          nb::kw_only(), "cell_size"_a,
+          nb::sig("def split(self, *, cell_size: float) -> dict[tuple[int, int, int] | None, "
+                  "PrototypeMap]"),
+          R"(Parts by space, as open maps of their own.
+
+Args:
+    cell_size: edge of the cubes into which space is cut, in the unit of the positions.
+
+Returns:
+    A map for each cube (i, j, k) that has landmarks, those whose coordinates are from i to i + 1
+    times cell_size and so on, ascending; and under None one of the landmarks without a position,
+    where there are any.
+
+Raises:
+    ValueError: cell_size is not above 0, or too small for the map's extent.)")
       .def(
           "set_positions",
           [](PrototypeMap& self, nb::object ids, nb::object positions) {
@@ -489,7 +660,7 @@ Raises:
           "an "
           "unknown id.")
       .def("build_index", &PrototypeMap::build_index, "cells"_a = nb::none(), "threads"_a = 1,
-           nb::call_guard<nb::gil_scoped_release>(),
+           ReleaseGil(),
            nb::sig("def build_index(self, cells: int | None = None, threads: int = 1) -> None"),
            R"(Learn coarse cells from the map's prototypes, for search with recall or probes.
 
@@ -501,29 +672,28 @@ Args:
 
 Raises:
     ValueError: cells is none of these, or the map is empty.)")
-      .def("drop_index", &PrototypeMap::drop_index, nb::call_guard<nb::gil_scoped_release>(),
+      .def("drop_index", &PrototypeMap::drop_index, ReleaseGil(),
            nb::sig("def drop_index(self) -> None"), "Forget the cells.")
-      .def("probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1,
-           nb::call_guard<nb::gil_scoped_release>(),
+      .def("probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1, ReleaseGil(),
            nb::sig("def probes(self, recall: float, threads: int = 1) -> int"),
            "Number of cells that are searched for a recall in (0, 1], as measured on the map: the "
            "nearest landmark to a landmark's prototype, itself left out, is in one of them that "
            "often. Measured once, and again when a tenth of the map has changed. Raises ValueError "
            "for another recall, and without an index.")
-      .def("save", &PrototypeMap::save, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+      .def("save", &PrototypeMap::save, "path"_a, ReleaseGil(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the map, whole or not at all. Raises FileError.")
       .def(
           "seal",
-          [](const PrototypeMap& self, const Path& path, int bits,
-             std::optional<double> prototypes) {
+          [](const PrototypeMap& self, const Path& path, int bits, std::optional<double> prototypes,
+             int position_bits) {
             const nb::gil_scoped_release release;
-            self.seal(path, bits, prototypes);
+            self.seal(path, bits, prototypes, position_bits);
             return SealedMap(path);
           },
-          "path"_a, "bits"_a = 8, "prototypes"_a = nb::none(),
+          "path"_a, "bits"_a = 8, "prototypes"_a = nb::none(), "position_bits"_a = 32,
           nb::sig("def seal(self, path: str | os.PathLike[str], bits: int = 8, prototypes: float | "
-                  "None = None) -> SealedMap"),
+                  "None = None, position_bits: int = 32) -> SealedMap"),
           R"(Write a sealed map, whole or not at all, and open it.
 
 Args:
@@ -534,14 +704,18 @@ Args:
         of a landmark are joined, over the whole map those first whose joining adds least to the
         squared distances of observations to their prototypes (Ward's criterion), until it fits.
         None: every look is kept (of one landmark at most 255).
+    position_bits: bits of a coordinate. With 32, positions are floats relative to the middle of the
+        map; with 16 they take half the bytes, as whole steps along each axis of the box around
+        them, 65534 from end to end (position_error).
 
 Raises:
     FileError: the file cannot be written.
-    ValueError: bits is neither 8 nor 4, or prototypes is below 1.)")
+    ValueError: bits is neither 8 nor 4, prototypes is below 1, position_bits is neither 32 nor 16,
+        or positions are further than 3.4e38 from their middle.)")
       .def("__repr__", [](const PrototypeMap& self) {
-        return "<protomark.PrototypeMap: " + std::to_string(self.size()) + " landmarks" +
-               describe_prototypes(self) + ", " + std::to_string(self.dim()) +
-               " dimensions, encoder '" + self.encoder()->info().name + "'>";
+        return "<protomark.PrototypeMap: " + describe_size(self) + ", " +
+               std::to_string(self.dim()) + " dimensions, encoder '" + self.encoder()->info().name +
+               "'>";
       });
 }
 
@@ -554,7 +728,8 @@ void bind_sealed_map(nb::module_& m) {
   map.def(
          "counts",
          [](const SealedMap& m, nb::object ids) {
-           return counts(m.counts(view(landmarks(ids))), true);
+           const auto l = landmarks(ids);
+           return counts(without_gil([&] { return m.counts(view(l)); }), true);
          },
          "landmark_ids"_a,
          nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint8]"),
@@ -562,20 +737,38 @@ void bind_sealed_map(nb::module_& m) {
          "id that is not in the map.")
       .def(
           "looks",
-          [](const SealedMap& m, std::int64_t id) { return stacked(m.looks(id), m.dim()); },
+          [](const SealedMap& m, std::int64_t id) {
+            return stacked(without_gil([&] { return m.looks(id); }), m.dim());
+          },
           "landmark_id"_a, nb::sig("def looks(self, landmark_id: int) -> NDArray[numpy.float32]"),
           "Prototypes of one landmark, (r, dim) float32, in code units, with an index in no "
           "particular order. Raises KeyError for an id that is not in the map.")
-      .def("probes", &SealedMap::probes, "recall"_a,
+      .def("probes", &SealedMap::probes, "recall"_a, ReleaseGil(),
            nb::sig("def probes(self, recall: float) -> int"),
            "Number of cells that are searched for a recall in (0, 1], as measured when the map was "
            "sealed. Raises ValueError for another recall, and without an index.");
+  map.def_prop_ro(
+      "metadata", [](const SealedMap& m) { return from_metadata(m.metadata()); },
+      nb::sig("def metadata(self) -> MappingProxyType[str, str]"),
+      "What the map says of itself: texts by name, as in the open map that was sealed.");
+  map.def_prop_ro("position_bits", &SealedMap::position_bits,
+                  "Bits of a position's coordinate: 32 or 16, 0 where no landmark has a position.")
+      .def_prop_ro(
+          "position_error",
+          [](const SealedMap& m) -> nb::object {
+            const auto error = m.position_error();
+            if (!error) return nb::none();
+            return new_vector(std::vector<double>(error->begin(), error->end()));
+          },
+          nb::sig("def position_error(self) -> NDArray[numpy.float64] | None"),
+          "With 16-bit positions, how far they may be from those of the open map along each axis, "
+          "(3,) float64: half a step. None otherwise: float32 are relative to the middle of the "
+          "map.");
   map.def_prop_ro("code_bits", &SealedMap::code_bits,
                   "Bits of a prototype's number: 8, or 4 where the map was sealed so.");
   map.def("__repr__", [](const SealedMap& self) {
-    return "<protomark.SealedMap: " + std::to_string(self.size()) + " landmarks" +
-           describe_prototypes(self) + ", " + std::to_string(self.dim()) + " dimensions" +
-           (self.code_bits() == 8 ? "" : " of 4 bits") + ", encoder '" +
+    return "<protomark.SealedMap: " + describe_size(self) + ", " + std::to_string(self.dim()) +
+           " dimensions" + (self.code_bits() == 8 ? "" : " of 4 bits") + ", encoder '" +
            self.encoder()->info().name + "'>";
   });
 }
@@ -628,16 +821,41 @@ Returns:
         "chooses another one. All give the same bytes.");
   m.def(
       "open",
-      [](const Path& path) -> nb::object {
-        if (map_kind(path) == MapKind::open) return nb::cast(PrototypeMap::load(path));
-        return nb::cast(SealedMap(path));
+      [](const Path& path, const Encoder* encoder,
+         const std::optional<std::string>& descriptor) -> nb::object {
+        const auto check = [&](const auto& map) {
+          if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
+          if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
+        };
+        if (without_gil([&] { return map_kind(path); }) == MapKind::open) {
+          PrototypeMap map = without_gil([&] { return PrototypeMap::load(path); });
+          check(map);
+          return nb::cast(std::move(map));
+        }
+        SealedMap map = without_gil([&] { return SealedMap(path); });
+        check(map);
+        return nb::cast(std::move(map));
       },
-      "path"_a, nb::sig("def open(path: str | os.PathLike[str]) -> PrototypeMap | SealedMap"),
-      "Open a map file: an open map is read, a sealed one mapped. Raises FileError.");
-  m.def("file_sections", &file_sections, "path"_a,
+      "path"_a, nb::kw_only(), "encoder"_a.none() = nb::none(), "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, encoder: Encoder | None = None, "
+              "descriptor: str | None = None) -> PrototypeMap | SealedMap"),
+      R"(Open a map file: an open map is read, a sealed one mapped.
+
+A map encodes descriptors itself, with the encoder that it was built with. Where they are encoded
+elsewhere, or come from a detector that the map has not seen, say what you have:
+
+Args:
+    path: the map file.
+    encoder: the map must have been made with this encoder, or one of equal identity.
+    descriptor: the map must be one of this descriptor, for example "orb".
+
+Raises:
+    FileError: the file is no map, or broken.
+    ValueError: the map is of another encoder or descriptor.)");
+  m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
         nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");
-  m.def("verify_file", &verify_file, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
+  m.def("verify_file", &verify_file, "path"_a, ReleaseGil(),
         nb::sig("def verify_file(path: str | os.PathLike[str]) -> None"),
         "Check every checksum of a model or map file. Raises FileError.");
 }

@@ -31,6 +31,7 @@ print(f"{len(matched)} of {len(truth)} keypoints matched, {right.sum()} surely r
 # The frame's right matches update their prototypes; the descriptors are not needed any more.
 scene.add(ids[matched, 0][right], tracks.descriptors[frame][matched][right])
 
+scene.metadata = {"frame": "COLMAP, no scale", "source": "sample"}
 scene.save("scene.pmk")
 # 4 bits a number, looks joined until a landmark has 1.29 prototypes on average.
 sealed = scene.seal("scene.sealed.pmk", bits=4, prototypes=1.29)

@@ -21,7 +21,7 @@ def sections(data: bytes, kinds: tuple[int, ...]) -> dict[str, bytes]:
     if len(data) < 64 or data[:8] != b"PROTOMRK":
         raise ValueError("not a Protomark file")
     version, kind, size, count, crc = struct.unpack_from("<IIQII", data, 8)
-    if not 1 <= version <= 2 or kind not in kinds:
+    if not 1 <= version <= 4 or kind not in kinds:
         raise ValueError(f"a file of version {version} and kind {kind}")
     end = 64 + 32 * count
     if size != len(data) or count > 64 or end > size:
@@ -45,6 +45,35 @@ def array(content: bytes, dtype: str, *shape: int) -> Any:
     if len(content) != np.dtype(dtype).itemsize * int(np.prod(shape)):
         raise ValueError("a section has the wrong size")
     return np.frombuffer(content, dtype).reshape(shape)
+
+
+def bit_numbers(content: Any, count: int, width: int) -> Any:
+    """Numbers of `width` bits one after the other, least significant bits first."""
+    bits = np.unpackbits(content, count=count * width, bitorder="little").reshape(count, width)
+    return (bits.astype(np.int64) << np.arange(width)).sum(1)
+
+
+def texts(content: bytes) -> dict[str, str]:
+    """Pairs of texts: what a map says of itself."""
+    found = []
+    while content:
+        (size,) = struct.unpack_from("<I", content)
+        found.append(content[4 : 4 + size].decode())
+        content = content[4 + size :]
+    return dict(zip(found[::2], found[1::2], strict=True))
+
+
+def sealed_ids(parts: dict[str, bytes], n: int) -> Any:
+    """The ids of a sealed map's n landmarks: runs of blocks, plain in old files, or 0 ... n - 1."""
+    if "idblocks" not in parts:
+        return array(parts["ids"], "<i8", n) if "ids" in parts else np.arange(n)
+    blocks = array(parts["idblocks"], "<i8", -(-n // 128), 2)
+    rests = np.frombuffer(parts["idrests"], np.uint8)
+    ids = np.arange(n) % 128
+    for i, (base, place) in enumerate(blocks.tolist()):
+        block = ids[128 * i : 128 * i + 128]
+        block += base + bit_numbers(rests[place // 64 * 8 :], len(block), place % 64)
+    return ids
 
 
 class Encoder:
@@ -78,14 +107,15 @@ class Encoder:
 
 
 class Map:
-    """Prototypes (m, k), rounded; `landmarks` (m,) ids of their landmarks; counts, positions."""
+    """Prototypes (m, k), rounded, `landmarks` (m,) ids of theirs; counts, positions, metadata."""
 
     def __init__(self, data: bytes) -> None:
         parts = sections(data, (OPEN_MAP, SEALED_MAP))
         self.encoder = Encoder(parts["encoder"])
         n, k, *origin = struct.unpack("<QQ3d", parts["shape"])
-        self.ids = array(parts["ids"], "<i8", n) if "ids" in parts else np.arange(n)
+        self.metadata = texts(parts.get("metadata", b""))
         is_open = "sums" in parts
+        self.ids = array(parts["ids"], "<i8", n) if is_open else sealed_ids(parts, n)
         rows = array(parts["rows"], "<u4" if is_open else "u1", n) if "rows" in parts else [1] * n
         self.landmarks = np.repeat(self.ids, rows)
         m = len(self.landmarks)
@@ -97,6 +127,11 @@ class Map:
         else:
             self.counts = array(parts["counts"], "u1", n)  # of each landmark
             blocks = -(-m // 16)
+            if "cells" in parts:  # an index: rows cell after cell, each cell from a new block on
+                rows = np.frombuffer(parts["cellrows"], "<u4").astype(np.int64)
+                blocks = int((-(-rows // 16)).sum())
+                order = np.frombuffer(parts["order"], np.uint8)
+                order = bit_numbers(order, 16 * blocks, max(n, 1).bit_length())
             if "levels" in parts:  # 4 bits a number
                 _, half_step = array(parts["levels"], "<u4", 2)
                 b = array(parts["protos"], "u1", blocks, -(-k // 8), 16, 4)
@@ -104,9 +139,16 @@ class Map:
                 p = int(half_step) * (2 * b.astype(np.int64) - 15)
             else:
                 p = array(parts["protos"], "i1", blocks, -(-k // 4), 16, 4).astype(np.int64)
-            self.prototypes = p.transpose(0, 2, 1, 3).reshape(16 * blocks, -1)[:m, :k]
+            p = p.transpose(0, 2, 1, 3).reshape(16 * blocks, -1)[:, :k]
+            # By landmark; in an index, places with no landmark are padding.
+            by_id = np.argsort(order, kind="stable") if "cells" in parts else np.arange(m)
+            self.prototypes = p[by_id[:m]]
         self.positions = np.full((n, 3), np.nan)
-        if "position" in parts:
+        if "steps" in parts:
+            cells = array(parts["position"], "<u2", n, 3)
+            steps = array(parts["steps"], "<f8", 3)
+            self.positions = np.where(cells == 65535, np.nan, origin + steps * cells)
+        elif "position" in parts:
             self.positions = array(parts["position"], "<f8" if is_open else "<f4", n, 3) + origin
 
     def search(self, descriptors: Any) -> tuple[Any, Any]:

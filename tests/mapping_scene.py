@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tracks_scene import PINHOLE, texture
 
 from protomark.tracks.colmap import rays
 from protomark.tracks.file import Camera
+from tracks_scene import PINHOLE
 
 # Depth of each wall (it stands parallel to the x axis and y axis), its extent in x, and its seed.
 _WALLS = ((3.0, (-4.0, 6.0), 3), (2.2, (-1.2, -0.3), 5), (1.8, (0.9, 1.7), 7))
 _SIDE = 10.0
 
 
-@lru_cache(maxsize=None)
+@cache
 def _paper(seed: int) -> NDArray[np.uint8]:
-    return texture(3000, seed)
+    """Random triangles over each other: corners that look alike nowhere."""
+    rng = np.random.default_rng(seed)
+    paper = np.full((2000, 2000), 128, np.uint8)
+    for size in (300, 120, 60):
+        for _ in range(int(1.5 * (2000 / size) ** 2)):
+            corners = rng.uniform(0, 2000, 2) + rng.uniform(-size, size, (3, 2)) / 2
+            cv2.fillConvexPoly(paper, corners.astype(np.int32), int(rng.integers(0, 256)))
+    return paper
 
 
 def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
@@ -28,7 +35,7 @@ def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
     out = []
     for i in range(count):
         center = np.array([i * step - 0.5, 0.05 * np.sin(0.9 * i), 0.02 * i])
-        rotation = cv2.Rodrigues(np.array([0.0, 0.01 * np.sin(0.5 * i), 0.004 * i]))[0]
+        rotation = cv2.Rodrigues(np.array([0.0, 0.08 * np.sin(0.5 * i), 0.01 * i]))[0]
         out.append(np.column_stack([rotation, -rotation @ center]))
     return np.array(out)
 

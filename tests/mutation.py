@@ -51,7 +51,7 @@ def mutated_container(data: bytes, rng: np.random.Generator) -> bytes:
     name, content = parts[at]
     match rng.integers(0, 12):
         case 0:
-            version = int(rng.integers(0, 4))
+            version = int(rng.integers(0, 5))
         case 1:
             kind = int(rng.integers(0, 5))
         case 2:

@@ -57,7 +57,10 @@ def model(encoder: pm.Encoder, tmp_path: Path) -> Path:
 def test_help_lists_the_commands() -> None:
     done = protomark("--help")
     assert done.returncode == 0
-    for command in ("demo", "tracks", "build", "info", "train", "evaluate", "reproduce", "bench"):
+    for command in (
+        *("demo", "tracks", "build", "join", "split", "info", "train"),
+        *("evaluate", "reproduce", "bench"),
+    ):
         assert command in done.stdout
         assert protomark(command, "--help").returncode == 0
     assert protomark("--version").stdout.strip() == f"protomark {pm.__version__}"
@@ -102,15 +105,15 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert isinstance(pm.open(scene), pm.SealedMap)
-    assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "21"
+    assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "19.00"
 
     build = ["build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model]
     done = protomark(*build, "--sealed", "--code-bits", 4, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
-    # The ids are 0, 1, 2 and 7, so they are kept: 12 dimensions in two
-    # words of 8, a count and 8 bytes.
-    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 8)
+    # 12 dimensions in two words of 8, a count, and ids, which are 0, 1, 2 and 7: a block of 16
+    # bytes and a word of 8 for all four.
+    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 24 / 4)
     assert row(done.stdout, "code bits").split()[-1] == "4"
     done = protomark(*build, "--code-bits", 4)
     assert (done.returncode, done.stderr.strip()) == (
@@ -130,7 +133,7 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert (facts["prototypes"], facts["prototypes_per_landmark"]) == (6, 1.5)
-    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 12 + 2 + 8
+    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 12 + 2 + 6
     assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
     for options, message in (
         (["--prototypes", 2], "is for sealed maps: add --sealed"),
@@ -179,3 +182,84 @@ def test_errors_are_one_sentence(tracks: Tracks, model: Path, tmp_path: Path) ->
         assert message in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
         assert not output.exists()
+
+
+def test_split_and_join(encoder: pm.Encoder, tmp_path: Path) -> None:
+    scene = pm.PrototypeMap(encoder)
+    scene.add(np.arange(30) % 10, random_descriptors(30))
+    scene.set_positions(np.arange(8), np.repeat(np.arange(8.0)[:, None], 3, axis=1))
+    whole = tmp_path / "scene.pmk"
+    scene.save(whole)
+    facts_file = tmp_path / "facts.json"
+
+    done = protomark("split", whole, "--parts", 3, "-o", tmp_path / "parts", "--json", facts_file)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(facts_file.read_text())
+    assert [part["ids"] for part in facts["parts"]] == [[0, 2], [3, 5], [6, 9]]
+    names = [f"scene.{i}.pmk" for i in range(3)]
+    assert sorted(file.name for file in (tmp_path / "parts").iterdir()) == names
+    assert "scene.1.pmk" in done.stdout
+    parts = [tmp_path / "parts" / name for name in names]
+    done = protomark("join", *parts, "-o", tmp_path / "joined.pmk", "--json", facts_file)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "joined.pmk").read_bytes() == whole.read_bytes()
+    facts = json.loads(facts_file.read_text())
+    assert (facts["landmarks"], [one["in_common"] for one in facts["inputs"]]) == (10, [0, 0, 0])
+
+    done = protomark("split", whole, "--cell-size", 4, "--sealed", "-o", tmp_path / "tiles")
+    assert done.returncode == 0, done.stderr
+    names = [f"scene.{cell}.sealed.pmk" for cell in ("0_0_0", "1_1_1", "nowhere")]
+    assert sorted(file.name for file in (tmp_path / "tiles").iterdir()) == names
+    tile = pm.open(tmp_path / "tiles" / names[1])
+    assert isinstance(tile, pm.SealedMap)
+    np.testing.assert_array_equal(tile.ids, [4, 5, 6, 7])
+    assert protomark("split", whole, "--ids", "5", "-o", tmp_path / "parts").returncode == 0
+    np.testing.assert_array_equal(pm.open(parts[0]).ids, np.arange(5))
+
+    # The same landmarks under the same ids by accident, and otherwise.
+    copy = tmp_path / "copy.pmk"
+    copy.write_bytes(whole.read_bytes())
+    done = protomark("join", whole, copy, "-o", tmp_path / "joined.pmk")
+    assert "10 of them known before" in done.stdout
+    np.testing.assert_array_equal(pm.open(tmp_path / "joined.pmk").counts(0), [6])
+    done = protomark("join", whole, copy, "-o", tmp_path / "joined.pmk", "--renumber")
+    assert done.returncode == 0, done.stderr
+    joined = pm.open(tmp_path / "joined.pmk")
+    np.testing.assert_array_equal(joined.ids, np.arange(20))
+    np.testing.assert_array_equal(joined.prototype(np.arange(10, 20)), scene.prototype(scene.ids))
+
+
+def test_what_cannot_be_joined_or_split_is_refused(encoder: pm.Encoder, tmp_path: Path) -> None:
+    one, short, sealed = (tmp_path / name for name in ("one.pmk", "short.pmk", "sealed.pmk"))
+    scene = pm.PrototypeMap(encoder)
+    scene.add([1, 2], random_descriptors(2))
+    scene.save(one)
+    scene.seal(sealed)
+    pm.PrototypeMap(encoder, dim=5).save(short)
+    (tmp_path / "two.pmk").write_bytes(one.read_bytes())
+    before = one.read_bytes()
+    output = tmp_path / "out.pmk"
+    calls = [
+        (["join", one, "-o", output], "name at least two maps"),
+        (["join", one, tmp_path / "." / "one.pmk", "-o", output], "is named twice"),
+        (["join", one, tmp_path / "two.pmk", "-o", one], "is one of the maps to join"),
+        (["join", one, short, "-o", output], f"{short}: maps of different encoders or dimensions"),
+        (["join", one, sealed, "-o", output], "is a sealed map, which keeps no sums"),
+        (["join", one, tmp_path / "none.pmk", "-o", output], "No such file"),
+        (["join", one, short, "-o", tmp_path / "none" / "out.pmk"], "no such folder"),
+        (["split", one, "-o", tmp_path], "one of --ids, --parts and --cell-size"),
+        (["split", one, "--parts", 2, "--ids", "1", "-o", tmp_path], "one of --ids"),
+        (["split", one, "--parts", 3, "-o", tmp_path], "a map of 2 landmarks has 1 to 2"),
+        (["split", one, "--ids", "3,2", "-o", tmp_path], "boundaries of parts must ascend"),
+        (["split", one, "--cell-size", 0, "-o", tmp_path], "must be above 0"),
+        (["split", one, "--parts", 2, "-o", one], "is a file: name a folder"),
+        (["split", sealed, "--parts", 2, "-o", tmp_path], "is a sealed map"),
+    ]
+    for arguments, message in calls:
+        done = protomark(*arguments)
+        assert done.returncode == 1
+        # A progress bar that has gone leaves an empty line.
+        assert done.stderr.lstrip().startswith("error: ")
+        assert message in done.stderr.replace("\n", " ")
+        assert not output.exists()
+    assert one.read_bytes() == before

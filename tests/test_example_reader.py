@@ -24,6 +24,7 @@ def scene(encoder: pm.Encoder, dim: int, look_bits: int, step: int) -> pm.Protot
     scene.add(ids, random_descriptors(600))
     some = scene.ids[::2]
     scene.set_positions(some, np.random.default_rng(1).normal(5e5, 10, (len(some), 3)))
+    scene.metadata = {"frame": "ENU, mètres", "created": "2026-11-23T03:39:41Z", "empty": ""}
     return scene
 
 
@@ -40,21 +41,29 @@ def test_the_same_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("look_bits", [0, 4])
 @pytest.mark.parametrize("dim", [5, 12])
-@pytest.mark.parametrize("kind", ["open", "sealed", "4 bits", "joined"])
+@pytest.mark.parametrize(
+    "kind", ["open", "sealed", "4 bits", "joined", "16-bit positions", "index", "index, 4 bits"]
+)
 def test_the_same_answers(
     kind: str, dim: int, look_bits: int, encoder: pm.Encoder, tmp_path: Path
 ) -> None:
     built = scene(encoder, dim, look_bits, step=7 if dim == 5 else 1)
+    if kind.startswith("index"):
+        built.build_index(7)
     path = tmp_path / "map.pmk"
     {
         "open": built.save,
         "sealed": built.seal,
         "4 bits": partial(built.seal, bits=4),
         "joined": partial(built.seal, prototypes=1.5),
+        "16-bit positions": partial(built.seal, position_bits=16),
+        "index": built.seal,
+        "index, 4 bits": partial(built.seal, bits=4),
     }[kind](path)
     ours, theirs = pm.open(path), READER["Map"](path.read_bytes())
     ids = ours.ids
     np.testing.assert_array_equal(theirs.ids, ids)
+    assert theirs.metadata == ours.metadata
     np.testing.assert_array_equal(theirs.positions, ours.positions(ids))
     assert len(theirs.prototypes) == ours.prototype_count
     for landmark in ids[:20]:
@@ -67,6 +76,16 @@ def test_the_same_answers(
         np.testing.assert_array_equal(counts, observations)
     else:
         np.testing.assert_array_equal(theirs.counts, observations)
+    queries = random_descriptors(300, seed=9)
+    for a, b in zip(theirs.search(queries), ours.search(queries, k=1), strict=True):
+        np.testing.assert_array_equal(a, b[:, 0])
+
+
+@pytest.mark.parametrize("name", ["open", "sealed"])
+def test_old_files(name: str) -> None:
+    path = Path(__file__).parent / "data" / f"{name}_before_version_4.pmk"
+    ours, theirs = pm.open(path), READER["Map"](path.read_bytes())
+    np.testing.assert_array_equal(theirs.ids, ours.ids)
     queries = random_descriptors(300, seed=9)
     for a, b in zip(theirs.search(queries), ours.search(queries, k=1), strict=True):
         np.testing.assert_array_equal(a, b[:, 0])

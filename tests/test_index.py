@@ -270,6 +270,21 @@ def test_hostile_sections_are_refused(
         pm.open(path)
 
 
+def test_the_checksum_of_the_numbers_of_rows_is_always_checked(
+    coder: pm.Encoder, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.pmk"
+    scene = filled(coder, 200)
+    scene.build_index(10)
+    scene.seal(path)
+    whole = path.read_bytes()
+    rows = dict(sections(whole))["cellrows"]
+    path.unlink()
+    path.write_bytes(whole.replace(rows, rows[4:] + rows[:4]))
+    with pytest.raises(pm.FileError, match="'cellrows' does not match its checksum"):
+        pm.open(path)
+
+
 def test_a_hostile_order_gives_no_landmark_that_is_not_there(
     coder: pm.Encoder, tmp_path: Path
 ) -> None:

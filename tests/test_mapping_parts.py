@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from tracks_scene import PINHOLE
 
 import protomark as pm
 from protomark.mapping.camera import given_camera
@@ -9,6 +8,7 @@ from protomark.mapping.memory import Descriptors, Medoids, Prototypes
 from protomark.mapping.nearby import near_pairs
 from protomark.mapping.outputs import quaternion_of
 from protomark.mapping.source import Folder, Video, open_source
+from tracks_scene import PINHOLE
 
 
 @pytest.fixture(scope="module")

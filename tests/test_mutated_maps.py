@@ -16,10 +16,13 @@ from mutation import SEED, bounded, mutated_container
 FILES = 1500
 
 
-def scene(encoder: pm.Encoder, look_bits: int) -> pm.PrototypeMap:
+def scene(encoder: pm.Encoder, look_bits: int, cells: int = 0) -> pm.PrototypeMap:
     scene = pm.PrototypeMap(encoder, look_bits=look_bits)
     scene.add(np.random.default_rng(0).integers(0, 30, 120) * 7, random_descriptors(120))
     scene.set_positions(scene.ids[::2], np.ones((len(scene.ids[::2]), 3)))
+    scene.metadata = {"created": "2026-11-23T03:39:41Z", "frame": "ENU, metres", "x": "é"}
+    if cells:
+        scene.build_index(cells)
     return scene
 
 
@@ -30,8 +33,14 @@ def read_map(path: Path) -> None:
     found, distances = read.search(random_descriptors(3, read.encoder.bits))
     assert np.isin(found[found >= 0], ids).all()
     assert found.shape == distances.shape
+    if read.index_cells:
+        for options in ({"probes": 2}, {"recall": 0.9}):
+            found, _ = read.search(random_descriptors(3, read.encoder.bits), **options)
+            assert np.isin(found[found >= 0], ids).all()
     read.counts(ids)
     read.prototype(ids)
+    assert all(name for name in read.metadata)
+    assert read.summary()["landmarks_with_position"] <= len(read)
     positions = read.positions(ids)
     assert not np.isinf(positions).any()
     for landmark in ids[:5]:
@@ -45,7 +54,13 @@ def read_model(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", ["model", "open", "open with looks", "sealed", "sealed, 4 bits, several prototypes"]
+    "kind",
+    [
+        "model",
+        *("open", "open with looks", "open with an index"),
+        *("sealed", "sealed, 16-bit positions", "sealed with an index"),
+        "sealed, 4 bits, several prototypes",
+    ],
 )
 def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
     print(f"PROTOMARK_SEED={SEED}")
@@ -55,7 +70,10 @@ def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_pa
         "model": encoder.save,
         "open": scene(encoder, 0).save,
         "open with looks": scene(encoder, 3).save,
+        "open with an index": scene(encoder, 3, cells=5).save,
         "sealed": scene(encoder, 0).seal,
+        "sealed, 16-bit positions": partial(scene(encoder, 0).seal, position_bits=16),
+        "sealed with an index": scene(encoder, 3, cells=5).seal,
         "sealed, 4 bits, several prototypes": partial(scene(encoder, 3).seal, bits=4),
     }[kind](path)
     whole = path.read_bytes()

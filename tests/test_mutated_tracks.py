@@ -97,10 +97,15 @@ def test_broken_tracks_files_are_refused_or_read(tmp_path: Path) -> None:
         for _ in range(FILES):
             path.unlink()
             path.write_bytes(mutated_tracks(whole, rng))
+            unnamed = False
             try:
                 read = Tracks.load(path)
-            except ValueError:
+            except ValueError as error:
+                unnamed = not str(error).startswith(f"{path}: ")
                 refused += 1
+                read = None
+            assert not unnamed
+            if read is None:
                 continue
             # What was read is what a tracks file holds, whatever it says.
             assert all(isinstance(name, str) for name in [*read.keyframe_names, read.descriptor])

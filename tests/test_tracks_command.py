@@ -20,17 +20,17 @@ from tracks_scene import PINHOLE, poses, write_model, write_sequence
 FAST = ["--max-keypoints", "300", "--threads", "1"]
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+def run(*arguments: object, command: str = "tracks") -> subprocess.CompletedProcess[str]:
     """The command in this process, which saves its start."""
-    command = ["protomark", "tracks", *map(str, arguments)]
+    words = ["protomark", command, *map(str, arguments)]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", command)
+        patch.setattr(sys, "argv", words)
         try:
             main()
         except SystemExit as stop:
             code = int(stop.code or 0)
-    return subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue())
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="module")

@@ -62,6 +62,7 @@ int main(int argc, char** argv) try {
   }
   std::printf("%zu landmarks, %zu matches accepted, %zu right\n", map.size(), accepted, right);
 
+  map.set_metadata({{"frame", "ENU, metres"}, {"source", "example"}});
   map.save(folder / "scene.pmk");
   map.seal(folder / "scene.sealed.pmk");
   const pm::SealedMap sealed(folder / "scene.sealed.pmk");

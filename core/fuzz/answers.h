@@ -33,10 +33,24 @@ void search_map(const Map& map, const Looks& looks, bool exact = true) {
   options.ratio = 0.8f;
   options.max_distance = 300.0f;
   map.search_codes(queries, options, {ids.data(), n, k}, {distances.data(), n, k});
-  map.search_codes(queries, {}, {ids.data(), n, k}, {distances.data(), n, k});
-
   const auto all = map.ids();
   EXPECT(all.size() == map.size());
+  if (map.index_cells() != 0) {
+    for (const bool by_recall : {false, true}) {
+      SearchOptions some;
+      if (by_recall) {
+        some.recall = 0.9;
+      } else {
+        some.probes = 2;
+      }
+      map.search_codes(queries, some, {ids.data(), n, k}, {distances.data(), n, k});
+      for (const std::int64_t id : ids) {
+        EXPECT(id == -1 || std::binary_search(all.begin(), all.end(), id));
+      }
+    }
+    EXPECT(map.probes(0.5) <= map.probes(1.0) && map.probes(1.0) == map.index_cells());
+  }
+  map.search_codes(queries, {}, {ids.data(), n, k}, {distances.data(), n, k});
   if (!exact || all.size() > 300) return;
   for (std::size_t q = 0; q < n; ++q) {
     std::vector<std::pair<std::int64_t, std::int64_t>> found;  // squared distance, id

@@ -69,12 +69,16 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     map.positions(ids);
     change(map);
     try {
-      map.seal(scratch(), size % 2 == 0 ? 8 : 4, 1.0);
-      EXPECT(SealedMap(scratch()).ids() == map.ids());
+      map.seal(scratch(), size % 2 == 0 ? 8 : 4, 1.0, size % 3 == 0 ? 16 : 32);
+      const SealedMap sealed(scratch());
+      EXPECT(sealed.ids() == map.ids());
+      EXPECT(sealed.metadata() == map.metadata());
+      EXPECT(sealed.summary().placed == map.summary().placed);
     } catch (const std::invalid_argument&) {  // positions too far apart for 32 bits
     }
+    map.drop_index();
     PrototypeMap joined(map.encoder(), map.dim(), map.look_bits());
-    joined.update(map);
+    for (const PrototypeMap& part : map.split(ids)) joined.update(part);
     EXPECT(saved(joined) == saved(map));
     if (ids.size() >= 2) {
       map.merge(std::span(ids).first(1), std::span(ids).subspan(1, 1));

@@ -22,6 +22,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
       EXPECT(std::isnan(p[0]) == std::isnan(p[1]) && std::isnan(p[0]) == std::isnan(p[2]));
       EXPECT(!std::isinf(p[0]) && !std::isinf(p[1]) && !std::isinf(p[2]));
     }
+    const MapSummary summary = map.summary();
+    EXPECT(summary.placed <= map.size() && summary.observations <= 255 * map.size());
     const std::int64_t unknown = -1;
     try {
       map.counts(std::span(&unknown, 1));

@@ -38,7 +38,7 @@ if command -v llvm-profdata > /dev/null && ls "$profiles"/*.profraw > /dev/null 
   llvm-profdata merge -sparse "$profiles"/*.profraw -o "$profiles/all.profdata"
   echo "lines of the readers that these inputs ran:"
   llvm-cov report "${objects[@]:1}" -instr-profile="$profiles/all.profdata" \
-    "$here"/../src/{container,encoder,map_file,map_sections,prototypes}.cpp 2> /dev/null |
+    "$here"/../src/{container,encoder,landmark_ids,map_file,map_sections,metadata,prototypes}.cpp 2> /dev/null |
     awk '/\.cpp|TOTAL/ { print "  " $1, $10 }'
 fi
 exit $failed

@@ -1,4 +1,5 @@
 // Writes small valid files for the fuzzer to start from: seeds FOLDER makes FOLDER/<target>/.
+#include <algorithm>
 #include <cstdio>
 #include <filesystem>
 #include <limits>
@@ -67,10 +68,18 @@ int main(int argc, char** argv) try {
         PrototypeMap map(encoder, 0, look_bits);
         const std::string name = std::to_string(number++);
         if (landmarks > 0) fill(map, landmarks, number % 2 == 0 ? 1 : 7, number % 3 == 0);
+        if (number % 2 == 0) {
+          map.set_metadata({{"created", "2026-11-23T03:39:41Z"}, {"frame", "ENU, metres"}});
+        }
         map.save(folder / "open_map" / name);
         map.seal(folder / "sealed_map" / name);
-        map.seal(folder / "sealed_map" / (name + ".4"), 4);
+        map.seal(folder / "sealed_map" / (name + ".4"), 4, std::nullopt, 16);
         map.seal(folder / "sealed_map" / (name + ".1"), 8, 1.5);
+        if (landmarks == 0) continue;
+        map.build_index(std::min<std::size_t>(landmarks, 4));
+        map.save(folder / "open_map" / (name + ".cells"));
+        map.seal(folder / "sealed_map" / (name + ".cells"));
+        map.seal(folder / "sealed_map" / (name + ".4.cells"), 4);
       }
     }
   }

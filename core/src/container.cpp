@@ -15,6 +15,7 @@
 
 #include "crc32.h"
 #include "protomark/error.h"
+#include "utf8.h"
 
 namespace protomark {
 namespace {
@@ -23,7 +24,7 @@ static_assert(std::endian::native == std::endian::little,
               "the file format is little-endian; a big-endian machine needs byte swaps here");
 
 constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
-constexpr std::uint32_t kNewestVersion = 3;
+constexpr std::uint32_t kNewestVersion = 4;
 constexpr std::size_t kAlignment = 64;
 constexpr std::uint32_t kMaxSections = 64;
 
@@ -332,10 +333,12 @@ MappedFile::~MappedFile() {
   if (data_ != nullptr) ::munmap(data_, size_);
 }
 
-std::string SectionReader::text(std::size_t n) {
+std::string SectionReader::text() {
+  const auto n = value<std::uint32_t>();
   if (n > rest_.size()) too_short();
   std::string result(n, '\0');
   take(result.data(), n);
+  if (!is_utf8(result)) file_->fail("its section '" + section_ + "' has a text that is no UTF-8");
   return result;
 }
 

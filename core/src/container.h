@@ -156,7 +156,8 @@ class SectionReader {
     if (n > rest_.size() / sizeof(T)) too_short();
     take(to, n * sizeof(T));
   }
-  std::string text(std::size_t n);
+  // A u32 length and that many bytes of UTF-8.
+  std::string text();
   bool empty() const { return rest_.empty(); }
   // Throws FileError where bytes are left.
   void finish() const;
@@ -198,6 +199,11 @@ class SectionWriter {
   void values(const T* v, std::size_t n) {
     const auto* p = reinterpret_cast<const std::byte*>(v);
     bytes_.insert(bytes_.end(), p, p + n * sizeof(T));
+  }
+  // As SectionReader reads it.
+  void text(const std::string& v) {
+    value(static_cast<std::uint32_t>(v.size()));
+    values(v.data(), v.size());
   }
   std::vector<std::byte> take() { return std::move(bytes_); }
 

@@ -13,6 +13,7 @@
 #include "parallel.h"
 #include "protomark/error.h"
 #include "sha256.h"
+#include "utf8.h"
 
 namespace protomark {
 namespace {
@@ -70,9 +71,14 @@ void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t
   check_sums(layer, first, where);
 }
 
-void write_text(SectionWriter& out, const std::string& text) {
-  out.value(static_cast<std::uint32_t>(text.size()));
-  out.values(text.data(), text.size());
+// All that a model says of itself.
+std::vector<std::pair<std::string, std::string>> texts(const EncoderInfo& info) {
+  std::vector<std::pair<std::string, std::string>> result = {{"name", info.name},
+                                                             {"descriptor", info.descriptor},
+                                                             {"data", info.data},
+                                                             {"licence", info.licence}};
+  result.insert(result.end(), info.notes.begin(), info.notes.end());
+  return result;
 }
 
 }  // namespace
@@ -95,6 +101,9 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::s
                  float scale)
     : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
   if (info_.name.empty() || info_.descriptor.empty()) invalid("name and descriptor must be given");
+  for (const auto& [key, value] : texts(info_)) {
+    if (!is_utf8(key) || !is_utf8(value)) invalid("what it says of itself must be UTF-8");
+  }
   if (layers_.empty() || layers_.size() > kMaxLayers) {
     invalid("it has " + std::to_string(layers_.size()) + " layers, 1 to " +
             std::to_string(kMaxLayers) + " are allowed");
@@ -186,14 +195,9 @@ std::vector<std::byte> Encoder::network_bytes() const {
 
 std::vector<std::byte> Encoder::serialize() const {
   SectionWriter info;
-  std::vector<std::pair<std::string, std::string>> pairs = {{"name", info_.name},
-                                                            {"descriptor", info_.descriptor},
-                                                            {"data", info_.data},
-                                                            {"licence", info_.licence}};
-  pairs.insert(pairs.end(), info_.notes.begin(), info_.notes.end());
-  for (const auto& [key, value] : pairs) {
-    write_text(info, key);
-    write_text(info, value);
+  for (const auto& [key, value] : texts(info_)) {
+    info.text(key);
+    info.text(value);
   }
   ContainerWriter file(FileKind::encoder);
   file.add("info", info.take());
@@ -214,8 +218,8 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
 
   EncoderInfo info;
   for (SectionReader in(file, "info"); !in.empty();) {
-    std::string key = in.text(in.value<std::uint32_t>());
-    std::string value = in.text(in.value<std::uint32_t>());
+    std::string key = in.text();
+    std::string value = in.text();
     if (key == "name") {
       info.name = std::move(value);
     } else if (key == "descriptor") {

@@ -21,6 +21,14 @@ class FairSharedMutex {
     mutex_.lock_shared();
     leave();
   }
+  // Fails where anybody waits.
+  bool try_lock_shared() {
+    std::uint32_t ticket = serving_.load();
+    if (!next_.compare_exchange_strong(ticket, ticket + 1)) return false;
+    const bool locked = mutex_.try_lock_shared();
+    leave();
+    return locked;
+  }
   void unlock() { mutex_.unlock(); }
   void unlock_shared() { mutex_.unlock_shared(); }
 

@@ -1,6 +1,7 @@
 // Landmark id -> row, 4 bytes a slot: the slots hold rows, the ids stay in the map's own array.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -32,9 +33,23 @@ class IdIndex {
     if (row != kNone) __builtin_prefetch(&ids[row]);
   }
 
+  bool has_room(std::size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }
+  // The same index with room for as many ids more.
+  IdIndex with_room(const LargeVector<std::int64_t>& ids, std::size_t more) const {
+    IdIndex result;
+    result.used_ = used_;
+    std::size_t size = std::max<std::size_t>(16, slots_.size());
+    while (3 * (used_ + more) > 2 * size) size *= 2;
+    result.slots_.assign(size, kNone);
+    for (const std::uint32_t row : slots_) {
+      if (row != kNone) result.place(ids, row);
+    }
+    return result;
+  }
+
   // Takes a row whose id is not there yet.
   void insert(const LargeVector<std::int64_t>& ids, std::uint32_t row) {
-    if (3 * (used_ + 1) > 2 * slots_.size()) grow(ids);
+    if (!has_room(1)) *this = with_room(ids, 1);
     place(ids, row);
     ++used_;
   }
@@ -88,14 +103,6 @@ class IdIndex {
     std::size_t s = home(ids[row]);
     while (slots_[s] != kNone) s = next(s);
     slots_[s] = row;
-  }
-
-  void grow(const LargeVector<std::int64_t>& ids) {
-    LargeVector<std::uint32_t> old(slots_.empty() ? 16 : 2 * slots_.size(), kNone);
-    old.swap(slots_);
-    for (const std::uint32_t row : old) {
-      if (row != kNone) place(ids, row);
-    }
   }
 
   LargeVector<std::uint32_t> slots_;

@@ -4,19 +4,39 @@
 #include <bit>
 #include <cmath>
 #include <mutex>
-#include <numeric>
+#include <optional>
 #include <stdexcept>
 
 #include "bit_numbers.h"
 #include "cell_search.h"
 #include "cells.h"
 #include "container.h"
+#include "landmark_ids.h"
 #include "map_sections.h"
+#include "position_grid.h"
 #include "probe_ranks.h"
 #include "protomark/error.h"
 #include "quantize4.h"
+#include "summary_builder.h"
 
 namespace protomark {
+
+void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::string& map) {
+  if (encoder.identity() == expected.identity()) return;
+  const auto named = [](const Encoder& e) {
+    return "'" + e.info().name + "' (identity " + e.identity().substr(0, 12) + ")";
+  };
+  throw std::invalid_argument(map + ": it was made with encoder " + named(encoder) + ", not with " +
+                              named(expected) +
+                              ": use the map's own encoder, or build the map with the other");
+}
+
+void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
+                       const std::string& map) {
+  if (encoder.info().descriptor == descriptor) return;
+  throw std::invalid_argument(map + ": it is a map of " + encoder.info().descriptor +
+                              " descriptors, not of " + descriptor);
+}
 
 MapKind map_kind(const std::filesystem::path& path) {
   const MappedFile mapped(path);
@@ -53,6 +73,7 @@ struct SealedMap::Content {
     file.expect(FileKind::sealed_map);
     encoder = read_encoder(file);
     shape = read_shape(file, *encoder);
+    metadata = read_metadata(file);
     const std::size_t n = shape.landmarks;
     rows = n;
     if (const auto bytes = file.read_if_there(section::kRows)) read_rows();
@@ -78,12 +99,12 @@ struct SealedMap::Content {
     }
     prototypes.landmarks = prototypes4.landmarks = landmarks;
     counts = map<std::uint8_t>(section::kCounts, n);
-    if (const auto bytes = file.read_if_there(section::kIds)) {
-      ids = map<std::int64_t>(section::kIds, n);
-      check_ids(file, {ids, n});
-      prototypes.ids = prototypes4.ids = ids;
-    }
-    if (file.map_if_there(section::kPositions)) {
+    ids = LandmarkIds(file, n);
+    if (!file.map_if_there(section::kPositions)) return;
+    if (file.map_if_there(section::kSteps)) {
+      grid = PositionGrid(shape.origin, read_steps(file, shape.origin));
+      position_cells = map<PositionGrid::Cell>(section::kPositions, n);
+    } else {
       positions = map<std::array<float, 3>>(section::kPositions, n);
     }
   }
@@ -99,15 +120,14 @@ struct SealedMap::Content {
     return reinterpret_cast<const T*>(bytes->data());
   }
 
-  std::size_t at(std::int64_t id) const {
-    const std::size_t n = shape.landmarks;
-    if (ids == nullptr) {
-      if (id < 0 || static_cast<std::size_t>(id) >= n) throw UnknownLandmark(id);
-      return static_cast<std::size_t>(id);
-    }
-    const std::int64_t* found = std::lower_bound(ids, ids + n, id);
-    if (found == ids + n || *found != id) throw UnknownLandmark(id);
-    return static_cast<std::size_t>(found - ids);
+  // NaN where there is none, or where a broken file has no number.
+  Position position(std::size_t landmark) const {
+    constexpr Position kNone = {NAN, NAN, NAN};
+    if (position_cells != nullptr) return grid.position(position_cells[landmark]);
+    if (positions == nullptr) return kNone;
+    Position p = shape.origin;
+    for (std::size_t i = 0; i < 3; ++i) p[i] += positions[landmark][i];
+    return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]) ? p : kNone;
   }
 
   void read_rows() {
@@ -126,6 +146,7 @@ struct SealedMap::Content {
     centroids = read_cells(file, shape.dim);
     const std::size_t cells = centroids.size() / shape.dim;
     packed_centroids = pack_codes({centroids.data(), cells, shape.dim});
+    file.read(section::kCellRows);  // for its checksum
     cell_rows = {map<std::uint32_t>(section::kCellRows, cells), cells};
     first_blocks.push_back(0);
     std::uint64_t all = 0;
@@ -216,6 +237,7 @@ struct SealedMap::Content {
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
+  Metadata metadata;
   std::size_t rows = 0;                   // prototypes
   const std::uint8_t* rows_of = nullptr;  // of each landmark; nullptr: each has one
   std::vector<std::uint32_t> first_rows;
@@ -233,8 +255,10 @@ struct SealedMap::Content {
   mutable std::vector<std::uint32_t> places;  // of each row
 
   const std::uint8_t* counts = nullptr;
-  const std::int64_t* ids = nullptr;
+  LandmarkIds ids;
   const std::array<float, 3>* positions = nullptr;
+  const PositionGrid::Cell* position_cells = nullptr;  // and with them
+  PositionGrid grid;
 };
 
 SealedMap::SealedMap(const std::filesystem::path& path)
@@ -249,6 +273,7 @@ SealedMap::~SealedMap() = default;
 SealedMap::SealedMap(SealedMap&&) noexcept = default;
 
 const std::shared_ptr<const Encoder>& SealedMap::encoder() const { return content_->encoder; }
+const Metadata& SealedMap::metadata() const { return content_->metadata; }
 std::size_t SealedMap::dim() const { return content_->shape.dim; }
 std::size_t SealedMap::size() const { return content_->shape.landmarks; }
 std::size_t SealedMap::prototype_count() const { return content_->rows; }
@@ -261,20 +286,24 @@ std::size_t SealedMap::probes(double recall) const {
   return probes_for(content_->ranks, recall, index_cells());
 }
 
-std::vector<std::int64_t> SealedMap::ids() const {
-  std::vector<std::int64_t> result(size());
-  if (content_->ids != nullptr) {
-    std::copy_n(content_->ids, size(), result.begin());
-  } else {
-    std::iota(result.begin(), result.end(), std::int64_t{0});
-  }
-  return result;
+int SealedMap::position_bits() const {
+  return content_->position_cells != nullptr ? 16 : content_->positions != nullptr ? 32 : 0;
 }
+
+std::optional<Position> SealedMap::position_error() const {
+  if (content_->position_cells == nullptr) return std::nullopt;
+  const Position& step = content_->grid.step;
+  return Position{step[0] / 2, step[1] / 2, step[2] / 2};
+}
+
+std::vector<std::int64_t> SealedMap::ids() const { return content_->ids.all(); }
 
 std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmarks) const {
   std::vector<std::uint32_t> result;
   result.reserve(landmarks.size());
-  for (const std::int64_t id : landmarks) result.push_back(content_->counts[content_->at(id)]);
+  for (const std::int64_t id : landmarks) {
+    result.push_back(content_->counts[content_->ids.find(id)]);
+  }
   return result;
 }
 
@@ -283,7 +312,7 @@ void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<f
     throw std::invalid_argument("means must be landmarks x dim");
   }
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const auto [first, end] = content_->rows_at(content_->at(landmarks[i]));
+    const auto [first, end] = content_->rows_at(content_->ids.find(landmarks[i]));
     for (std::size_t d = 0; d < dim(); ++d) {
       int sum = 0;
       for (std::size_t row = first; row < end; ++row) sum += content_->prototype(row, d);
@@ -293,7 +322,7 @@ void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<f
 }
 
 std::vector<std::vector<float>> SealedMap::looks(std::int64_t landmark) const {
-  const auto [first, end] = content_->rows_at(content_->at(landmark));
+  const auto [first, end] = content_->rows_at(content_->ids.find(landmark));
   std::vector<std::vector<float>> result;
   for (std::size_t row = first; row < end; ++row) {
     std::vector<float>& look = result.emplace_back(dim());
@@ -307,18 +336,16 @@ std::vector<std::vector<float>> SealedMap::looks(std::int64_t landmark) const {
 std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmarks) const {
   std::vector<Position> result;
   result.reserve(landmarks.size());
-  const Position& origin = content_->shape.origin;
   for (const std::int64_t id : landmarks) {
-    const std::size_t row = content_->at(id);
-    Position p = {NAN, NAN, NAN};
-    if (content_->positions != nullptr) {
-      for (std::size_t i = 0; i < 3; ++i) p[i] = origin[i] + content_->positions[row][i];
-    }
-    // Nobody has looked at them yet; what is no position is given as none.
-    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
-    result.push_back(finite ? p : Position{NAN, NAN, NAN});
+    result.push_back(content_->position(content_->ids.find(id)));
   }
   return result;
+}
+
+MapSummary SealedMap::summary() const {
+  SummaryBuilder result;
+  for (std::size_t i = 0; i < size(); ++i) result.add(content_->counts[i], content_->position(i));
+  return result.take();
 }
 
 void SealedMap::search(Descriptors queries, const SearchOptions& options,
@@ -351,6 +378,11 @@ void SealedMap::search_codes(Codes queries, const SearchOptions& options,
     run(c.prototypes4);
   } else {
     run(c.prototypes);
+  }
+  // Ids ascend as numbers do, so that these decide between equals as ids would.
+  if (c.ids.are_numbers()) return;
+  for (std::int64_t& id : std::span(ids.data, ids.rows * ids.columns)) {
+    if (id >= 0) id = c.ids[static_cast<std::size_t>(id)];
   }
 }
 

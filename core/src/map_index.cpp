@@ -1,8 +1,10 @@
 // The index of an open map.
+#include <memory>
 #include <mutex>
 #include <shared_mutex>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 #include "cell_search.h"
 #include "prototype_store.h"
@@ -18,7 +20,7 @@ constexpr std::size_t kStaleShare = 10;
 
 void PrototypeMap::build_index(std::optional<std::size_t> cells, int threads) {
   if (threads < 1) throw std::invalid_argument("threads must be at least 1");
-  const std::unique_lock lock(store_->mutex);
+  const std::unique_lock changing(store_->changing);
   const std::size_t rows = store_->rows();
   if (rows == 0) throw std::invalid_argument("a map without landmarks has no cells to learn");
   const std::size_t number = cells.value_or(Cells::number_for(rows, dim_));
@@ -32,12 +34,13 @@ void PrototypeMap::build_index(std::optional<std::size_t> cells, int threads) {
   std::vector<std::uint32_t> sample(std::min(rows, Cells::sample_for(number)));
   for (std::size_t i = 0; i < sample.size(); ++i) sample[i] = sorted[i * rows / sample.size()];
   const std::vector<std::int8_t> codes = store_->rounded(sample);
-  store_->set_cells(Cells::learn({codes.data(), sample.size(), dim_}, number, threads), threads);
+  Cells learned = Cells::learn({codes.data(), sample.size(), dim_}, number, threads);
+  store_->replace(store_->with_cells(std::move(learned), threads));
 }
 
 void PrototypeMap::drop_index() {
-  const std::unique_lock lock(store_->mutex);
-  store_->set_cells({}, 1);
+  const std::unique_lock changing(store_->changing);
+  store_->replace(store_->with_cells({}, 1));
 }
 
 std::size_t PrototypeMap::index_cells() const {
@@ -46,34 +49,60 @@ std::size_t PrototypeMap::index_cells() const {
 }
 
 std::size_t PrototypeMap::probes(double recall, int threads) const {
-  const std::shared_lock lock(store_->mutex);
-  const std::size_t cells = store_->cells().size();
-  check_recall(recall, cells, kRemedy);
-  return probes_for(store_->ranks(threads), recall, cells);
+  std::shared_lock lock(store_->mutex);
+  const auto measured = store_->ranks(lock, recall, threads);
+  return probes_for(measured->ranks, recall, store_->cells().size());
 }
 
 void PrototypeMap::search_codes(Codes queries, const SearchOptions& options,
                                 MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
-  const std::shared_lock lock(store_->mutex);
-  const std::size_t cells = store_->cells().size();
-  const auto probes = asked_probes(options, cells, kRemedy);
-  if (!probes) {
-    protomark::search(store_->view(), queries, options, ids, distances);
-    return;
+  std::shared_lock lock(store_->mutex);
+  auto probes = asked_probes(options, store_->cells().size(), kRemedy);
+  if (options.recall) {
+    const auto measured = store_->ranks(lock, *options.recall, options.threads);
+    probes = probes_for(measured->ranks, *options.recall, store_->cells().size());
   }
-  const std::size_t searched =
-      options.recall ? probes_for(store_->ranks(options.threads), *options.recall, cells) : *probes;
-  if (searched >= cells) {
+  if (!probes || *probes >= store_->cells().size()) {
     protomark::search(store_->view(), queries, exact(options), ids, distances);
     return;
   }
-  search_cells(store_->view(), CellView(store_->blocks()), store_->cells().packed(), searched,
+  search_cells(store_->view(), CellView(store_->blocks()), store_->cells().packed(), *probes,
                queries, exact(options), ids, distances);
 }
 
-ProbeRanks PrototypeMap::Store::ranks(int threads) const {
-  const std::scoped_lock lock(ranks_mutex_);
-  if (!ranks_.empty() && (changes() - ranks_changes_) * kStaleShare < rows()) return ranks_;
+std::shared_ptr<const MeasuredRanks> PrototypeMap::Store::ranks(
+    std::shared_lock<FairSharedMutex>& lock, double recall, int threads) const {
+  for (bool tried = false;; tried = true) {
+    check_recall(recall, cells().size(), kRemedy);
+    std::shared_ptr<const MeasuredRanks> known;
+    {
+      const std::scoped_lock reading(ranks_mutex_);
+      known = ranks_;
+    }
+    const bool of_these = known && known->cells_version == cells_version();
+    if (of_these && (tried || !is_stale(*known))) return known;
+    lock.unlock();
+    measure(threads, !of_these);
+    lock.lock();
+  }
+}
+
+bool PrototypeMap::Store::is_stale(const MeasuredRanks& ranks) const {
+  return ranks.cells_version != cells_version() ||
+         (changes() - ranks.changes) * kStaleShare >= rows();
+}
+
+// Without `wait` only where nobody else measures or changes the map.
+void PrototypeMap::Store::measure(int threads, bool wait) const {
+  std::unique_lock one(measuring_, std::defer_lock);
+  std::shared_lock still(changing, std::defer_lock);
+  if (wait) {
+    one.lock();
+    still.lock();
+  } else if (!one.try_lock() || !still.try_lock()) {
+    return;
+  }
+  if (cells().size() == 0 || (ranks_ && !is_stale(*ranks_))) return;
   const std::vector<std::uint32_t> sorted = sorted_rows();
   std::vector<std::uint32_t> rows;
   std::vector<std::int64_t> own;
@@ -103,10 +132,13 @@ ProbeRanks PrototypeMap::Store::ranks(int threads) const {
     }
     return cell;
   };
-  ranks_ = measure_ranks({codes.data(), rows.size(), dim()}, own, cells().centroids(), search_two,
-                         cell_of);
-  ranks_changes_ = changes();
-  return ranks_;
+  auto measured = std::make_shared<MeasuredRanks>();
+  measured->ranks = measure_ranks({codes.data(), rows.size(), dim()}, own, cells().centroids(),
+                                  search_two, cell_of);
+  measured->cells_version = cells_version();
+  measured->changes = changes();
+  const std::scoped_lock writing(ranks_mutex_);
+  ranks_ = std::move(measured);
 }
 
 }  // namespace protomark

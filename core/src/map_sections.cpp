@@ -5,6 +5,7 @@
 #include <string>
 
 #include "cells.h"
+#include "position_grid.h"
 
 namespace protomark {
 
@@ -103,18 +104,23 @@ void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {
   }
 }
 
-Position middle(std::span<const Position> positions) {
-  Position low{}, high{};
-  bool any = false;
-  for (const Position& p : positions) {
-    if (std::isnan(p[0])) continue;
-    for (std::size_t i = 0; i < 3; ++i) {
-      low[i] = any ? std::min(low[i], p[i]) : p[i];
-      high[i] = any ? std::max(high[i], p[i]) : p[i];
+std::vector<std::byte> write_steps(const Position& step) {
+  SectionWriter out;
+  out.values(step.data(), step.size());
+  return out.take();
+}
+
+Position read_steps(const ContainerReader& file, const Position& origin) {
+  SectionReader in(file, section::kSteps);
+  Position step;
+  in.copy(step.data(), step.size());
+  in.finish();
+  for (std::size_t i = 0; i < 3; ++i) {
+    if (!(step[i] >= 0) || !std::isfinite(origin[i] + step[i] * PositionGrid::kLast)) {
+      file.fail("the steps of its positions are impossible");
     }
-    any = true;
   }
-  return {low[0] / 2 + high[0] / 2, low[1] / 2 + high[1] / 2, low[2] / 2 + high[2] / 2};
+  return step;
 }
 
 }  // namespace protomark

@@ -16,6 +16,13 @@ namespace protomark {
 // cell nearest to the query; ascending.
 using ProbeRanks = std::vector<std::uint32_t>;
 
+// Ranks of an open map, and of which cells and after how many changes.
+struct MeasuredRanks {
+  ProbeRanks ranks;
+  std::size_t cells_version = 0;
+  std::size_t changes = 0;
+};
+
 // Rows of a map that are taken as test queries: evenly spread over `rows`, at most kTestQueries.
 inline constexpr std::size_t kTestQueries = 2048;
 std::vector<std::size_t> test_rows(std::size_t rows);

@@ -7,6 +7,7 @@
 #include <limits>
 #include <numeric>
 #include <stdexcept>
+#include <type_traits>
 #include <utility>
 
 #include "protomark/error.h"
@@ -32,18 +33,26 @@ std::uint16_t PrototypeStore::look_of(const std::int8_t* code) const {
   return static_cast<std::uint16_t>(look);
 }
 
-void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
-  const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows, places = blocks * kPackedRows;
-  ids_.reserve(look_bits_ == 0 ? places : landmarks);
-  sums_.reserve(places * dim_);
-  counts_.reserve(places);
-  packed_.reserve(packed_size(places, dim_) / sizeof(CodeVector));
-  blocks_.reserve(blocks);
+// Calls todo(array, elements) with what so many landmarks and places take of each array.
+template <typename Do>
+void PrototypeStore::for_each_array(std::size_t landmarks, std::size_t places, const Do& todo) {
+  if (look_bits_ == 0) landmarks = places;
+  todo(ids_, landmarks);
+  if (!positions_.empty()) todo(positions_, landmarks);
+  todo(sums_, places * dim_);
+  todo(counts_, places);
+  todo(packed_, packed_size(places, dim_) / sizeof(CodeVector));
   if (look_bits_ == 0) return;
-  heads_.reserve(landmarks);
-  looks_.reserve(places);
-  owners_.reserve(places);
-  next_.reserve(places);
+  todo(heads_, landmarks);
+  todo(looks_, places);
+  todo(owners_, places);
+  todo(next_, places);
+}
+
+void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
+  const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows;
+  for_each_array(landmarks, blocks * kPackedRows, [](auto& v, std::size_t n) { v.reserve(n); });
+  blocks_.reserve(blocks);
 }
 
 std::uint32_t PrototypeStore::at(std::int64_t id) const {
@@ -60,10 +69,20 @@ std::uint32_t PrototypeStore::find_row(std::uint32_t landmark, std::uint16_t loo
 
 namespace {
 
-// Room for more elements, growing as push_back does, so that adding them cannot fail half-way.
-template <typename T, typename Allocator>
-void make_room(std::vector<T, Allocator>& v, std::size_t more) {
-  if (v.capacity() - v.size() < more) v.reserve(std::max(2 * v.capacity(), v.size() + more));
+template <typename Vector>
+bool has_room(const Vector& v, std::size_t more) {
+  return v.capacity() - v.size() >= more;
+}
+
+// As push_back grows, so that adding elements cannot fail half-way.
+template <typename Vector>
+std::size_t larger_capacity(const Vector& v, std::size_t more) {
+  return std::max(2 * v.capacity(), v.size() + more);
+}
+
+template <typename Vector>
+void make_room_in(Vector& v, std::size_t more) {
+  if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
 }
 
 }  // namespace
@@ -88,9 +107,9 @@ std::uint32_t PrototypeStore::create_landmark(std::int64_t id) {
     ids_[landmark] = id;
   } else {
     landmark = static_cast<std::uint32_t>(landmarks());
-    make_room(ids_, 1);
-    make_room(positions_, 1);
-    make_room(heads_, 1);
+    make_room_in(ids_, 1);
+    make_room_in(positions_, 1);
+    make_room_in(heads_, 1);
     ids_.push_back(id);
     heads_.push_back(kNone);
     if (!positions_.empty()) positions_.push_back(kNowhere);
@@ -111,19 +130,36 @@ std::uint32_t PrototypeStore::create_landmark(std::int64_t id) {
 }
 
 void PrototypeStore::make_room_for_row() {
-  constexpr std::size_t kRows = kPackedRows;
   blocks_.make_room();
-  make_room(sums_, kRows * dim_);
-  make_room(counts_, kRows);
-  make_room(packed_, packed_size(kRows, dim_) / sizeof(CodeVector));
-  if (look_bits_ == 0) {
-    make_room(ids_, kRows);
-    if (!positions_.empty()) make_room(positions_, kRows);
-    return;
+  for_each_array(0, kPackedRows, [](auto& v, std::size_t more) { make_room_in(v, more); });
+}
+
+void PrototypeStore::make_room(std::span<const std::int64_t> landmarks, std::size_t rows,
+                               const Alone& alone) {
+  // New rows begin in the first cell, and each that moves may be the first of a block.
+  const std::size_t moving = cells_.size() == 0 ? 0 : std::min(rows, cells_.size());
+  const auto places_of = [&](std::size_t n) {
+    return (2 * ((n + kPackedRows - 1) / kPackedRows) + moving) * kPackedRows;
+  };
+  bool enough = index_.has_room(landmarks.size());
+  for_each_array(landmarks.size(), places_of(rows),
+                 [&](auto& v, std::size_t more) { enough = enough && has_room(v, more); });
+  if (enough) return;
+  // Most may be known.
+  const auto unknown = static_cast<std::size_t>(std::count_if(
+      landmarks.begin(), landmarks.end(), [&](std::int64_t id) { return find(id) == kNone; }));
+  for_each_array(unknown, places_of(look_bits_ == 0 ? unknown : rows),
+                 [&](auto& v, std::size_t more) {
+                   if (has_room(v, more)) return;
+                   std::remove_reference_t<decltype(v)> larger;
+                   larger.reserve(larger_capacity(v, more));
+                   larger.assign(v.begin(), v.end());
+                   alone([&] { v.swap(larger); });
+                 });
+  if (!index_.has_room(unknown)) {
+    IdIndex larger = index_.with_room(ids_, unknown);
+    alone([&] { std::swap(index_, larger); });
   }
-  make_room(looks_, kRows);
-  make_room(owners_, kRows);
-  make_room(next_, kRows);
 }
 
 void PrototypeStore::resize_rows(std::size_t places) {
@@ -434,7 +470,24 @@ void PrototypeStore::settle(int threads) {
   unsettled_.clear();
 }
 
-void PrototypeStore::set_cells(Cells cells, int threads) {
+namespace {
+
+// Elements of `size` values each, those at `from` put to `to`, padding between them; none of none.
+template <typename Vector>
+Vector moved(const Vector& v, std::size_t size, const std::vector<std::uint32_t>& from,
+             const std::vector<std::uint32_t>& to, std::size_t places,
+             const typename Vector::value_type& padding) {
+  if (v.empty()) return {};
+  Vector result(places * size, padding);
+  for (std::size_t i = 0; i < from.size(); ++i) {
+    std::copy_n(&v[from[i] * size], size, &result[to[i] * size]);
+  }
+  return result;
+}
+
+}  // namespace
+
+PrototypeStore PrototypeStore::with_cells(Cells cells, int threads) const {
   std::vector<std::uint32_t> rows;
   rows.reserve(rows_);
   for (std::uint32_t row = 0; row < places(); ++row) {
@@ -447,92 +500,57 @@ void PrototypeStore::set_cells(Cells cells, int threads) {
     const auto own = cells.assign({codes.data(), some.size(), dim_}, threads);
     std::copy(own.begin(), own.end(), cell_of_row.begin() + static_cast<std::ptrdiff_t>(first));
   }
-  rearrange(rows, cell_of_row, std::max<std::size_t>(cells.size(), 1));
-  cells_ = std::move(cells);
-  unsettled_.clear();
-  changes_ += rows_;
-}
-
-namespace {
-
-// Elements of `size` values that are to go from one place to another one. The room is taken first,
-// and not touched until they go, so that they do all or, where memory runs out, none, and take no
-// more than twice the largest array's.
-template <typename Vector>
-class MovedElements {
- public:
-  MovedElements(Vector& v, std::size_t size, std::size_t places,
-                const typename Vector::value_type& padding)
-      : from_(v), size_(size), places_(v.empty() ? 0 : places), padding_(padding) {
-    to_.reserve(places_ * size_);
-  }
-
-  void move(const std::vector<std::uint32_t>& from, const std::vector<std::uint32_t>& to) {
-    to_.resize(places_ * size_, padding_);
-    for (std::size_t i = 0; places_ != 0 && i < from.size(); ++i) {
-      std::copy_n(&from_[from[i] * size_], size_, &to_[to[i] * size_]);
-    }
-    from_ = std::move(to_);
-  }
-
- private:
-  Vector& from_;
-  Vector to_;
-  std::size_t size_, places_;
-  typename Vector::value_type padding_;
-};
-
-}  // namespace
-
-// Puts all rows into the blocks of these cells.
-void PrototypeStore::rearrange(const std::vector<std::uint32_t>& rows,
-                               const std::vector<std::uint32_t>& cell_of_row, std::size_t cells) {
-  const CellOrder order(cell_of_row, cells);
+  const std::size_t number_of_cells = std::max<std::size_t>(cells.size(), 1);
+  const CellOrder order(cell_of_row, number_of_cells);
   const std::vector<std::uint32_t>& to = order.places;
   const std::size_t end = order.first_blocks.back() * kPackedRows;
-  CellBlocks blocks(cells);
-  blocks.reserve(order.first_blocks.back());
-  for (std::uint32_t c = 0; c < cells; ++c) {
-    for (std::size_t i = 0; i < order.rows[c]; ++i) blocks.append(c);
+
+  PrototypeStore result(dim_, look_bits_);
+  result.rows_ = rows_;
+  result.changes_ = changes_ + rows_;
+  result.cells_version_ = cells_version_ + 1;
+  result.cells_ = std::move(cells);
+  result.blocks_ = CellBlocks(number_of_cells);
+  result.blocks_.reserve(order.first_blocks.back());
+  for (std::uint32_t c = 0; c < number_of_cells; ++c) {
+    for (std::size_t i = 0; i < order.rows[c]; ++i) result.blocks_.append(c);
+  }
+  result.sums_ = moved(sums_, dim_, rows, to, end, 0);
+  result.counts_ = moved(counts_, 1, rows, to, end, 0);
+  result.packed_.resize(packed_size(end, dim_) / sizeof(CodeVector));
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    for (std::size_t d = 0; d < dim_; d += 4) {
+      std::memcpy(result.packed() + packed_index(to[i], d, dim_),
+                  packed() + packed_index(rows[i], d, dim_), 4);
+    }
   }
   std::vector<std::uint32_t> number(places(), kNone);
   for (std::size_t i = 0; i < rows.size(); ++i) number[rows[i]] = to[i];
-  MovedElements sums(sums_, dim_, end, std::int16_t{0});
-  MovedElements counts(counts_, 1, end, std::uint8_t{0});
-  const std::size_t landmarks = look_bits_ == 0 ? end : 0;
-  MovedElements ids(ids_, 1, landmarks, std::int64_t{-1});
-  MovedElements positions(positions_, 1, landmarks, kNowhere);
-  MovedElements looks(looks_, 1, end, std::uint16_t{0});
-  MovedElements owners(owners_, 1, end, std::uint32_t{kNone});
-  MovedElements next(next_, 1, end, std::uint32_t{kNone});
-  LargeVector<CodeVector> packed(packed_size(end, dim_) / sizeof(CodeVector));
-
-  // From here on nothing asks for memory.
-  auto* codes = reinterpret_cast<std::int8_t*>(packed.data());
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    for (std::size_t d = 0; d < dim_; d += 4) {
-      std::memcpy(codes + packed_index(to[i], d, dim_),
-                  this->packed() + packed_index(rows[i], d, dim_), 4);
-    }
-  }
-  packed_ = std::move(packed);
-  blocks_ = std::move(blocks);
-  sums.move(rows, to);
-  counts.move(rows, to);
+  result.index_ = index_;
   if (look_bits_ == 0) {
-    ids.move(rows, to);
-    positions.move(rows, to);
-    index_.renumber(number);
-    return;
+    result.ids_ = moved(ids_, 1, rows, to, end, -1);
+    result.positions_ = moved(positions_, 1, rows, to, end, kNowhere);
+    result.index_.renumber(number);
+    return result;
   }
-  looks.move(rows, to);
-  owners.move(rows, to);
-  next.move(rows, to);
-  for (auto* links : {&heads_, &next_}) {
+  result.ids_ = ids_;
+  result.positions_ = positions_;
+  result.heads_ = heads_;
+  result.looks_ = moved(looks_, 1, rows, to, end, 0);
+  result.owners_ = moved(owners_, 1, rows, to, end, kNone);
+  result.next_ = moved(next_, 1, rows, to, end, kNone);
+  for (auto* links : {&result.heads_, &result.next_}) {
     for (std::uint32_t& row : *links) {
       if (row != kNone) row = number[row];
     }
   }
+  return result;
+}
+
+void PrototypeStore::make_room_for_positions(const Alone& alone) {
+  if (!positions_.empty()) return;
+  std::vector<Position> fresh(ids_.size(), kNowhere);
+  alone([&] { positions_.swap(fresh); });
 }
 
 void PrototypeStore::set_position(std::uint32_t landmark, const Position& position) {
@@ -545,6 +563,33 @@ void PrototypeStore::set_position(std::uint32_t landmark, const Position& positi
 
 Position PrototypeStore::position(std::uint32_t landmark) const {
   return positions_.empty() ? kNowhere : positions_[landmark];
+}
+
+void PrototypeMap::Store::add_piece(std::span<const std::int64_t> landmarks, Codes codes,
+                                    int threads) {
+  make_room(landmarks, landmarks.size());
+  const std::unique_lock lock(mutex);
+  add(landmarks, codes);
+  settle(threads);
+}
+
+void PrototypeMap::Store::make_room(std::span<const std::int64_t> landmarks, std::size_t rows) {
+  PrototypeStore::make_room(landmarks, rows, [&](const auto& swap) { alone(swap); });
+}
+
+void PrototypeMap::Store::make_room_for_positions() {
+  PrototypeStore::make_room_for_positions([&](const auto& swap) { alone(swap); });
+}
+
+void PrototypeMap::Store::alone(const std::function<void()>& swap) {
+  const std::unique_lock lock(mutex);
+  swap();
+}
+
+// What was there before goes when the lock has.
+void PrototypeMap::Store::replace(PrototypeStore other) {
+  const std::unique_lock lock(mutex);
+  std::swap(static_cast<PrototypeStore&>(*this), other);
 }
 
 PackedPrototypes PrototypeStore::view() const {

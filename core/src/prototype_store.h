@@ -1,9 +1,13 @@
 // What an open map holds in memory: landmarks, and rows, one for each prototype.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
+#include <memory>
 #include <mutex>
+#include <shared_mutex>
 #include <span>
 #include <vector>
 
@@ -57,6 +61,10 @@ class PrototypeStore {
   std::uint32_t create_row(std::uint32_t landmark, std::uint16_t look);
   // Afterwards the next create_row does not throw for want of memory.
   void make_room_for_row();
+  // Room for so many rows more of these landmarks, so that making them takes no time for it. Only
+  // reads the map, but within `alone(swap)`, which calls swap() while nobody else reads.
+  using Alone = std::function<void(const std::function<void()>& swap)>;
+  void make_room(std::span<const std::int64_t> landmarks, std::size_t rows, const Alone& alone);
   // With its last row a landmark leaves.
   void erase_row(std::uint32_t row);
   void erase(std::int64_t id);
@@ -104,13 +112,17 @@ class PrototypeStore {
   // Coarse cells; none: there is no index.
   const Cells& cells() const { return cells_; }
   const CellBlocks& blocks() const { return blocks_; }
-  void set_cells(Cells cells, int threads);
+  // A number that every set of cells has for itself.
+  std::size_t cells_version() const { return cells_version_; }
+  // The same map with these cells.
+  PrototypeStore with_cells(Cells cells, int threads) const;
   // Puts rows that were created or refreshed into their cells; ends every change.
   void settle(int threads);
   // A number that grows with each row that came, changed or went while there was an index.
   std::size_t changes() const { return changes_; }
 
   void set_position(std::uint32_t landmark, const Position& position);
+  void make_room_for_positions(const Alone& alone);
   Position position(std::uint32_t landmark) const;
   // Empty while no landmark has ever had one, else one for each landmark number.
   const std::vector<Position>& positions() const { return positions_; }
@@ -128,14 +140,14 @@ class PrototypeStore {
   std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
   void add(std::uint32_t row, const std::int8_t* code);
   void prefetch_rounded(std::uint32_t row) const;
+  template <typename Do>
+  void for_each_array(std::size_t landmarks, std::size_t places, const Do& todo);
   std::uint32_t* link_to(std::uint32_t row);
   std::uint32_t take_place(std::uint32_t cell);
   void resize_rows(std::size_t places);
   void relocate(std::uint32_t from, std::uint32_t to);
   void close_gap(std::uint32_t row);
   void erase_landmark(std::uint32_t landmark);
-  void rearrange(const std::vector<std::uint32_t>& rows, const std::vector<std::uint32_t>& cells,
-                 std::size_t number_of_cells);
 
   std::size_t dim_;
   std::size_t look_bits_;
@@ -156,22 +168,55 @@ class PrototypeStore {
 
   CellBlocks blocks_;
   Cells cells_;
+  std::size_t cells_version_ = 0;
   std::vector<Key> unsettled_;
   std::size_t changes_ = 0;
 };
 
 // What users do not see of an open map.
+//
+// Two locks, so that a search waits for nothing but a piece of a change. A change holds `changing`
+// alone from its first look at the map to its end, and `mutex` alone while it writes, a piece at a
+// time. What reads the map for long (save, seal, the other map of an update) shares `changing`,
+// searches and short questions share `mutex`. Who needs both takes `changing` first.
 struct PrototypeMap::Store : PrototypeStore {
-  using PrototypeStore::PrototypeStore;
-  // As measured on the map, now or when it was much the same.
-  ProbeRanks ranks(int threads) const;
+  // Observations or landmarks of a change that searches wait for.
+  static constexpr std::size_t kPiece = 1 << 13;
 
-  mutable FairSharedMutex mutex;
+  using PrototypeStore::PrototypeStore;
+
+  // Calls change(begin, end) for pieces of [0, n), each alone with the map. The caller holds
+  // `changing`, as that of make_room and replace.
+  template <typename Change>
+  void in_pieces(std::size_t n, const Change& change) {
+    for (std::size_t begin = 0; begin < n; begin += kPiece) {
+      const std::unique_lock lock(mutex);
+      change(begin, std::min(n, begin + kPiece));
+      settle(1);
+    }
+  }
+  void add_piece(std::span<const std::int64_t> landmarks, Codes codes, int threads);
+  void make_room(std::span<const std::int64_t> landmarks, std::size_t rows);
+  void make_room_for_positions();
+  void replace(PrototypeStore other);
+
+  // As measured on the map, now or when it was much the same; where others measure or change the
+  // map, with these cells at least. `lock` is one of `mutex`, and is let go while ranks are
+  // measured.
+  std::shared_ptr<const MeasuredRanks> ranks(std::shared_lock<FairSharedMutex>& lock, double recall,
+                                             int threads) const;
+
+  Metadata metadata;
+  mutable FairSharedMutex changing, mutex;
 
  private:
-  mutable std::mutex ranks_mutex_;
-  mutable ProbeRanks ranks_;  // empty: not measured
-  mutable std::size_t ranks_changes_ = 0;
+  void alone(const std::function<void()>& swap);
+  bool is_stale(const MeasuredRanks& ranks) const;
+  void measure(int threads, bool wait) const;
+
+  mutable std::mutex measuring_;    // before `changing`
+  mutable std::mutex ranks_mutex_;  // last
+  mutable std::shared_ptr<const MeasuredRanks> ranks_;
 };
 
 bool is_nowhere(const Position& position);

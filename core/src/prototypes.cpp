@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
-#include <functional>
 #include <mutex>
 #include <stdexcept>
 #include <string>
@@ -13,12 +12,10 @@
 #include "map_sections.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
+#include "summary_builder.h"
 
 namespace protomark {
 namespace {
-
-// Descriptors that are encoded and added at a time, to bound the memory for their codes.
-constexpr std::size_t kEncodeChunk = 1 << 13;
 
 void check_pairs(std::size_t landmarks, std::size_t rows, const char* what) {
   if (landmarks != rows) {
@@ -84,11 +81,13 @@ std::size_t PrototypeMap::prototype_count() const {
 std::size_t PrototypeMap::look_bits() const { return store_->look_bits(); }
 
 std::vector<std::int64_t> PrototypeMap::ids() const {
-  const std::shared_lock lock(store_->mutex);
   std::vector<std::int64_t> result;
-  result.reserve(store_->landmarks());
-  for (const std::int64_t id : store_->ids()) {
-    if (id >= 0) result.push_back(id);
+  {
+    const std::shared_lock lock(store_->mutex);
+    result.reserve(store_->landmarks());
+    for (const std::int64_t id : store_->ids()) {
+      if (id >= 0) result.push_back(id);
+    }
   }
   std::sort(result.begin(), result.end());
   return result;
@@ -98,15 +97,14 @@ void PrototypeMap::add(std::span<const std::int64_t> landmarks, Descriptors desc
                        int threads) {
   check_pairs(landmarks.size(), descriptors.rows, "descriptors");
   check_new_ids(landmarks);
-  std::vector<std::int8_t> buffer(std::min(descriptors.rows, kEncodeChunk) * dim_);
+  std::vector<std::int8_t> buffer(std::min(descriptors.rows, Store::kPiece) * dim_);
+  const std::unique_lock changing(store_->changing);
   // Even no observation at all is checked for its length.
-  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += kEncodeChunk) {
-    const std::size_t n = std::min(kEncodeChunk, descriptors.rows - begin);
-    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, {buffer.data(), n, dim_},
-                     threads);
-    const std::unique_lock lock(store_->mutex);
-    store_->add(landmarks.subspan(begin, n), {buffer.data(), n, dim_});
-    store_->settle(threads);
+  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += Store::kPiece) {
+    const std::size_t n = std::min(Store::kPiece, descriptors.rows - begin);
+    const MatrixView<std::int8_t> codes{buffer.data(), n, dim_};
+    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, codes, threads);
+    store_->add_piece(landmarks.subspan(begin, n), {buffer.data(), n, dim_}, threads);
   }
 }
 
@@ -114,9 +112,11 @@ void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes code
   check_pairs(landmarks.size(), codes.rows, "codes");
   check_codes(codes, dim_);
   check_new_ids(landmarks);
-  const std::unique_lock lock(store_->mutex);
-  store_->add(landmarks, codes);
-  store_->settle(1);
+  const std::unique_lock changing(store_->changing);
+  for (std::size_t begin = 0; begin < codes.rows; begin += Store::kPiece) {
+    const std::size_t n = std::min(Store::kPiece, codes.rows - begin);
+    store_->add_piece(landmarks.subspan(begin, n), {codes.row(begin), n, dim_}, 1);
+  }
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors descriptors,
@@ -130,7 +130,7 @@ void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors d
 void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes codes) {
   check_pairs(landmarks.size(), codes.rows, "codes");
   check_codes(codes, dim_);
-  const std::unique_lock lock(store_->mutex);
+  const std::unique_lock changing(store_->changing);
 
   // What is to be taken from each row, added up first so that all can be checked before any
   // changes.
@@ -166,27 +166,36 @@ void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes c
     }
   }
   // By what does not change when others go.
-  std::vector<std::pair<std::int64_t, std::uint16_t>> empty;
+  struct Key {
+    std::int64_t id;
+    std::uint16_t look;
+    const Part* part;
+  };
+  std::vector<Key> keys;
+  keys.reserve(parts.size());
   for (const auto& [row, part] : parts) {
-    if (store_->count(row) == part.count) {
-      empty.emplace_back(store_->ids()[store_->landmark_of(row)], store_->look(row));
-      continue;
-    }
-    for (std::size_t d = 0; d < dim_; ++d) {
-      store_->sum(row)[d] = static_cast<std::int16_t>(store_->sum(row)[d] - part.sum[d]);
-    }
-    store_->set_count(row, store_->count(row) - part.count);
-    store_->refresh(row);
+    keys.push_back({store_->ids()[store_->landmark_of(row)], store_->look(row), &part});
   }
-  for (const auto& [id, look] : empty) {
-    store_->erase_row(store_->find_row(store_->at(id), look));
-  }
-  store_->settle(1);
+  store_->in_pieces(keys.size(), [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) {
+      const std::uint32_t row = store_->find_row(store_->at(keys[i].id), keys[i].look);
+      const Part& part = *keys[i].part;
+      if (store_->count(row) == part.count) {
+        store_->erase_row(row);
+        continue;
+      }
+      for (std::size_t d = 0; d < dim_; ++d) {
+        store_->sum(row)[d] = static_cast<std::int16_t>(store_->sum(row)[d] - part.sum[d]);
+      }
+      store_->set_count(row, store_->count(row) - part.count);
+      store_->refresh(row);
+    }
+  });
 }
 
 void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source) {
   check_pairs(into.size(), source.size(), "sources");
-  const std::unique_lock lock(store_->mutex);
+  const std::unique_lock changing(store_->changing);
   std::unordered_map<std::int64_t, bool> gone;
   for (std::size_t i = 0; i < into.size(); ++i) {
     for (const std::int64_t id : {into[i], source[i]}) {
@@ -202,73 +211,50 @@ void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std
     }
     gone[source[i]] = true;
   }
-  for (std::size_t i = 0; i < into.size(); ++i) {
-    const std::uint32_t other = store_->at(source[i]);
-    for (std::uint32_t from = store_->first_row(other); from != Store::kNone;
-         from = store_->next_row(from)) {
-      const std::uint32_t row = store_->find_or_create_row(into[i], store_->look(from));
-      store_->join(row, store_->sum(from), store_->count(from));
+  store_->in_pieces(into.size(), [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) {
+      const std::uint32_t other = store_->at(source[i]);
+      for (std::uint32_t from = store_->first_row(other); from != Store::kNone;
+           from = store_->next_row(from)) {
+        const std::uint32_t row = store_->find_or_create_row(into[i], store_->look(from));
+        store_->join(row, store_->sum(from), store_->count(from));
+      }
+      const std::uint32_t landmark = store_->at(into[i]);
+      if (is_nowhere(store_->position(landmark))) {
+        store_->set_position(landmark, store_->position(other));
+      }
+      store_->erase(source[i]);
     }
-    const std::uint32_t landmark = store_->at(into[i]);
-    if (is_nowhere(store_->position(landmark))) {
-      store_->set_position(landmark, store_->position(other));
-    }
-    store_->erase(source[i]);
-  }
-  store_->settle(1);
+  });
 }
 
 void PrototypeMap::discard(std::span<const std::int64_t> landmarks) {
-  const std::unique_lock lock(store_->mutex);
+  const std::unique_lock changing(store_->changing);
   std::vector<std::int64_t> sorted(landmarks.begin(), landmarks.end());
   std::sort(sorted.begin(), sorted.end());
   sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
   for (const std::int64_t id : sorted) store_->at(id);
-  for (const std::int64_t id : sorted) store_->erase(id);
+  store_->in_pieces(sorted.size(), [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) store_->erase(sorted[i]);
+  });
 }
 
-void PrototypeMap::update(const PrototypeMap& other) {
-  if (&other == this) throw std::invalid_argument("a map cannot be joined to itself");
-  if (other.encoder_->identity() != encoder_->identity() || other.dim_ != dim_) {
-    throw std::invalid_argument("maps of different encoders or dimensions cannot be joined: '" +
-                                encoder_->info().name + "' with " + std::to_string(dim_) + ", '" +
-                                other.encoder_->info().name + "' with " +
-                                std::to_string(other.dim_));
-  }
-  if (other.look_bits() != look_bits()) {
-    throw std::invalid_argument("maps of " + std::to_string(look_bits()) + " and " +
-                                std::to_string(other.look_bits()) +
-                                " look bits cannot be joined: build both with the same");
-  }
-  // Both wait for their turn, in one order for all pairs of maps, so that no two updates wait for
-  // each other.
-  std::unique_lock own(store_->mutex, std::defer_lock);
-  std::shared_lock others(other.store_->mutex, std::defer_lock);
-  if (std::less<>{}(store_.get(), other.store_.get())) {
-    own.lock();
-    others.lock();
-  } else {
-    others.lock();
-    own.lock();
-  }
-  const Store& from = *other.store_;
-  for (std::uint32_t i = 0; i < from.places(); ++i) {
-    if (!from.is_row(i)) continue;
-    const std::int64_t id = from.ids()[from.landmark_of(i)];
-    store_->join(store_->find_or_create_row(id, from.look(i)), from.sum(i), from.count(i));
-  }
-  store_->settle(1);
-  for (std::uint32_t i = 0; i < from.ids().size(); ++i) {
-    if (from.ids()[i] < 0) continue;
-    const std::uint32_t landmark = store_->at(from.ids()[i]);
-    if (is_nowhere(store_->position(landmark))) store_->set_position(landmark, from.position(i));
-  }
+Metadata PrototypeMap::metadata() const {
+  const std::shared_lock lock(store_->mutex);
+  return store_->metadata;
+}
+
+void PrototypeMap::set_metadata(Metadata metadata) {
+  check_metadata(metadata);
+  const std::unique_lock changing(store_->changing);
+  const std::unique_lock lock(store_->mutex);
+  store_->metadata = std::move(metadata);
 }
 
 void PrototypeMap::set_positions(std::span<const std::int64_t> landmarks,
                                  std::span<const Position> positions) {
   check_pairs(landmarks.size(), positions.size(), "positions");
-  const std::unique_lock lock(store_->mutex);
+  const std::unique_lock changing(store_->changing);
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
     store_->at(landmarks[i]);
     const Position& p = positions[i];
@@ -278,9 +264,14 @@ void PrototypeMap::set_positions(std::span<const std::int64_t> landmarks,
                                   " is not finite");
     }
   }
-  for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    store_->set_position(store_->at(landmarks[i]), positions[i]);
+  if (!std::all_of(positions.begin(), positions.end(), is_nowhere)) {
+    store_->make_room_for_positions();
   }
+  store_->in_pieces(landmarks.size(), [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) {
+      store_->set_position(store_->at(landmarks[i]), positions[i]);
+    }
+  });
 }
 
 std::vector<Position> PrototypeMap::positions(std::span<const std::int64_t> landmarks) const {
@@ -297,6 +288,16 @@ std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> la
   result.reserve(landmarks.size());
   for (const std::int64_t id : landmarks) result.push_back(store_->observations(store_->at(id)));
   return result;
+}
+
+MapSummary PrototypeMap::summary() const {
+  const std::shared_lock lock(store_->mutex);
+  SummaryBuilder result;
+  for (std::uint32_t i = 0; i < store_->ids().size(); ++i) {
+    if (store_->ids()[i] < 0) continue;
+    result.add(store_->observations(i), store_->position(i));
+  }
+  return result.take();
 }
 
 void PrototypeMap::prototypes(std::span<const std::int64_t> landmarks,
@@ -337,7 +338,7 @@ void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
 }
 
 void PrototypeMap::save(const std::filesystem::path& path) const {
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   const bool with_looks = look_bits() != 0;
   const auto landmarks = store_->sorted_landmarks();
   // Without looks a row is a landmark.
@@ -349,6 +350,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape({n, dim_, {}}));
+  add_metadata(file, store_->metadata);
   add_values<std::int64_t>(file, section::kIds, n, 1, [&](std::size_t i, std::int64_t* to) {
     *to = store_->ids()[landmarks[i]];
   });
@@ -407,6 +409,7 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
 
   PrototypeMap map(std::move(encoder), dim, look_bits);
   Store& store = *map.store_;
+  store.metadata = read_metadata(file);
   store.reserve(n, m);
   for (std::size_t i = 0, next = 0; i < n; ++i) {
     const std::uint32_t landmark = store.create_landmark(ids[i]);
@@ -436,8 +439,9 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
   }
   // After the landmarks, so that room for positions is made once.
   for (std::uint32_t i = 0; i < positions.size(); ++i) store.set_position(i, positions[i]);
-  if (auto cells = read_cells(file, dim); !cells.empty())
-    store.set_cells({std::move(cells), dim}, 1);
+  if (auto cells = read_cells(file, dim); !cells.empty()) {
+    store.replace(store.with_cells({std::move(cells), dim}, 1));
+  }
   return map;
 }
 

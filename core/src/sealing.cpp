@@ -16,7 +16,10 @@
 #include "bit_numbers.h"
 #include "cells.h"
 #include "container.h"
+#include "landmark_ids.h"
 #include "map_sections.h"
+#include "position_box.h"
+#include "position_grid.h"
 #include "probe_ranks.h"
 #include "prototype_store.h"
 #include "quantize4.h"
@@ -200,7 +203,7 @@ std::array<float, 3> relative(const Position& position, const Position& origin) 
   for (std::size_t i = 0; i < 3; ++i) {
     const double distance = position[i] - origin[i];
     if (std::abs(distance) > std::numeric_limits<float>::max()) {
-      throw std::invalid_argument("positions are too far apart for the 32 bits of a sealed map");
+      throw std::invalid_argument("positions are too far apart for a sealed map");
     }
     result[i] = static_cast<float>(distance);
   }
@@ -231,7 +234,7 @@ void write_order(const SealedRows& rows, const Places& places, int bits,
 }  // namespace
 
 void PrototypeMap::seal(const std::filesystem::path& path, int bits,
-                        std::optional<double> prototypes) const {
+                        std::optional<double> prototypes, int position_bits) const {
   if (bits != 8 && bits != 4) {
     throw std::invalid_argument("prototypes are sealed with 8 or 4 bits a number, not " +
                                 std::to_string(bits));
@@ -240,18 +243,24 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
     throw std::invalid_argument("a map is sealed with at least 1 prototype a landmark, not " +
                                 std::to_string(*prototypes));
   }
-  const std::shared_lock lock(store_->mutex);
+  if (position_bits != 32 && position_bits != 16) {
+    throw std::invalid_argument("positions are sealed with 32 or 16 bits a coordinate, not " +
+                                std::to_string(position_bits));
+  }
+  const std::shared_lock changing(store_->changing);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();
   const std::size_t n = landmarks.size();
   const auto id = [&](std::size_t i) { return store_->ids()[landmarks[i]]; };
   MapShape shape{n, dim_, {}};
-  const auto& positions = store_->positions();
-  const bool placed = !std::all_of(positions.begin(), positions.end(), is_nowhere);
+  PositionBox box;
+  for (const Position& position : store_->positions()) box.add(position);
+  const bool placed = box.placed != 0, gridded = placed && position_bits == 16;
+  const PositionGrid grid = gridded ? PositionGrid(box) : PositionGrid();
   if (placed) {
-    shape.origin = middle(positions);
-    // All are looked at before anything is written.
-    for (const Position& position : positions) relative(position, shape.origin);
+    shape.origin = gridded ? grid.origin : box.middle();
+    // Before anything is written; no position is further away than these.
+    for (const Position& corner : {box.low, box.high}) relative(corner, box.middle());
   }
   const int half_step = bits == 4 ? best_half_step(occurrences(rows)) : 0;
   const BlockPacker packer(rows, half_step);
@@ -259,15 +268,16 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
   const bool indexed = cells.size() != 0;
   const Places places(rows, std::max<std::size_t>(cells.size(), 1));
   const ProbeRanks probe_ranks = indexed ? ranks(rows, packer, cells) : ProbeRanks();
-  const bool implicit_ids = n == 0 || (id(0) == 0 && id(n - 1) == std::int64_t(n) - 1);
+  const bool numbered = n == 0 || ids_are_numbers(n, id(n - 1));
 
-  ContainerWriter file(FileKind::sealed_map, indexed ? 3 : bits == 4 || rows.several() ? 2 : 1);
+  ContainerWriter file(FileKind::sealed_map, !numbered || gridded          ? 4
+                                             : indexed                     ? 3
+                                             : bits == 4 || rows.several() ? 2
+                                                                           : 1);
   file.add(section::kEncoder, encoder_->serialize());
   file.add(section::kShape, write_shape(shape));
-  if (!implicit_ids) {
-    add_values<std::int64_t>(file, section::kIds, n, 1,
-                             [&](std::size_t i, std::int64_t* to) { *to = id(i); });
-  }
+  add_metadata(file, store_->metadata);
+  add_ids(file, n, id);
   add_values<std::uint8_t>(file, section::kCounts, n, 1, [&](std::size_t i, std::uint8_t* to) {
     *to = static_cast<std::uint8_t>(std::min(store_->observations(landmarks[i]), 255u));
   });
@@ -281,7 +291,13 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
                            packer.size(), [&](std::size_t block, std::uint8_t* to) {
                              packer.pack(&places.row_at[block * kPackedRows], to);
                            });
-  if (placed) {
+  if (gridded) {
+    file.add(section::kSteps, write_steps(grid.step));
+    add_values<PositionGrid::Cell>(file, section::kPositions, n, 1,
+                                   [&](std::size_t i, PositionGrid::Cell* to) {
+                                     *to = grid.cell(store_->position(landmarks[i]));
+                                   });
+  } else if (placed) {
     using Relative = std::array<float, 3>;
     add_values<Relative>(file, section::kPositions, n, 1, [&](std::size_t i, Relative* to) {
       *to = relative(store_->position(landmarks[i]), shape.origin);

@@ -191,6 +191,88 @@ void test_updates_while_both_are_searched() {
   CHECK(left.size() == 200 + right.size());
 }
 
+// A change of more than a piece shows piece by piece to searches, and whole to files.
+void test_large_changes_show_in_pieces(const fs::path& folder) {
+  constexpr std::size_t kPiece = 8192, kAll = 3 * kPiece + 1000;
+  const auto encoder = test::random_encoder();
+  std::vector<std::int64_t> ids(kAll);
+  std::iota(ids.begin(), ids.end(), 1);
+  test::Random random(11);
+  const auto codes = random.integers<std::int8_t>(kAll * kDim, -127, 127);
+  const std::vector<Position> positions(kAll, Position{1, 2, 3});
+  PrototypeMap map(encoder);
+  const std::int64_t first = 0;
+  map.add_codes(std::span(&first, 1), {codes.data(), 1, kDim});
+  std::atomic<int> wrong = 0, files = 0;
+  {
+    const std::jthread reader([&](const std::stop_token& stop) {
+      while (!stop.stop_requested()) {
+        const std::size_t n = map.size() - 1;
+        wrong += n % kPiece == 0 || n == kAll || (kAll - n) % kPiece == 0 ? 0 : 1;
+      }
+    });
+    const std::jthread saver([&](const std::stop_token& stop) {
+      while (!stop.stop_requested()) {
+        map.save(folder / "pieces.pmk");
+        const std::size_t n = PrototypeMap::load(folder / "pieces.pmk").size() - 1;
+        wrong += n == 0 || n == kAll ? 0 : 1;
+        ++files;
+      }
+    });
+    for (int round = 0; round < 20 || files < 3; ++round) {
+      map.add_codes(ids, {codes.data(), kAll, kDim});
+      map.set_positions(ids, positions);
+      map.discard(ids);
+    }
+  }
+  CHECK(wrong == 0);
+}
+
+// Exact answers do not depend on an index that comes and goes, and approximate ones are given with
+// ranks of its own cells.
+void test_searches_while_an_index_is_built() {
+  const auto encoder = test::random_encoder();
+  test::Random random(12);
+  const Observations some = observations(random, 4000, 0);
+  const auto codes = random.integers<std::int8_t>(kQueries * kDim, -127, 127);
+  const Codes queries{codes.data(), kQueries, kDim};
+  PrototypeMap map(encoder);
+  map.add_codes(some.ids, some.view());
+  const Answer exact = ask(map, queries, 1);
+  std::atomic<int> wrong = 0, searches = 0;
+  {
+    std::vector<std::jthread> readers;
+    readers.emplace_back([&](const std::stop_token& stop) {
+      while (!stop.stop_requested()) wrong += ask(map, queries, 1) == exact ? 0 : 1;
+    });
+    for (int i = 0; i < 2; ++i) {
+      readers.emplace_back([&](const std::stop_token& stop) {
+        SearchOptions options;
+        options.recall = 1;
+        Answer answer;
+        while (!stop.stop_requested()) {
+          try {
+            map.search_codes(queries, options, {answer.ids.data(), kQueries, kNeighbours},
+                             {answer.distances.data(), kQueries, kNeighbours});
+            wrong += answer == exact ? 0 : 1;
+            wrong += map.probes(0.9) <= 16 ? 0 : 1;
+          } catch (const std::invalid_argument&) {
+            continue;  // there is no index now
+          }
+          ++searches;
+        }
+      });
+    }
+    for (int round = 0; round < 20 || searches < 100; ++round) {
+      map.build_index(4 + round % 13);
+      map.add_codes(some.ids, some.view());
+      map.remove_codes(some.ids, some.view());
+      if (round % 4 == 3) map.drop_index();
+    }
+  }
+  CHECK(wrong == 0);
+}
+
 }  // namespace
 
 int main() {
@@ -202,6 +284,8 @@ int main() {
   }
   test_updates_of_each_other();
   test_updates_while_both_are_searched();
+  test_large_changes_show_in_pieces(folder);
+  test_searches_while_an_index_is_built();
   fs::remove_all(folder);
   return check::result();
 }

@@ -241,12 +241,23 @@ void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::pat
   map.set_positions(Ids{2}, std::span(&near, 1));
   map.save(path);
   CHECK(PrototypeMap::load(path).positions(Ids{1, 2}) == (std::vector{far, near}));
-  CHECK(refused([&] { map.seal(path); }, "too far apart"));
+  for (const int bits : {32, 16}) {
+    CHECK(refused([&] { map.seal(path, 8, std::nullopt, bits); }, "too far apart"));
+  }
+  CHECK(refused([&] { map.seal(path, 8, std::nullopt, 24); }, "32 or 16 bits a coordinate"));
   map.set_positions(Ids{2}, std::span(&none, 1));
-  map.seal(path);
-  const SealedMap sealed(path);
-  CHECK(sealed.positions(Ids{1})[0] == far);
-  CHECK(std::isnan(sealed.positions(Ids{2})[0][1]));
+  for (const int bits : {32, 16}) {
+    map.seal(path, 8, std::nullopt, bits);
+    const SealedMap sealed(path);
+    CHECK(sealed.position_bits() == bits);
+    CHECK(sealed.positions(Ids{1})[0] == far);
+    CHECK(std::isnan(sealed.positions(Ids{2})[0][1]));
+    CHECK(sealed.summary().placed == 1 && sealed.summary().high == far);
+  }
+  CHECK((SealedMap(path).position_error() == Position{0, 0, 0}));
+  map.set_positions(Ids{1}, std::span(&none, 1));
+  map.seal(path, 8, std::nullopt, 16);
+  CHECK(SealedMap(path).position_bits() == 0 && !SealedMap(path).position_error());
 }
 
 // Whatever can be done with a map can be done with one of no landmarks, and with one of one.
@@ -394,8 +405,10 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
     CHECK(says(File(path).set("shape", 16, kInfinity), "origin is not finite"));
     CHECK(says(File(path).resize("shape", 39), "'shape' is shorter"));
     CHECK(says(File(path).resize("shape", 41), "'shape' is longer"));
-    CHECK(says(File(path).set("ids", 0, std::int64_t{-1}), "negative landmark id"));
-    CHECK(says(File(path).set("ids", 8, std::int64_t{0}), "do not ascend"));
+    const char* ids_section = path == open ? "ids" : "idblocks";
+    CHECK(says(File(path).set(ids_section, 0, std::int64_t{-1}), "negative landmark id"));
+    CHECK(says(File(path).set(ids_section, 0, kMostId), "do not ascend"));
+    CHECK(says(File(path).resize(ids_section, 15), "section 'id"));
     CHECK(says(File(path).drop("encoder"), "lacks the section 'encoder'"));
     CHECK(says(File(path).drop("counts"), "lacks the section 'counts'"));
     CHECK(says(File(path).resize("encoder", 10), "encoder: not a Protomark file"));
@@ -416,6 +429,11 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(File(sealed).resize("protos", 64), "'protos' has the wrong size"));
   CHECK(says(File(sealed).resize("position", 13), "'position' has the wrong size"));
   CHECK(says(File(sealed).drop("protos"), "lacks the section 'protos'"));
+  CHECK(says(File(sealed).resize("steps", 23), "'steps' is shorter"));
+  CHECK(says(File(sealed).resize("steps", 24), "'position' has the wrong size"));
+  for (const double step : {-1.0, kNaN, kInfinity, 1e305}) {
+    CHECK(says(File(sealed).resize("steps", 24).set("steps", 16, step), "steps of its positions"));
+  }
   CHECK(says(File(model).set("network", 0, -1.0f), "scale must be positive"));
   CHECK(says(File(model).set("network", 4, std::uint32_t{257}), "too many dims"));
   CHECK(says(File(model).set("network", 16, std::uint32_t{17}), "too many layers"));

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -73,17 +74,25 @@ def build_file(
     look_bits: int = 0,
     prototypes: float | None = None,
     index: bool = False,
+    metadata: Mapping[str, str] | None = None,
+    position_bits: int = 32,
 ) -> PrototypeMap:
     """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor.
 
     With `upright` angles and sizes of the keypoints go in, too (`protomark.upright`); with `index`
-    the map can be searched approximately.
+    the map can be searched approximately. `metadata` is what the map shall say of itself.
 
     Raises:
         ValueError: as `build_map`; or `code_bits`, those of a sealed map, is neither 8 nor 4, or is
             4 where none is sealed; or `prototypes`, a sealed map's largest mean number of them a
-            landmark, is below 1, or given where no map is sealed or landmarks have no looks.
+            landmark, is below 1, or given where no map is sealed or landmarks have no looks; or
+            `position_bits`, of a sealed map's coordinates, is neither 32 nor 16, or is 16 where
+            none is sealed.
     """
+    if position_bits not in (32, 16):
+        raise ValueError(f"--position-bits {position_bits}: a sealed map has 32 or 16")
+    if position_bits != 32 and not seal:
+        raise ValueError(f"--position-bits {position_bits} is for sealed maps: add --sealed")
     if code_bits not in (8, 4):
         raise ValueError(f"--code-bits {code_bits}: a sealed map has 8 or 4 bits a number")
     if code_bits != 8 and not seal:
@@ -108,10 +117,11 @@ def build_file(
         threads,
         look_bits,
     )
+    scene.metadata = metadata or {}
     if index:
         scene.build_index(threads=threads)
     if seal:
-        scene.seal(output, bits=code_bits, prototypes=prototypes)
+        scene.seal(output, bits=code_bits, prototypes=prototypes, position_bits=position_bits)
     else:
         scene.save(output)
     return scene

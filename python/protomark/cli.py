@@ -291,6 +291,28 @@ def build(
             help="For cameras that do not roll: encode the keypoints' angles and sizes, too.",
         ),
     ] = False,
+    position_bits: Annotated[
+        int,
+        typer.Option(
+            help="Bits of a sealed position's coordinate: 32, or 16 for half the bytes, exact to a "
+            "131068th of the map's extent."
+        ),
+    ] = 32,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Coordinate frame of the positions and their unit, for the map's metadata: 'ENU, "
+            "metres', 'COLMAP, no scale', 'map (REP 105), metres'."
+        ),
+    ] = None,
+    metadata: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=TEXT",
+            help="What else the map shall say of itself; may be repeated. 'created' is now, or "
+            "SOURCE_DATE_EPOCH where that is set.",
+        ),
+    ] = None,
     threads: Annotated[int, typer.Option(help="CPU threads.")] = 1,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the facts to this file.")
@@ -300,8 +322,10 @@ def build(
     from protomark.build import build_file
     from protomark.evaluation.command import check_outputs
     from protomark.info import describe, show
+    from protomark.metadata import command_metadata
 
     check_outputs(output, json_file)
+    texts = command_metadata(frame, metadata or [])
     build_file(
         tracks,
         output,
@@ -315,6 +339,8 @@ def build(
         look_bits=look_bits,
         prototypes=prototypes,
         index=index,
+        metadata=texts,
+        position_bits=position_bits,
     )
     facts = describe(output)
     _write_json(json_file, facts)
@@ -446,6 +472,76 @@ def map_(
 
 
 @app.command()
+def join(
+    maps: Annotated[
+        list[Path],
+        typer.Argument(metavar="MAP", help="Open maps of the same encoder, dim and look bits."),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
+    renumber: Annotated[
+        bool,
+        typer.Option(
+            "--renumber",
+            help="The maps have no landmark in common, whatever the ids say: those of each further "
+            "map get new ids, above all before it.",
+        ),
+    ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the facts to this file.")
+    ] = None,
+) -> None:
+    """Join maps that were built apart, exactly as if they had been one all along.
+
+    Landmarks of one id are one landmark, and their observations are summed; the number of them is
+    printed, as ids may be equal by accident. docs/sharing.md says more.
+    """
+    from protomark.evaluation.command import check_outputs
+    from protomark.join import join_files, show
+
+    check_outputs(output, json_file)
+    facts = join_files(maps, output, renumber)
+    _write_json(json_file, facts)
+    show(facts)
+
+
+@app.command()
+def split(
+    file: Annotated[Path, typer.Argument(metavar="MAP", help="An open map.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the parts.")],
+    ids: Annotated[
+        str,
+        typer.Option(help="Ids at which a part begins, ascending, for example 100000,200000."),
+    ] = "",
+    parts: Annotated[
+        int | None, typer.Option(min=1, help="Number of parts by id, of as many landmarks each.")
+    ] = None,
+    cell_size: Annotated[
+        float | None,
+        typer.Option(
+            help="Edge of the cubes into which space is cut, in the unit of the positions; "
+            "landmarks without a position are a part of their own."
+        ),
+    ] = None,
+    sealed: Annotated[bool, typer.Option("--sealed", help="Seal the parts.")] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the facts to this file.")
+    ] = None,
+) -> None:
+    """Split a map by id or by space, for maps that are served in parts.
+
+    The parts have no index. `protomark join` makes the same map of them again.
+    """
+    from protomark.evaluation.command import check_outputs
+    from protomark.split import show, split_file
+
+    check_outputs(json_file)
+    boundaries = list(_numbers("--ids", ids)) or None
+    facts = split_file(file, output, boundaries, parts, cell_size, sealed)
+    _write_json(json_file, facts)
+    show(facts)
+
+
+@app.command()
 def info(
     file: Annotated[Path, typer.Argument(help="A map, an encoder or a tracks file.")],
     verify: Annotated[
@@ -457,12 +553,14 @@ def info(
 ) -> None:
     """Say what a file holds."""
     from protomark import verify_file
+    from protomark.console import progress_console
     from protomark.info import describe, show
 
-    facts = describe(file)
-    if verify and facts["kind"] != "tracks":
-        verify_file(file)
-        facts["checksums"] = "all right"
+    with progress_console.status(f"Reading {file.name}"):
+        facts = describe(file)
+        if verify and facts["kind"] != "tracks":
+            verify_file(file)
+            facts["checksums"] = "all right"
     _write_json(json_file, facts)
     show(facts)
 
@@ -747,7 +845,7 @@ def bench(
         str,
         typer.Option(
             help="Sections, for example encode,search; of encode, search, hamming, approximate, "
-            "frame, add, growth and large. By default all."
+            "real, frame, add, growth and large. By default all."
         ),
     ] = "",
     full: Annotated[

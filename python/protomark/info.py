@@ -93,31 +93,36 @@ def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]
 
 def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     scene = pm.open(path)
-    ids = scene.ids
-    counts = scene.counts(ids).astype(np.int64)
-    positions = scene.positions(ids)
-    placed = positions[~np.isnan(positions).any(axis=1)]
-    code_bits = scene.code_bits if isinstance(scene, pm.SealedMap) else None
-    matching = matching_bytes(scene) + (8 if "ids" in sections else 0)
+    summary = scene.summary()
+    sealed = scene if isinstance(scene, pm.SealedMap) else None
+    landmarks = max(1, len(scene))
+    ids = sum(sections.get(name, 0) for name in ("ids", "idblocks", "idrests")) / landmarks
+    error = None if sealed is None else sealed.position_error
     look_bits = scene.look_bits if isinstance(scene, pm.PrototypeMap) else 0
     looks = look_bits > 0 or scene.prototype_count != len(scene)
     return {
-        "kind": "open map" if code_bits is None else "sealed map",
+        "kind": "open map" if sealed is None else "sealed map",
         "landmarks": len(scene),
         "prototypes": scene.prototype_count if looks else None,
-        "prototypes_per_landmark": scene.prototype_count / max(1, len(scene)) if looks else None,
+        "prototypes_per_landmark": scene.prototype_count / landmarks if looks else None,
         "look_bits": look_bits or None,
         "dim": scene.dim,
-        "code_bits": code_bits,
+        "code_bits": None if sealed is None else sealed.code_bits,
         "index_cells": scene.index_cells or None,
         "index_bytes_per_landmark": _index_bytes(scene, sections),
-        "observations": int(counts.sum()),
-        "count_histogram": np.bincount(np.minimum(counts, 255)).tolist() if len(counts) else [],
-        "landmarks_with_position": len(placed),
-        "extent": [placed.min(0).tolist(), placed.max(0).tolist()] if len(placed) else None,
-        "bytes_per_landmark_for_matching": None if code_bits is None else matching,
+        "observations": summary["observations"],
+        "count_histogram": np.trim_zeros(summary["count_histogram"], "b").tolist(),
+        "landmarks_with_position": summary["landmarks_with_position"],
+        "position_bits": None if sealed is None else sealed.position_bits or None,
+        "position_error": None if error is None else error.tolist(),
+        "extent": None if summary["extent"] is None else summary["extent"].tolist(),
+        "metadata": dict(scene.metadata),
+        "bytes_per_landmark_for_matching": None if sealed is None else matching_bytes(scene) + ids,
         "bytes": path.stat().st_size,
         "bytes_by_section": sections,
+        "bytes_per_landmark_by_section": {
+            name: size / landmarks for name, size in sections.items()
+        },
         "encoder": _encoder_facts(scene.encoder),
     }
 
@@ -137,21 +142,42 @@ def show(facts: dict[str, Any]) -> None:
     from protomark.console import console
 
     table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")
     for key, value in facts.items():
         if value is None:
             continue
         name = key.replace("_", " ")
         if key == "count_histogram":
             table.add_row("observations a landmark", f"1 {_bars(value)} 16 and more")
+        elif key == "extent":
+            table.add_row(name, " to ".join(_vector(corner) for corner in value))
+        elif key == "position_error":
+            table.add_row(name, _vector(value))
+        elif key == "bytes_by_section":
+            for section, size in value.items():
+                landmark = facts["bytes_per_landmark_by_section"][section]
+                table.add_row(
+                    escape(_text(f"bytes: {section}")), f"{size:,}  {landmark:,.2f} a landmark"
+                )
+        elif key == "bytes_per_landmark_by_section":
+            continue
         elif isinstance(value, dict):
             for inner, v in value.items():
-                table.add_row(f"{name}: {inner.replace('_', ' ')}", escape(_text(v)))
+                table.add_row(escape(_text(f"{name}: {inner.replace('_', ' ')}")), escape(_text(v)))
         else:
             table.add_row(name, escape(_text(value)))
     console.print(table)
 
 
+def _vector(values: list[float]) -> str:
+    return f"({', '.join(f'{v:,.6g}' for v in values)})"
+
+
 def _text(value: Any) -> str:
+    if isinstance(value, str) and not value.isprintable():
+        # A file from a stranger shall not speak to the terminal.
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return str(value)
     return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}"

@@ -5,19 +5,29 @@
 #include <cstdint>
 #include <filesystem>
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <utility>
 #include <vector>
 
 #include "protomark/encoder.h"
+#include "protomark/map_summary.h"
 #include "protomark/matrix_view.h"
+#include "protomark/metadata.h"
 #include "protomark/prototypes.h"
 #include "protomark/search.h"
 
 namespace protomark {
 
 enum class MapKind { open, sealed };
+
+// Throws std::invalid_argument, its text beginning with `map`, unless `encoder`, that of the map,
+// gives the same codes as `expected`: descriptors that were encoded by another mean nothing in it.
+void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::string& map);
+// Throws it unless the encoder takes descriptors of this name ("freak").
+void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
+                       const std::string& map);
 
 // What a map file holds, by its header. Throws FileError where it is no map.
 MapKind map_kind(const std::filesystem::path& path);
@@ -30,9 +40,9 @@ void verify_file(const std::filesystem::path& path);
 
 // A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, prototypes to
 // one of 16), with 4 bits a number dim / 2 + 1 (dimensions padded to a multiple of 8). Where
-// landmarks have several prototypes these take dim or dim / 2 bytes each, and a landmark 2 more. 8
-// more where ids are not 0 ... n - 1, 12 more where landmarks have positions. Reads are safe from
-// any thread.
+// landmarks have several prototypes these take dim or dim / 2 bytes each, and a landmark 2 more. An
+// eighth more where ids are not 0 ... n - 1, and the bits of what is missing between them; 12 or 6
+// more where landmarks have positions. Reads are safe from any thread.
 class SealedMap {
  public:
   // Throws FileError. The large sections are not read; verify_file checks them.
@@ -44,6 +54,7 @@ class SealedMap {
   SealedMap(SealedMap&&) noexcept;
 
   const std::shared_ptr<const Encoder>& encoder() const;
+  const Metadata& metadata() const;
   std::size_t dim() const;
   // Landmarks.
   std::size_t size() const;
@@ -51,6 +62,12 @@ class SealedMap {
   std::size_t prototype_count() const;
   // Bits of a prototype's number: 8, or 4 where it was sealed so.
   int code_bits() const;
+  // Bits of a position's coordinate: 32, 16, or 0 where no landmark has a position.
+  int position_bits() const;
+  // With 16 bits, how far a coordinate may be from what the open map had, along each axis; with 32
+  // they are rounded to floats, relative to the middle of the map.
+  std::optional<Position> position_error() const;
+  // Throws FileError where the file's ids do not ascend, which only this looks at.
   std::vector<std::int64_t> ids() const;
   // Number of cells of the index; 0: there is none.
   std::size_t index_cells() const;
@@ -61,12 +78,14 @@ class SealedMap {
 
   // Throw UnknownLandmark. Counts are at most 255. Prototypes are the rounded ones; with 4 bits,
   // the levels nearest to these. Of a landmark with several they are the mean, each counting alike.
-  // Positions are 32-bit, relative to the middle of the map; NaN where there is none.
+  // Positions are NaN where there is none.
   std::vector<std::uint32_t> counts(std::span<const std::int64_t> landmarks) const;
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
   // The prototypes of one landmark, with an index in no particular order.
   std::vector<std::vector<float>> looks(std::int64_t landmark) const;
   std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
+  // Reads all counts and positions once, and keeps nothing.
+  MapSummary summary() const;
 
   void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
               MatrixView<float> distances) const;

@@ -13,7 +13,9 @@
 #include <vector>
 
 #include "protomark/encoder.h"
+#include "protomark/map_summary.h"
 #include "protomark/matrix_view.h"
+#include "protomark/metadata.h"
 #include "protomark/search.h"
 
 namespace protomark {
@@ -25,6 +27,8 @@ struct Look {
   std::vector<float> mean;
   int count;
 };
+
+struct MapPart;
 
 // A landmark is kept as the integer sum of its codes and their number n, so that its prototype, the
 // mean (Komorowski and Trzcinski, Eq. 1), follows every change without rounding: observations may
@@ -42,7 +46,10 @@ struct Look {
 // Search compares codes with prototypes rounded to int8, halves away from zero.
 //
 // Every function either does all it was asked or throws and changes nothing (memory that runs out
-// aside). Calls from several threads are safe: changes exclude each other and searches.
+// aside). Calls from several threads are safe. Changes exclude each other, and save, seal, split
+// and the map that update reads. A search sees the map between two changes or, of a change of more
+// than 8192 observations or landmarks, between two pieces of that size: it never waits for longer
+// than one of them takes and searches that began before it (docs/sharing.md).
 class PrototypeMap {
  public:
   static constexpr int kMaxCount = 255;
@@ -80,18 +87,39 @@ class PrototypeMap {
   void merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source);
   // Forgets landmarks.
   void discard(std::span<const std::int64_t> landmarks);
-  // Joins another map of the same encoder, dim and look_bits: landmarks of both are summed, the
-  // rest taken over.
-  void update(const PrototypeMap& other);
+  // Joins another map of the same encoder, dim and look_bits, as if its observations had been added
+  // here. Its landmark source[i] is landmark into[i] of this map, known or new; the others keep
+  // their ids, and landmarks of one id are one landmark. Several that become one are summed look by
+  // look, by ascending id there; positions as in merge. Metadata under names that this map lacks is
+  // taken over, and "created" becomes the earlier. The other map does not change. Throws
+  // UnknownLandmark for a source that it does not have, and std::invalid_argument for one that is
+  // named twice and for negative ids.
+  void update(const PrototypeMap& other, std::span<const std::int64_t> into = {},
+              std::span<const std::int64_t> source = {});
+
+  // Parts of this map, with all that they know of their landmarks, but without an index. A map of
+  // the same dim and look_bits that is updated with all of them equals this one without its index.
+  //
+  // By id: landmarks below boundaries[0], from there to below boundaries[1] and so on, one part
+  // more than boundaries, which ascend. Throws std::invalid_argument where they do not.
+  std::vector<PrototypeMap> split(std::span<const std::int64_t> boundaries) const;
+  // By space: a part for each cube of this edge that has landmarks, by ascending cell, and at last
+  // one of the landmarks without a position, where there are any. Throws std::invalid_argument for
+  // an edge that is not above 0 or is too small for the map's extent.
+  std::vector<MapPart> split(double cell_size) const;
 
   // World coordinates. Finite; NaN in all three takes a position away.
   void set_positions(std::span<const std::int64_t> landmarks, std::span<const Position> positions);
   // NaN where there is none.
   std::vector<Position> positions(std::span<const std::int64_t> landmarks) const;
+  // What the map says of itself; a new map says nothing. Throws std::invalid_argument (metadata.h).
+  Metadata metadata() const;
+  void set_metadata(Metadata metadata);
   // Observations of each landmark, over all its looks.
   std::vector<std::uint32_t> counts(std::span<const std::int64_t> landmarks) const;
   // Means over all looks, (landmarks x dim), in code units.
   void prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const;
+  MapSummary summary() const;
   // The looks of one landmark, by ascending sign bits.
   std::vector<Look> looks(std::int64_t landmark) const;
 
@@ -126,14 +154,19 @@ class PrototypeMap {
   // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
   // average over the map, at least 1: looks of a landmark are joined, those first whose joining
   // adds least to the squared distances of all observations to their prototypes (Ward's criterion),
-  // until the map fits. One landmark keeps at most 255 looks. An index goes along. Throws
-  // FileError, and std::invalid_argument for other `bits` and `prototypes` and for positions
-  // further than 3.4e38 from their middle.
+  // until the map fits. One landmark keeps at most 255 looks. Positions have 32 bits a coordinate,
+  // as floats relative to their middle, or 16, as whole steps along each axis of the box around
+  // them, 65534 from end to end: half a step is the largest error. An index and metadata go along.
+  // Throws FileError, and std::invalid_argument for other `bits`, `prototypes` and `position_bits`
+  // and for positions further than 3.4e38 from their middle.
   void seal(const std::filesystem::path& path, int bits = 8,
-            std::optional<double> prototypes = std::nullopt) const;
+            std::optional<double> prototypes = std::nullopt, int position_bits = 32) const;
 
  private:
   struct Store;
+
+  // A map of some of the landmarks, by number.
+  PrototypeMap part(std::span<const std::uint32_t> landmarks) const;
 
   std::shared_ptr<const Encoder> encoder_;
   std::size_t dim_;
@@ -141,6 +174,13 @@ class PrototypeMap {
 
  public:
   ~PrototypeMap();
+};
+
+// Landmarks of one cube of space.
+struct MapPart {
+  // Coordinate i of a position is in [cell[i], cell[i] + 1) * cell_size; none: it has no position.
+  std::optional<std::array<std::int64_t, 3>> cell;
+  PrototypeMap map;
 };
 
 }  // namespace protomark

@@ -7,7 +7,17 @@ from pathlib import Path
 
 from protomark.bench.race import Pace
 
-SECTIONS = ("encode", "search", "hamming", "approximate", "frame", "add", "growth", "large")
+SECTIONS = (
+    "encode",
+    "search",
+    "hamming",
+    "approximate",
+    "real",
+    "frame",
+    "add",
+    "growth",
+    "large",
+)
 
 
 @dataclass(frozen=True)

@@ -202,9 +202,7 @@ def _take_over(
             params = tuple(float(p) for p in camera.params)
             if np.isfinite(params).all() and camera.mean_focal_length() > 0:
                 ours = structure.cameras[camera_id]
-                structure.set_camera(
-                    camera_id, Camera(ours.model, ours.width, ours.height, params)
-                )
+                structure.set_camera(camera_id, Camera(ours.model, ours.width, ours.height, params))
 
 
 def _carry(structure: Structure, ids: Ids, before: dict[int, Array]) -> None:

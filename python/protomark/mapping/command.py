@@ -81,13 +81,18 @@ def make_map(request: Request) -> dict[str, Any]:
         Interrupted: Ctrl-C was pressed; the map so far is written, and `resume` goes on with it.
         FileNotFoundError, FileExistsError, ValueError: what is asked for cannot be done.
     """
+    if request.view:
+        from protomark.mapping.view import find_rerun
+
+        find_rerun()
     source = open_source(request.images, request.every)
     _check_output(request)
     poses = read_poses(request.poses) if request.poses else None
-    mapper, cursor, prefix = _begin(request, source, poses)
+    mapper, cursor, prefix, inputs = _begin(request, source, poses)
     request.output.mkdir(parents=True, exist_ok=True)
     view = _view(request)
-    facts = {"input": source.path.name, "prefix": prefix}
+    facts = {"input": source.path.name, "prefix": prefix, "inputs": inputs}
+    inputs[str(source.path.resolve())] = prefix
     stopped = _frames(request, mapper, source, poses, cursor, facts, view)
     if not stopped:
         _finish(mapper, source, prefix)
@@ -132,8 +137,8 @@ def _check_output(request: Request) -> None:
 
 def _begin(
     request: Request, source: Folder | Video, poses: GivenPoses | None
-) -> tuple[Mapper, int, str]:
-    """The mapper, the place in the source to go on at, and what comes before names."""
+) -> tuple[Mapper, int, str, dict[str, str]]:
+    """The mapper, the place to go on at, what comes before names, and of earlier inputs' names."""
     scene = request.output
     size = source.size()
     camera = None
@@ -148,21 +153,10 @@ def _begin(
                 f"{scene}: the interrupted map was of {facts.get('input')}, "
                 f"not of {source.path.name}"
             )
-        return mapper, int(facts["cursor"]), str(facts["prefix"])
+        return mapper, int(facts["cursor"]), str(facts["prefix"]), facts["inputs"]
     if request.extend:
-        mapper, _ = load_state(scene, request.threads, camera)
-        known = mapper.history.entries
-        names = source.names if isinstance(source, Folder) else [p.name for p in source.pictures()]
-        prefix = ""
-        if any(name in known for name in names):
-            prefix = f"{source.path.resolve().parent.name}-{source.path.name}/"
-        double = [n for n in names if prefix + n in known]
-        if double:
-            raise ValueError(
-                f"{scene}: {len(double)} of these frames are in this map already, such as "
-                f"{double[0]}; was it extended with them before?"
-            )
-        return mapper, 0, prefix
+        mapper, facts = load_state(scene, request.threads, camera)
+        return mapper, 0, _prefix(mapper, source, facts), facts["inputs"]
     settings = request.settings
     if poses is not None:
         settings = replace(settings, fixed_poses=True)
@@ -179,7 +173,28 @@ def _begin(
         )
     if request.force:
         shutil.rmtree(scene / CHECKPOINT, ignore_errors=True)
-    return Mapper(settings, camera, request.threads), 0, ""
+    return Mapper(settings, camera, request.threads), 0, "", {}
+
+
+def _prefix(mapper: Mapper, source: Folder | Video, facts: dict[str, Any]) -> str:
+    """What comes before the names of new frames, so that they are no names of old ones.
+
+    A folder that the map was made from before may have grown: its old images are passed over.
+
+    Raises:
+        ValueError: no frame is new.
+    """
+    inputs: dict[str, str] = facts.get("inputs", {})
+    here = str(source.path.resolve())
+    known = mapper.history.entries
+    if here in inputs:
+        prefix = inputs[here]
+        names = source.names if isinstance(source, Folder) else [p.name for p in source.pictures()]
+        if all(prefix + name in known for name in names):
+            raise ValueError(f"{source.path}: all its {len(names)} frames are in this map already")
+        return prefix
+    names = [source.path.name, *(f"{source.path.name}-{i}" for i in range(2, 1000))]
+    return next(f"{n}/" for n in names if not any(k.startswith(f"{n}/") for k in known))
 
 
 def _view(request: Request) -> View | None:
@@ -214,7 +229,8 @@ def _frames(
     with progress_bar() as bar, _stop_on_interrupt() as stop:
         task = bar.add_task("map", total=len(source), completed=cursor)
         for picture in pictures:
-            mapper.add(picture)
+            if picture.name not in mapper.history.entries:
+                mapper.add(picture)
             cursor = picture.index + 1
             if view is not None:
                 view.show(mapper, picture)
@@ -340,5 +356,3 @@ def explain_interruption(scene: Path) -> None:
         highlight=False,
         soft_wrap=True,
     )
-
-

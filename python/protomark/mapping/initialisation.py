@@ -20,9 +20,9 @@ _MIN_MATCHES = 60
 # Median angle between the two rays of a match, degrees.
 _MIN_PARALLAX = 2.0
 # Where this share of matches is explained by a turn on the spot, there is no parallax.
-_MAX_TURNED = 0.5
+_MAX_TURNED = 0.7
 # Share of the landmarks that other frames see which must agree with a pose of that frame, within
-# half the largest error; and the lead over any other relative pose.
+# three quarters of the largest error; and the lead over any other relative pose.
 _MIN_SUPPORT = 0.7
 _LEAD = 1.05
 _WITNESSES = 4
@@ -106,7 +106,7 @@ class Initialiser:
             return []
         ray_a, ray_b = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
         pose = np.asarray(found.Rt, np.float64)
-        limit = 2 * self.max_error / focal
+        limit = self.max_error / focal
         if _turned(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_TURNED:
             return []
         plane, facts = poselib.estimate_homography(
@@ -173,7 +173,7 @@ class Initialiser:
         points = np.full((len(one.keypoints), 3), np.nan)
         at = rows[good, 0]
         points[at] = np.column_stack([one.rays[at], np.ones(len(at))]) * depth[good, None]
-        limit = 0.5 * self.max_error
+        limit = 0.75 * self.max_error
         fit, fitting, total = 0.0, 0, 0
         for witness, pairs in witnesses:
             known = np.isfinite(points[pairs[:, 0], 0])

@@ -18,6 +18,8 @@ _MIN_INLIERS = 30
 # If what the frame sees is off by less than this many times the largest error under the pose that
 # the old landmarks give, there is no drift to take back.
 _DRIFT = 3.0
+# Frames that follow each other in the map, but not within this many in the input, are no run.
+_GAP = 3
 
 
 def revisit(
@@ -36,15 +38,14 @@ def revisit(
     keyframes = structure.keyframes()
     for i in keyframes[-RECENT:]:
         recent[structure.frames[i].seen] = True
-    if recent.sum() == len(structure.ids):
-        return 0, False
+    old = structure.ids
+    old = old[~recent[old]]
     frame = structure.frames[newest]
-    found = tracker.relocalize(frame, ~recent)
+    # Among old landmarks alone: beside their own doubles they would not pass the ratio test.
+    found = tracker.relocalize(frame, old)
     if found is None or len(found.matches) < _MIN_INLIERS:
         return 0, False
     matches = found.matches
-    old = np.zeros(len(structure.positions), bool)
-    old[matches.ids] = True
     drift = _drift(structure, frame, found.pose) > _DRIFT * structure.tolerance(
         frame.camera_id, max_error
     )
@@ -82,7 +83,7 @@ def _correct(structure: Structure, newest: int, pose: Array, rows: Ids, ids: Ids
     turn = cv2.Rodrigues(rotation)[0][:, 0]
     before, after = centre(frame.pose), centre(pose)
     scale = _scale(structure, frame, pose, rows, ids)
-    start = _last_witness(structure, newest, ids)
+    start = max(_last_witness(structure, newest, ids), _run_start(structure, newest))
     place = np.arange(len(structure.frames))
     shares = np.clip((place - start) / max(newest - start, 1), 0, 1)
     first = np.full(len(structure.positions), len(structure.frames))
@@ -95,9 +96,7 @@ def _correct(structure: Structure, newest: int, pose: Array, rows: Ids, ids: Ids
         part, grown = cv2.Rodrigues(share * turn)[0], scale**share
         shift = before + share * (after - before)
         mine = np.flatnonzero((first == i) & structure.alive)
-        structure.positions[mine] = (
-            grown * (structure.positions[mine] - before) @ part.T + shift
-        )
+        structure.positions[mine] = grown * (structure.positions[mine] - before) @ part.T + shift
         center = grown * part @ (centre(one.pose) - before) + shift
         turned = one.pose[:, :3] @ part.T
         one.pose = np.column_stack([turned, -turned @ center])
@@ -122,3 +121,12 @@ def _last_witness(structure: Structure, newest: int, ids: Ids) -> int:
     counts = [int(wanted[frame.seen].sum()) for frame in structure.frames[:newest]]
     many = np.flatnonzero(np.array(counts) >= max(1, max(counts) // 2))
     return int(many[-1])
+
+
+def _run_start(structure: Structure, newest: int) -> int:
+    """Where the unbroken run of frames that ends with the newest one begins."""
+    frames = structure.frames
+    start = newest
+    while start > 0 and abs(frames[start].index - frames[start - 1].index) <= _GAP:
+        start -= 1
+    return start

@@ -81,6 +81,7 @@ class Mapper:
         self.structure.cameras[1] = camera
         self.next_global = _FIRST_GLOBAL
         self.lost_in_row = 0
+        self.looking_again = False
         self._extractor = Extractor(settings.descriptor, settings.max_keypoints)
         self._start_over()
 
@@ -297,9 +298,7 @@ class Mapper:
         s = self.settings
         with self.clock.stage("triangulate"):
             window = [i for i in self._window() if i != place]
-            same = triangulate(
-                self.structure, self.memory, place, window, s.max_error, s.min_angle
-            )
+            same = triangulate(self.structure, self.memory, place, window, s.max_error, s.min_angle)
             merge(self.structure, self.memory, same, s.max_error)
 
     def _cull(self, frames: list[int]) -> None:
@@ -321,7 +320,8 @@ class Mapper:
         for i in self._window()[: -self.settings.window]:
             self.structure.frames[i].forget()
         keyframes = len(self.structure.keyframes())
-        if not self.settings.fixed_poses and keyframes % _LOOP_EVERY == 0:
+        often = 1 if self.looking_again else _LOOP_EVERY
+        if not self.settings.fixed_poses and keyframes % often == 0:
             self._close_loop(place)
         if keyframes >= self.next_global:
             self.next_global = int(keyframes * _GROWTH) + 1
@@ -394,13 +394,14 @@ class Mapper:
         if self.structure.frames:
             self._adjust_all(2)
         for frame in self.structure.frames:
-            if frame.descriptors is not None:
-                frame.forget()
+            frame.descriptors = frame.encoded = None
         # The window is gone: what was never confirmed goes now.
         with self.clock.stage("adjust"):
             culling.discard_weak(
                 self.structure, self.memory, self.structure.ids, self.settings.min_angle
             )
+        for frame in self.structure.frames:
+            frame.forget()
         later = self.clock.lap()
         for name, seconds in later.items():
             self.history.later[name] = self.history.later.get(name, 0.0) + seconds
@@ -411,6 +412,7 @@ class Mapper:
         done: Callable[[int, int], None],
     ) -> None:
         """Backward first: a frame that was not found yet often leads to one that was."""
+        self.looking_again = True
         fruitless = 0
         backward = True
         while fruitless < 2:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # Rows that are no longer anyone's are dropped when they are this share of all.
 _DEAD_SHARE = 0.25
+_CHUNK = 256
 _SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
@@ -53,9 +54,15 @@ class Memory(ABC):
 
     @abstractmethod
     def search(
-        self, encoded: NDArray[Any], threads: int = 1
+        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The two nearest landmarks of each, exactly: ids (q, 2), -1 for none, and distances."""
+        """The two nearest landmarks of each, exactly: ids (q, 2), -1 for none, and distances.
+
+        Args:
+            encoded: (q, width).
+            threads: threads to search on; the result is the same.
+            among: landmarks to search, ascending; None: all.
+        """
 
     @abstractmethod
     def distances(
@@ -104,7 +111,7 @@ class Prototypes(Memory):
         self.map.add_codes(ids, encoded)
 
     def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`; a landmark that was halved at 255 observations may keep its share."""
+        """See `Memory.remove`; a landmark halved at 255 observations may keep its share."""
         try:
             self.map.remove_codes(ids, encoded)
         except ValueError:
@@ -121,10 +128,28 @@ class Prototypes(Memory):
         self.map.discard(ids)
 
     def search(
-        self, encoded: NDArray[Any], threads: int = 1
+        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Memory.search`."""
-        return self.map.search_codes(encoded, k=2, threads=threads)
+        if among is None:
+            return self.map.search_codes(encoded, k=2, threads=threads)
+        # Sums of integers far below 2^24: exact in float32.
+        codes, places = encoded.astype(np.float32), self._rounded(among)
+        ids = np.full((len(codes), 2), -1, np.int64)
+        distances = np.full((len(codes), 2), np.inf, np.float32)
+        if not len(among):
+            return ids, distances
+        lengths = (places * places).sum(1)
+        for at in range(0, len(codes), _CHUNK):
+            some = codes[at : at + _CHUNK]
+            squares = (some * some).sum(1)[:, None] + lengths - 2 * some @ places.T
+            for k in range(min(2, len(among))):
+                best = np.argmin(squares, axis=1)
+                rows = np.arange(len(some))
+                ids[at : at + _CHUNK, k] = among[best]
+                distances[at : at + _CHUNK, k] = np.sqrt(squares[rows, best])
+                squares[rows, best] = np.inf
+        return ids, distances
 
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
@@ -133,12 +158,17 @@ class Prototypes(Memory):
         if not len(rows):
             return np.zeros(0, np.float32)
         known, inverse = np.unique(ids, return_inverse=True)
-        difference = self.map.prototype(known)[inverse] - encoded[rows]
+        difference = self._rounded(known)[inverse] - encoded[rows]
         return np.sqrt(np.einsum("pd,pd->p", difference, difference), dtype=np.float32)
 
     def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """See `Memory.known`."""
         return np.isin(ids, self.map.ids)
+
+    def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Prototypes as search compares them: to integers, halves away from zero."""
+        means = self.map.prototype(ids)
+        return np.sign(means) * np.floor(np.abs(means) + np.float32(0.5))
 
     @property
     def bytes(self) -> int:
@@ -217,10 +247,13 @@ class Descriptors(Memory):
         return self._sorted
 
     def search(
-        self, encoded: NDArray[Any], threads: int = 1
+        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Memory.search`."""
         owners, descriptors = self.table()
+        if among is not None:
+            chosen = np.isin(owners, among)
+            owners, descriptors = owners[chosen], descriptors[chosen]
         ids, distances = pm.hamming_search(
             encoded, descriptors, k=2, landmarks=owners, threads=threads
         )

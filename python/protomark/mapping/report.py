@@ -87,7 +87,7 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
             "memory for matching",
             f"{facts['memory']}: {facts['memory_bytes']:,} bytes, "
             f"{facts['bytes_per_landmark']:.0f} a landmark; all {facts['descriptor']} descriptors "
-            f"of these observations: {facts['descriptor_bytes']:,} bytes, {ratio:.1f} times as many",
+            f"of these observations: {facts['descriptor_bytes']:,} bytes, {ratio:.1f} times that",
         ),
         ("camera", f"{camera['model']}, {camera['width']}x{camera['height']}: {params}"),
         (
@@ -149,7 +149,13 @@ def _overview(mapper: Mapper) -> Figure:
     path = centre(poses) @ plane.T
     if len(points):
         shown = axes.scatter(
-            *points.T, s=2, c=np.minimum(counts, 20), cmap="viridis", linewidths=0, rasterized=True
+            points[:, 0],
+            points[:, 1],
+            s=2,
+            c=np.minimum(counts, 20),
+            cmap="viridis",
+            linewidths=0,
+            rasterized=True,
         )
         figure.colorbar(shown, ax=axes, label="observations (20 and more: yellow)")
         low = np.minimum(np.quantile(points, 0.03, axis=0), path.min(0))

@@ -91,7 +91,7 @@ class Video:
         wanted = [p.index for p in self._forward(start, only, decode=False)]
         for last in range(len(wanted), 0, -_CHUNK):
             chunk = set(wanted[max(0, last - _CHUNK) : last])
-            yield from [p for p in self._forward(start, only, chunk)][::-1]
+            yield from reversed(list(self._forward(start, only, chunk)))
 
     def _forward(
         self,
@@ -182,12 +182,12 @@ def _open_video(path: Path) -> Any:
     import cv2
 
     # OpenCV and FFmpeg print what they think of a broken file; our sentence says it.
-    level = cv2.getLogLevel()  # type: ignore[attr-defined]
-    cv2.setLogLevel(0)  # type: ignore[attr-defined]
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
     try:
         video = cv2.VideoCapture(str(path))
     finally:
-        cv2.setLogLevel(level)  # type: ignore[attr-defined]
+        cv2.utils.logging.setLogLevel(level)
     if not video.isOpened():
         raise ValueError(
             f"{path}: not a video that OpenCV can decode; convert it, for example with "

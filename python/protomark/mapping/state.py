@@ -53,6 +53,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
 
     structure, waiting = mapper.structure, mapper.initialiser.waiting
     frames = structure.frames
+    every: list[Frame | Sighting] = [*frames, *waiting]
     kept = [f.descriptors for f in frames if f.descriptors is not None]
     kept += [s.descriptors for s in waiting]
     width = mapper.width
@@ -62,10 +63,8 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         "distances": structure.distances,
         "born": structure.born,
         "poses": np.array([f.pose for f in frames]).reshape(-1, 3, 4),
-        "offsets": np.cumsum([0, *(len(f.keypoints) for f in [*frames, *waiting])]),
-        "keypoints": np.concatenate(
-            [np.zeros((0, 2), np.float32), *(f.keypoints for f in [*frames, *waiting])]
-        ),
+        "offsets": np.cumsum([0, *(len(f.keypoints) for f in every)]),
+        "keypoints": np.concatenate([np.zeros((0, 2), np.float32), *(f.keypoints for f in every)]),
         "landmarks": np.concatenate([np.zeros(0, np.int64), *(f.landmarks for f in frames)]),
         "descriptors": np.concatenate([np.zeros((0, width), np.uint8), *kept]),
         **mapper.memory.arrays(),
@@ -153,7 +152,11 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 def _restore(mapper: Mapper, arrays: dict[str, NDArray[Any]], told: dict[str, Any]) -> None:
     structure = mapper.structure
     many = len(arrays["positions"])
-    shapes = {"positions": (many, 3), "directions": (many, 3), "distances": (many, 2)}
+    shapes: dict[str, tuple[int, ...]] = {
+        "positions": (many, 3),
+        "directions": (many, 3),
+        "distances": (many, 2),
+    }
     shapes |= {"born": (many,), "poses": (len(told["frames"]), 3, 4)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:

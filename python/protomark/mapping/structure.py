@@ -21,6 +21,8 @@ Ids = NDArray[np.int64]
 # from, and at distances changed by at most this factor: descriptors do not bear more.
 _MAX_VIEWING_COSINE = np.cos(np.radians(60))
 _MAX_SCALE_CHANGE = 2.0
+# Keypoints are not better than this, however small the image.
+_MIN_PIXELS = 2.5
 
 
 @dataclass
@@ -138,9 +140,9 @@ class Structure:
         return focal_length(self.cameras[camera_id])
 
     def tolerance(self, camera_id: int, share: float) -> float:
-        """A share of the longer side of a camera's images, in pixels."""
+        """A share of the longer side of a camera's images, in pixels, at least `_MIN_PIXELS`."""
         camera = self.cameras[camera_id]
-        return share * max(camera.width, camera.height)
+        return max(share * max(camera.width, camera.height), _MIN_PIXELS)
 
     def keyframes(self) -> list[int]:
         """Places of the keyframes in the list of frames."""
@@ -203,9 +205,7 @@ class Structure:
         toward = centre(pose) - at
         distance = np.linalg.norm(toward, axis=1)
         mean = self.directions[ids]
-        cosine = (toward * mean).sum(1) / np.maximum(
-            distance * np.linalg.norm(mean, axis=1), 1e-12
-        )
+        cosine = (toward * mean).sum(1) / np.maximum(distance * np.linalg.norm(mean, axis=1), 1e-12)
         near, far = self.distances[ids].T
         fits = cosine > _MAX_VIEWING_COSINE
         fits &= (distance * _MAX_SCALE_CHANGE > near) & (distance < far * _MAX_SCALE_CHANGE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from protomark.mapping.memory import Memory
 from protomark.mapping.nearby import near_pairs
 from protomark.mapping.pose import absolute_pose, refine_pose
-from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Ids, Structure
 from protomark.mapping.thresholds import thresholds
 
@@ -44,6 +44,22 @@ class Matches:
         return Matches(self.rows[keep], self.ids[keep])
 
 
+class Query(Protocol):
+    """What a frame that looks for its pose must tell: a `Sighting`, or a `Frame` of the window."""
+
+    @property
+    def camera_id(self) -> int:
+        """Its camera."""
+
+    @property
+    def keypoints(self) -> NDArray[np.float32]:
+        """(n, 2) pixels."""
+
+    @property
+    def encoded(self) -> Any:
+        """(n, width), descriptors as the memory compares them."""
+
+
 @dataclass
 class Tracked:
     """A pose (3, 4) and the matches that agree with it."""
@@ -75,24 +91,21 @@ class Tracker:
         self.max_error, self.min_inliers, self.threads = max_error, min_inliers, threads
         self.bounds = thresholds(memory)
 
-    def track(self, query: Sighting, predicted: Array) -> Tracked | None:
+    def track(self, query: Query, predicted: Array) -> Tracked | None:
         """The pose of a frame that should be near a predicted one."""
         found = self._solve(query, self.guided(query, predicted, _PREDICTED_RADIUS))
         return self.settle(query, found.pose) if found else None
 
-    def relocalize(self, query: Sighting, allowed: NDArray[np.bool_] | None = None) -> Tracked | None:
+    def relocalize(self, query: Query, among: Ids | None = None) -> Tracked | None:
         """The pose of a frame that may be anywhere, by prototypes of the whole map alone.
 
         Args:
             query: the frame.
-            allowed: (l,) bool, landmarks whose matches count; None: all.
+            among: landmarks to search, ascending; None: all.
         """
-        matches = self.search(query)
-        if allowed is not None:
-            matches = matches.where(allowed[matches.ids])
-        return self._solve(query, matches)
+        return self._solve(query, self.search(query, among))
 
-    def settle(self, query: Sighting, pose: Array) -> Tracked | None:
+    def settle(self, query: Query, pose: Array) -> Tracked | None:
         """From a rough pose to all that the frame sees, and to the pose that they give."""
         matches = self.guided(query, pose, _FOUND_RADIUS)
         for _ in range(2):
@@ -103,16 +116,16 @@ class Tracker:
             return None
         return Tracked(pose, matches.where(inliers))
 
-    def search(self, query: Sighting) -> Matches:
+    def search(self, query: Query, among: Ids | None = None) -> Matches:
         """Nearest landmark of each keypoint in the whole map, under the ratio test."""
-        ids, distances = self.memory.search(query.encoded, self.threads)
+        ids, distances = self.memory.search(query.encoded, self.threads, among)
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
         rows = np.flatnonzero((ids[:, 0] >= 0) & (ratio < self.bounds.ratio))
         rows = rows[np.lexsort((distances[rows, 0], ratio[rows]))]
         return _one_each(rows, ids[rows, 0])
 
-    def guided(self, query: Sighting, pose: Array, radius: float) -> Matches:
+    def guided(self, query: Query, pose: Array, radius: float) -> Matches:
         """Nearest landmark of each keypoint among those that project within `radius` of it."""
         structure = self.structure
         pixels = structure.tolerance(query.camera_id, radius)
@@ -138,19 +151,19 @@ class Tracker:
         order = np.lexsort((rows, first))
         return _one_each(rows[order], ids[best[order]])
 
-    def _typical_distance(self, query: Sighting, ids: Ids) -> float:
+    def _typical_distance(self, query: Query, ids: Ids) -> float:
         many = min(_SAMPLE, len(query.encoded) * len(ids))
         pick = np.arange(many) * 7919
         rows, others = pick % len(query.encoded), ids[pick % len(ids)]
         return float(np.median(self.memory.distances(query.encoded, rows, others)))
 
-    def _solve(self, query: Sighting, matches: Matches) -> Tracked | None:
+    def _solve(self, query: Query, matches: Matches) -> Tracked | None:
         if len(matches) < self.min_inliers:
             return None
         camera = self.structure.cameras[query.camera_id]
         found = absolute_pose(
             camera,
-            query.keypoints[matches.rows],
+            query.keypoints[matches.rows].astype(np.float64),
             self.structure.positions[matches.ids],
             self.structure.tolerance(query.camera_id, self.max_error),
         )
@@ -159,7 +172,7 @@ class Tracker:
         return Tracked(found[0], matches.where(found[1]))
 
     def _refine(
-        self, query: Sighting, matches: Matches, pose: Array
+        self, query: Query, matches: Matches, pose: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
         return refine_pose(
             self.structure.cameras[query.camera_id],

@@ -16,24 +16,30 @@ _MAP_EVERY = 5
 _MOST_OBSERVATIONS = 20
 
 
+def find_rerun() -> Any:
+    """Rerun's module.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    try:
+        import rerun
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "--view needs the Rerun SDK, which is not installed: pip install protomark[view]"
+        ) from None
+    return rerun
+
+
 class View:
     """Writes a .rrd file while a map is made.
 
     Args:
         path: file to write.
-
-    Raises:
-        ModuleNotFoundError: Rerun is not installed.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            import rerun
-        except ModuleNotFoundError:
-            raise ModuleNotFoundError(
-                "--view needs the Rerun SDK, which is not installed: pip install protomark[view]"
-            ) from None
-        self._rr: Any = rerun
+        self._rr = rerun = find_rerun()
         self._recording = rerun.RecordingStream("protomark map")
         self._recording.save(str(path))
         self._recording.log("world", rerun.ViewCoordinates.RDF, static=True)

@@ -212,15 +212,15 @@ class Tracks:
             with safe_open(path, framework="numpy") as file:
                 header = file.metadata() or {}
                 if header.get("format") != FORMAT:
-                    raise ValueError(f"{path}: a safetensors file, but not a Protomark tracks file")
+                    raise ValueError("a safetensors file, but not a Protomark tracks file")
                 if int(header["version"]) > VERSION:
                     raise ValueError(
-                        f"{path}: tracks version {header['version']}, this Protomark reads up to "
+                        f"tracks version {header['version']}, this Protomark reads up to "
                         f"{VERSION}; update it"
                     )
                 missing = set(_ARRAYS) - set(file.keys())
                 if missing:
-                    raise ValueError(f"{path}: tracks file lacks {', '.join(sorted(missing))}")
+                    raise ValueError(f"tracks file lacks {', '.join(sorted(missing))}")
                 arrays = {name: file.get_tensor(name) for name in _ARRAYS}
             tracks = cls(
                 descriptor=header["descriptor"],
@@ -234,6 +234,8 @@ class Tracks:
             raise ValueError(f"{path}: not a tracks file, or a broken one ({error})") from None
         except (KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ValueError(f"{path}: broken tracks file ({error!r})") from None
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
         return tracks
 
 

@@ -78,21 +78,29 @@ class _Entrant:
 
 
 def run(workload: Workload, results: Results, bar: Bar) -> None:
-    """Real landmarks, and grown ones of every size."""
+    """Grown landmarks of every size."""
     settings = workload.settings
-    races = len(settings.approximate) + 1
-    bar.begin("approximate", races * (10 + len(GOALS) * turns(11, settings.pace)))
-    reason = lacks(len(workload.real) * BYTES)
-    if reason:
-        results.skipped.append(f"real landmarks: {reason}")
-    else:
-        _contests(workload, results, bar, _real(workload))
+    _begin(workload, bar, "approximate", len(settings.approximate))
     for n in settings.approximate:
         reason = lacks(n * BYTES)
         if reason:
             results.skipped.append(f"approximate, {n:,} landmarks: {reason}")
             continue
         _contests(workload, results, bar, _grown(workload, n))
+
+
+def run_real(workload: Workload, results: Results, bar: Bar) -> None:
+    """Real landmarks."""
+    _begin(workload, bar, "real", 1)
+    reason = lacks(len(workload.real) * BYTES)
+    if reason:
+        results.skipped.append(f"real landmarks: {reason}")
+    else:
+        _contests(workload, results, bar, _real(workload))
+
+
+def _begin(workload: Workload, bar: Bar, name: str, races: int) -> None:
+    bar.begin(name, races * (10 + len(GOALS) * turns(11, workload.settings.pace)))
 
 
 def _real(workload: Workload) -> _Ground:
