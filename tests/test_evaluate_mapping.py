@@ -55,8 +55,8 @@ def test_one_command_gives_the_report_and_a_second_run_maps_nothing(room, tmp_pa
     for one in runs.values():
         assert one["registered"] == FRAMES - 1
         assert sum(one["not_registered"].values()) == 1
-        # Of a walk of 0.7: a map that is right, not only one that is there.
-        assert one["error"] < 0.02
+        # Of a walk of 0.5: a map that is right, not only one that is there.
+        assert one["error"] < 0.04
         assert sum(one["seconds"].values()) > 0
     ours, theirs = runs["prototypes-32"], runs["traditional"]
     assert ours["memory_bytes"] == 33 * ours["landmarks"] <= ours["peak_bytes"]

@@ -46,7 +46,8 @@ def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
 
     columns = min(count, _COLUMNS)
     rows = -(-count // columns)
-    figure = Figure(figsize=(3.9 * columns, height * rows), layout="constrained")
+    # Wide enough for the legend.
+    figure = Figure(figsize=(max(3.9 * columns, 8), height * rows), layout="constrained")
     return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
 
 
