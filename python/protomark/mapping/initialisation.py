@@ -27,6 +27,7 @@ _MIN_SUPPORT = 0.7
 _LEAD = 1.05
 _WITNESSES = 4
 _MIN_COMMON = 40
+# When more wait, every second one goes; it is looked for at the end.
 _MAX_WAITING = 40
 
 
@@ -66,7 +67,8 @@ class Initialiser:
         """Try the new frame with those that wait, the oldest first; it then waits, too."""
         self.waiting.append(sighting)
         if len(self.waiting) > _MAX_WAITING:
-            del self.waiting[0]
+            # Not the oldest: a slow video needs a long way back.
+            del self.waiting[1:-1:2]
         last = len(self.waiting) - 1
         for first in range(last):
             pose = self._relative_pose(first, last)

@@ -9,12 +9,14 @@ from protomark.evaluation.pose import centre
 from protomark.mapping.memory import Memory
 from protomark.mapping.merging import merge
 from protomark.mapping.structure import Array, Frame, Ids, Structure
-from protomark.mapping.tracking import Tracker
+from protomark.mapping.tracking import Tracked, Tracker
 from protomark.mapping.triangulation import remember
 
 # Landmarks that the last keyframes see are no revisit.
 RECENT = 20
 _MIN_INLIERS = 30
+# Nor is it one if they are few beside what the frame sees as tracked: repeated texture.
+_MIN_SHARE = 0.25
 # If what the frame sees is off by less than this many times the largest error under the pose that
 # the old landmarks give, there is no drift to take back.
 _DRIFT = 3.0
@@ -43,7 +45,12 @@ def revisit(
     frame = structure.frames[newest]
     # Among old landmarks alone: beside their own doubles they would not pass the ratio test.
     found = tracker.relocalize(frame, old)
-    if found is None or len(found.matches) < _MIN_INLIERS:
+    if found is not None:
+        found = tracker.settle(frame, found.pose, old)
+    enough = max(_MIN_INLIERS, _MIN_SHARE * len(frame.seen))
+    if found is None or len(found.matches) < enough:
+        found = _beside(structure, tracker, newest, old)
+    if found is None:
         return 0, False
     matches = found.matches
     drift = _drift(structure, frame, found.pose) > _DRIFT * structure.tolerance(
@@ -58,6 +65,22 @@ def revisit(
     double = (seen >= 0) & (seen != matches.ids)
     pairs = list(zip(seen[double].tolist(), matches.ids[double].tolist(), strict=True))
     return merge(structure, memory, pairs, max_error, check=not drift), drift
+
+
+def _beside(structure: Structure, tracker: Tracker, newest: int, old: Ids) -> Tracked | None:
+    """The pose that the other side of a gap gives, where this frame has reached it."""
+    frame = structure.frames[newest]
+    recent = set(structure.keyframes()[-RECENT:])
+    for place, other in enumerate(structure.frames):
+        if (
+            place not in recent
+            and other.camera_id == frame.camera_id
+            and 0 < abs(other.index - frame.index) <= _GAP
+        ):
+            found = tracker.near(frame, other.pose, old)
+            if found is not None:
+                return tracker.settle(frame, found.pose, old)
+    return None
 
 
 def _drift(structure: Structure, frame: Frame, pose: Array) -> float:

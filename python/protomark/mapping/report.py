@@ -208,7 +208,9 @@ def _quality(mapper: Mapper, facts: dict[str, Any]) -> Figure:
     structure = mapper.structure
     if structure.frames:
         errors = structure.errors(structure.observations(range(len(structure.frames))))
-        middle.hist(errors[np.isfinite(errors)], bins=40, color=OURS)
+        errors = errors[np.isfinite(errors)]
+        if len(errors):
+            middle.hist(errors, bins=40, range=(0, np.quantile(errors, 0.995)), color=OURS)
     style_axes(middle, "pixels", "observations")
     _title(middle, "Reprojection error")
     entries = list(mapper.history.entries.values())

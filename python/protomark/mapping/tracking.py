@@ -105,12 +105,16 @@ class Tracker:
         """
         return self._solve(query, self.search(query, among))
 
-    def settle(self, query: Query, pose: Array) -> Tracked | None:
-        """From a rough pose to all that the frame sees, and to the pose that they give."""
-        matches = self.guided(query, pose, _FOUND_RADIUS)
+    def near(self, query: Query, predicted: Array, among: Ids) -> Tracked | None:
+        """The pose of a frame near a predicted one, by some landmarks only."""
+        return self._solve(query, self.guided(query, predicted, _PREDICTED_RADIUS, among))
+
+    def settle(self, query: Query, pose: Array, among: Ids | None = None) -> Tracked | None:
+        """From a rough pose to all that the frame sees (of some), and to the pose that they give."""
+        matches = self.guided(query, pose, _FOUND_RADIUS, among)
         for _ in range(2):
             pose, inliers = self._refine(query, matches, pose)
-            matches = self.guided(query, pose, self.max_error * 1.5)
+            matches = self.guided(query, pose, self.max_error * 1.5, among)
         pose, inliers = self._refine(query, matches, pose)
         if inliers.sum() < self.min_inliers:
             return None
@@ -125,11 +129,14 @@ class Tracker:
         rows = rows[np.lexsort((distances[rows, 0], ratio[rows]))]
         return _one_each(rows, ids[rows, 0])
 
-    def guided(self, query: Query, pose: Array, radius: float) -> Matches:
+    def guided(self, query: Query, pose: Array, radius: float, among: Ids | None = None) -> Matches:
         """Nearest landmark of each keypoint among those that project within `radius` of it."""
         structure = self.structure
         pixels = structure.tolerance(query.camera_id, radius)
         ids, places = structure.visible(pose, query.camera_id, margin=pixels)
+        if among is not None:
+            chosen = np.isin(ids, among)
+            ids, places = ids[chosen], places[chosen]
         rows, near = near_pairs(query.keypoints.astype(np.float64), places, pixels)
         if not len(rows):
             return Matches(rows, rows)
