@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from protomark.cli import app
 from protomark.evaluation.mapping import pipeline
 from protomark.evaluation.mapping.figures import NAMES
 from protomark.evaluation.mapping.ledger import Ledger
+from protomark.evaluation.mapping.reading import reading
 from protomark.evaluation.mapping.results import Drift, Results, Run, SequenceResult
 from protomark.evaluation.mapping.sequences import error, open_sequence
 from protomark.evaluation.mapping.targets import targets
@@ -209,9 +211,15 @@ def test_targets(ours, met):
         f"{i}": np.column_stack([np.eye(3), [-i, -(i**2), 0.0]]).astype(float) for i in range(20)
     }
     sequence = SequenceResult("a", 20, 20, "as given", 1.0, poses, runs)
-    found = targets(Results([sequence], [], "", [], {}))
+    results = Results([sequence], [], "", [], {})
+    found = targets(results)
     assert [t.met for t in found[:5]] == met
     assert [t.met for t in found[5:]] == [True, None]
+    verdict, *rest = reading(replace(results, targets=found))
+    for target in found[:5]:
+        assert (f"{target.name} (a)" in verdict) is not target.met
+    assert "not measured: localization." in verdict
+    assert f"take {36 / ours[2]:.1f} times the bytes" in "\n".join(rest)
     assert [v.name for v in choose([])] == [
         "traditional",
         "medoid",

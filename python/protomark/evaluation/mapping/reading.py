@@ -81,10 +81,10 @@ def _memory(pairs: _Pairs) -> str:
     if not shares:
         return "**Memory.** No map was made."
     return (
-        f"**Memory.** At the end all descriptors take {min(shares):.1f} to {max(shares):.1f} times "
-        f"the bytes of sealed prototypes ({min(opens):.1f} to {max(opens):.1f} times those of the "
+        f"**Memory.** At the end all descriptors take {_range(shares, 1)} times "
+        f"the bytes of sealed prototypes ({_range(opens, 1)} times those of the "
         "open map that the pipeline itself works on). While mapping, the window of both is counted "
-        f"too, and at the peak the ratio is only {min(peaks):.1f} to {max(peaks):.1f}: the shorter "
+        f"too, and at the peak the ratio is only {_range(peaks, 1)}: the shorter "
         "a sequence, the more the window weighs."
     )
 
@@ -97,16 +97,13 @@ def _time(pairs: _Pairs) -> str:
     search = [t.search_ms / p.search_ms for _, p, t in used if p.search_ms and t.search_ms]
     whole = [p.total / t.total for _, p, t in used]
     text = (
-        f"**Time.** Finding a frame in the map takes {min(match):.2f} to {max(match):.2f} of the "
-        "time with all descriptors; most of it is not comparing but geometry, and the search is "
-        "guided by the predicted pose"
+        f"**Time.** Finding a frame in the map takes {_range(match, 2)} of the "
+        "time with all descriptors; this counts the start of a map, RANSAC and the refinement of "
+        "poses, and most frames are sought near a predicted pose only"
     )
     if search:
-        text += (
-            f". The search of the whole map (a lost frame) is {min(search):.1f} to "
-            f"{max(search):.1f} times as fast"
-        )
-    return text + f". The whole pipeline takes {min(whole):.2f} to {max(whole):.2f} of the time."
+        text += f". The search of the whole map (a lost frame) is {_range(search, 1)} times as fast"
+    return text + f". The whole pipeline takes {_range(whole, 2)} of the time."
 
 
 def _beside_colmap(results: Results) -> str:
@@ -123,7 +120,7 @@ def _beside_colmap(results: Results) -> str:
             errors.append(f"{s.name} {one / other:.1f}")
     text = (
         f"**COLMAP** registers {theirs} frames where prototypes register {ours}, in "
-        f"{min(time):.1f} to {max(time):.1f} times the CPU time"
+        f"{_range(time, 1)} times the CPU time"
     )
     if errors:
         text += (
@@ -161,10 +158,16 @@ def _drift(results: Results) -> str:
     text = (
         f"**Drift.** Not the same bytes: {'; '.join(apart)}"
         if apart
-        else f"**Drift.** All {len(drifts)} maps of prototypes are saved in the very bytes of a "
+        else f"**Drift.** All maps of prototypes ({len(drifts)}) are saved in the very bytes of a "
         "map made at once of the observations that were put into them"
     )
     return text + (
         f". {100 * dropped / max(held, 1):.2f} % of these observations were found wrong "
         "after their descriptors were gone: the geometry has dropped them, the prototypes have not."
     )
+
+
+def _range(values: list[float], digits: int) -> str:
+    """From the least to the largest."""
+    low, high = (f"{f(values):.{digits}f}" for f in (min, max))
+    return low if low == high else f"{low} to {high}"
