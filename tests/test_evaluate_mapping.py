@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import protomark as pm
 from mapping_scene import walk, write_images
 from protomark.cli import app
-from protomark.evaluation.mapping import pipeline
+from protomark.evaluation.mapping import colmap, pipeline
 from protomark.evaluation.mapping.figures import NAMES
 from protomark.evaluation.mapping.ledger import Ledger
 from protomark.evaluation.mapping.reading import reading
@@ -21,7 +21,7 @@ from protomark.evaluation.mapping.results import Drift, Results, Run, SequenceRe
 from protomark.evaluation.mapping.sequences import error, open_sequence
 from protomark.evaluation.mapping.targets import targets
 from protomark.evaluation.mapping.variants import choose
-from tracks_scene import PINHOLE, write_model
+from tracks_scene import DISTORTED, PINHOLE, write_model, write_sequence
 
 # The last but one of the frames shows another room: it is looked at again, and left out.
 FRAMES, STRANGE = 8, 7
@@ -128,6 +128,13 @@ def test_mistakes_are_one_sentence(room, tmp_path, words, message):
     result = run(*words, *(() if "-o" in words else ("-o", tmp_path / "out")))
     assert result.exit_code == 1
     assert re.search(message, str(result.exception))
+
+
+def test_colmap_takes_a_known_camera_with_strong_distortion(tmp_path):
+    sequence = open_sequence(write_sequence(tmp_path / "bent", DISTORTED, count=7))
+    found = colmap.run(sequence, 1)
+    assert found.registered == 7
+    assert error(found.centers, sequence.centers) < 0.02
 
 
 def test_every_nth_image_and_at_most_so_many(room):

@@ -93,7 +93,10 @@ def _mapping_options(threads: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
     options.random_seed = options.mapper.random_seed = 0
-    # The camera is known, as it is to the pipeline.
+    # The camera is known, as it is to the pipeline, whatever its coefficients are: by default
+    # COLMAP takes those above 1 for nonsense and registers nothing.
+    for bounds in (options, options.mapper, options.triangulation):
+        bounds.max_extra_param = 1e12
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
