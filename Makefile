@@ -8,7 +8,8 @@ JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads coverage fuzz torture check format clean
+.PHONY: help demo test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads \
+  sanitize-python-memory sanitize-python-threads coverage fuzz torture check format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make test      run the tests (C++ and Python)"
@@ -48,17 +49,35 @@ test-arm: .venv-test/installed
 	.venv-test/bin/cmake --build build/arm -j$(JOBS)
 	.venv-test/bin/ctest --test-dir build/arm --output-on-failure
 
-# The C++ tests under each set of sanitizers, then the Python tests of the core, in a module that was
-# built with the first one.
+# The C++ tests under each set of sanitizers, then the Python tests of the core, each in a module that
+# was built with it.
 comma := ,
 sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$(1)
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
 CORE_TESTS := $(addprefix tests/test_,encoder.py example_reader.py files.py four_bit_maps.py \
-  hamming.py limits.py looks.py map_file.py mutated_maps.py prototypes.py)
-sanitize: sanitize-memory sanitize-threads .venv-sanitize/installed
-	LD_PRELOAD="$(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)" \
-	ASAN_OPTIONS=detect_leaks=0 .venv-sanitize/bin/python -m pytest -p no:cacheprovider $(CORE_TESTS)
+  hamming.py index.py journal.py limits.py looks.py map_file.py mutated_maps.py prototypes.py \
+  sharing.py)
+sanitize: sanitize-memory sanitize-threads sanitize-python-memory sanitize-python-threads
+
+# Python itself was built without them, so the sanitizer's library has to come first.
+library = $(shell $(CXX) -print-file-name=$(1))
+runtime-memory := libasan.so
+runtime-threads := libtsan.so
+sanitize-python-memory sanitize-python-threads: sanitize-python-%: build/sanitize-python/%/installed
+	LD_PRELOAD="$(call library,$(runtime-$*)) $(call library,libstdc++.so)" \
+	ASAN_OPTIONS=detect_leaks=0 \
+	PYTHONPATH=$(dir $<)packages \
+	  .venv-sanitize/bin/python -m pytest -p no:cacheprovider $(CORE_TESTS)
+
+# Without most of what the package needs: the core's tests do not.
+build/sanitize-python/%/installed: $(SOURCES) .venv-sanitize/tools
+	.venv-sanitize/bin/pip install --quiet -c constraints.txt scikit-build-core nanobind numpy \
+	  safetensors rich typer hypothesis pytest
+	.venv-sanitize/bin/pip install --quiet --upgrade --target $(@D)/packages \
+	  --no-deps --no-build-isolation . -C build-dir=$(@D)/build -C cmake.build-type= \
+	  -C cmake.define.PROTOMARK_BUILD_STUBS=OFF -C cmake.define.CMAKE_CXX_FLAGS="$($*)"
+	touch $@
 
 sanitize-memory sanitize-threads: sanitize-%: .venv-sanitize/tools
 	$(call cmake,.venv-sanitize) -S core -B build/sanitize-$* -DPROTOMARK_BUILD_EXAMPLES=OFF \
@@ -123,16 +142,6 @@ clean:
 .venv-sanitize/tools:
 	test -x .venv-sanitize/bin/python || $(PYTHON) -m venv .venv-sanitize
 	.venv-sanitize/bin/pip install --quiet -c constraints.txt cmake ninja gcovr
-	touch $@
-
-# Without what the package needs beside NumPy: the core's tests do not.
-.venv-sanitize/installed: $(SOURCES) .venv-sanitize/tools
-	.venv-sanitize/bin/pip install --quiet -c constraints.txt scikit-build-core nanobind numpy \
-	  hypothesis pytest
-	# The stub is made by a Python that has not loaded the sanitizer first.
-	ASAN_OPTIONS=detect_leaks=0:verify_asan_link_order=0 .venv-sanitize/bin/pip install --quiet \
-	  --no-deps --no-build-isolation . -C build-dir=build/sanitize-python \
-	  -C cmake.build-type= -C cmake.define.CMAKE_CXX_FLAGS="$(memory)"
 	touch $@
 
 .venv-check/installed: $(SOURCES)

@@ -398,6 +398,22 @@ Returns:
             return std::map<std::string, std::string>(e.info().notes.begin(), e.info().notes.end());
           },
           "Whatever else the model says of itself.")
+      .def(
+          "acceptance",
+          [](nb::object self, nb::object dim) {
+            return nb::module_::import_("protomark.acceptance")
+                .attr("Acceptance")
+                .attr("of")(self, dim);
+          },
+          "dim"_a = nb::none(),
+          nb::sig("def acceptance(self, dim: int | None = None) -> Acceptance"),
+          R"(How likely a match is right, by the distances to the two nearest landmarks.
+
+Args:
+    dim: length of a code, one of `dims`; None: the full length.
+
+Raises:
+    ValueError: the encoder was not calibrated for codes of this length.)")
       .def_prop_ro(
           "layers",
           [](const Encoder& e) {
@@ -443,8 +459,15 @@ Raises:
     ValueError: dim or look_bits is none of these.)");
   bind_reading(map);
   map.def_prop_rw(
-      "metadata", [](const PrototypeMap& m) { return from_metadata(m.metadata()); },
-      [](PrototypeMap& m, nb::object metadata) { m.set_metadata(to_metadata(metadata)); },
+      "metadata",
+      [](const PrototypeMap& m) {
+        return from_metadata(without_gil([&] { return m.metadata(); }));
+      },
+      [](PrototypeMap& m, nb::object metadata) {
+        Metadata texts = to_metadata(metadata);
+        const nb::gil_scoped_release release;
+        m.set_metadata(std::move(texts));
+      },
       nb::for_getter(nb::sig("def metadata(self) -> MappingProxyType[str, str]")),
       nb::for_setter(nb::sig("def metadata(self, metadata: Mapping[str, str], /) -> None")),
       R"(What the map says of itself: texts by name. A view; assign to change it:
@@ -680,9 +703,54 @@ Raises:
            "nearest landmark to a landmark's prototype, itself left out, is in one of them that "
            "often. Measured once, and again when a tenth of the map has changed. Raises ValueError "
            "for another recall, and without an index.")
-      .def("save", &PrototypeMap::save, "path"_a, ReleaseGil(),
-           nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
-           "Write the map, whole or not at all. Raises FileError.")
+      .def(
+          "save", &PrototypeMap::save, "path"_a, ReleaseGil(),
+          nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
+          R"(Write the map, whole or not at all. Onto its own file, where it has a journal: compact.
+
+Raises:
+    FileError: the file cannot be written, or its journal is in use or holds commits, which would be
+        lost.)")
+      .def_prop_ro("has_journal", &PrototypeMap::has_journal, ReleaseGil(),
+                   "Whether the map was opened with a journal, and not closed since.")
+      .def("commit", &PrototypeMap::commit, ReleaseGil(), nb::sig("def commit(self) -> int"),
+           R"(Make all changes up to here last, in the journal beside the map file.
+
+The cost grows with the number of landmarks that changed, not with the map. Once this has returned,
+opening the file gives this map, whatever happens to the process or the power. If it is interrupted,
+opening gives this map or the one of the commit before.
+
+Returns:
+    Bytes written; 0 where nothing has changed.
+
+Raises:
+    FileError: the journal cannot be written, for example on a full disk. The map in memory is as
+        before, and a later commit takes everything.
+    ValueError: the map has no journal (open(path, journal=True)).)")
+      .def(
+          "compact", &PrototypeMap::compact, ReleaseGil(), nb::sig("def compact(self) -> None"),
+          "Write the map file anew, with all changes, and empty the journal. If it is interrupted, "
+          "opening gives this map or the one of the last commit. Raises FileError, and ValueError "
+          "where the map has no journal.")
+      .def("close", &PrototypeMap::close, ReleaseGil(), nb::sig("def close(self) -> None"),
+           "Give the journal back, so that another map can be opened with it; the map stays in "
+           "memory, without a journal. What was not committed is not in the file.")
+      .def(
+          "__enter__", [](PrototypeMap& self) -> PrototypeMap& { return self; },
+          nb::rv_policy::reference, nb::sig("def __enter__(self) -> PrototypeMap"),
+          "The map, to be closed at the end of the block.")
+      .def(
+          "__exit__",
+          [](PrototypeMap& self, nb::object type, nb::object, nb::object) {
+            const nb::gil_scoped_release release;
+            if (self.has_journal() && type.is_none()) self.commit();
+            self.close();
+          },
+          "type"_a.none(), "value"_a.none(), "traceback"_a.none(),
+          nb::sig("def __exit__(self, type: object, value: object, traceback: object) -> None"),
+          "Commit where the block ended without an exception, and close. Where committing fails, "
+          "the map "
+          "stays open, so that one may try again.")
       .def(
           "seal",
           [](const PrototypeMap& self, const Path& path, int bits, std::optional<double> prototypes,
@@ -709,7 +777,8 @@ Args:
         them, 65534 from end to end (position_error).
 
 Raises:
-    FileError: the file cannot be written.
+    FileError: the file cannot be written, or an open map's journal beside it is in use or holds
+        commits, which would be lost.
     ValueError: bits is neither 8 nor 4, prototypes is below 1, position_bits is neither 32 nor 16,
         or positions are further than 3.4e38 from their middle.)")
       .def("__repr__", [](const PrototypeMap& self) {
@@ -819,43 +888,80 @@ Returns:
   m.def("instruction_set", &instruction_set,
         "The instruction set in use, for example avx512; the environment variable PROTOMARK_ISA "
         "chooses another one. All give the same bytes.");
+  const auto check_map = [](const auto& map, const Path& path, const Encoder* encoder,
+                            const std::optional<std::string>& descriptor) {
+    if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
+    if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
+  };
+  // What can commit is an open map, which type checkers are told.
   m.def(
       "open",
-      [](const Path& path, const Encoder* encoder,
-         const std::optional<std::string>& descriptor) -> nb::object {
-        const auto check = [&](const auto& map) {
-          if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
-          if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
-        };
+      [check_map](const Path& path, bool journal, const Encoder* encoder,
+                  const std::optional<std::string>& descriptor) {
+        if (!journal) throw nb::next_overload();
+        PrototypeMap map = without_gil([&] { return PrototypeMap::load(path, true); });
+        check_map(map, path, encoder, descriptor);
+        return map;
+      },
+      "path"_a, nb::kw_only(), "journal"_a, "encoder"_a.none() = nb::none(),
+      "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, journal: Literal[True], "
+              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap"));
+  m.def(
+      "open",
+      [check_map](const Path& path, bool, const Encoder* encoder,
+                  const std::optional<std::string>& descriptor) -> nb::object {
         if (without_gil([&] { return map_kind(path); }) == MapKind::open) {
           PrototypeMap map = without_gil([&] { return PrototypeMap::load(path); });
-          check(map);
+          check_map(map, path, encoder, descriptor);
           return nb::cast(std::move(map));
         }
         SealedMap map = without_gil([&] { return SealedMap(path); });
-        check(map);
+        check_map(map, path, encoder, descriptor);
         return nb::cast(std::move(map));
       },
-      "path"_a, nb::kw_only(), "encoder"_a.none() = nb::none(), "descriptor"_a = nb::none(),
-      nb::sig("def open(path: str | os.PathLike[str], *, encoder: Encoder | None = None, "
-              "descriptor: str | None = None) -> PrototypeMap | SealedMap"),
-      R"(Open a map file: an open map is read, a sealed one mapped.
+      "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),
+      "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, journal: bool = False, "
+              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap | "
+              "SealedMap"),
+      R"(Open a map file: an open map is read, with what was committed to its journal; a sealed one
+is mapped.
 
 A map encodes descriptors itself, with the encoder that it was built with. Where they are encoded
 elsewhere, or come from a detector that the map has not seen, say what you have:
 
 Args:
     path: the map file.
+    journal: the map is the one that may commit to the journal beside the file, which is made where
+        there is none. No other map can be opened so until this one is closed or gone.
     encoder: the map must have been made with this encoder, or one of equal identity.
     descriptor: the map must be one of this descriptor, for example "orb".
 
 Raises:
-    FileError: the file is no map, or broken.
+    FileError: the file is no map, or broken; with journal also where it is sealed, or where another
+        map has the journal.
     ValueError: the map is of another encoder or descriptor.)");
   m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
         nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");
   m.def("verify_file", &verify_file, "path"_a, ReleaseGil(),
         nb::sig("def verify_file(path: str | os.PathLike[str]) -> None"),
-        "Check every checksum of a model or map file. Raises FileError.");
+        "Check every checksum of a model or map file, and of the journal beside it. Raises "
+        "FileError.");
+  m.def(
+      "file_journal",
+      [](const Path& path) -> nb::object {
+        const auto journal = without_gil([&] { return file_journal(path); });
+        if (!journal) return nb::none();
+        nb::dict result;
+        result["commits"] = journal->commits;
+        result["bytes"] = journal->bytes;
+        result["torn_bytes"] = journal->torn_bytes;
+        return result;
+      },
+      "path"_a, nb::sig("def file_journal(path: str | os.PathLike[str]) -> dict[str, int] | None"),
+      "The journal beside a map file: commits since the file was written, bytes, and how many of "
+      "these are of an interrupted commit, which is not there. None: there is no journal. Raises "
+      "FileError.");
 }

@@ -58,8 +58,8 @@ def test_help_lists_the_commands() -> None:
     done = protomark("--help")
     assert done.returncode == 0
     for command in (
-        *("demo", "tracks", "build", "join", "split", "info", "train"),
-        *("evaluate", "reproduce", "bench"),
+        *("demo", "tracks", "build", "join", "split", "info", "localize", "train"),
+        *("calibrate", "evaluate", "reproduce", "bench"),
     ):
         assert command in done.stdout
         assert protomark(command, "--help").returncode == 0

@@ -61,7 +61,12 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
     assert (np.abs(codes.astype(int)) == 127).mean() < 0.01
     assert codes.std() > 15
 
+    # Which matches to accept is fitted at the end, and the card says to what.
+    near, far = encoder.acceptance(8).probability([[20.0, 60.0], [20.0, 21.0]])
+    assert near > far
+
     figures = json.loads((tmp_path / "mine.json").read_text())
+    assert figures["calibrated_on"] == "a, b, unseen"
     (validation,) = figures["figures"]
     assert validation["sequence"] == "unseen"
     assert validation["integer_precision"]["8"] > 0.3
@@ -80,6 +85,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
         "--licence Apache-2.0 --data-licence b=MIT"
     ) in card
     assert f"{validation['integer_precision']['8']:.4f}" in card
+    assert "fitted to a, b, unseen " in card
     assert "![loss and validation precision](mine.png)" in card
     assert str(tmp_path) not in card
 

@@ -70,7 +70,7 @@ Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
   auto& sections = file.sections;
   if (one_in(16)) return mutate_table(bytes);
   if (one_in(16)) file.version = 1 + random() % 3;
-  if (one_in(32)) file.kind = static_cast<FileKind>(1 + random() % 3);
+  if (one_in(32)) file.kind = static_cast<FileKind>(1 + random() % 6);
   if (sections.empty()) return file.serialize();
   auto& [name, content] = sections[random() % sections.size()];
   if (one_in(16)) {
@@ -89,6 +89,62 @@ Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
     mutate(content, most);
   }
   return file.serialize();
+}
+
+// The containers that a journal consists of, and what follows the last whole one.
+std::vector<Content> split(Bytes bytes) {
+  std::vector<Content> result;
+  while (!bytes.empty()) {
+    std::uint64_t size = 0;
+    if (has_container_head(bytes)) std::memcpy(&size, &bytes[16], sizeof(size));
+    if (size == 0 || size > bytes.size()) size = bytes.size();
+    const Bytes part = bytes.first(size);
+    result.emplace_back(part.begin(), part.end());
+    bytes = bytes.subspan(size);
+  }
+  return result;
+}
+
+// Names in a record the one before it.
+void chain(Content& record, std::uint64_t number, const Content& previous) {
+  File file(record);
+  for (auto& [name, content] : file.sections) {
+    if (name != "chain" || content.size() != 16) continue;
+    std::memcpy(content.data(), &number, sizeof(number));
+    std::memcpy(&content[8], &previous[28], sizeof(std::uint32_t));
+  }
+  record = file.serialize();
+}
+
+Content mutate_journal(std::vector<Content> parts, Random& random, std::size_t most) {
+  const auto one_in = [&](unsigned n) { return random() % n == 0; };
+  const auto any = [&] {
+    return parts.begin() + static_cast<std::ptrdiff_t>(random() % parts.size());
+  };
+  if (one_in(8)) {
+    parts.insert(any(), Content(*any()));
+  } else if (one_in(8)) {
+    parts.erase(any());
+  } else if (one_in(8)) {
+    std::iter_swap(any(), any());
+  } else {
+    Content& part = *any();
+    try {
+      part = mutate_file(part, random, most);
+    } catch (const FileError&) {
+      mutate(part, most);
+    }
+  }
+  const bool repaired = !one_in(8);
+  Content result;
+  for (std::size_t i = 0; i < parts.size(); ++i) {
+    try {
+      if (repaired && i > 0 && parts[i - 1].size() >= 32) chain(parts[i], i, parts[i - 1]);
+    } catch (const FileError&) {  // a torn tail
+    }
+    result.insert(result.end(), parts[i].begin(), parts[i].end());
+  }
+  return result;
 }
 
 // Sections of the same name, from one file or the other.
@@ -123,8 +179,11 @@ extern "C" std::size_t LLVMFuzzerCustomMutator(std::uint8_t* data, std::size_t s
   fuzz::Random random(seed);
   if (random() % 32 != 0) {
     try {
-      const auto mutated =
-          fuzz::mutate_file(std::as_bytes(std::span(data, size)), random, max_size);
+      const auto input = std::as_bytes(std::span(data, size));
+      auto parts = fuzz::split(input);
+      const auto mutated = parts.size() > 1
+                               ? fuzz::mutate_journal(std::move(parts), random, max_size)
+                               : fuzz::mutate_file(input, random, max_size);
       if (const std::size_t n = fuzz::put(mutated, data, max_size); n > 0) return n;
     } catch (const FileError&) {  // not a file any more: mutated as it is
     }

@@ -4,6 +4,7 @@
 #include <filesystem>
 #include <limits>
 
+#include "journal_base.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"
 #include "random.h"
@@ -44,6 +45,35 @@ void fill(PrototypeMap& map, std::size_t landmarks, std::int64_t step, bool posi
   }
 }
 
+// Journals of one commit, of several, and with a map file in between.
+void write_journals(const fs::path& folder) {
+  const fs::path path = folder.parent_path() / "journal.pmk";
+  int number = 0;
+  for (const PrototypeMap& base : fuzz::journal_bases()) {
+    base.save(path);
+    PrototypeMap map = PrototypeMap::load(path, true);
+    const auto keep = [&] {
+      fs::copy(path.string() + ".journal", folder / std::to_string(number++));
+    };
+    keep();
+    fuzz::observe(map, 2, 3);
+    map.commit();
+    keep();
+    map.discard(std::vector{map.ids()[1]});
+    map.set_positions(std::vector{map.ids()[0]}, std::vector{Position{1, 2, 3}});
+    map.build_index(2);
+    map.commit();
+    keep();
+    map.drop_index();
+    fuzz::observe(map, 3, 1);
+    map.commit();
+    keep();
+    map.close();
+    fs::remove(path.string() + ".journal");
+  }
+  fs::remove(path);
+}
+
 }  // namespace
 
 int main(int argc, char** argv) try {
@@ -52,7 +82,7 @@ int main(int argc, char** argv) try {
     return 2;
   }
   const fs::path folder = argv[1];
-  for (const char* target : {"container", "encoder", "open_map", "sealed_map"}) {
+  for (const char* target : {"container", "encoder", "journal", "open_map", "sealed_map"}) {
     fs::create_directories(folder / target);
   }
   const auto plain = small_encoder(4, 2), deep = small_encoder(9, 4), flat = small_encoder(1, 1);
@@ -83,6 +113,7 @@ int main(int argc, char** argv) try {
       }
     }
   }
+  write_journals(folder / "journal");
   fs::copy(folder / "encoder" / "plain", folder / "container" / "encoder");
   fs::copy(folder / "open_map" / "2", folder / "container" / "open");
   fs::copy(folder / "sealed_map" / "2", folder / "container" / "sealed");

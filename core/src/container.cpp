@@ -10,11 +10,11 @@
 #include <bit>
 #include <cerrno>
 #include <cstring>
-#include <random>
 #include <stdexcept>
 
 #include "crc32.h"
 #include "protomark/error.h"
+#include "sha256.h"
 #include "utf8.h"
 
 namespace protomark {
@@ -27,6 +27,7 @@ constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
 constexpr std::uint32_t kNewestVersion = 4;
 constexpr std::size_t kAlignment = 64;
 constexpr std::uint32_t kMaxSections = 64;
+constexpr auto kLastKind = static_cast<std::uint32_t>(FileKind::fold);
 
 struct Header {
   char magic[8];
@@ -57,76 +58,6 @@ constexpr std::uint64_t align(std::uint64_t n) {
   return (n + kAlignment - 1) / kAlignment * kAlignment;
 }
 
-std::string system_error() { return std::strerror(errno); }
-
-// A file being written beside its target; removed unless it is committed.
-class TemporaryFile {
- public:
-  explicit TemporaryFile(const std::filesystem::path& target) : target_(target) {
-    // Not mkstemp, whose files only their owner may read: a map is as readable as any file.
-    std::random_device random;
-    do {
-      path_ = target.string() + "." + std::to_string(random());
-      descriptor_ = ::open(path_.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
-    } while (descriptor_ < 0 && errno == EEXIST);
-    if (descriptor_ < 0) {
-      path_.clear();
-      fail();
-    }
-  }
-  ~TemporaryFile() {
-    if (descriptor_ >= 0) ::close(descriptor_);
-    if (!path_.empty()) ::unlink(path_.c_str());
-  }
-  TemporaryFile(const TemporaryFile&) = delete;
-  TemporaryFile& operator=(const TemporaryFile&) = delete;
-
-  void write(Bytes bytes) {
-    while (!bytes.empty()) {
-      const ssize_t written = ::write(descriptor_, bytes.data(), bytes.size());
-      if (written < 0 && errno == EINTR) continue;
-      if (written < 0) fail();
-      bytes = bytes.subspan(static_cast<std::size_t>(written));
-    }
-  }
-
-  void seek(std::size_t offset) {
-    if (::lseek(descriptor_, static_cast<off_t>(offset), SEEK_SET) < 0) fail();
-  }
-
-  void commit() {
-    if (::fsync(descriptor_) != 0) fail();
-    const int descriptor = std::exchange(descriptor_, -1);
-    if (::close(descriptor) != 0) fail();
-    if (::rename(path_.c_str(), target_.c_str()) != 0) fail();
-    path_.clear();
-    sync_folder();
-  }
-
- private:
-  [[noreturn]] void fail() const {
-    throw FileError(target_.string() + ": cannot be written: " + system_error());
-  }
-
-  // Without this a power cut may bring the old name back.
-  void sync_folder() const {
-    auto folder = target_.parent_path();
-    if (folder.empty()) folder = ".";
-    const int descriptor = ::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-    if (descriptor < 0) return;  // a folder may be writable and yet not readable
-    const bool failed = ::fsync(descriptor) != 0 && errno != EINVAL && errno != ENOTSUP;
-    const std::string why = system_error();
-    ::close(descriptor);
-    if (failed) {
-      throw FileError(target_.string() + ": is written, but its folder cannot be synced: " + why);
-    }
-  }
-
-  std::filesystem::path target_;
-  std::string path_;
-  int descriptor_ = -1;
-};
-
 }  // namespace
 
 const char* describe(FileKind kind) {
@@ -137,6 +68,11 @@ const char* describe(FileKind kind) {
       return "an open map";
     case FileKind::sealed_map:
       return "a sealed map";
+    case FileKind::journal:
+      return "a journal";
+    case FileKind::commit:
+    case FileKind::fold:
+      return "a record of a journal";
   }
   return "something unknown";
 }
@@ -204,19 +140,51 @@ std::vector<std::byte> ContainerWriter::serialize() const {
   return result;
 }
 
-void ContainerWriter::write(const std::filesystem::path& path) const {
+void ContainerWriter::write(const std::filesystem::path& path,
+                            const std::function<void(const std::string&)>& before) const {
   TemporaryFile file(path);
   file.seek(head_size());
   const auto head = emit([&](Bytes bytes) { file.write(bytes); });
   file.seek(0);
   file.write(head);
-  file.commit();
+  file.sync();
+  if (before) before(file_identity(head));
+  file.replace_target();
+}
+
+namespace {
+
+// Header and section table, where they are there.
+std::optional<Bytes> head_of(Bytes file) {
+  Header header;
+  if (file.size() < sizeof(header)) return std::nullopt;
+  std::memcpy(&header, file.data(), sizeof(header));
+  const std::size_t size = sizeof(header) + std::size_t{header.sections} * sizeof(Entry);
+  if (header.sections > kMaxSections || size > file.size()) return std::nullopt;
+  return file.first(size);
+}
+
+}  // namespace
+
+std::string file_identity(Bytes head) {
+  const auto bytes = head_of(head);
+  return bytes ? sha256(*bytes) : "";
+}
+
+bool has_container_head(Bytes head) {
+  const auto bytes = head_of(head);
+  if (!bytes) return false;
+  Header header;
+  std::memcpy(&header, bytes->data(), sizeof(header));
+  const std::uint32_t crc = std::exchange(header.crc, 0);
+  return crc32(bytes->subspan(sizeof(header)), crc32(as_bytes(header))) == crc;
 }
 
 void write_file(const std::filesystem::path& path, Bytes bytes) {
   TemporaryFile file(path);
   file.write(bytes);
-  file.commit();
+  file.sync();
+  file.replace_target();
 }
 
 ContainerReader::ContainerReader(Bytes file, std::string name)
@@ -240,8 +208,10 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   const Bytes table = file_.subspan(sizeof(Header), table_size);
   const std::uint32_t crc = std::exchange(header.crc, 0);
   if (crc32(table, crc32(as_bytes(header))) != crc) fail("its header does not match its checksum");
-  if (header.kind < 1 || header.kind > 3) fail("it is of a kind that this Protomark does not know");
+  if (header.kind < 1 || header.kind > kLastKind)
+    fail("it is of a kind that this Protomark does not know");
   kind_ = static_cast<FileKind>(header.kind);
+  checksum_ = crc;
 
   std::uint64_t end = sizeof(Header) + table_size;
   for (std::uint32_t i = 0; i < header.sections; ++i) {

@@ -21,13 +21,21 @@
 #include <utility>
 #include <vector>
 
+#include "disk.h"
+
 namespace protomark {
 
-enum class FileKind : std::uint32_t { encoder = 1, open_map = 2, sealed_map = 3 };
+enum class FileKind : std::uint32_t {
+  encoder = 1,
+  open_map = 2,
+  sealed_map = 3,
+  // A journal is one of the first kind and any number of the others, one after the other.
+  journal = 4,
+  commit = 5,
+  fold = 6
+};
 
 const char* describe(FileKind kind);
-
-using Bytes = std::span<const std::byte>;
 
 // Sections to be written as one file. They are in memory and belong to somebody else, or come into
 // being piece by piece while the file is written.
@@ -51,8 +59,10 @@ class ContainerWriter {
 
   std::vector<std::byte> serialize() const;
   // Writes the file as write_file does, without a copy of the sections. What a producer throws
-  // passes through, and the old file is still there.
-  void write(const std::filesystem::path& path) const;
+  // passes through, and the old file is still there. `before` is called with the new file's
+  // identity when that is synced and has not taken the place of the old one yet.
+  void write(const std::filesystem::path& path,
+             const std::function<void(const std::string&)>& before = {}) const;
 
  private:
   struct Section {
@@ -70,6 +80,13 @@ class ContainerWriter {
   std::vector<Section> sections_;
 };
 
+// The identity of a file that begins with these bytes: the SHA-256 of its header and section table,
+// which have the checksum and size of everything in it. Empty where these are not there.
+std::string file_identity(Bytes head);
+
+// Whether bytes begin with a header and section table that match their checksum.
+bool has_container_head(Bytes head);
+
 // Writes bytes beside `path`, syncs, renames over it, syncs the folder. On any failure the old file
 // is still there and the new one is gone; only where the folder cannot be synced is it the new one
 // that is there, and may be lost with the power. A process that is killed leaves
@@ -85,6 +102,11 @@ class ContainerReader {
 
   FileKind kind() const { return kind_; }
   const std::string& name() const { return name_; }
+  // Of header and table, and thereby of everything.
+  std::uint32_t checksum() const { return checksum_; }
+  std::string identity() const { return file_identity(file_); }
+  // In bytes, padding included.
+  std::size_t size() const { return file_.size(); }
   // Throws FileError where the file is of another kind.
   void expect(FileKind kind) const;
 
@@ -113,6 +135,7 @@ class ContainerReader {
   Bytes file_;
   std::string name_;
   FileKind kind_;
+  std::uint32_t checksum_ = 0;
   std::vector<Section> sections_;
 };
 

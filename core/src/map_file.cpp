@@ -11,6 +11,7 @@
 #include "cell_search.h"
 #include "cells.h"
 #include "container.h"
+#include "journal.h"
 #include "landmark_ids.h"
 #include "map_sections.h"
 #include "position_grid.h"
@@ -52,8 +53,17 @@ std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesy
 }
 
 void verify_file(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  ContainerReader(mapped.bytes(), path.string()).verify();
+  const JournaledFile both(path);
+  both.file().verify();
+  both.journal().commits(both.file().identity());
+}
+
+std::optional<FileJournal> file_journal(const std::filesystem::path& path) {
+  const JournaledFile both(path);
+  const JournalContent& journal = both.journal();
+  if (journal.size() == 0) return std::nullopt;
+  return FileJournal{journal.commits(both.file().identity()).size(), journal.size(),
+                     journal.torn()};
 }
 
 namespace {
@@ -64,7 +74,11 @@ constexpr char kRemedy[] = "call build_index before the map is sealed";
 
 struct SealedMap::Content {
   explicit Content(const std::filesystem::path& path)
-      : Content(std::make_unique<MappedFile>(path), path.string()) {}
+      : Content(std::make_unique<MappedFile>(path), path.string()) {
+    // Commits that somebody put this map in the way of are not passed over in silence.
+    const JournaledFile both(path);
+    both.journal().commits(both.file().identity());
+  }
   Content(std::unique_ptr<MappedFile> from, const std::string& name)
       : Content(from->bytes(), name) {
     mapped = std::move(from);

@@ -85,16 +85,15 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
   // By id, so that the result does not depend on how the other map came about.
   const std::vector<std::uint32_t> landmarks = from.sorted_landmarks();
   std::vector<std::int64_t> ids;
-  for (std::size_t first = 0; first < landmarks.size(); first += Store::kPiece) {
-    const auto piece =
-        std::span(landmarks).subspan(first, std::min(Store::kPiece, landmarks.size() - first));
+  for (std::size_t first = 0, last = 0; first < landmarks.size(); first = last) {
     ids.clear();
     std::size_t rows = 0;
-    for (const std::uint32_t landmark : piece) {
-      const auto found = renamed.find(landmark);
-      ids.push_back(found == renamed.end() ? from.ids()[landmark] : found->second);
-      rows += from.rows_of(landmark);
+    for (; last < landmarks.size() && rows < Store::kPiece; ++last) {
+      const auto found = renamed.find(landmarks[last]);
+      ids.push_back(found == renamed.end() ? from.ids()[landmarks[last]] : found->second);
+      rows += from.rows_of(landmarks[last]);
     }
+    const auto piece = std::span(landmarks).subspan(first, last - first);
     store_->make_room(ids, rows);
     const std::unique_lock lock(store_->mutex);
     for (std::size_t i = 0; i < piece.size(); ++i) {
@@ -111,7 +110,7 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
     store_->settle(1);
   }
   const std::unique_lock lock(store_->mutex);
-  store_->metadata = std::move(metadata);
+  store_->set_metadata(std::move(metadata));
 }
 
 PrototypeMap PrototypeMap::part(std::span<const std::uint32_t> landmarks) const {

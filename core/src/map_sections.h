@@ -35,6 +35,9 @@ inline constexpr char kProbes[] = "probes";      // ... uint32, ProbeRanks
 // Open: 3 x float64; sealed: 3 x float32, with steps 3 x uint16.
 inline constexpr char kPositions[] = "position";
 inline constexpr char kSteps[] = "steps";  // sealed, positions of 16 bits: 3 x float64
+inline constexpr char kBase[] = "base";    // journal, fold: identity of a map file
+inline constexpr char kChain[] = "chain";  // commit, fold: what stands before it
+inline constexpr char kGone[] = "gone";    // commit: int64, ids of landmarks that went
 }  // namespace section
 
 struct MapShape {

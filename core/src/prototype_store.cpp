@@ -269,6 +269,7 @@ void PrototypeStore::erase_landmark(std::uint32_t landmark) {
 }
 
 void PrototypeStore::erase_row(std::uint32_t row) {
+  if (uncommitted_) uncommitted_->insert(ids_[landmark_of(row)]);
   if (look_bits_ == 0) {
     index_.erase(ids_, ids_[row]);
     close_gap(row);
@@ -311,12 +312,14 @@ std::vector<std::uint32_t> PrototypeStore::sorted_landmarks() const {
   return result;
 }
 
-std::vector<std::uint32_t> PrototypeStore::sorted_rows() const {
-  std::vector<std::uint32_t> result = sorted_landmarks();
-  if (look_bits_ == 0) return result;
+std::vector<std::uint32_t> PrototypeStore::sorted_rows(
+    std::span<const std::uint32_t> landmarks) const {
+  if (look_bits_ == 0) return {landmarks.begin(), landmarks.end()};
+  std::size_t rows = 0;
+  for (const std::uint32_t landmark : landmarks) rows += rows_of(landmark);
   std::vector<std::uint32_t> all;
-  all.reserve(rows());
-  for (const std::uint32_t landmark : result) {
+  all.reserve(rows);
+  for (const std::uint32_t landmark : landmarks) {
     const auto own = sorted_rows(landmark);
     all.insert(all.end(), own.begin(), own.end());
   }
@@ -431,6 +434,7 @@ void PrototypeStore::refresh(std::uint32_t row) {
     changed = changed || std::memcmp(to, &mean[d], n) != 0;
     std::memcpy(to, &mean[d], n);
   }
+  if (uncommitted_) uncommitted_->insert(ids_[landmark_of(row)]);
   if (changed && cells_.size() != 0) unsettled_.push_back({ids_[landmark_of(row)], look(row)});
 }
 
@@ -558,19 +562,25 @@ void PrototypeStore::set_position(std::uint32_t landmark, const Position& positi
     if (is_nowhere(position)) return;
     positions_.assign(ids_.size(), kNowhere);
   }
-  positions_[landmark] = position;
+  // One NaN for all, so that equal maps give equal files.
+  positions_[landmark] = is_nowhere(position) ? kNowhere : position;
+  if (uncommitted_) uncommitted_->insert(ids_[landmark]);
 }
 
 Position PrototypeStore::position(std::uint32_t landmark) const {
   return positions_.empty() ? kNowhere : positions_[landmark];
 }
 
-void PrototypeMap::Store::add_piece(std::span<const std::int64_t> landmarks, Codes codes,
-                                    int threads) {
-  make_room(landmarks, landmarks.size());
-  const std::unique_lock lock(mutex);
-  add(landmarks, codes);
-  settle(threads);
+void PrototypeMap::Store::add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes,
+                                        int threads) {
+  for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
+    const std::size_t n = std::min(kPiece, codes.rows - begin);
+    const auto piece = landmarks.subspan(begin, n);
+    make_room(piece, n);
+    const std::unique_lock lock(mutex);
+    add(piece, {codes.row(begin), n, codes.columns});
+    settle(threads);
+  }
 }
 
 void PrototypeMap::Store::make_room(std::span<const std::int64_t> landmarks, std::size_t rows) {
@@ -589,6 +599,7 @@ void PrototypeMap::Store::alone(const std::function<void()>& swap) {
 // What was there before goes when the lock has.
 void PrototypeMap::Store::replace(PrototypeStore other) {
   const std::unique_lock lock(mutex);
+  other.take_notes_of(*this);
   std::swap(static_cast<PrototypeStore&>(*this), other);
 }
 

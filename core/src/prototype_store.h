@@ -9,12 +9,15 @@
 #include <mutex>
 #include <shared_mutex>
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "cell_blocks.h"
 #include "cells.h"
+#include "changes.h"
 #include "fair_shared_mutex.h"
 #include "id_index.h"
+#include "journal.h"
 #include "large_vector.h"
 #include "probe_ranks.h"
 #include "protomark/prototypes.h"
@@ -85,7 +88,9 @@ class PrototypeStore {
 
   // Landmarks by id, and rows by id and then look.
   std::vector<std::uint32_t> sorted_landmarks() const;
-  std::vector<std::uint32_t> sorted_rows() const;
+  std::vector<std::uint32_t> sorted_rows() const { return sorted_rows(sorted_landmarks()); }
+  // Rows of some landmarks, in their order and then by look.
+  std::vector<std::uint32_t> sorted_rows(std::span<const std::uint32_t> landmarks) const;
   // Rows of one landmark by look.
   std::vector<std::uint32_t> sorted_rows(std::uint32_t landmark) const;
 
@@ -120,6 +125,17 @@ class PrototypeStore {
   void settle(int threads);
   // A number that grows with each row that came, changed or went while there was an index.
   std::size_t changes() const { return changes_; }
+
+  // Notes from now on what changes. Only whoever commits takes the notes, no change going on.
+  void track_changes() { uncommitted_ = std::make_unique<Changes>(); }
+  bool tracks_changes() const { return uncommitted_ != nullptr; }
+  void forget_changes() { uncommitted_.reset(); }
+  Changes& uncommitted() const { return *uncommitted_; }
+  // Of the same map with other cells.
+  void take_notes_of(PrototypeStore& other) {
+    uncommitted_ = std::move(other.uncommitted_);
+    if (uncommitted_) uncommitted_->cells = true;
+  }
 
   void set_position(std::uint32_t landmark, const Position& position);
   void make_room_for_positions(const Alone& alone);
@@ -171,6 +187,7 @@ class PrototypeStore {
   std::size_t cells_version_ = 0;
   std::vector<Key> unsettled_;
   std::size_t changes_ = 0;
+  std::unique_ptr<Changes> uncommitted_;  // nullptr: nobody commits
 };
 
 // What users do not see of an open map.
@@ -181,7 +198,7 @@ class PrototypeStore {
 // searches and short questions share `mutex`. Who needs both takes `changing` first.
 struct PrototypeMap::Store : PrototypeStore {
   // Observations or landmarks of a change that searches wait for.
-  static constexpr std::size_t kPiece = 1 << 13;
+  static constexpr std::size_t kPiece = 1 << 11;
 
   using PrototypeStore::PrototypeStore;
 
@@ -195,7 +212,7 @@ struct PrototypeMap::Store : PrototypeStore {
       settle(1);
     }
   }
-  void add_piece(std::span<const std::int64_t> landmarks, Codes codes, int threads);
+  void add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes, int threads);
   void make_room(std::span<const std::int64_t> landmarks, std::size_t rows);
   void make_room_for_positions();
   void replace(PrototypeStore other);
@@ -206,8 +223,15 @@ struct PrototypeMap::Store : PrototypeStore {
   std::shared_ptr<const MeasuredRanks> ranks(std::shared_lock<FairSharedMutex>& lock, double recall,
                                              int threads) const;
 
+  void set_metadata(Metadata texts) {
+    if (tracks_changes()) uncommitted().metadata |= texts != metadata;
+    metadata = std::move(texts);
+  }
   Metadata metadata;
   mutable FairSharedMutex changing, mutex;
+  // Of the journal; before the other two.
+  std::mutex journal_mutex;
+  std::unique_ptr<Journal> journal;  // nullptr: there is none
 
  private:
   void alone(const std::function<void()>& swap);

@@ -8,7 +8,6 @@
 #include <string>
 #include <unordered_map>
 
-#include "container.h"
 #include "map_sections.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
@@ -16,6 +15,9 @@
 
 namespace protomark {
 namespace {
+
+// Descriptors that are encoded at a time, to bound the memory for their codes.
+constexpr std::size_t kEncodeChunk = 1 << 13;
 
 void check_pairs(std::size_t landmarks, std::size_t rows, const char* what) {
   if (landmarks != rows) {
@@ -97,14 +99,14 @@ void PrototypeMap::add(std::span<const std::int64_t> landmarks, Descriptors desc
                        int threads) {
   check_pairs(landmarks.size(), descriptors.rows, "descriptors");
   check_new_ids(landmarks);
-  std::vector<std::int8_t> buffer(std::min(descriptors.rows, Store::kPiece) * dim_);
+  std::vector<std::int8_t> buffer(std::min(descriptors.rows, kEncodeChunk) * dim_);
   const std::unique_lock changing(store_->changing);
   // Even no observation at all is checked for its length.
-  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += Store::kPiece) {
-    const std::size_t n = std::min(Store::kPiece, descriptors.rows - begin);
-    const MatrixView<std::int8_t> codes{buffer.data(), n, dim_};
-    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, codes, threads);
-    store_->add_piece(landmarks.subspan(begin, n), {buffer.data(), n, dim_}, threads);
+  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += kEncodeChunk) {
+    const std::size_t n = std::min(kEncodeChunk, descriptors.rows - begin);
+    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, {buffer.data(), n, dim_},
+                     threads);
+    store_->add_in_pieces(landmarks.subspan(begin, n), {buffer.data(), n, dim_}, threads);
   }
 }
 
@@ -113,10 +115,7 @@ void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes code
   check_codes(codes, dim_);
   check_new_ids(landmarks);
   const std::unique_lock changing(store_->changing);
-  for (std::size_t begin = 0; begin < codes.rows; begin += Store::kPiece) {
-    const std::size_t n = std::min(Store::kPiece, codes.rows - begin);
-    store_->add_piece(landmarks.subspan(begin, n), {codes.row(begin), n, dim_}, 1);
-  }
+  store_->add_in_pieces(landmarks, codes, 1);
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> landmarks, Descriptors descriptors,
@@ -248,7 +247,7 @@ void PrototypeMap::set_metadata(Metadata metadata) {
   check_metadata(metadata);
   const std::unique_lock changing(store_->changing);
   const std::unique_lock lock(store_->mutex);
-  store_->metadata = std::move(metadata);
+  store_->set_metadata(std::move(metadata));
 }
 
 void PrototypeMap::set_positions(std::span<const std::int64_t> landmarks,
@@ -291,7 +290,7 @@ std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> la
 }
 
 MapSummary PrototypeMap::summary() const {
-  const std::shared_lock lock(store_->mutex);
+  const std::shared_lock changing(store_->changing);
   SummaryBuilder result;
   for (std::uint32_t i = 0; i < store_->ids().size(); ++i) {
     if (store_->ids()[i] < 0) continue;
@@ -335,114 +334,6 @@ void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
   std::vector<std::int8_t> codes(queries.rows * dim_);
   encoder_->encode(queries, {codes.data(), queries.rows, dim_}, options.threads);
   search_codes({codes.data(), queries.rows, dim_}, options, ids, distances);
-}
-
-void PrototypeMap::save(const std::filesystem::path& path) const {
-  const std::shared_lock changing(store_->changing);
-  const bool with_looks = look_bits() != 0;
-  const auto landmarks = store_->sorted_landmarks();
-  // Without looks a row is a landmark.
-  const auto looks = with_looks ? store_->sorted_rows() : std::vector<std::uint32_t>();
-  const auto& rows = with_looks ? looks : landmarks;
-  const std::size_t n = landmarks.size(), m = rows.size();
-  const std::vector<std::int8_t>& cells = store_->cells().centroids();
-
-  ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : with_looks ? 2 : 1);
-  file.add(section::kEncoder, encoder_->serialize());
-  file.add(section::kShape, write_shape({n, dim_, {}}));
-  add_metadata(file, store_->metadata);
-  add_values<std::int64_t>(file, section::kIds, n, 1, [&](std::size_t i, std::int64_t* to) {
-    *to = store_->ids()[landmarks[i]];
-  });
-  if (with_looks) {
-    file.add(section::kLookBits, write_look_bits(look_bits()));
-    add_values<std::uint32_t>(file, section::kRows, n, 1, [&](std::size_t i, std::uint32_t* to) {
-      *to = static_cast<std::uint32_t>(store_->rows_of(landmarks[i]));
-    });
-    add_values<std::uint16_t>(file, section::kLooks, m, 1, [&](std::size_t i, std::uint16_t* to) {
-      *to = store_->look(rows[i]);
-    });
-  }
-  add_values<std::uint8_t>(file, section::kCounts, m, 1,
-                           [&](std::size_t i, std::uint8_t* to) { *to = store_->count(rows[i]); });
-  add_values<std::int16_t>(file, section::kSums, m, dim_, [&](std::size_t i, std::int16_t* to) {
-    std::copy_n(store_->sum(rows[i]), dim_, to);
-  });
-  // A map whose positions were all taken away equals one that never had any.
-  if (!std::all_of(store_->positions().begin(), store_->positions().end(), is_nowhere)) {
-    add_values<Position>(file, section::kPositions, n, 1, [&](std::size_t i, Position* to) {
-      *to = store_->position(landmarks[i]);
-    });
-  }
-  if (!cells.empty()) file.add(section::kCells, std::as_bytes(std::span(cells)));
-  file.write(path);
-}
-
-PrototypeMap PrototypeMap::load(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  return parse(mapped.bytes(), path.string());
-}
-
-PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::string& name) {
-  const ContainerReader file(bytes, name);
-  file.expect(FileKind::open_map);
-  auto encoder = read_encoder(file);
-  const MapShape shape = read_shape(file, *encoder);
-  const std::size_t n = shape.landmarks, dim = shape.dim;
-  const std::size_t look_bits = read_look_bits(file, dim);
-  const auto ids = read_section<std::int64_t>(file, section::kIds, n);
-  check_ids(file, ids);
-  std::vector<std::uint32_t> rows_of;
-  std::size_t m = n;
-  if (look_bits != 0) {
-    rows_of = read_section<std::uint32_t>(file, section::kRows, n);
-    m = count_rows(file, std::span<const std::uint32_t>(rows_of));
-  }
-  std::vector<std::uint16_t> looks;
-  if (look_bits != 0) looks = read_section<std::uint16_t>(file, section::kLooks, m);
-  const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
-  const auto sums = read_section<std::int16_t>(file, section::kSums, m * dim);
-  std::vector<Position> positions;
-  if (file.map_if_there(section::kPositions)) {
-    positions = read_section<Position>(file, section::kPositions, n);
-  }
-
-  PrototypeMap map(std::move(encoder), dim, look_bits);
-  Store& store = *map.store_;
-  store.metadata = read_metadata(file);
-  store.reserve(n, m);
-  for (std::size_t i = 0, next = 0; i < n; ++i) {
-    const std::uint32_t landmark = store.create_landmark(ids[i]);
-    const std::size_t end = next + (look_bits != 0 ? rows_of[i] : 1);
-    for (const std::size_t first = next; next < end; ++next) {
-      const int count = counts[next];
-      const std::int16_t* sum = &sums[next * dim];
-      if (count == 0 ||
-          std::any_of(sum, sum + dim, [&](int s) { return std::abs(s) > 127 * count; })) {
-        file.fail("landmark " + std::to_string(ids[i]) + " has an impossible prototype");
-      }
-      if (look_bits != 0 &&
-          (looks[next] >> look_bits != 0 || (next > first && looks[next] <= looks[next - 1]))) {
-        file.fail("the looks of landmark " + std::to_string(ids[i]) + " do not ascend");
-      }
-      const std::uint32_t row = store.create_row(landmark, look_bits != 0 ? looks[next] : 0);
-      std::copy_n(sum, dim, store.sum(row));
-      store.set_count(row, count);
-      store.refresh(row);
-    }
-    if (positions.empty()) continue;
-    const Position& p = positions[i];
-    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
-    if (!finite && !is_nowhere(p)) {
-      file.fail("landmark " + std::to_string(ids[i]) + " has no finite position");
-    }
-  }
-  // After the landmarks, so that room for positions is made once.
-  for (std::uint32_t i = 0; i < positions.size(); ++i) store.set_position(i, positions[i]);
-  if (auto cells = read_cells(file, dim); !cells.empty()) {
-    store.replace(store.with_cells({std::move(cells), dim}, 1));
-  }
-  return map;
 }
 
 }  // namespace protomark

@@ -16,6 +16,7 @@
 #include "bit_numbers.h"
 #include "cells.h"
 #include "container.h"
+#include "journal.h"
 #include "landmark_ids.h"
 #include "map_sections.h"
 #include "position_box.h"
@@ -247,6 +248,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
     throw std::invalid_argument("positions are sealed with 32 or 16 bits a coordinate, not " +
                                 std::to_string(position_bits));
   }
+  const JournalGuard guard(path);
   const std::shared_lock changing(store_->changing);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();

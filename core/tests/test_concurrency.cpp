@@ -114,9 +114,14 @@ void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path&
 
   const States states(cycle, queries, PrototypeMap(encoder, kDim, look_bits));
 
-  PrototypeMap shared(encoder, kDim, look_bits);
-  cycle.start(shared);
-  std::atomic<int> wrong = 0, searches = 0, files = 0;
+  const fs::path journaled = folder / "journaled.pmk";
+  {
+    PrototypeMap first(encoder, kDim, look_bits);
+    cycle.start(first);
+    first.save(journaled);
+  }
+  PrototypeMap shared = PrototypeMap::load(journaled, true);
+  std::atomic<int> wrong = 0, searches = 0, files = 0, commits = 0, read = 0;
   const auto search = [&](const std::stop_token& stop, int threads) {
     while (!stop.stop_requested()) {
       wrong += states.has(ask(shared, queries, threads)) ? 0 : 1;
@@ -140,19 +145,33 @@ void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path&
       ++files;
     }
   };
+  const auto commit = [&](const std::stop_token& stop) {
+    for (; !stop.stop_requested(); ++commits)
+      commits % 8 == 7 ? shared.compact() : void(shared.commit());
+  };
+  const auto read_what_is_committed = [&](const std::stop_token& stop) {
+    for (; !stop.stop_requested(); ++read) {
+      wrong += states.has(ask(PrototypeMap::load(journaled), queries, 1)) ? 0 : 1;
+    }
+  };
   {
     std::vector<std::jthread> readers;
     for (const int threads : {1, 1, 2}) {
       readers.emplace_back([&, threads](const std::stop_token& s) { search(s, threads); });
     }
     readers.emplace_back(write_and_read);
+    readers.emplace_back(commit);
+    readers.emplace_back(read_what_is_committed);
     for (std::size_t i = 0; i < kRounds * Cycle::kSteps; ++i) cycle.step(shared, i);
-    while (searches == 0 || files == 0) std::this_thread::yield();
+    while (searches == 0 || files == 0 || commits == 0 || read == 0) std::this_thread::yield();
   }
   CHECK(wrong == 0);
   CHECK(ask(shared, queries, 1) == states.answers.front());
-  std::printf("look_bits %zu: %d searches, %d files during %zu changes\n", look_bits,
-              searches.load(), files.load(), kRounds * Cycle::kSteps);
+  shared.commit();
+  CHECK(ask(PrototypeMap::load(journaled), queries, 1) == states.answers.front());
+  std::printf("look_bits %zu: %d searches, %d files, %d commits, %d opened during %zu changes\n",
+              look_bits, searches.load(), files.load(), commits.load(), read.load(),
+              kRounds * Cycle::kSteps);
 }
 
 // Two maps that take each other over at the same time.
@@ -191,9 +210,10 @@ void test_updates_while_both_are_searched() {
   CHECK(left.size() == 200 + right.size());
 }
 
-// A change of more than a piece shows piece by piece to searches, and whole to files.
+// A change of more than a piece (PrototypeMap::Store::kPiece) shows piece by piece to searches, and
+// whole to files.
 void test_large_changes_show_in_pieces(const fs::path& folder) {
-  constexpr std::size_t kPiece = 8192, kAll = 3 * kPiece + 1000;
+  constexpr std::size_t kPiece = 2048, kAll = 9 * kPiece + 1000;
   const auto encoder = test::random_encoder();
   std::vector<std::int64_t> ids(kAll);
   std::iota(ids.begin(), ids.end(), 1);
@@ -233,7 +253,7 @@ void test_large_changes_show_in_pieces(const fs::path& folder) {
 void test_searches_while_an_index_is_built() {
   const auto encoder = test::random_encoder();
   test::Random random(12);
-  const Observations some = observations(random, 4000, 0);
+  const Observations some = observations(random, 2000, 0);
   const auto codes = random.integers<std::int8_t>(kQueries * kDim, -127, 127);
   const Codes queries{codes.data(), kQueries, kDim};
   PrototypeMap map(encoder);

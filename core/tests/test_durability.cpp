@@ -1,71 +1,21 @@
 // What a save does to the disk, in which order, and what is there when a step of it fails.
-#include <fcntl.h>
 #include <sys/stat.h>
-#include <sys/syscall.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
-#include <cstdio>
 #include <filesystem>
 #include <fstream>
 #include <iterator>
 
 #include "check.h"
 #include "container.h"
+#include "faulty_disk.h"
 #include "protomark/error.h"
 #include "protomark/prototypes.h"
 #include "random.h"
 
 namespace fs = std::filesystem;
-
-namespace {
-
-// The system calls of this program go through here.
-struct Disk {
-  std::vector<std::string> calls;
-  long room = -1;           // bytes until the disk is full; -1: never
-  long write_at_most = -1;  // bytes that one call writes, which a signal interrupts each time
-  int fsync_file = 0, fsync_folder = 0, rename = 0;  // errno of each; 0: it works
-  bool interrupted = false;
-} disk;
-
-int failed(int error) {
-  errno = error;
-  return -1;
-}
-
-}  // namespace
-
-extern "C" ssize_t write(int descriptor, const void* data, std::size_t size) {
-  if (descriptor <= 2) return syscall(SYS_write, descriptor, data, size);
-  if (disk.write_at_most >= 0) {
-    disk.interrupted = !disk.interrupted;
-    if (disk.interrupted) return failed(EINTR);
-    size = std::min(size, static_cast<std::size_t>(disk.write_at_most));
-  }
-  if (disk.room >= 0) {
-    if (disk.room == 0 && size > 0) return failed(ENOSPC);
-    size = std::min(size, static_cast<std::size_t>(disk.room));
-    disk.room -= static_cast<long>(size);
-  }
-  return syscall(SYS_write, descriptor, data, size);
-}
-
-extern "C" int fsync(int descriptor) {
-  struct stat status;
-  ::fstat(descriptor, &status);
-  const bool folder = S_ISDIR(status.st_mode);
-  disk.calls.emplace_back(folder ? "sync folder" : "sync file");
-  const int error = folder ? disk.fsync_folder : disk.fsync_file;
-  return error != 0 ? failed(error) : static_cast<int>(syscall(SYS_fsync, descriptor));
-}
-
-extern "C" int rename(const char* from, const char* to) noexcept {
-  disk.calls.emplace_back("rename");
-  if (disk.rename != 0) return failed(disk.rename);
-  return static_cast<int>(syscall(SYS_renameat2, AT_FDCWD, from, AT_FDCWD, to, 0));
-}
 
 using namespace protomark;
 

@@ -9,11 +9,13 @@ ids, distances = scene.search(new_descriptors, k=2)
 """
 
 from importlib.metadata import version as _version
+from typing import TYPE_CHECKING
 
 from protomark._core import (
     Encoder,
     PrototypeMap,
     SealedMap,
+    file_journal,
     file_sections,
     hamming_search,
     instruction_set,
@@ -23,18 +25,36 @@ from protomark._core import (
 from protomark.errors import FileError
 from protomark.upright import upright_descriptors
 
+if TYPE_CHECKING:
+    from protomark.localization import Localizer as Localizer
+    from protomark.matching import match as match
+
 __version__ = _version("protomark")
 
 __all__ = [
     "Encoder",
     "FileError",
+    "Localizer",
     "PrototypeMap",
     "SealedMap",
     "__version__",
+    "file_journal",
     "file_sections",
     "hamming_search",
     "instruction_set",
+    "match",
     "open",
     "upright_descriptors",
     "verify_file",
 ]
+
+# What search alone does not need is imported when it is first asked for.
+_LATER = {"Localizer": "protomark.localization", "match": "protomark.matching"}
+
+
+def __getattr__(name: str) -> object:
+    if name in _LATER:
+        from importlib import import_module
+
+        return getattr(import_module(_LATER[name]), name)
+    raise AttributeError(f"module 'protomark' has no attribute {name!r}")

@@ -123,6 +123,7 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "bytes_per_landmark_by_section": {
             name: size / landmarks for name, size in sections.items()
         },
+        "journal": pm.file_journal(path),
         "encoder": _encoder_facts(scene.encoder),
     }
 

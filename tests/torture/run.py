@@ -4,8 +4,10 @@
 
 A child process saves three states of a file in turn and says when each save has returned. It is
 killed (SIGKILL) at a random moment, and the file must then hold the state that was saved last or
-the one after it, byte for byte. Killing a process does not lose what the system has already taken
-over; that everything is synced before it is renamed is tested in core/tests/test_durability.cpp.
+the one after it, byte for byte. A map with a journal goes from state to state by commits, every
+fourth time by a compaction; what is compared then is the map that opening the file gives. Killing a
+process does not lose what the system has already taken over; that everything is synced in the right
+order is tested in core/tests/test_durability.cpp and test_journal_durability.cpp.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ from protomark.tracks import Tracks
 
 Save = Callable[[Path], object]
 LEFT_BEHIND = re.compile(r"target\.\d+|\.target\.[0-9a-f]{8}")
+Report = Callable[[], object]
 
 
 @dataclass
@@ -47,6 +50,7 @@ class Case:
     tracks: bool = False
     contents: list[bytes] = field(default_factory=list)
     seconds: float = 0
+    size: int = 0  # bytes that the second save needs
 
     def holds(self, path: Path, state: int) -> bool:
         """Whether a file is whole and of this state."""
@@ -56,13 +60,117 @@ class Case:
         return path.read_bytes() == self.contents[state]
 
     def prepare(self, folder: Path) -> None:
+        """Learn what each state is and how long saving takes."""
         begin = time.monotonic()
         for save in self.saves:
             save(folder / "target")
             self.contents.append((folder / "target").read_bytes())
         self.seconds = (time.monotonic() - begin) / len(self.saves)
+        self.size = len(self.contents[1])
         (folder / "target").unlink()
         assert len(set(self.contents)) == len(self.contents)
+
+    def start(self, path: Path) -> None:
+        """What is there before the saver is."""
+
+    def run(self, path: Path, report: Report) -> None:
+        """Save one state after the other, and report each."""
+        for save in self.saves * 1000:
+            save(path)
+            report()
+
+    def state_after(self, saves: int) -> int | None:
+        """The state that is there then; None: no file."""
+        return (saves - 1) % len(self.saves) if saves else None
+
+
+class Journal(Case):
+    """A map that goes from state to state by commits and compactions, and back to the first."""
+
+    def __init__(self, name: str, first: pm.PrototypeMap, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.first = first
+        self.some = [
+            (
+                rng.integers(0, 3 * len(first), 1000),
+                rng.integers(-127, 128, (1000, first.dim), dtype=np.int8),
+            )
+            for _ in range(2)
+        ]
+        super().__init__(name, [self.save_first, self.save_second])
+
+    def save_first(self, path: Path) -> None:
+        journal_of(path).unlink(missing_ok=True)
+        self.first.save(path)
+
+    def save_second(self, path: Path) -> None:
+        scene = opened(path)
+        self.change(scene, 0)
+        scene.commit()
+
+    def change(self, scene: pm.PrototypeMap, state: int) -> None:
+        """From this state to the next one."""
+        if state < 2:
+            scene.add_codes(*self.some[state])
+            return
+        for ids, codes in self.some:
+            scene.remove_codes(ids, codes)
+
+    def holds(self, path: Path, state: int) -> bool:
+        pm.verify_file(path)
+        return self.bytes_of(pm.open(path), path) == self.contents[state]
+
+    @staticmethod
+    def bytes_of(scene: pm.PrototypeMap | pm.SealedMap, path: Path) -> bytes:
+        assert isinstance(scene, pm.PrototypeMap)
+        with tempfile.TemporaryDirectory(dir="/dev/shm") as name:
+            scene.save(Path(name) / "state")
+            return (Path(name) / "state").read_bytes()
+
+    def prepare(self, folder: Path) -> None:
+        path = folder / "target"
+        self.save_first(path)
+        begin = time.monotonic()
+        scene = opened(path)
+        for state in range(3):
+            self.contents.append(self.bytes_of(scene, path))
+            self.change(scene, state)
+            if state == 0:
+                scene.commit()
+                self.size = journal_of(path).stat().st_size
+        scene.compact()
+        self.seconds = time.monotonic() - begin
+        assert self.bytes_of(scene, path) == self.contents[0]
+        assert len(set(self.contents)) == 3
+        scene.close()
+        path.unlink()
+        journal_of(path).unlink()
+
+    def start(self, path: Path) -> None:
+        self.save_first(path)
+
+    def run(self, path: Path, report: Report) -> None:
+        scene = opened(path)
+        for step in range(10_000):
+            self.change(scene, step % 3)
+            if step % 4 == 3:
+                scene.compact()
+            else:
+                scene.commit()
+            report()
+
+    def state_after(self, saves: int) -> int | None:
+        return saves % 3
+
+
+def journal_of(path: Path) -> Path:
+    return path.with_name(path.name + ".journal")
+
+
+def opened(path: Path) -> pm.PrototypeMap:
+    scene = pm.open(path, journal=True)
+    assert isinstance(scene, pm.PrototypeMap)
+    return scene
 
 
 def scene(landmarks: int, look_bits: int, rng: np.random.Generator) -> pm.PrototypeMap:
@@ -99,6 +207,8 @@ def cases(large: int, seed: int) -> list[Case]:
             "sealed map, 20,000 landmarks, 4 bits, looks joined",
             [partial(m.seal, bits=4, prototypes=1.5) for m in middle],
         ),
+        Journal("journal, map of 100 landmarks", scene(100, 0, rng), seed),
+        Journal("journal, map of 20,000 landmarks with looks", scene(20_000, 4, rng), seed),
         Case("encoder", [e.save for e in encoders]),
         Case("tracks", [t.save for t in described], tracks=True),
     ]
@@ -106,7 +216,7 @@ def cases(large: int, seed: int) -> list[Case]:
 
 def left_behind(folder: Path) -> list[Path]:
     """Files beside the target; only those that a killed save may leave."""
-    found = [p for p in folder.iterdir() if p.name != "target"]
+    found = [p for p in folder.iterdir() if p.name not in ("target", "target.journal")]
     for path in found:
         assert LEFT_BEHIND.fullmatch(path.name), f"{path} was left behind"
     return found
@@ -114,13 +224,13 @@ def left_behind(folder: Path) -> list[Path]:
 
 def kill_once(case: Case, folder: Path, delay: float) -> str:
     """Kill a saver after `delay` seconds; whether the old or the new state is there."""
+    target = folder / "target"
+    case.start(target)
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         try:
-            for save in case.saves * 1000:
-                save(folder / "target")
-                os.write(writing, b".")
+            case.run(target, lambda: os.write(writing, b"."))
         finally:
             os._exit(1)
     os.close(writing)
@@ -132,21 +242,30 @@ def kill_once(case: Case, folder: Path, delay: float) -> str:
     while block := os.read(reading, 1 << 16):
         saved += len(block)
     os.close(reading)
-    target = folder / "target"
+    old, new = case.state_after(saved), case.state_after(saved + 1)
+    assert new is not None
     if not target.exists():
-        assert saved == 0, "a saved file is gone"
+        assert old is None, "a saved file is gone"
         return "old"
-    if saved > 0 and case.holds(target, (saved - 1) % len(case.saves)):
+    if old is not None and case.holds(target, old):
         return "old"
-    assert case.holds(target, saved % len(case.saves)), "neither the old nor the new file"
+    assert case.holds(target, new), "neither the old nor the new file"
     return "new"
+
+
+def is_torn(path: Path) -> bool:
+    """Whether a commit was interrupted half-way."""
+    if not journal_of(path).exists():
+        return False
+    journal = pm.file_journal(path)
+    return journal is not None and journal["torn_bytes"] > 0
 
 
 def kills(case: Case, folder: Path, n: int, rng: random.Random) -> Counter[str]:
     counts: Counter[str] = Counter()
     for _ in range(n):
         counts[kill_once(case, folder, rng.uniform(0, 2.5 * case.seconds))] += 1
-        counts["within a save"] += bool(left_behind(folder))
+        counts["within a save"] += bool(left_behind(folder)) or is_torn(folder / "target")
         for path in folder.iterdir():
             path.unlink()
     return counts
@@ -185,9 +304,9 @@ def limit_file_size(size: int) -> None:
 
 def file_limits(case: Case, folder: Path, n: int, rng: random.Random) -> Counter[str]:
     counts: Counter[str] = Counter()
-    case.saves[0](folder / "target")
     for _ in range(n):
-        size = rng.randrange(len(case.contents[1]))
+        case.saves[0](folder / "target")
+        size = rng.randrange(case.size)
         met = refused(case, folder, partial(limit_file_size, size), "File too large")
         assert met, f"{size} bytes were enough"
         counts["old"] += 1
@@ -218,7 +337,7 @@ def full_disks(case: Case, n: int, rng: random.Random) -> Counter[str] | None:
         scratch.mkdir()
         for _ in range(n):
             case.saves[0](scratch / "target")
-            left = rng.randrange(len(case.contents[1]))
+            left = rng.randrange(case.size)
             with (folder / "ballast").open("wb") as ballast:
                 os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(folder).free - left)
             met = refused(case, scratch, lambda: None, "No space left on device")

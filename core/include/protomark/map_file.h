@@ -35,8 +35,17 @@ MapKind map_kind(const std::filesystem::path& path);
 // Names and sizes in bytes of the sections of a model or map file. Throws FileError.
 std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path);
 
-// Checks every checksum of a model or map file. Throws FileError.
+// Checks every checksum of a model or map file, and of the journal beside it. Throws FileError.
 void verify_file(const std::filesystem::path& path);
+
+struct FileJournal {
+  std::size_t commits;     // since the map file was written
+  std::size_t bytes;       // of the whole journal
+  std::size_t torn_bytes;  // of a commit that was interrupted, at the end
+};
+
+// The journal beside a map file (PrototypeMap::commit), where there is one. Throws FileError.
+std::optional<FileJournal> file_journal(const std::filesystem::path& path);
 
 // A sealed map takes dim + 1 bytes a landmark (dimensions padded to a multiple of 4, prototypes to
 // one of 16), with 4 bits a number dim / 2 + 1 (dimensions padded to a multiple of 8). Where

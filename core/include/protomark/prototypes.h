@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <filesystem>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <span>
@@ -19,6 +20,12 @@
 #include "protomark/search.h"
 
 namespace protomark {
+
+class Changes;
+class ContainerReader;
+class ContainerWriter;
+class Journal;
+class JournalContent;
 
 using Position = std::array<double, 3>;
 
@@ -46,10 +53,11 @@ struct MapPart;
 // Search compares codes with prototypes rounded to int8, halves away from zero.
 //
 // Every function either does all it was asked or throws and changes nothing (memory that runs out
-// aside). Calls from several threads are safe. Changes exclude each other, and save, seal, split
-// and the map that update reads. A search sees the map between two changes or, of a change of more
-// than 8192 observations or landmarks, between two pieces of that size: it never waits for longer
-// than one of them takes and searches that began before it (docs/sharing.md).
+// aside). Calls from several threads are safe. Changes exclude each other, and save, compact, seal,
+// split and the map that update reads; commit only while it copies what has changed. A search sees
+// the map between two changes or, of a change of more than 2048 observations or landmarks, between
+// two pieces of that size: it never waits for longer than one of them takes and searches that began
+// before it (docs/sharing.md).
 class PrototypeMap {
  public:
   static constexpr int kMaxCount = 255;
@@ -144,11 +152,30 @@ class PrototypeMap {
                     MatrixView<float> distances) const;
 
   // Writes the map, landmarks by ascending id, so that equal maps (of equal cells) give equal
-  // files. Whole or not at all. Throws FileError.
+  // files. Whole or not at all. Onto the file that it was loaded from with a journal: compacts.
+  // Throws FileError, also where another map may commit to `path` or has, which would be lost.
   void save(const std::filesystem::path& path) const;
-  static PrototypeMap load(const std::filesystem::path& path);
-  // Reads and checks the bytes of a map file; `name` is what errors call them.
-  static PrototypeMap parse(std::span<const std::byte> bytes, const std::string& name);
+  // Reads a map file and what was committed to the journal beside it. With `journal` the map is the
+  // one that may commit to it until it is closed or gone; nobody else can at the same time. Throws
+  // FileError.
+  static PrototypeMap load(const std::filesystem::path& path, bool journal = false);
+  // Reads and checks the bytes of a map file and of its journal; `name` is what errors call them.
+  static PrototypeMap parse(std::span<const std::byte> bytes, const std::string& name,
+                            std::span<const std::byte> journal = {});
+
+  // The journal is a file beside the map file, <path>.journal (docs/format.md).
+  bool has_journal() const;
+  // Makes all changes up to here last, at a cost that grows with the number of landmarks that
+  // changed: when it has returned, the map file and its journal give this map, whatever happens.
+  // Returns the bytes written; nothing is where nothing changed. Throws FileError, and then the map
+  // in memory is as before and one may commit again; std::invalid_argument without a journal, as
+  // does compact.
+  std::size_t commit();
+  // Writes the map file anew, as save does, and empties the journal. Whatever happens, the two of
+  // them give this map or what was committed last. Throws FileError.
+  void compact();
+  // Gives the journal back, and what was not committed stays in memory only.
+  void close();
   // Writes a sealed map (protomark/map_file.h) whose prototypes have 8 or 4 bits a number. With 8
   // it gives the same answers; with 4 numbers are rounded to 16 levels that fit this map best,
   // which takes half the bytes. `prototypes` is the largest number of prototypes a landmark has on
@@ -165,6 +192,15 @@ class PrototypeMap {
  private:
   struct Store;
 
+  static PrototypeMap read(const ContainerReader& file, const JournalContent& journal);
+  static PrototypeMap load_with_journal(const std::filesystem::path& path);
+  // Writes the map file; `before` is called with its identity before it takes its place.
+  void write(const std::filesystem::path& path,
+             const std::function<void(const std::string&)>& before) const;
+  // The rest of a commit's record.
+  std::vector<std::byte> serialize(ContainerWriter& record, const Changes& changes) const;
+  Journal& journal() const;
+  void fold() const;
   // A map of some of the landmarks, by number.
   PrototypeMap part(std::span<const std::uint32_t> landmarks) const;
 

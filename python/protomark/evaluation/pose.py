@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.localization.absolute_pose import estimate, pose_error, project
 from protomark.tracks.file import Camera, Tracks
 
 # A pose is found if it is off by at most this share of the median scene depth, and this angle.
@@ -16,18 +17,6 @@ DEGREES = 2.0
 ACCEPTED_SHARE = 0.25
 # Reprojection error of an inlier, and of a right match, as a share of the image's longer side.
 PIXEL_SHARE = 0.005
-MAX_ITERATIONS = 2000
-
-# Camera models that both COLMAP and PoseLib know.
-_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "OPENCV_FISHEYE",
-)
 
 
 @dataclass(frozen=True)
@@ -142,22 +131,6 @@ def right(frame: Frame, matches: Matches, positions: NDArray[np.float64]) -> NDA
     return own | (off <= frame.tolerance)
 
 
-def project(
-    camera: Camera, cam_from_world: NDArray[np.float64], positions: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(n, 3) world positions -> (n, 2) pixels, infinite for what lies behind the camera."""
-    import poselib
-
-    _check(camera)
-    points = positions @ cam_from_world[:, :3].T + cam_from_world[:, 3]
-    pixels = np.full((len(points), 2), np.inf)
-    front = points[:, 2] > 0
-    if front.any():
-        model = poselib.Camera(camera.model, list(camera.params), camera.width, camera.height)
-        pixels[front] = np.asarray(model.project(points[front, :2] / points[front, 2:]))
-    return pixels
-
-
 def localize(frame: Frame, matches: Matches, positions: NDArray[np.float64]) -> Localization:
     """Absolute pose by PoseLib's RANSAC and refinement, held against the frame's true pose.
 
@@ -166,48 +139,12 @@ def localize(frame: Frame, matches: Matches, positions: NDArray[np.float64]) -> 
         matches: its accepted matches, the clearest first.
         positions: (a, 3) float64, position of each match's landmark.
     """
-    import poselib
-
-    _check(frame.camera)
     nothing = Localization(None, np.inf, np.inf, np.zeros(len(positions), dtype=bool))
-    if len(positions) < 4:
+    found = estimate(frame.keypoints[matches.keypoints], positions, frame.camera, frame.tolerance)
+    if found is None:
         return nothing
-    # Tracks and PoseLib share COLMAP's pixels and camera parameters: nothing to shift.
-    pose, found = poselib.estimate_absolute_pose(
-        frame.keypoints[matches.keypoints],
-        positions,
-        frame.camera.as_dict(),
-        {
-            "max_reproj_error": frame.tolerance,
-            "max_iterations": MAX_ITERATIONS,
-            "min_iterations": 100,
-            "progressive_sampling": True,
-            "seed": 0,
-        },
-        {},
-    )
-    estimate = np.asarray(pose.Rt, dtype=np.float64)
-    if found["num_inliers"] < 4 or not np.isfinite(estimate).all():
-        return nothing
-    return Localization(
-        estimate,
-        *pose_error(estimate, frame.cam_from_world),
-        np.asarray(found["inliers"], dtype=bool),
-    )
-
-
-def pose_error(estimate: NDArray[np.float64], true: NDArray[np.float64]) -> tuple[float, float]:
-    """Distance of the camera centres in world units, and angle of the rotation in degrees."""
-    distance = np.linalg.norm(centre(estimate) - centre(true))
-    # From the distance of the matrices: exact for small angles, where arccos of the trace is not.
-    chord = np.linalg.norm(estimate[:, :3] - true[:, :3]) / np.sqrt(8)
-    return float(distance), float(np.degrees(2 * np.arcsin(min(chord, 1.0))))
-
-
-def centre(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(..., 3, 4) poses -> (..., 3) camera centres in the world."""
-    rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
-    return np.asarray(-np.einsum("...ji,...j->...i", rotation, translation))
+    pose = found.cam_from_world
+    return Localization(pose, *pose_error(pose, frame.cam_from_world), found.inliers)
 
 
 def scene_depth(tracks: Tracks) -> float:
@@ -219,11 +156,3 @@ def scene_depth(tracks: Tracks) -> float:
         np.einsum("nj,nj->n", poses[:, 2, :3], tracks.landmark_positions[where]) + poses[:, 2, 3]
     )
     return float(np.median(depths))
-
-
-def _check(camera: Camera) -> None:
-    if camera.model not in _MODELS:
-        raise ValueError(
-            f"camera model {camera.model} is not one that poses can be found for: undistort the "
-            f"images to one of {', '.join(_MODELS)}"
-        )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.evaluation.plot import GRID, INK, MUTED, OURS
-from protomark.evaluation.pose import centre
+from protomark.localization.absolute_pose import centre
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -58,6 +58,7 @@ class Card:
         figures: precision, by sequence.
         history: (step, loss, mean validation precision) of each validation.
         curve: file name of the picture of the training, beside the card, or "".
+        calibrated_on: sequences that the acceptance of matches was fitted to, or "".
     """
 
     name: str
@@ -78,6 +79,7 @@ class Card:
     figures: list[Figures]
     history: list[tuple[int, float, float]] = field(default_factory=list)
     curve: str = ""
+    calibrated_on: str = ""
 
     @property
     def multiply_adds(self) -> int:
@@ -101,6 +103,8 @@ class Card:
             f"- licence: {self.licence or 'none stated'}",
             f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "
             f"the weights of step {self.best_step} kept",
+            f"- which matches to accept: fitted to {self.calibrated_on or 'nothing'} "
+            "(`protomark calibrate`)",
             "",
             "Train it again:",
             "",

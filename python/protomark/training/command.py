@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from protomark.acceptance import SOURCE_KEY
+from protomark.calibration import calibrate
 from protomark.console import console, progress_bar, progress_console
 from protomark.evaluation.encode_cost import encode_nanoseconds
 from protomark.evaluation.methods.bitwise import majority
 from protomark.evaluation.methods.medoid import medoid
 from protomark.evaluation.support import Support
+from protomark.evaluation.threads import one_blas_thread
 from protomark.files import write_text
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.card import Card, Figures, describe_data
@@ -118,6 +121,7 @@ def train_encoder(
         data=describe_data(data.sources),
         licence=licence,
     )
+    encoder, calibrated_on = _calibrated(encoder, [*training, *validation], threads)
     encoder.save(output)
     figures = []
     with progress_bar() as bar:
@@ -155,12 +159,33 @@ def train_encoder(
         figures=figures,
         history=[(p.step, p.loss, p.mean_precision) for p in trainer.history],
         curve=curve.name,
+        calibrated_on=calibrated_on,
     )
     write_text(card_path, card.markdown())
     if json_path is not None:
         write_text(json_path, json.dumps(asdict(card), indent=1) + "\n")
     checkpoint.unlink(missing_ok=True)
     return card
+
+
+def _calibrated(encoder: pm.Encoder, paths: Sequence[Path], threads: int) -> tuple[pm.Encoder, str]:
+    """The encoder with what to accept, fitted to those files that have no varied copies.
+
+    Tracks that leave nothing to fit end no training: the encoder then says nothing.
+    """
+    plain = [path for path in paths if not Tracks.load(path).info.get("variants")]
+    try:
+        with one_blas_thread():  # more add up in another order
+            encoder, _ = calibrate(encoder, plain, threads)
+    except ValueError as error:
+        progress_console.print(
+            f"not calibrated, so that `protomark localize` will not know which matches to accept: "
+            f"{error}",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+    return encoder, encoder.notes.get(SOURCE_KEY, "")
 
 
 def default_output(tracks: Path, resume: bool = False, upright: bool = False) -> Path:

@@ -1,0 +1,47 @@
+// Writing so that it lasts, and that files are there whole or not at all.
+#pragma once
+
+#include <cstddef>
+#include <filesystem>
+#include <span>
+#include <string>
+
+namespace protomark {
+
+using Bytes = std::span<const std::byte>;
+
+// What errno says.
+std::string system_error();
+
+// Writes all of the bytes where the descriptor stands. False, with errno set, where that fails.
+bool write_all(int descriptor, Bytes bytes);
+
+// Syncs the folder of `path`: without this a power cut may bring the old name back. False, with
+// errno set, where that fails, and not where the file system cannot or the folder is not readable.
+bool sync_folder(const std::filesystem::path& path);
+
+// A file being written beside its target; removed unless it takes the target's place. All throw
+// FileError.
+class TemporaryFile {
+ public:
+  explicit TemporaryFile(const std::filesystem::path& target);
+  ~TemporaryFile();
+  TemporaryFile(const TemporaryFile&) = delete;
+  TemporaryFile& operator=(const TemporaryFile&) = delete;
+
+  void write(Bytes bytes);
+  void seek(std::size_t offset);
+  // Ends the writing, so that the file outlasts a power cut.
+  void sync();
+  // Renames the file, which is synced, over its target, and syncs the folder.
+  void replace_target();
+
+ private:
+  [[noreturn]] void fail() const;
+
+  std::filesystem::path target_;
+  std::string path_;
+  int descriptor_ = -1;
+};
+
+}  // namespace protomark

@@ -1,0 +1,110 @@
+#include "landmark_sections.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <string>
+#include <utility>
+
+namespace protomark {
+
+LandmarkSections::LandmarkSections(const PrototypeStore& store,
+                                   std::vector<std::uint32_t> landmarks)
+    : store_(&store), landmarks_(std::move(landmarks)) {
+  if (store.look_bits() != 0) rows_ = store.sorted_rows(landmarks_);
+}
+
+void LandmarkSections::add_to(ContainerWriter& file) const {
+  const PrototypeStore& store = *store_;
+  const std::span<const std::uint32_t> landmarks = landmarks_, rows = this->rows();
+  const std::size_t n = landmarks.size(), m = rows.size(), dim = store.dim();
+  add_values<std::int64_t>(file, section::kIds, n, 1, [=, &store](std::size_t i, std::int64_t* to) {
+    *to = store.ids()[landmarks[i]];
+  });
+  if (store.look_bits() != 0) {
+    file.add(section::kLookBits, write_look_bits(store.look_bits()));
+    add_values<std::uint32_t>(file, section::kRows, n, 1,
+                              [=, &store](std::size_t i, std::uint32_t* to) {
+                                *to = static_cast<std::uint32_t>(store.rows_of(landmarks[i]));
+                              });
+    add_values<std::uint16_t>(
+        file, section::kLooks, m, 1,
+        [=, &store](std::size_t i, std::uint16_t* to) { *to = store.look(rows[i]); });
+  }
+  add_values<std::uint8_t>(
+      file, section::kCounts, m, 1,
+      [=, &store](std::size_t i, std::uint8_t* to) { *to = store.count(rows[i]); });
+  add_values<std::int16_t>(
+      file, section::kSums, m, dim,
+      [=, &store](std::size_t i, std::int16_t* to) { std::copy_n(store.sum(rows[i]), dim, to); });
+  // A map whose positions were all taken away equals one that never had any.
+  const auto has_none = [&](std::uint32_t l) { return is_nowhere(store.position(l)); };
+  if (std::all_of(landmarks.begin(), landmarks.end(), has_none)) return;
+  add_values<Position>(file, section::kPositions, n, 1, [=, &store](std::size_t i, Position* to) {
+    *to = store.position(landmarks[i]);
+  });
+}
+
+void read_landmarks(const ContainerReader& file, const MapShape& shape, PrototypeStore& store) {
+  const std::size_t n = shape.landmarks, dim = shape.dim, look_bits = store.look_bits();
+  const auto ids = read_section<std::int64_t>(file, section::kIds, n);
+  check_ids(file, ids);
+  std::vector<std::uint32_t> rows_of;
+  std::size_t m = n;
+  if (look_bits != 0) {
+    rows_of = read_section<std::uint32_t>(file, section::kRows, n);
+    m = count_rows(file, std::span<const std::uint32_t>(rows_of));
+  }
+  std::vector<std::uint16_t> looks;
+  if (look_bits != 0) looks = read_section<std::uint16_t>(file, section::kLooks, m);
+  const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
+  const auto sums = read_section<std::int16_t>(file, section::kSums, m * dim);
+  std::vector<Position> positions;
+  if (file.map_if_there(section::kPositions)) {
+    positions = read_section<Position>(file, section::kPositions, n);
+  }
+
+  if (store.landmarks() == 0) {
+    store.reserve(n, m);
+  } else {
+    // All of them before the first comes: numbers of landmarks hold only until one goes.
+    for (const std::int64_t id : ids) {
+      if (store.find(id) != PrototypeStore::kNone) store.erase(id);
+    }
+  }
+  std::vector<std::uint32_t> landmarks;  // where there are positions
+  landmarks.reserve(positions.size());
+  for (std::size_t i = 0, next = 0; i < n; ++i) {
+    const std::uint32_t landmark = store.create_landmark(ids[i]);
+    const std::size_t end = next + (look_bits != 0 ? rows_of[i] : 1);
+    for (const std::size_t first = next; next < end; ++next) {
+      const int count = counts[next];
+      const std::int16_t* sum = &sums[next * dim];
+      if (count == 0 ||
+          std::any_of(sum, sum + dim, [&](int s) { return std::abs(s) > 127 * count; })) {
+        file.fail("landmark " + std::to_string(ids[i]) + " has an impossible prototype");
+      }
+      if (look_bits != 0 &&
+          (looks[next] >> look_bits != 0 || (next > first && looks[next] <= looks[next - 1]))) {
+        file.fail("the looks of landmark " + std::to_string(ids[i]) + " do not ascend");
+      }
+      const std::uint32_t row = store.create_row(landmark, look_bits != 0 ? looks[next] : 0);
+      std::copy_n(sum, dim, store.sum(row));
+      store.set_count(row, count);
+      store.refresh(row);
+    }
+    if (positions.empty()) continue;
+    landmarks.push_back(landmark);
+    const Position& p = positions[i];
+    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
+    if (!finite && !is_nowhere(p)) {
+      file.fail("landmark " + std::to_string(ids[i]) + " has no finite position");
+    }
+  }
+  // After the landmarks, so that room for positions is made once.
+  for (std::size_t i = 0; i < positions.size(); ++i) {
+    store.set_position(landmarks[i], positions[i]);
+  }
+}
+
+}  // namespace protomark

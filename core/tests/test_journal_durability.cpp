@@ -1,0 +1,291 @@
+// What a commit and a compaction do to the disk: the order of steps, each step that fails, and each
+// moment at which a process is killed or the power goes.
+#include <cerrno>
+#include <cstring>
+#include <filesystem>
+#include <fstream>
+#include <iterator>
+#include <map>
+#include <optional>
+#include <set>
+#include <utility>
+
+#include "check.h"
+#include "faulty_disk.h"
+#include "protomark/error.h"
+#include "protomark/map_file.h"
+#include "protomark/prototypes.h"
+#include "random.h"
+
+namespace fs = std::filesystem;
+
+using namespace protomark;
+
+namespace {
+
+using Content = std::vector<char>;
+
+const fs::path folder =
+    fs::temp_directory_path() / ("protomark_journal_" + std::to_string(::getpid()));
+const fs::path path = folder / "disk" / "map.pmk";
+
+Content read(const fs::path& file) {
+  std::ifstream in(file, std::ios::binary);
+  return {std::istreambuf_iterator<char>(in), {}};
+}
+
+// The map file and journal that a disk may have after a power cut at some moment: what was synced,
+// and of the rest any part. A process that is killed leaves the present names and contents.
+class PowerCuts {
+ public:
+  using World = std::map<std::string, Content>;
+
+  // What is there now is synced.
+  PowerCuts() {
+    look();
+    synced_names_ = names_;
+    synced_ = current_;
+    worlds_.clear();
+    disk.before_step = [this] { look(); };
+    disk.after_sync = [this](int descriptor, bool of_folder) {
+      look();
+      struct stat status;
+      ::fstat(descriptor, &status);
+      if (of_folder) synced_names_ = names_;
+      if (!of_folder) synced_[status.st_ino] = current_[status.st_ino];
+    };
+  }
+  ~PowerCuts() { disk = {}; }
+  PowerCuts(const PowerCuts&) = delete;
+  PowerCuts& operator=(const PowerCuts&) = delete;
+
+  // Those that there may have been since the last time.
+  std::set<World> take() {
+    look();
+    return std::exchange(worlds_, {});
+  }
+
+ private:
+  using Names = std::map<std::string, ino_t>;
+
+  void look() {
+    names_.clear();
+    for (const auto& entry : fs::directory_iterator(path.parent_path())) {
+      struct stat status;
+      ::stat(entry.path().c_str(), &status);
+      names_[entry.path().filename()] = status.st_ino;
+      current_[status.st_ino] = read(entry.path());
+    }
+    for (const Names& names : {names_, synced_names_}) {
+      std::vector<World> some(1);
+      for (const auto& [name, inode] : names) {
+        if (name != "map.pmk" && name != "map.pmk.journal") continue;
+        std::vector<World> more;
+        for (const World& world : some) {
+          for (const Content& content : contents(inode)) {
+            more.push_back(world);
+            more.back()[name] = content;
+          }
+        }
+        some = std::move(more);
+      }
+      worlds_.insert(some.begin(), some.end());
+    }
+  }
+
+  std::set<Content> contents(ino_t inode) {
+    const Content &now = current_[inode], &synced = synced_[inode];
+    // The size is there, and what was to stand there is not.
+    Content zeros = now;
+    for (std::size_t i = synced.size(); i < zeros.size(); ++i) zeros[i] = 0;
+    return {now, synced, zeros};
+  }
+
+  Names names_, synced_names_;
+  std::map<ino_t, Content> current_, synced_;
+  std::set<World> worlds_;
+};
+
+void add(PrototypeMap& map, std::uint32_t seed, std::int64_t first, std::size_t n) {
+  test::Random random(seed);
+  const auto codes = random.integers<std::int8_t>(n * 12, -127, 127);
+  const auto ids = random.integers<std::int64_t>(n, first, first + 20);
+  map.add_codes(ids, {codes.data(), n, 12});
+}
+
+Content bytes_of(const PrototypeMap& map) {
+  map.save(folder / "scratch.pmk");
+  return read(folder / "scratch.pmk");
+}
+
+// A map file, commits behind it, and changes that are not committed.
+struct Session {
+  Session() {
+    fs::remove_all(path.parent_path());
+    fs::create_directories(path.parent_path());
+    PrototypeMap first(test::random_encoder(), 0, 2);
+    add(first, 1, 0, 30);
+    first.save(path);
+    map.emplace(PrototypeMap::load(path, true));
+    add(*map, 2, 10, 10);
+    map->commit();
+    map->discard(std::vector<std::int64_t>{map->ids().front()});
+    map->build_index(3);
+    CHECK(map->commit() > 0);
+    committed = bytes_of(*map);
+    add(*map, 3, 100, 10);
+    map->merge(std::vector{map->ids()[1]}, std::vector{map->ids()[2]});
+    changed = bytes_of(*map);
+    CHECK(committed != changed);
+  }
+
+  std::optional<PrototypeMap> map;
+  Content committed, changed;
+};
+
+using Action = void (*)(PrototypeMap&);
+void commit(PrototypeMap& map) { map.commit(); }
+void compact(PrototypeMap& map) { map.compact(); }
+
+// A map that is opened there is one of these, and one can go on with it.
+void check_world(const PowerCuts::World& world, const std::set<Content>& states) {
+  const fs::path there = folder / "world";
+  fs::remove_all(there);
+  fs::create_directory(there);
+  for (const auto& [name, content] : world) {
+    std::ofstream(there / name, std::ios::binary)
+        .write(content.data(), static_cast<std::streamsize>(content.size()));
+  }
+  try {
+    CHECK(states.contains(bytes_of(PrototypeMap::load(there / "map.pmk"))));
+    PrototypeMap map = PrototypeMap::load(there / "map.pmk", true);
+    CHECK(states.contains(bytes_of(map)));
+    add(map, 9, 0, 5);
+    map.commit();
+    verify_file(there / "map.pmk");
+    CHECK(bytes_of(PrototypeMap::load(there / "map.pmk")) == bytes_of(map));
+  } catch (const std::exception& error) {
+    std::printf("%s\n", error.what());
+    CHECK(!"it opens");
+  }
+}
+
+void power_cuts(Action action) {
+  Session session;
+  std::set<PowerCuts::World> during, after;
+  {
+    PowerCuts cuts;
+    action(*session.map);
+    during = cuts.take();
+    after = cuts.take();
+  }
+  for (const auto& world : during) check_world(world, {session.committed, session.changed});
+  for (const auto& world : after) check_world(world, {session.changed});
+  std::printf("%zu states of the disk, %zu when it had returned\n", during.size(), after.size());
+  CHECK(during.size() > 3);
+}
+
+// Opening begins a journal, cuts a torn one, or begins it anew behind another map file.
+void power_cuts_at_opening() {
+  Session session;
+  session.map->close();
+  for (const int kind : {0, 1, 2}) {
+    const fs::path journal = path.string() + ".journal";
+    if (kind == 0) {
+      std::ofstream(journal, std::ios::binary | std::ios::app) << std::string(100, 'x');
+    } else if (kind == 1) {
+      fs::remove(journal);
+      std::ofstream(path, std::ios::binary)
+          .write(session.committed.data(), static_cast<std::streamsize>(session.committed.size()));
+    } else {
+      std::ofstream(path, std::ios::binary)
+          .write(session.changed.data(), static_cast<std::streamsize>(session.changed.size()));
+    }
+    std::set<PowerCuts::World> worlds;
+    {
+      PowerCuts cuts;
+      const PrototypeMap map = PrototypeMap::load(path, true);
+      worlds = cuts.take();
+    }
+    CHECK(worlds.size() > 1);
+    for (const auto& world : worlds) {
+      check_world(world, {kind == 2 ? session.changed : session.committed});
+    }
+  }
+}
+
+void failing_steps(Action action) {
+  long steps = 0;
+  for (bool done = false; !done; ++steps) {
+    for (const bool broken : {false, true}) {
+      for (const int error : {EIO, ENOSPC}) {
+        Session session;
+        disk = {};
+        disk.fails_at = steps;
+        disk.broken = broken;
+        disk.error = error;
+        bool threw = false;
+        try {
+          action(*session.map);
+        } catch (const FileError& e) {
+          threw = true;
+          CHECK(std::string(e.what()).find(std::strerror(error)) != std::string::npos);
+        }
+        done = disk.steps <= steps;
+        CHECK(done == !threw);
+        disk = {};
+        const Content there = bytes_of(PrototypeMap::load(path));
+        CHECK(there == session.changed || (threw && there == session.committed));
+        CHECK(bytes_of(*session.map) == session.changed);
+        // What failed may be tried again, in any way.
+        if (broken) compact(*session.map);
+        session.map->commit();
+        CHECK(bytes_of(PrototypeMap::load(path)) == session.changed);
+        add(*session.map, 5, 0, 20);
+        CHECK(session.map->commit() > 0);
+        const Content last = bytes_of(*session.map);
+        CHECK(bytes_of(PrototypeMap::load(path)) == last);
+        session.map->close();
+        CHECK(bytes_of(PrototypeMap::load(path, true)) == last);
+      }
+    }
+  }
+  std::printf("%ld steps that fail\n", steps - 1);
+}
+
+void order_of_steps() {
+  using Calls = std::vector<std::string>;
+  Session session;
+  disk = {};
+  session.map->commit();
+  CHECK(disk.calls == Calls{"sync file"});
+  disk = {};
+  CHECK(session.map->commit() == 0);
+  CHECK(disk.steps == 0);
+  add(*session.map, 4, 0, 1);
+  session.map->compact();
+  CHECK(disk.calls ==
+        Calls{"sync file", "sync file", "rename", "sync folder", "cut", "sync file", "sync file"});
+  CHECK(session.map->commit() == 0);
+  session.map->close();
+  fs::remove(path.string() + ".journal");
+  disk = {};
+  PrototypeMap::load(path);
+  CHECK(disk.steps == 0);
+  PrototypeMap::load(path, true);
+  CHECK(disk.calls == Calls{"cut", "sync file", "sync file", "sync folder"});
+}
+
+}  // namespace
+
+int main() {
+  fs::create_directories(folder);
+  order_of_steps();
+  for (const Action action : {commit, compact}) {
+    power_cuts(action);
+    failing_steps(action);
+  }
+  power_cuts_at_opening();
+  fs::remove_all(folder);
+  return check::result();
+}

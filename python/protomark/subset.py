@@ -1,0 +1,63 @@
+"""Search among some of a map's landmarks only, as if the map held no others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import protomark as pm
+
+
+class Subset:
+    """Some landmarks of a map, for search alone.
+
+    It answers as the map would that held these landmarks and no others: the same ids, distances
+    and order. Making it costs time in proportion to the landmarks in it, not to the map.
+
+    Args:
+        scene: an open or a sealed map.
+        landmark_ids: (n,) int64, those to search.
+
+    Raises:
+        KeyError: an id is not in the map.
+    """
+
+    def __init__(self, scene: pm.PrototypeMap | pm.SealedMap, landmark_ids: ArrayLike) -> None:
+        ids = np.unique(np.asarray(landmark_ids, np.int64))
+        self._looks = scene.prototype_count != len(scene)
+        if self._looks:
+            each = [scene.looks(int(i)) for i in ids]
+            means = np.concatenate([*each, np.zeros((0, scene.dim), np.float32)])
+            self._most = max((len(rows) for rows in each), default=1)
+            self._landmarks = np.repeat(ids, [len(rows) for rows in each])
+            rows = np.arange(len(means))
+        else:
+            means = scene.prototype(ids)
+            rows = ids
+        # A map compares codes with means rounded to int8, halves away from zero; such a rounded
+        # mean, added as the one code of a landmark, is that landmark's prototype again.
+        codes = np.trunc(means + np.copysign(np.float32(0.5), means)).astype(np.int8)
+        self._map = pm.PrototypeMap(scene.encoder, scene.dim)
+        self._map.add_codes(rows, codes)
+        self._size = len(ids)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def search_codes(
+        self, codes: NDArray[np.int8], k: int = 2, threads: int = 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """As `PrototypeMap.search_codes`: ids (q, k) and distances (q, k)."""
+        if not self._looks:
+            return self._map.search_codes(codes, k=k, threads=threads)
+        # Rows of a landmark follow each other, so equal distances stay in the order of landmarks.
+        rows, distances = self._map.search_codes(codes, k=(k - 1) * self._most + 1, threads=threads)
+        landmarks = np.append(self._landmarks, -1)[rows]  # the last is for row -1
+        ids = np.full((len(codes), k), -1, np.int64)
+        found = np.full((len(codes), k), np.inf, np.float32)
+        for i, (row, away) in enumerate(zip(landmarks, distances, strict=True)):
+            _, first = np.unique(row, return_index=True)
+            first = np.sort(first[row[first] >= 0])[:k]
+            ids[i, : len(first)] = row[first]
+            found[i, : len(first)] = away[first]
+        return ids, found

@@ -1,0 +1,323 @@
+"""Where images were taken: rendered images in maps made of others, good and bad ones."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner, Result
+
+import protomark as pm
+from protomark import sample
+from protomark.build import build_map
+from protomark.cli import app
+from protomark.evaluation.pose import Frame, scene_depth
+from protomark.evaluation.protocol import split
+from protomark.localization import Localization, Localizer, PosePrior
+from protomark.localization.absolute_pose import centre, pose_error
+from protomark.localization.cameras import camera_of_exif
+from protomark.localization.halves import calibrated, localize_halves, medoids, prototypes
+from protomark.tracks import Tracks
+from protomark.tracks.command import make_tracks
+from protomark.tracks.extract import Settings
+from protomark.upright import upright_tracks
+from tracks_scene import PINHOLE, poses, quaternion, render, texture, write_model, write_sequence
+
+KEYPOINTS = 600
+# Between the poses that the maps are made of.
+NEW_POSES = poses(15)[[3, 6, 9]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tracks and maps of a plane, in both descriptors that the tests use."""
+    folder = tmp_path_factory.mktemp("localization")
+    sequence = write_sequence(folder / "plane", count=8)
+    settings = [Settings(descriptor=name, max_keypoints=KEYPOINTS) for name in ("freak", "orb")]
+    make_tracks([sequence], settings, folder, threads=1)
+    return folder
+
+
+def tracks_of(folder: Path, descriptor: str = "freak") -> Tracks:
+    return Tracks.load(folder / f"plane.{descriptor}.safetensors")
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> pm.PrototypeMap:
+    return build_map(tracks_of(folder), pm.Encoder.load("freak"), 32)
+
+
+@pytest.fixture(scope="module")
+def images() -> list[NDArray[np.uint8]]:
+    return [render(pose, PINHOLE, texture()) for pose in NEW_POSES]
+
+
+def close(
+    found: Localization, true: NDArray[np.float64], distance: float = 0.02, degrees: float = 0.5
+) -> bool:
+    assert found.cam_from_world is not None, found.reason
+    off, angle = pose_error(found.cam_from_world, true)
+    return off < distance and angle < degrees
+
+
+def test_three_lines(folder: Path, scene: pm.PrototypeMap, images: list[Any]) -> None:
+    scene.save(folder / "three.pmk")
+    cv2.imwrite(str(folder / "three.png"), images[1])
+    localizer = pm.Localizer(pm.open(folder / "three.pmk"), max_keypoints=KEYPOINTS)
+    result = localizer.localize(folder / "three.png", PINHOLE)
+    assert close(result, NEW_POSES[1])
+    assert result.confidence > 0.99
+    assert result.inliers == len(result.landmarks) == len(result.pixels) > 30
+    assert list(result.seconds) == ["features", "encode", "search", "pose", "total"]
+    assert all(s > 0 for s in result.seconds.values())
+    # The inliers project to where they were seen.
+    seen = scene.positions(result.landmarks) @ result.cam_from_world[:, :3].T
+    seen += result.cam_from_world[:, 3]
+    pixels = 300 * seen[:, :2] / seen[:, 2:] + (160, 120)
+    assert np.abs(pixels - result.pixels).max() < 0.005 * 320
+
+
+@pytest.mark.parametrize("kind", ["8 bits", "4 bits", "looks", "orb", "upright", "64"])
+def test_every_kind_of_map(folder: Path, images: list[Any], kind: str, tmp_path: Path) -> None:
+    tracks = tracks_of(folder, "orb" if kind == "orb" else "freak")
+    encoder = pm.Encoder.load("freak-upright" if kind == "upright" else tracks.descriptor)
+    if kind == "upright":
+        tracks = upright_tracks(tracks)
+    look_bits = 8 if kind == "looks" else 0
+    dim = 64 if kind == "64" else 32
+    made: pm.PrototypeMap | pm.SealedMap = build_map(tracks, encoder, dim, look_bits=look_bits)
+    if kind.endswith("bits"):
+        assert isinstance(made, pm.PrototypeMap)
+        made = made.seal(tmp_path / "s.pmk", bits=int(kind[0]))
+    localizer = Localizer(made, max_keypoints=KEYPOINTS)
+    for image, pose in zip(images, NEW_POSES, strict=True):
+        assert close(localizer.localize(image, PINHOLE), pose)
+
+
+def test_unknown_and_rough_focal_lengths(scene: pm.PrototypeMap, images: list[Any]) -> None:
+    localizer = Localizer(scene, max_keypoints=KEYPOINTS)
+    unknown = localizer.localize(images[0])
+    # A plane nearly face on says little of the focal length.
+    assert unknown.camera.params[0] == pytest.approx(300, rel=0.1)
+    assert close(unknown, NEW_POSES[0], 0.2, 2)
+    rough = replace(PINHOLE, params=(330.0, 330.0, 160.0, 120.0))
+    refined = localizer.localize(images[0], rough, focal_length="rough")
+    assert refined.camera.params[0] == pytest.approx(300, rel=0.1)
+    assert close(refined, NEW_POSES[0], 0.2, 2)
+
+
+def test_images_of_nothing_and_of_another_place(scene: pm.PrototypeMap, images: list[Any]) -> None:
+    localizer = Localizer(scene, max_keypoints=KEYPOINTS)
+    black = localizer.localize(np.zeros((240, 320), np.uint8), PINHOLE)
+    assert (black.cam_from_world, black.confidence) == (None, 0.0)
+    assert "0 keypoints" in black.reason
+    blurred = localizer.localize(cv2.GaussianBlur(images[0], (0, 0), 12), PINHOLE)
+    assert blurred.confidence < 0.5
+    for seed in range(4, 12):
+        elsewhere = render(NEW_POSES[0], PINHOLE, texture(seed=seed))
+        assert localizer.localize(elsewhere, PINHOLE).confidence < 0.5
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    assert localizer.localize(noise, PINHOLE).confidence < 0.5
+
+
+def test_a_prior_searches_what_it_makes_visible(
+    folder: Path, scene: pm.PrototypeMap, images: list[Any]
+) -> None:
+    localizer = Localizer(scene, max_keypoints=KEYPOINTS)
+    prior = PosePrior(NEW_POSES[0], 0.1, 5)
+    found = localizer.localize(images[0], PINHOLE, prior)
+    assert close(found, NEW_POSES[0])
+    # A camera that looks away sees nothing of the map.
+    turned = np.diag([-1.0, 1.0, -1.0]) @ NEW_POSES[0]
+    nothing = localizer.localize(images[0], PINHOLE, PosePrior(turned, 0.1, 5))
+    assert nothing.cam_from_world is None
+
+
+def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any]) -> None:
+    bare = pm.PrototypeMap(scene.encoder, 32)
+    bare.add([1], np.zeros((1, 64), np.uint8))
+    with pytest.raises(ValueError, match="none of the map's 1 landmarks has a position"):
+        Localizer(bare)
+    localizer = Localizer(scene)
+    with pytest.raises(ValueError, match="320 x 240 pixels, its camera 640 x 480"):
+        localizer.localize(images[0], replace(PINHOLE, width=640, height=480))
+    with pytest.raises(ValueError, match="undistort"):
+        localizer.localize(images[0], replace(PINHOLE, model="FOV"))
+    with pytest.raises(ValueError, match="PINHOLE has 4 parameters, not 3"):
+        localizer.localize(images[0], replace(PINHOLE, params=(300.0, 160.0, 120.0)))
+    with pytest.raises(ValueError, match="uint8"):
+        localizer.localize(np.zeros((240, 320)), PINHOLE)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="3 keypoints, but 2 descriptors"):
+        localizer.localize_features(np.zeros((3, 2)), np.zeros((2, 64), np.uint8), PINHOLE)
+    other = pm.PrototypeMap(encoder)
+    other.add([1], np.zeros((1, 8), np.uint8))
+    other.set_positions([1], [[0, 0, 0]])
+    with pytest.raises(ValueError, match="protomark calibrate"):
+        Localizer(other)
+
+
+def test_real_frames_of_the_sample() -> None:
+    tracks = Tracks.load(sample.path())
+    part = split(tracks, 0)
+    kept = np.zeros(len(tracks.keypoints), bool)
+    kept[part.support_rows] = True
+    localizer = Localizer(build_map(tracks.where(kept), pm.Encoder.load("freak"), 32))
+    for keyframe in part.query_keyframes[:4]:
+        frame = Frame.of(tracks, int(keyframe))
+        found = localizer.localize_features(frame.keypoints, frame.descriptors, frame.camera)
+        assert close(found, frame.cam_from_world, 0.01 * scene_depth(tracks))
+        assert found.confidence > 0.9
+
+
+def test_halves_of_the_sample() -> None:
+    tracks = Tracks.load(sample.path())
+    variants = [medoids(), prototypes(pm.Encoder.load("freak"), 32)]
+    results = []
+    for variant in variants:
+        acceptance = calibrated(variant, [tracks], frames=3)
+        result, found = localize_halves(tracks, variant, acceptance, share=0.8, stride=6)
+        assert result.frames == len(found) == 3
+        results.append(result)
+    one, ours = results
+    assert (one.bytes_per_landmark, ours.bytes_per_landmark) == (64, 33)
+    assert one.landmarks == ours.landmarks
+    assert ours.recall[-1] >= one.recall[-1] > 0
+
+
+@pytest.fixture
+def query(folder: Path, scene: pm.PrototypeMap, images: list[Any], tmp_path: Path) -> Path:
+    """A map, three images with true poses, a black one and one that is none."""
+    scene.save(tmp_path / "scene.pmk")
+    (tmp_path / "images").mkdir()
+    for i, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / "images" / f"{i + 1}.png"), image)
+    names = [f"{i + 1}.png" for i in range(len(images))]
+    write_model(tmp_path / "true", PINHOLE, names, NEW_POSES)
+    return tmp_path
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["localize", *map(str, arguments)])
+
+
+def test_command(query: Path) -> None:
+    cv2.imwrite(str(query / "images" / "black.png"), np.zeros((240, 320), np.uint8))
+    (query / "images" / "torn.png").write_bytes((query / "images" / "1.png").read_bytes()[:999])
+    cv2.imwrite(str(query / "images" / "small.png"), np.zeros((24, 32), np.uint8))
+    out = query / "out"
+    done = run(
+        *(query / "scene.pmk", query / "images", "-o", out, "--json", query / "f.json"),
+        *("--camera", query / "true" / "cameras.txt", "--poses", query / "true" / "images.txt"),
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    facts = json.loads((query / "f.json").read_text())
+    assert (facts["images"], facts["localized"], facts["unreadable"]) == (6, 3, 2)
+    assert [row["recall"] for row in facts["recall"]] == [1, 1, 1, 1]
+    assert re.search(r"recall at 0.05, 5 degrees +1.000 of 3", done.output)
+
+    rows = {row["image"]: row for row in csv.DictReader((out / "poses.csv").open())}
+    assert {name for name, row in rows.items() if row["accepted"] == "1"} == {
+        f"{i}.png" for i in (1, 2, 3)
+    }
+    assert "truncated" in rows["torn.png"]["note"]
+    assert "0 keypoints" in rows["black.png"]["note"]
+    assert "32 x 24 pixels" in rows["small.png"]["note"]
+    position = [float(rows["2.png"][axis]) for axis in "xyz"]
+    assert position == pytest.approx(centre(NEW_POSES[1]), abs=0.02)
+
+    from protomark.tracks.colmap import pycolmap
+
+    model = pycolmap.Reconstruction(str(out))
+    assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
+    for image in model.images.values():
+        row = rows[image.name]
+        assert image.projection_center() == pytest.approx([float(row[a]) for a in "xyz"], abs=1e-6)
+        rotation = [float(row[f"r{i}{j}"]) for i in range(3) for j in range(3)]
+        turned = image.cam_from_world().rotation.matrix().ravel()
+        assert turned == pytest.approx(rotation, abs=1e-6)
+
+    # What it wrote it may write again, but not over another's model.
+    assert run(query / "scene.pmk", query / "images" / "1.png", "-o", out).exit_code == 0
+    other = run(query / "scene.pmk", query / "images", "-o", query / "true")
+    assert "holds a COLMAP model" in str(other.exception)
+
+
+def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
+    stamps = []
+    for i, pose in enumerate(NEW_POSES):
+        w, *v = quaternion(pose[:, :3].T)
+        stamps.append(" ".join(map(str, [f"{i + 1}.0", *centre(pose), *v, w])))
+    (query / "tum.txt").write_text("# time x y z q\n" + "\n".join(stamps) + "\n")
+    for camera in ("PINHOLE 320 240 300 300 160 120", str(query / "true")):
+        done = run(
+            *(query / "scene.pmk", query / "images", "-o", query / "out", "--camera", camera),
+            *("--poses", query / "tum.txt", "--priors", query / "true", "--prior-distance", 0.1),
+            *("--json", query / "f.json"),
+        )
+        assert done.exit_code == 0, done.output + str(done.exception)
+        facts = json.loads((query / "f.json").read_text())
+        assert facts["recall"][0]["recall"] == 1
+
+
+def test_without_a_camera(query: Path) -> None:
+    done = run(query / "scene.pmk", query / "images", "-o", query / "o", "--json", query / "f.json")
+    assert done.exit_code == 0, done.output + str(done.exception)
+    facts = json.loads((query / "f.json").read_text())
+    assert facts["localized"] == 3
+    for image in facts["each"]:
+        assert image["focal_length"] == pytest.approx(300, rel=0.1)
+
+
+def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x8769] = {0xA405: 34}  # focal length of 35 mm film, by the image's diagonal 43.3 mm
+    with Image.open(query / "images" / "1.png") as image:
+        image.save(query / "exif.jpg", quality=98, exif=exif)
+    camera = camera_of_exif(query / "exif.jpg")
+    assert camera is not None
+    assert camera.params[0] == pytest.approx(34 / 43.27 * 400, rel=0.01)
+    assert camera_of_exif(query / "images" / "1.png") is None
+    done = run(
+        query / "scene.pmk", query / "exif.jpg", "-o", query / "o", "--json", query / "f.json"
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    (image,) = json.loads((query / "f.json").read_text())["each"]
+    assert image["focal_length"] == pytest.approx(300, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{q}/scene.pmk", "{q}/nowhere"], "no such image or folder"),
+        (["{q}/scene.pmk", "{q}/true"], "no image in this folder"),
+        (["{q}/scene.pmk", "{q}/images", "--camera", "{q}/gone.txt"], "no cameras.txt"),
+        (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 300"], "has 4 parameters"),
+        (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 a"], "number that is none"),
+        (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 32 24 30 30 16 12"], "32 x 24"),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/gone.txt"], "no such file of poses"),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/true/cameras.txt"], "no poses in it"),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/else.txt"], "is of one of the images"),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/long.txt"], "is not of length 1"),
+        (["{q}/images/1.png", "{q}/images"], "1.png"),
+    ],
+)
+def test_bad_input_in_one_sentence(query: Path, arguments: list[str], message: str) -> None:
+    (query / "else.txt").write_text("1 1 0 0 0 0 0 0 1 another.png\n\n")
+    (query / "long.txt").write_text("1.0 0 0 0 5 0 0 1\n")
+    before = shutil.copytree(query / "true", query / "before")
+    done = run(*(a.format(q=query) for a in arguments), "-o", query / "out")
+    assert isinstance(done.exception, (ValueError, OSError))
+    assert message in str(done.exception)
+    assert not (query / "out" / "images.txt").exists()
+    assert sorted(p.name for p in before.iterdir()) == ["cameras.txt", "images.txt"]
