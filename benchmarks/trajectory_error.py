@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from protomark.evaluation.pose import centre
 from protomark.evaluation.trajectory import trajectory_error
+from protomark.localization.absolute_pose import centre
 from protomark.tracks.colmap import find_model, model_of, read_model, read_reconstruction
 
 

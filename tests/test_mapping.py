@@ -14,8 +14,8 @@ import pytest
 
 import protomark as pm
 from mapping_scene import show, walk, write_images
-from protomark.evaluation.pose import centre
 from protomark.evaluation.trajectory import trajectory_error
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.command import Interrupted, Request, make_map
 from protomark.mapping.given_poses import read_poses
 from protomark.mapping.mapper import Mapper, Picture

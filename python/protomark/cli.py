@@ -810,6 +810,20 @@ def evaluate_mapping(
     frames: Annotated[
         int, typer.Option(min=0, help="Take the first so many of those only, 0 for all.")
     ] = 0,
+    halves: Annotated[
+        Path | None,
+        typer.Option(
+            help="Tracks file, its poses in metres: also localize its second half in a map of its "
+            "first half (--frames frames of it at most)."
+        ),
+    ] = None,
+    calibrate: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Tracks file of another sequence, to learn there which matches are right, for "
+            "--halves; may be repeated."
+        ),
+    ] = None,
     descriptor: Annotated[
         str, typer.Option("--descriptor", "-d", help="Descriptor; the paper's is freak.")
     ] = "freak",
@@ -837,10 +851,14 @@ def evaluate_mapping(
     from protomark.mapping.settings import Settings
 
     check_outputs(json_file)
+    if halves is not None and not calibrate:
+        raise ValueError("--halves needs tracks of another sequence, give them with --calibrate")
     flags = [f"--variants {variants}"] if variants else []
     flags += [] if colmap else ["--no-colmap"]
     flags += [f"--every {every}"] if every > 1 else []
     flags += [f"--frames {frames}"] if frames else []
+    flags += [f"--halves {halves.name}"] if halves is not None else []
+    flags += [f"--calibrate {path.name}" for path in calibrate or []]
     flags += [f"-d {descriptor}"] if descriptor != "freak" else []
     flags += [f"--encoder {Path(encoder).name}"] if encoder else []
     flags += [f"--max-keypoints {max_keypoints}"] if max_keypoints != 2000 else []
@@ -854,6 +872,8 @@ def evaluate_mapping(
         colmap=colmap,
         every=every,
         frames=frames,
+        halves=halves,
+        calibrate=calibrate or [],
         threads=threads,
         repeat=" ".join(["protomark evaluate-mapping", *names, *flags]),
     )

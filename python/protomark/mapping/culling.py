@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from protomark.evaluation.pose import centre
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Ids, Observations, Structure
 from protomark.tracks.geometry import widest_angle

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from protomark.evaluation.pose import centre
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.memory import Memory
 from protomark.mapping.merging import merge
 from protomark.mapping.structure import Array, Frame, Ids, Structure

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from protomark.evaluation.pose import centre
 from protomark.files import write_text
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.memory import Memory, Prototypes
 from protomark.mapping.structure import Array, Structure
 from protomark.tracks.colmap import pycolmap, quiet

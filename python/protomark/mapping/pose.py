@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.evaluation.pose import project
+from protomark.localization.absolute_pose import project
 from protomark.tracks.file import Camera
 
 Array = NDArray[np.float64]

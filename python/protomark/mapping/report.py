@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from protomark.evaluation.plot import GRID, INK, MUTED, OURS, style_axes
-from protomark.evaluation.pose import centre
 from protomark.evaluation.scene_plot import view_from_above
 from protomark.files import write_text
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.clock import STAGES
 from protomark.mapping.history import REGISTERED
 from protomark.mapping.mapper import Mapper

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.evaluation.pose import centre
+from protomark.localization.absolute_pose import centre
 from protomark.tracks.colmap import focal_length, project, rays
 from protomark.tracks.file import Camera
 from protomark.tracks.geometry import residuals

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from protomark.evaluation.pose import centre
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.mapper import Mapper, Picture
 from protomark.tracks.colmap import focal_length
 

@@ -18,7 +18,7 @@ import protomark as pm
 from protomark.console import console, progress_bar, progress_console
 from protomark.evaluation.mapping import figures
 from protomark.evaluation.mapping.report import mark, markdown
-from protomark.evaluation.mapping.results import Results, Run, SequenceResult
+from protomark.evaluation.mapping.results import Recall, Results, Run, SequenceResult
 from protomark.evaluation.mapping.sequences import open_sequences
 from protomark.evaluation.mapping.targets import targets
 from protomark.evaluation.mapping.variants import COLMAP, Variant
@@ -45,6 +45,8 @@ class Request:
         colmap: whether COLMAP runs beside them.
         every: take every n-th image only.
         frames: take the first so many of them only; 0: all.
+        halves: tracks file whose second half is localized in a map of its first; None: left out.
+        calibrate: tracks files that say which matches to accept there.
         threads: of every run.
         repeat: the command, as the report tells it.
     """
@@ -56,6 +58,8 @@ class Request:
     colmap: bool = True
     every: int = 1
     frames: int = 0
+    halves: Path | None = None
+    calibrate: Sequence[Path] = ()
     threads: int = 1
     repeat: str = "protomark evaluate-mapping"
 
@@ -82,6 +86,7 @@ def evaluate_mapping(request: Request, json_path: Path | None = None) -> Results
     cv2.setNumThreads(request.threads)
     with one_blas_thread():
         runs = _runs(request, sequences, kept)
+        recalls = _recalls(request, kept)
     results = Results(
         sequences=[
             SequenceResult(
@@ -89,9 +94,9 @@ def evaluate_mapping(request: Request, json_path: Path | None = None) -> Results
             )
             for s in sequences
         ],
-        recalls=[],
-        localized="",
-        calibrated=[],
+        recalls=recalls,
+        localized="" if request.halves is None else _name(request.halves),
+        calibrated=[_name(path) for path in request.calibrate],
         conditions=_conditions(request),
     )
     results = replace(results, targets=targets(results))
@@ -102,6 +107,10 @@ def evaluate_mapping(request: Request, json_path: Path | None = None) -> Results
         write_text(json_path, text)
     write_text(output / REPORT, markdown(results))
     return results
+
+
+def _name(path: Path) -> str:
+    return path.name.split(".")[0]
 
 
 @dataclass(frozen=True)
@@ -208,6 +217,31 @@ def _load(kept: Kept, key: str) -> Run | None:
         return None if found is None else Run.from_dict(found)
     except (KeyError, TypeError):
         return None
+
+
+def _recalls(request: Request, kept: Kept) -> list[Recall]:
+    if request.halves is None:
+        return []
+    from protomark.evaluation.mapping import halves
+
+    key = key_of(
+        halves=[(p.name, p.stat().st_size) for p in (request.halves, *request.calibrate)],
+        variants=[v.name for v in request.variants],
+        encoder=request.base.encoder,
+        frames=request.frames,
+    )
+    found = kept.load_figures(key)
+    if found is None:
+        recalls = halves.recalls(
+            request.halves,
+            request.calibrate,
+            request.variants,
+            request.base.encoder,
+            request.frames,
+        )
+        kept.save_figures(key, {"rows": [vars(r) for r in recalls]})
+        return recalls
+    return [Recall(**row) for row in found["rows"]]
 
 
 def _conditions(request: Request) -> dict[str, str]:

@@ -11,7 +11,7 @@ import numpy as np
 from protomark.evaluation.mapping.drift import drift
 from protomark.evaluation.mapping.ledger import Ledger
 from protomark.evaluation.mapping.results import Run
-from protomark.evaluation.pose import centre
+from protomark.localization.absolute_pose import centre
 from protomark.mapping.clock import Clock
 from protomark.mapping.mapper import Mapper, Picture
 from protomark.mapping.memory import Prototypes
