@@ -6,14 +6,19 @@ from pathlib import Path
 
 from protomark.files import write_text
 
-START, END = "<!-- tables: start -->", "<!-- tables: end -->"
 
+def replace_tables(document: Path, tables: str, name: str = "tables") -> None:
+    """Put the tables between the document's marks, or with marks at its end if it has none.
 
-def replace_tables(document: Path, tables: str) -> None:
-    """Put the tables between the document's marks, or with marks at its end if it has none."""
+    Args:
+        document: Markdown with the marks `<!-- name: start -->` and `<!-- name: end -->`.
+        tables: what comes between them.
+        name: of the marks.
+    """
+    start, end = f"<!-- {name}: start -->", f"<!-- {name}: end -->"
     text = document.read_text(encoding="utf-8")
-    if START not in text:
-        text = f"{text.rstrip()}\n\n{START}\n{END}\n"
-    before, rest = text.split(START)
-    _, after = rest.split(END)
-    write_text(document, f"{before}{START}\n\n{tables}\n{END}{after}")
+    if start not in text:
+        text = f"{text.rstrip()}\n\n{start}\n{end}\n"
+    before, rest = text.split(start)
+    _, after = rest.split(end)
+    write_text(document, f"{before}{start}\n\n{tables}\n{end}{after}")

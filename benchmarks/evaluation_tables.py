@@ -33,6 +33,10 @@ SPLITS = {
     "validation": ("caliterra",),
     "test": ("toy", "kitchen", "castle", "kitti07"),
 }
+INPUTS = {
+    "upright": ("Cameras that do not roll", "angle and size"),
+    "sized": ("Places seen from like distances again", "size"),
+}
 COLUMNS = {
     "unaggregated": "all",
     "medoid": "medoid",
@@ -199,18 +203,18 @@ def _measure_encoding(card: Path) -> None:
     write_text(card, re.sub(r"- encode: .*\n", line, text))
 
 
-def upright_table(plain: list[SequenceResult], upright: list[SequenceResult]) -> str:
-    """Precision without and with the keypoints' angles and sizes, a row a sequence."""
+def inputs_table(plain: list[SequenceResult], longer: list[SequenceResult], inputs: str) -> str:
+    """Precision without and with further inputs ("upright" or "sized"), a row a sequence."""
     names = ["protomark-32", "protomark-32x4", "looks-17", "looks-33", "looks-65"]
     lines = [
-        "Plain, and with angle and size of the keypoint:",
+        f"Plain, and with {INPUTS[inputs][1]} of the keypoint:",
         "",
         "| sequence | all descriptors | "
-        + " | ".join(f"{COLUMNS[name].strip('*')}: plain, upright" for name in names)
+        + " | ".join(f"{COLUMNS[name].strip('*')}: plain, {inputs}" for name in names)
         + " |",
         "|---|---:|" + "---:|" * len(names),
     ]
-    others = {result.sequence: result for result in upright}
+    others = {result.sequence: result for result in longer}
     for result in plain:
         if result.sequence not in others:
             continue
@@ -246,13 +250,14 @@ def main() -> int:
             title = f"{descriptor.upper()}: mean of {', '.join(r.sequence for r in plotted)}"
             save_plot(mean_rows(plotted), DOCUMENT.parent / f"precision.{descriptor}.png", title)
             parts.append(f"![{title}](precision.{descriptor}.png)\n")
-        upright = ROOT / "benchmarks" / "results" / f"upright.{descriptor}.json"
-        if upright.is_file():
-            parts.append(f"#### Cameras that do not roll: `{descriptor}-upright`\n")
-            table = upright_table(same, load_json(upright))
-            parts.append(table)
-            heading = "## Beside the plain encoder\n\n"
-            replace_tables(MODELS / f"{descriptor}-upright.md", heading + table)
+        for inputs, (title, _) in INPUTS.items():
+            longer = ROOT / "benchmarks" / "results" / f"{inputs}.{descriptor}.json"
+            if longer.is_file():
+                parts.append(f"#### {title}: `{descriptor}-{inputs}`\n")
+                table = inputs_table(same, load_json(longer), inputs)
+                parts.append(table)
+                heading = "## Beside the plain encoder\n\n"
+                replace_tables(MODELS / f"{descriptor}-{inputs}.md", heading + table)
     parts.append("### Every figure\n")
     for split, members in SPLITS.items():
         chosen = [result for result in results if result.sequence in members]

@@ -96,6 +96,9 @@ def test_prototypes_of_other_dimensions(encoder):
 def test_camera_as_text(tmp_path):
     camera = given_camera("PINHOLE:300,300,160,120", (320, 240))
     assert camera == PINHOLE
+    assert given_camera("pinhole 320 240 300 300 160 120", (320, 240)) == PINHOLE
+    with pytest.raises(ValueError, match="the images have 640x480 pixels"):
+        given_camera("PINHOLE 320 240 300 300 160 120", (640, 480))
     file = tmp_path / "cameras.txt"
     file.write_text("# a comment\n1 PINHOLE 320 240 300 300 160 120\n")
     assert given_camera(str(file), (320, 240)) == PINHOLE

@@ -137,11 +137,23 @@ def test_file_round_trip(orb: Tracks, tmp_path: Path) -> None:
     path = tmp_path / "plane.orb.safetensors"
     orb.save(path)
     back = Tracks.load(path)
-    for name in ("descriptors", "keypoints", "landmark_of_keypoint", "landmark_positions"):
-        assert np.array_equal(getattr(back, name), getattr(orb, name))
+    keypoint = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
+    for name in (*keypoint, "landmark_of_keypoint", "landmark_positions"):
+        assert np.array_equal(getattr(back, name), getattr(orb, name)), name
     assert back.info == orb.info
     assert back.cameras == orb.cameras
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_keypoints_keep_what_the_detector_says(orb: Tracks) -> None:
+    assert len(np.unique(orb.octaves)) > 2
+    np.testing.assert_allclose(orb.sizes, 31 * 1.2**orb.octaves, rtol=1e-4)
+    assert (orb.angles >= 0).all()
+    for i in range(len(orb.keyframe_names)):
+        responses = orb.responses[orb.keypoints_of(i)]
+        assert responses[-1] > 0
+        assert (np.diff(responses) <= 0).all()
+        assert len(np.unique(responses)) > len(responses) // 2
 
 
 def test_max_unlabelled_drops_only_keypoints_without_landmark(sequence: Path, orb: Tracks) -> None:

@@ -23,6 +23,7 @@ from protomark._core import (
     verify_file,
 )
 from protomark.errors import FileError
+from protomark.sized import sized_descriptors
 from protomark.upright import upright_descriptors
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ __all__ = [
     "instruction_set",
     "match",
     "open",
+    "sized_descriptors",
     "upright_descriptors",
     "verify_file",
 ]

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from protomark import Encoder, PrototypeMap
+from protomark.inputs import lacking, lengthen, option
 from protomark.tracks import Tracks
-from protomark.upright import SUFFIX, upright_tracks
 
 
 def build_map(
@@ -53,11 +53,11 @@ def build_map(
 def check_descriptor(tracks: Tracks, encoder: Encoder) -> None:
     """Raise ValueError unless the encoder takes the descriptors of the tracks."""
     if encoder.descriptor != tracks.descriptor or encoder.bits != tracks.bits:
-        longer = encoder.descriptor == tracks.descriptor + SUFFIX
+        longer = lacking(tracks.descriptor, encoder.descriptor)
         raise ValueError(
             f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, the "
             f"tracks hold {tracks.descriptor} with {tracks.bits}: choose an encoder for "
-            f"{tracks.descriptor}{', or build with --upright' if longer else ''}"
+            f"{tracks.descriptor}{f', or build with {option(longer)}' if longer else ''}"
         )
 
 
@@ -70,7 +70,7 @@ def build_file(
     seal: bool,
     threads: int,
     code_bits: int = 8,
-    upright: bool = False,
+    inputs: str = "",
     look_bits: int = 0,
     prototypes: float | None = None,
     index: bool = False,
@@ -79,8 +79,8 @@ def build_file(
 ) -> PrototypeMap:
     """Build the map of a tracks file and write it; `encoder` None: the one of that descriptor.
 
-    With `upright` angles and sizes of the keypoints go in, too (`protomark.upright`); with `index`
-    the map can be searched approximately. `metadata` is what the map shall say of itself.
+    With `inputs` angles or sizes of the keypoints go in, too (`protomark.inputs`); with `index` the
+    map can be searched approximately. `metadata` is what the map shall say of itself.
 
     Raises:
         ValueError: as `build_map`; or `code_bits`, those of a sealed map, is neither 8 nor 4, or is
@@ -106,9 +106,7 @@ def build_file(
             raise ValueError(
                 f"--prototypes {prototypes:g} is for landmarks with looks: add --look-bits 10"
             )
-    loaded = Tracks.load(tracks)
-    if upright:
-        loaded = upright_tracks(loaded)
+    loaded = lengthen(Tracks.load(tracks), inputs)
     scene = build_map(
         loaded,
         Encoder.load(encoder or loaded.descriptor),

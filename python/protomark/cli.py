@@ -169,6 +169,13 @@ def train(
             "--upright", help="For cameras that do not roll: learn from angles and sizes, too."
         ),
     ] = False,
+    sized: Annotated[
+        bool,
+        typer.Option(
+            "--sized",
+            help="For places seen from like distances again: learn from the keypoints' sizes, too.",
+        ),
+    ] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     threads: Annotated[
         int, typer.Option(help="CPU threads, 0 for one a core; take 1 on a busy machine.")
@@ -198,6 +205,7 @@ def train(
         raise ModuleNotFoundError(
             "training needs PyTorch, which is not installed: pip install protomark[train]"
         ) from None
+    from protomark.inputs import chosen
     from protomark.training.command import (
         default_output,
         explain_interruption,
@@ -217,7 +225,8 @@ def train(
     data_licences = dict(entry.split("=", 1) for entry in data_licence or [])
     options = Options(dims=parsed, steps=steps, landmarks=batch, seed=seed)
     learned, picking = hold_out(tracks, validation or [])
-    output = output or default_output(learned[0], resume, upright)
+    inputs = chosen(upright, sized)
+    output = output or default_output(learned[0], resume, inputs)
     try:
         card = train_encoder(
             learned,
@@ -226,7 +235,7 @@ def train(
             options,
             report=report or [],
             resume=resume,
-            upright=upright,
+            inputs=inputs,
             name=name,
             licence=licence,
             data_licences=data_licences,
@@ -291,6 +300,13 @@ def build(
             help="For cameras that do not roll: encode the keypoints' angles and sizes, too.",
         ),
     ] = False,
+    sized: Annotated[
+        bool,
+        typer.Option(
+            "--sized",
+            help="For places seen from like distances again: encode the keypoints' sizes, too.",
+        ),
+    ] = False,
     position_bits: Annotated[
         int,
         typer.Option(
@@ -322,6 +338,7 @@ def build(
     from protomark.build import build_file
     from protomark.evaluation.command import check_outputs
     from protomark.info import describe, show
+    from protomark.inputs import chosen
     from protomark.metadata import command_metadata
 
     check_outputs(output, json_file)
@@ -335,7 +352,7 @@ def build(
         sealed,
         threads,
         code_bits=code_bits,
-        upright=upright,
+        inputs=chosen(upright, sized),
         look_bits=look_bits,
         prototypes=prototypes,
         index=index,
@@ -364,7 +381,7 @@ def map_(
         typer.Option(
             "--descriptor", "-d", help="freak, orb, brisk, akaze, latch, beblid or teblid."
         ),
-    ] = "freak",
+    ] = "akaze",
     camera: Annotated[
         str | None,
         typer.Option(
@@ -726,6 +743,13 @@ def evaluate(
             "freak-upright); all other methods get the plain descriptors.",
         ),
     ] = False,
+    sized: Annotated[
+        bool,
+        typer.Option(
+            "--sized",
+            help="Give Protomark the keypoints' sizes, too (encoders such as freak-sized).",
+        ),
+    ] = False,
     methods: Annotated[
         str,
         typer.Option(
@@ -766,6 +790,7 @@ def evaluate(
     from protomark.evaluation import command
     from protomark.evaluation.run import Options
     from protomark.evaluation.threads import available_threads
+    from protomark.inputs import chosen
 
     command.check_plot(plot_file)
     command.check_outputs(json_file, markdown_file, plot_file)
@@ -777,7 +802,7 @@ def evaluate(
         encoders=encoder or [],
         methods=[name.strip() for name in methods.split(",") if name.strip()],
         discriminant_from=discriminant_from or [],
-        upright=upright,
+        inputs=chosen(upright, sized),
     )
     command.write(results, json_file, markdown_file, plot_file)
 

@@ -16,15 +16,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from protomark.sized import STEPS as _SIZES
+from protomark.sized import size_bits
+
 if TYPE_CHECKING:
     from protomark.tracks.file import Tracks
 
 SUFFIX = "-upright"
 BYTES = 8
 _ANGLES = 32  # of the full turn
-_SIZES = 32  # a quarter octave each, from 6 pixels on
-_LEAST_SIZE = 6.0
-_ANGLE_REACH, _SIZE_REACH = 3, 2  # neighbours set too, so that near values share bits
+_REACH = 3  # neighbours set too, so that near values share bits
 
 
 def upright_descriptors(
@@ -54,16 +55,11 @@ def upright_descriptors(
             "fit together: give (n, bytes), (n,) and (n,)"
         )
     bits = np.zeros((n, _ANGLES + _SIZES), np.uint8)
+    bits[:, _ANGLES:] = size_bits(size)
     rows = np.flatnonzero(np.isfinite(angle) & (angle >= 0))
     own = (angle[rows] * (_ANGLES / 360)).astype(np.int64)
-    for step in range(-_ANGLE_REACH, _ANGLE_REACH + 1):
+    for step in range(-_REACH, _REACH + 1):
         bits[rows, (own + step) % _ANGLES] = 1
-    rows = np.flatnonzero(np.isfinite(size) & (size > 0))
-    octaves = np.log2(np.maximum(size[rows], 1.0) / _LEAST_SIZE)
-    own = np.clip(np.floor(4 * octaves), 0, _SIZES - 1).astype(np.int64)
-    for step in range(-_SIZE_REACH, _SIZE_REACH + 1):
-        inside = (own + step >= 0) & (own + step < _SIZES)
-        bits[rows[inside], _ANGLES + own[inside] + step] = 1
     return np.hstack([descriptors, np.packbits(bits, axis=1, bitorder="little")])
 
 

@@ -15,8 +15,8 @@ from protomark.evaluation.results import SequenceResult, mean_rows, save_json
 from protomark.evaluation.run import Options, evaluate
 from protomark.evaluation.support import Moments, Support
 from protomark.files import write_text
+from protomark.inputs import lacking, lengthen, option
 from protomark.tracks.file import Tracks, sequence_name
-from protomark.upright import SUFFIX, upright_tracks
 
 if TYPE_CHECKING:
     import protomark as pm
@@ -29,7 +29,7 @@ def evaluate_files(
     encoders: Sequence[str] = (),
     methods: Sequence[str] = (),
     discriminant_from: Sequence[Path] = (),
-    upright: bool = False,
+    inputs: str = "",
 ) -> list[SequenceResult]:
     """Evaluate tracks files one after the other, printing each table as soon as it is there.
 
@@ -41,7 +41,7 @@ def evaluate_files(
         methods: names of methods, or of families of methods; none given: the default ones.
         discriminant_from: tracks files to learn the linear discriminants from; none given: from
             each sequence's own support.
-        upright: give Protomark's own methods descriptors with angles and sizes.
+        inputs: of keypoints that only Protomark's own methods get, see `protomark.inputs`.
 
     Raises:
         FileNotFoundError, ValueError: a file is missing, broken, or does not fit the others.
@@ -54,7 +54,7 @@ def evaluate_files(
     results = []
     for path in paths:
         tracks = Tracks.load(path)
-        longer = upright_tracks(tracks) if upright else tracks
+        longer = lengthen(tracks, inputs)
         fitting = encoders_for(longer, loaded, given=bool(encoders))
         kind = (tracks.descriptor, tracks.bits)
         if kind not in learned:
@@ -156,8 +156,10 @@ def encoders_for(
     ]
     if not fitting:
         whose = "none of the encoders given is" if given else "no encoder ships"
-        longer = any(encoder.descriptor == tracks.descriptor + SUFFIX for encoder in encoders)
-        remedy = "give --upright" if given and longer else "train one with `protomark train`"
+        longer = [i for e in encoders if (i := lacking(tracks.descriptor, e.descriptor))]
+        remedy = (
+            f"give {option(longer[0])}" if given and longer else "train one with `protomark train`"
+        )
         progress_console.print(
             f"note: {whose} for {tracks.descriptor} with {tracks.bits} bits; "
             f"only the other methods are compared ({remedy})",

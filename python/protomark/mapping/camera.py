@@ -16,29 +16,19 @@ _GUESSED_MODEL = "SIMPLE_RADIAL"
 
 
 def given_camera(text: str, size: tuple[int, int]) -> Camera:
-    """The camera of a COLMAP cameras file or model folder, or of MODEL:PARAMS.
+    """The camera of a COLMAP cameras file or model folder, or one that is written out.
 
     Args:
-        text: a path, or such as PINHOLE:500,500,320,240 (COLMAP's order of parameters).
+        text: a path, or such as PINHOLE:500,500,320,240 (COLMAP's order of parameters), or as in
+            a cameras.txt, PINHOLE 640 480 500 500 320 240.
         size: width and height of the images.
 
     Raises:
         FileNotFoundError: neither a file nor of that form.
         ValueError: there is no camera of this size, or several.
     """
-    model, colon, numbers = text.partition(":")
-    if colon and model.upper() in pycolmap.CameraModelId.__members__:
-        try:
-            params = tuple(float(p) for p in numbers.split(","))
-            camera = Camera(model.upper(), *size, params)
-            if not np.isfinite(params).all() or not _fine(camera):
-                raise ValueError
-        except (ValueError, RuntimeError):
-            raise ValueError(
-                f"--camera {text}: these are not the parameters of a {model.upper()} camera, "
-                "see https://colmap.github.io/cameras.html"
-            ) from None
-        return camera
+    if text.partition(":")[0].partition(" ")[0].upper() in pycolmap.CameraModelId.__members__:
+        return _written_out(text, size)
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(
@@ -54,6 +44,27 @@ def given_camera(text: str, size: tuple[int, int]) -> Camera:
             f"(its cameras have {sizes or 'no size'}); give one with --camera MODEL:PARAMS"
         )
     return fitting.pop()
+
+
+def _written_out(text: str, size: tuple[int, int]) -> Camera:
+    words = text.replace(":", " ").replace(",", " ").split()
+    sized = ":" not in text
+    try:
+        numbers = [float(word) for word in words[1:]]
+        given = (int(numbers[0]), int(numbers[1])) if sized else size
+        camera = Camera(words[0].upper(), *given, tuple(numbers[2 if sized else 0 :]))
+        if not np.isfinite(numbers).all() or not _fine(camera):
+            raise ValueError
+    except (ValueError, RuntimeError, IndexError, OverflowError):
+        raise ValueError(
+            f"--camera {text}: these are not the parameters of a {words[0].upper()} camera, "
+            "see https://colmap.github.io/cameras.html"
+        ) from None
+    if given != size:
+        raise ValueError(
+            f"--camera {text}: the images have {size[0]}x{size[1]} pixels; scale the parameters"
+        )
+    return camera
 
 
 def guessed_camera(source: Folder | Video, focal: float | None = None) -> tuple[Camera, str]:

@@ -247,6 +247,7 @@ def _frames(
                 saved = time.monotonic()
             if stop:
                 return True
+    save_checkpoint(mapper, request.output, {**facts, "cursor": cursor})
     return False
 
 

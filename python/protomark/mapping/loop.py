@@ -8,6 +8,7 @@ import numpy as np
 from protomark.localization.absolute_pose import centre
 from protomark.mapping.memory import Memory
 from protomark.mapping.merging import merge
+from protomark.mapping.prediction import REACH, predict
 from protomark.mapping.structure import Array, Frame, Ids, Structure
 from protomark.mapping.tracking import Tracked, Tracker
 from protomark.mapping.triangulation import remember
@@ -20,8 +21,6 @@ _MIN_SHARE = 0.25
 # If what the frame sees is off by less than this many times the largest error under the pose that
 # the old landmarks give, there is no drift to take back.
 _DRIFT = 3.0
-# Frames that follow each other in the map, but not within this many in the input, are no run.
-_GAP = 3
 
 
 def revisit(
@@ -71,16 +70,10 @@ def _beside(structure: Structure, tracker: Tracker, newest: int, old: Ids) -> Tr
     """The pose that the other side of a gap gives, where this frame has reached it."""
     frame = structure.frames[newest]
     recent = set(structure.keyframes()[-RECENT:])
-    for place, other in enumerate(structure.frames):
-        if (
-            place not in recent
-            and other.camera_id == frame.camera_id
-            and 0 < abs(other.index - frame.index) <= _GAP
-        ):
-            found = tracker.near(frame, other.pose, old)
-            if found is not None:
-                return tracker.settle(frame, found.pose, old)
-    return None
+    others = [other for place, other in enumerate(structure.frames) if place not in recent]
+    predicted = predict(others, frame.index, frame.camera_id)
+    found = None if predicted is None else tracker.near(frame, predicted, old)
+    return None if found is None else tracker.settle(frame, found.pose, old)
 
 
 def _drift(structure: Structure, frame: Frame, pose: Array) -> float:
@@ -150,6 +143,6 @@ def _run_start(structure: Structure, newest: int) -> int:
     """Where the unbroken run of frames that ends with the newest one begins."""
     frames = structure.frames
     start = newest
-    while start > 0 and abs(frames[start].index - frames[start - 1].index) <= _GAP:
+    while start > 0 and abs(frames[start].index - frames[start - 1].index) <= REACH:
         start -= 1
     return start

@@ -16,6 +16,7 @@ from protomark.mapping.keyframes import is_keyframe
 from protomark.mapping.memory import Memory, make_memory
 from protomark.mapping.merging import merge
 from protomark.mapping.pose import refine_pose
+from protomark.mapping.prediction import predict
 from protomark.mapping.settings import Settings
 from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Frame, Structure
@@ -33,10 +34,11 @@ _LOCAL_ITERATIONS = 8
 # The whole map is adjusted whenever it has grown by this factor.
 _GROWTH = 1.5
 _FIRST_GLOBAL = 6
-# A map this young that loses its second next frame was begun wrongly.
+# A map with fewer keyframes that loses this many frames in a row was begun wrongly.
 _YOUNG = 4
 _YOUNG_LOSSES = 3
-# A lost frame is looked for in the whole map; predictions older than this are none.
+# A pose under which less of what is in view is seen is held against one from the whole map.
+_DOUBTFUL = 0.3
 _LOOP_EVERY = 3
 _LOOP_SCALE = 8.0
 
@@ -126,6 +128,7 @@ class Mapper:
                 self._place(sighting, picture.pose, entry)
             elif self.structure.frames:
                 self._track(sighting, entry)
+                self._doubt(entry)
             else:
                 self._initialise(sighting, entry)
         if not again:
@@ -196,6 +199,7 @@ class Mapper:
             f"{second.name}: the map begins, with {first.name} and this frame"
         )
         self.initialiser.waiting = []
+        self.lost_in_row = 0
         return None
 
     def _give_up(self, entry: Entry, reason: str) -> None:
@@ -230,36 +234,28 @@ class Mapper:
         if found is None:
             self.lost_in_row += 1
             entry.outcome = "not found in the map: too few matches agree on a pose"
-            if len(self.structure.keyframes()) < _YOUNG and self.lost_in_row >= _YOUNG_LOSSES:
-                self._give_up(entry, "the map was lost when it had just begun")
             return
         self.lost_in_row = 0
         self._take_up(sighting, found, entry)
 
+    def _doubt(self, entry: Entry) -> None:
+        """A map that loses the camera when it has just begun was begun wrongly."""
+        young = len(self.structure.keyframes()) < _YOUNG and not self.looking_again
+        if young and self.lost_in_row >= _YOUNG_LOSSES:
+            self._give_up(entry, "the map was lost when it had just begun")
+
     def _find(self, sighting: Sighting) -> Tracked | None:
-        predicted = self._predict(sighting)
+        predicted = predict(self.structure.frames, sighting.index, sighting.camera_id)
         found = None
         if predicted is not None:
             found = self.tracker.track(sighting, predicted)
-        if found is None:
+        if found is None or found.share < _DOUBTFUL:
+            # A wrong prediction may have led to a wrong pose.
             rough = self.tracker.relocalize(sighting)
-            found = self.tracker.settle(sighting, rough.pose) if rough else None
+            other = self.tracker.settle(sighting, rough.pose) if rough else None
+            if found is None or (other and len(other.matches) > len(found.matches)):
+                found = other
         return found
-
-    def _predict(self, sighting: Sighting) -> Array | None:
-        """The pose if the camera goes on as it did between the two frames beside, if there are."""
-        by_index = {f.index: f for f in self.structure.frames if f.camera_id == self.camera_id}
-        for step in (1, 2, 3):
-            for way in (-step, step):
-                last = by_index.get(sighting.index + way)
-                if last is None:
-                    continue
-                before = by_index.get(sighting.index + 2 * way)
-                if before is None:
-                    return last.pose
-                motion = last.pose @ np.linalg.inv(np.vstack([before.pose, [0, 0, 0, 1]]))
-                return np.asarray(motion @ np.vstack([last.pose, [0, 0, 0, 1]]))
-        return None
 
     def _place(self, sighting: Sighting, pose: Array, entry: Entry) -> None:
         """A frame whose pose is given."""

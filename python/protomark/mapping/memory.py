@@ -204,12 +204,13 @@ class Descriptors(Memory):
 
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """See `Memory.add`."""
+        self._sorted = None
         self._descriptors = np.concatenate([self._descriptors, encoded])
         self._owners = np.concatenate([self._owners, ids])
-        self._sorted = None
 
     def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """See `Memory.remove`."""
+        self._sorted = None
         order = np.argsort(self._owners, kind="stable")
         sorted_owners = self._owners[order]
         first, last = (np.searchsorted(sorted_owners, ids, side) for side in ("left", "right"))
@@ -223,17 +224,20 @@ class Descriptors(Memory):
 
     def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
         """See `Memory.merge`."""
-        for a, b in zip(into, source, strict=True):
-            self._owners[self._owners == b] = a
         self._sorted = None
+        order = np.argsort(source)
+        at = np.minimum(np.searchsorted(source[order], self._owners), max(len(source) - 1, 0))
+        if len(source):
+            hit = source[order][at] == self._owners
+            self._owners[hit] = into[order][at[hit]]
 
     def discard(self, ids: NDArray[np.int64]) -> None:
         """See `Memory.discard`."""
+        self._sorted = None
         self._owners[np.isin(self._owners, ids)] = -1
         self._compact()
 
     def _compact(self) -> None:
-        self._sorted = None
         alive = self._owners >= 0
         if len(alive) and 1 - alive.mean() > _DEAD_SHARE:
             self._owners, self._descriptors = self._owners[alive], self._descriptors[alive]
@@ -271,7 +275,7 @@ class Descriptors(Memory):
         starts = np.cumsum(counts) - counts
         pair = np.repeat(np.arange(len(ids)), counts)
         row = first[pair] + np.arange(len(pair)) - starts[pair]
-        bits = _SET_BITS[encoded[rows[pair]] ^ descriptors[row]].sum(1, dtype=np.int32)
+        bits = _set_bits(encoded[rows[pair]] ^ descriptors[row])
         return np.minimum.reduceat(bits, starts).astype(np.float32)
 
     def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -305,6 +309,7 @@ class Medoids(Descriptors):
         super().__init__(width)
         self._medoids: dict[int, NDArray[np.uint8]] = {}
         self._changed: set[int] = set()
+        self._chosen: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
 
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """See `Memory.add`."""
@@ -330,17 +335,18 @@ class Medoids(Descriptors):
         """See `Memory.restore`."""
         super().restore(arrays, scene)
         self._medoids.clear()
+        self._chosen = None
         self._changed = set(self._owners[self._owners >= 0].tolist())
 
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """See `Descriptors.table`."""
         self._follow()
-        if self._sorted is None:
+        if self._chosen is None:
             ids = np.array(sorted(self._medoids), np.int64)
+            rows = [self._medoids[i] for i in ids.tolist()]
             width = self._descriptors.shape[1]
-            chosen = [self._medoids[i] for i in ids.tolist()]
-            self._sorted = ids, np.array(chosen, np.uint8).reshape(-1, width)
-        return self._sorted
+            self._chosen = ids, np.array(rows, np.uint8).reshape(-1, width)
+        return self._chosen
 
     def _follow(self) -> None:
         from protomark.evaluation.methods.medoid import medoid
@@ -348,6 +354,7 @@ class Medoids(Descriptors):
 
         if not self._changed:
             return
+        self._chosen = None
         changed = np.array(sorted(self._changed), np.int64)
         self._changed.clear()
         for i in changed.tolist():
@@ -362,6 +369,13 @@ class Medoids(Descriptors):
         """Medoids only."""
         self._follow()
         return len(self._medoids) * int(self._descriptors.shape[1])
+
+
+def _set_bits(values: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(n, bytes) uint8 -> (n,) how many bits are set."""
+    if hasattr(np, "bitwise_count"):
+        return np.asarray(np.bitwise_count(values).sum(1, dtype=np.int32))
+    return np.asarray(_SET_BITS[values].sum(1, dtype=np.int32))
 
 
 MEMORIES = ("prototypes", "medoids", "descriptors")

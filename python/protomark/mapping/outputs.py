@@ -78,7 +78,7 @@ def write_trajectory(structure: Structure, path: Path) -> None:
     for frame in sorted(structure.frames, key=lambda f: (f.time, f.name)):
         w, x, y, z = quaternion_of(frame.pose[:, :3].T)
         place = centre(frame.pose)
-        numbers = [f"{v:.9g}" for v in (*place, x, y, z, w)]
+        numbers = [f"{v + 0.0:.9g}" for v in (*place, x, y, z, w)]
         lines.append(" ".join([f"{frame.time:.6f}", *numbers]))
     write_text(path, "\n".join(lines) + "\n")
 

@@ -26,7 +26,7 @@ class Settings:
         fixed_poses: whether poses are given and stay as they are.
     """
 
-    descriptor: str = "freak"
+    descriptor: str = "akaze"
     max_keypoints: int = 2000
     memory: str = "prototypes"
     encoder: str = ""

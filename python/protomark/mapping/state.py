@@ -161,6 +161,13 @@ def _restore(mapper: Mapper, arrays: dict[str, NDArray[Any]], told: dict[str, An
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, expected {shape}")
+    if not many:
+        raise ValueError("positions are missing")
+    types = {"born": "int64", "offsets": "int64", "landmarks": "int64"}
+    types |= {"keypoints": "float32", "descriptors": "uint8"}
+    for name in {*shapes, *types}:
+        if arrays[name].dtype != types.get(name, "float64"):
+            raise ValueError(f"{name} is of type {arrays[name].dtype}")
     structure.positions, structure.directions = arrays["positions"], arrays["directions"]
     structure.distances, structure.born = arrays["distances"], arrays["born"]
     offsets, keypoints = arrays["offsets"], arrays["keypoints"]
@@ -212,6 +219,8 @@ def _restore(mapper: Mapper, arrays: dict[str, NDArray[Any]], told: dict[str, An
                 mapper.memory.encode(mine),
             )
         )
+    if not mapper.memory.known(structure.ids).all():
+        raise ValueError("its landmarks are not those of its map")
     mapper.initialiser.best_parallax = told["best_parallax"]
     mapper.next_global, mapper.lost_in_row = told["next_global"], told["lost_in_row"]
     mapper.history = History.from_dict(told["history"])

@@ -22,6 +22,8 @@ _FOUND_RADIUS = 0.012
 # does not hold them against each other.
 _SAME_PLACE = 3.0
 _SAMPLE = 997
+# Share of the keypoints, or of the landmarks in view if these are fewer, that must match.
+_MIN_SEEN = 0.03
 
 
 @dataclass
@@ -62,10 +64,17 @@ class Query(Protocol):
 
 @dataclass
 class Tracked:
-    """A pose (3, 4) and the matches that agree with it."""
+    """A pose.
+
+    Attributes:
+        pose: (3, 4) float64, cam_from_world.
+        matches: those that agree with it.
+        share: how many they are of the landmarks in view, or of the keypoints if these are fewer.
+    """
 
     pose: Array
     matches: Matches
+    share: float = 1.0
 
 
 class Tracker:
@@ -110,15 +119,20 @@ class Tracker:
         return self._solve(query, self.guided(query, predicted, _PREDICTED_RADIUS, among))
 
     def settle(self, query: Query, pose: Array, among: Ids | None = None) -> Tracked | None:
-        """From a rough pose to all that the frame sees (of some), and to the pose that they give."""
+        """From a rough pose to all that the frame sees, and to the pose that they give.
+
+        None if that is too little of what should be in view: a wrong pose finds matches, too.
+        """
         matches = self.guided(query, pose, _FOUND_RADIUS, among)
         for _ in range(2):
             pose, inliers = self._refine(query, matches, pose)
             matches = self.guided(query, pose, self.max_error * 1.5, among)
         pose, inliers = self._refine(query, matches, pose)
-        if inliers.sum() < self.min_inliers:
+        visible = len(self.structure.visible(pose, query.camera_id)[0])
+        share = float(inliers.sum()) / max(min(visible, len(query.keypoints)), 1)
+        if inliers.sum() < self.min_inliers or share < _MIN_SEEN:
             return None
-        return Tracked(pose, matches.where(inliers))
+        return Tracked(pose, matches.where(inliers), share)
 
     def search(self, query: Query, among: Ids | None = None) -> Matches:
         """Nearest landmark of each keypoint in the whole map, under the ratio test."""

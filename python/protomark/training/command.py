@@ -23,6 +23,7 @@ from protomark.evaluation.methods.medoid import medoid
 from protomark.evaluation.support import Support
 from protomark.evaluation.threads import one_blas_thread
 from protomark.files import write_text
+from protomark.inputs import option
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.card import Card, Figures, describe_data
 from protomark.training.curve import save_curve, sparkline
@@ -57,7 +58,7 @@ def train_encoder(
     *,
     report: Sequence[Path] = (),
     resume: bool = False,
-    upright: bool = False,
+    inputs: str = "",
     name: str = "",
     licence: str = "",
     data_licences: Mapping[str, str] | None = None,
@@ -77,7 +78,7 @@ def train_encoder(
         options: what decides the weights.
         report: tracks files on which the finished encoder is measured, and nothing else.
         resume: continue from the checkpoint.
-        upright: add angles and sizes of the keypoints to the descriptors.
+        inputs: of keypoints that are added to the descriptors, see `protomark.inputs`.
         name: of the encoder; the output's stem if empty.
         licence: of the weights.
         data_licences: of the sequences, by name, for the card and the model file.
@@ -101,9 +102,9 @@ def train_encoder(
     for path in report:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such tracks file")
-    data = load_training(training, validation, licences=data_licences, upright=upright)
+    data = load_training(training, validation, licences=data_licences, inputs=inputs)
     for path in report:
-        _check_report(path, data, upright)
+        _check_report(path, data, inputs)
     half = has_fast_bfloat16(device)
     checkpoint = output.with_name(output.name + ".checkpoint")
     trainer = Trainer(data.views, data.trials, options, checkpoint, data.fingerprint, device, half)
@@ -128,7 +129,7 @@ def train_encoder(
         files = [(p, "validation") for p in validation] + [(p, "report") for p in report]
         task = bar.add_task("measuring", total=len(files))
         for path, role in files:
-            figures.append(_measure(trainer, encoder, path, role, upright, device, threads))
+            figures.append(_measure(trainer, encoder, path, role, inputs, device, threads))
             bar.advance(task)
     card = Card(
         name=encoder.name,
@@ -146,7 +147,7 @@ def train_encoder(
             report,
             output,
             options,
-            upright,
+            inputs,
             name,
             licence,
             data_licences,
@@ -188,13 +189,13 @@ def _calibrated(encoder: pm.Encoder, paths: Sequence[Path], threads: int) -> tup
     return encoder, encoder.notes.get(SOURCE_KEY, "")
 
 
-def default_output(tracks: Path, resume: bool = False, upright: bool = False) -> Path:
+def default_output(tracks: Path, resume: bool = False, inputs: str = "") -> Path:
     """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
 
     Raises:
         FileExistsError: it, its card or its picture is there already, and would be overwritten.
     """
-    output = Path(f"{read_tracks(tracks, upright).descriptor}.pme")
+    output = Path(f"{read_tracks(tracks, inputs).descriptor}.pme")
     for path in (output, *_beside(output)):
         if path.exists() and not resume:
             raise FileExistsError(f"{path} exists and is kept; name another file with -o")
@@ -223,9 +224,9 @@ def _check_outputs(output: Path, json_path: Path | None) -> None:
             raise FileNotFoundError(f"{path}: the folder {path.absolute().parent} does not exist")
 
 
-def _check_report(path: Path, data: TrainingData, upright: bool) -> None:
+def _check_report(path: Path, data: TrainingData, inputs: str) -> None:
     """Raise before the first step if the encoder could not be measured on these tracks."""
-    tracks = read_tracks(path, upright)
+    tracks = read_tracks(path, inputs)
     if (tracks.descriptor, tracks.bits) != (data.descriptor, data.bits):
         raise ValueError(
             f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but the encoder is "
@@ -269,13 +270,13 @@ def _measure(
     encoder: pm.Encoder,
     path: Path,
     role: str,
-    upright: bool,
+    inputs: str,
     device: str,
     threads: int,
 ) -> Figures:
     dims = trainer.options.dims
-    trials = load_trials(read_tracks(path, upright), path, REPORT_SEEDS)
-    plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if upright else trials
+    trials = load_trials(read_tracks(path, inputs), path, REPORT_SEEDS)
+    plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if inputs else trials
     floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
     whole = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
     binary = [
@@ -323,7 +324,7 @@ def _command(
     report: Sequence[Path],
     output: Path,
     options: Options,
-    upright: bool,
+    inputs: str,
     name: str,
     licence: str,
     data_licences: Mapping[str, str] | None,
@@ -336,8 +337,8 @@ def _command(
     for path in report:
         words += ["--report", path.name]
     words += ["-o", output.name]
-    if upright:
-        words.append("--upright")
+    if inputs:
+        words.append(option(inputs))
     default = Options()
     if options.dims != default.dims:
         words += ["--dims", ",".join(map(str, options.dims))]

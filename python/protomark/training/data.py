@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from protomark.console import track
+from protomark.inputs import lengthen
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.sampling import Views
 from protomark.training.validation import Trial
-from protomark.upright import upright_tracks
 
 MIN_BITS = 64
 MAX_BITS = 1024
@@ -63,10 +63,9 @@ class TrainingData:
     fingerprint: str
 
 
-def read_tracks(path: Path, upright: bool) -> Tracks:
-    """A tracks file, with longer descriptors if `upright` (`protomark.upright`)."""
-    tracks = Tracks.load(path)
-    return upright_tracks(tracks) if upright else tracks
+def read_tracks(path: Path, inputs: str) -> Tracks:
+    """A tracks file, its descriptors longer by `inputs` (`protomark.inputs`)."""
+    return lengthen(Tracks.load(path), inputs)
 
 
 def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -98,7 +97,7 @@ def load_training(
     seeds: Sequence[int] = (0,),
     max_queries: int = 5_000,
     licences: Mapping[str, str] | None = None,
-    upright: bool = False,
+    inputs: str = "",
 ) -> TrainingData:
     """Read and check training and validation tracks.
 
@@ -108,7 +107,7 @@ def load_training(
         seeds: one split of each validation sequence for each.
         max_queries: queries of one split.
         licences: of the sequences, by name, for the card.
-        upright: add angles and sizes of the keypoints to the descriptors.
+        inputs: of keypoints that are added to the descriptors, see `protomark.inputs`.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -139,7 +138,7 @@ def load_training(
     learned: dict[str, str] = {}  # digest of what tracks were made from -> their file
     digest = hashlib.sha256()
     for i, path in enumerate(track([*training, *validation], "reading tracks")):
-        tracks = read_tracks(path, upright)
+        tracks = read_tracks(path, inputs)
         if not views and not trials:
             descriptor, bits = tracks.descriptor, tracks.bits
             if not MIN_BITS <= bits <= MAX_BITS:
