@@ -110,7 +110,10 @@ def test_a_run_that_was_cut_goes_on(room, tmp_path, monkeypatch):
     stopped = run(*words)
     assert stopped.exit_code == 130
     assert "the same command goes on" in stopped.output.replace("\n", " ")
+    report = tmp_path / "out" / "report.md"
+    assert "**Not run:** room, prototypes-16." in report.read_text()
     assert run(*words).exit_code == 0
+    assert "Not run" not in report.read_text()
     assert calls == ["medoid", "prototypes-16", "prototypes-16"]
 
 
@@ -222,7 +225,7 @@ def test_targets(ours, met):
         f"{i}": np.column_stack([np.eye(3), [-i, -(i**2), 0.0]]).astype(float) for i in range(20)
     }
     sequence = SequenceResult("a", 20, 20, "as given", 1.0, poses, runs)
-    results = Results([sequence], [], "", [], {})
+    results = Results([sequence], [], "", [], [], {})
     found = targets(results)
     assert [t.met for t in found[:5]] == met
     assert [t.met for t in found[5:]] == [True, None]

@@ -867,8 +867,8 @@ def evaluate_mapping(
 
     Frames registered, trajectory error against the true poses, landmarks, time and descriptor
     bytes, all variants in the same code, poses unknown and the camera known. OUTPUT gets report.md
-    with its plots and report.json. Finished runs are kept: after Ctrl-C the same command goes on.
-    A short run: --frames 60 --no-colmap.
+    with its plots and report.json. Finished runs are kept and reported: after Ctrl-C the same
+    command goes on. A short run: --frames 60 --no-colmap.
     """
     from protomark.evaluation.command import check_outputs
     from protomark.evaluation.mapping import command

@@ -73,7 +73,7 @@ def evaluate_mapping(request: Request, json_path: Path | None = None) -> Results
 
     Raises:
         FileNotFoundError, ValueError: a sequence is missing or broken.
-        KeyboardInterrupt: what is finished is kept; the same call goes on.
+        KeyboardInterrupt: what is finished is kept and reported; the same call goes on.
     """
     import cv2
 
@@ -84,19 +84,33 @@ def evaluate_mapping(request: Request, json_path: Path | None = None) -> Results
     output.mkdir(parents=True, exist_ok=True)
     kept = Kept(output / KEPT)
     cv2.setNumThreads(request.threads)
+    runs: dict[str, dict[str, Run]] = {s.name: {} for s in sequences}
+    recalls: list[Recall] = []
+    interrupted = False
     with one_blas_thread():
-        runs = _runs(request, sequences, kept)
-        recalls = _recalls(request, kept)
+        try:
+            recalls = _recalls(request, kept)
+            _runs(request, sequences, kept, runs)
+        except KeyboardInterrupt:
+            interrupted = True
+    order = [v.name for v in request.variants] + [COLMAP] * request.colmap
     results = Results(
         sequences=[
             SequenceResult(
-                s.name, len(s.source), s.available, s.truth, s.extent, s.poses, runs[s.name]
+                name=s.name,
+                frames=len(s.source),
+                available=s.available,
+                truth=s.truth,
+                extent=s.extent,
+                poses=s.poses,
+                runs={v: runs[s.name][v] for v in order if v in runs[s.name]},
             )
             for s in sequences
         ],
         recalls=recalls,
         localized="" if request.halves is None else _name(request.halves),
         calibrated=[_name(path) for path in request.calibrate],
+        missing=[f"{s.name}, {v}" for s in sequences for v in order if v not in runs[s.name]],
         conditions=_conditions(request),
     )
     results = replace(results, targets=targets(results))
@@ -106,6 +120,8 @@ def evaluate_mapping(request: Request, json_path: Path | None = None) -> Results
     if json_path is not None:
         write_text(json_path, text)
     write_text(output / REPORT, markdown(results))
+    if interrupted:
+        raise KeyboardInterrupt
     return results
 
 
@@ -123,9 +139,10 @@ class _Job:
     run: Callable[[Callable[[float], None]], Run]
 
 
-def _runs(request: Request, sequences: list[Images], kept: Kept) -> dict[str, dict[str, Run]]:
-    """Sequence -> variant -> its run, kept from earlier or made now."""
-    runs: dict[str, dict[str, Run]] = {s.name: {} for s in sequences}
+def _runs(
+    request: Request, sequences: list[Images], kept: Kept, runs: dict[str, dict[str, Run]]
+) -> None:
+    """Fill in sequence -> variant -> its run, kept from earlier or made now."""
     jobs = []
     for sequence in sequences:
         for job in _jobs(request, sequence):
@@ -146,8 +163,6 @@ def _runs(request: Request, sequences: list[Images], kept: Kept) -> dict[str, di
                 highlight=False,
                 soft_wrap=True,
             )
-    order = [*(v.name for v in request.variants), COLMAP]
-    return {name: {v: found[v] for v in order if v in found} for name, found in runs.items()}
 
 
 def _advancing(bar: Progress, task: TaskID, job: _Job) -> Callable[[float], None]:
@@ -312,7 +327,8 @@ def print_summary(results: Results, output: Path) -> None:
 def explain_interruption(output: Path) -> None:
     """What to do after Ctrl-C, on stderr."""
     progress_console.print(
-        f"stopped; finished runs are kept in {output}, and the same command goes on after them",
+        f"stopped; finished runs are kept and reported in {output}, and the same command goes on "
+        "after them",
         highlight=False,
         soft_wrap=True,
     )

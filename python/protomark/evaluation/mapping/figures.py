@@ -60,7 +60,7 @@ def _legend(figure: Figure, axes: list[Axes]) -> None:
         list(handles.values()),
         list(handles),
         loc="outside lower center",
-        ncols=len(handles),
+        ncols=max(len(handles), 1),
         frameon=False,
         labelcolor=INK,
         fontsize=9,

@@ -33,7 +33,8 @@ def markdown(results: Results) -> str:
         "distance (the traditional way), the medoid of each landmark, and prototypes. Beside it "
         "COLMAP's own incremental reconstruction with SIFT on the same images. Written by "
         "`protomark evaluate-mapping`.",
-        f"**Scale of this run:** {results.conditions['scale']}. {_shares(results)}",
+        f"**Scale of this run:** {results.conditions['scale']}. {_shares(results)}"
+        + (f" **Not run:** {'; '.join(results.missing)}." if results.missing else ""),
         "## What comes out",
         _bullets(reading(results)),
         "## Targets",

@@ -170,6 +170,7 @@ class Results:
         recalls: of the second half of a sequence in a map of its first half; empty: not measured.
         localized: name of that sequence.
         calibrated: names of those that said which matches to accept there.
+        missing: runs that Ctrl-C left out, "sequence, variant".
         conditions: name -> text.
         targets: what was aimed at.
     """
@@ -178,6 +179,7 @@ class Results:
     recalls: list[Recall]
     localized: str
     calibrated: list[str]
+    missing: list[str]
     conditions: dict[str, str]
     targets: list[Target] = field(default_factory=list)
 
@@ -187,6 +189,7 @@ class Results:
             "format": FORMAT,
             "version": VERSION,
             "conditions": self.conditions,
+            "missing": self.missing,
             "sequences": [
                 {
                     "name": s.name,
