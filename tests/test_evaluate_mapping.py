@@ -27,7 +27,7 @@ from tracks_scene import DISTORTED, PINHOLE, write_model, write_sequence
 # The last but one of the frames shows another room: it is looked at again, and left out.
 FRAMES, STRANGE = 8, 7
 SAMPLE = Path(pm.__file__).parent / "sample" / "toy.freak.safetensors"
-SHORT = ("--max-keypoints", 500, "--frames", FRAMES)
+SHORT = ("-d", "freak", "--max-keypoints", 500, "--frames", FRAMES)
 
 
 @pytest.fixture(scope="module")

@@ -850,8 +850,11 @@ def evaluate_mapping(
         ),
     ] = None,
     descriptor: Annotated[
-        str, typer.Option("--descriptor", "-d", help="Descriptor; the paper's is freak.")
-    ] = "freak",
+        str,
+        typer.Option(
+            "--descriptor", "-d", help="As `protomark map` takes them; the paper's is freak."
+        ),
+    ] = "akaze",
     encoder: Annotated[
         str, typer.Option(help="Name or file of the encoder; by default the descriptor's own.")
     ] = "",
@@ -884,7 +887,7 @@ def evaluate_mapping(
     flags += [f"--frames {frames}"] if frames else []
     flags += [f"--halves {halves.name}"] if halves is not None else []
     flags += [f"--calibrate {path.name}" for path in calibrate or []]
-    flags += [f"-d {descriptor}"] if descriptor != "freak" else []
+    flags += [f"-d {descriptor}"] if descriptor != "akaze" else []
     flags += [f"--encoder {Path(encoder).name}"] if encoder else []
     flags += [f"--max-keypoints {max_keypoints}"] if max_keypoints != 2000 else []
     flags += [f"--threads {threads}"] if threads != 1 else []
