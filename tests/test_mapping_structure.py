@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mapping_scene import walk
-from protomark.evaluation.pose import centre, project
+from protomark.localization.absolute_pose import centre, project
 from protomark.mapping import loop, merging
 from protomark.mapping.adjustment import adjust, adjust_global
 from protomark.mapping.culling import cull

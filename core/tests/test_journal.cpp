@@ -26,8 +26,10 @@ namespace {
 
 using Content = std::vector<char>;
 
+// In memory where that is possible: thousands of maps are saved here, and each one is synced.
 const fs::path folder =
-    fs::temp_directory_path() / ("protomark_test_journal_" + std::to_string(::getpid()));
+    (fs::is_directory("/dev/shm") ? fs::path("/dev/shm") : fs::temp_directory_path()) /
+    ("protomark_journal_" + std::to_string(getpid()));
 const fs::path path = folder / "map.pmk";
 const fs::path journal = folder / "map.pmk.journal";
 

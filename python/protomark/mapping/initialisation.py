@@ -22,9 +22,12 @@ _MIN_PARALLAX = 2.0
 # Where this share of matches is explained by a turn on the spot, there is no parallax.
 _MAX_TURNED = 0.7
 # Share of the landmarks that other frames see which must agree with a pose of that frame, within
-# three quarters of the largest error; and the lead over any other relative pose.
+# three quarters of the largest error; and the lead over any other relative pose, which is larger
+# where there are few such frames.
 _MIN_SUPPORT = 0.7
 _LEAD = 1.05
+_LEAD_OF_FEW = 1.2
+_FEW = 2
 _WITNESSES = 4
 _MIN_COMMON = 40
 # When more wait, every second one goes; it is looked for at the end.
@@ -90,8 +93,9 @@ class Initialiser:
         support, share = scores[best]
         if share < _MIN_SUPPORT or not self._is_wide(candidates[best], one, other, rows):
             return None
+        lead = _LEAD if len(witnesses) > _FEW else _LEAD_OF_FEW
         for pose, (rival, _) in zip(candidates, scores, strict=True):
-            if support < _LEAD * rival and not _alike(pose, candidates[best]):
+            if support < lead * rival and not _alike(pose, candidates[best]):
                 return None
         return candidates[best]
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
+from protomark.acceptance import Acceptance
 
 if TYPE_CHECKING:
     from protomark.mapping.settings import Settings
@@ -101,6 +102,9 @@ class Prototypes(Memory):
             )
         self.encoder, self.dim = encoder, dim
         self.map = pm.PrototypeMap(encoder, dim)
+        self.acceptance: Acceptance | None = None
+        with contextlib.suppress(ValueError):
+            self.acceptance = encoder.acceptance(dim)
 
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
         """See `Memory.encode`."""

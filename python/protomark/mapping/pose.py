@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.localization.absolute_pose import project
+from protomark.localization.absolute_pose import estimate, project
 from protomark.tracks.file import Camera
 
 Array = NDArray[np.float64]
-
-_MAX_ITERATIONS = 3000
 
 
 def absolute_pose(
@@ -24,27 +22,8 @@ def absolute_pose(
         points: (n, 3) in the world.
         max_error: largest reprojection error of an inlier, pixels.
     """
-    import poselib
-
-    if len(pixels) < 4:
-        return None
-    pose, found = poselib.estimate_absolute_pose(
-        np.asarray(pixels, np.float64),
-        points,
-        camera.as_dict(),
-        {
-            "max_reproj_error": max_error,
-            "max_iterations": _MAX_ITERATIONS,
-            "min_iterations": 100,
-            "progressive_sampling": True,
-            "seed": 0,
-        },
-        {},
-    )
-    estimate = np.asarray(pose.Rt, np.float64)
-    if found["num_inliers"] < 4 or not np.isfinite(estimate).all():
-        return None
-    return estimate, np.asarray(found["inliers"], bool)
+    found = estimate(np.asarray(pixels, np.float64), points, camera, max_error)
+    return None if found is None else (found.cam_from_world, found.inliers)
 
 
 def refine_pose(

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protomark.mapping.memory import Memory
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.mapping.memory import Memory, Prototypes
+
+# As `protomark localize` accepts.
+_MIN_PROBABILITY = 0.2
 
 
 @dataclass(frozen=True)
@@ -12,7 +18,8 @@ class Thresholds:
     """Bounds on the distance of a match.
 
     Attributes:
-        ratio: nearest to second nearest landmark, where the whole map is searched.
+        ratio: nearest to second nearest landmark, where the whole map is searched by a memory that
+            was not calibrated.
         guided_ratio: the same among landmarks that project near the keypoint.
         max_distance: of a guided match, as a share of the distance that the frame's keypoints
             typically (median) have to landmarks elsewhere.
@@ -31,3 +38,27 @@ _HAMMING = Thresholds(ratio=0.8, guided_ratio=0.85, max_distance=0.6)
 def thresholds(memory: Memory) -> Thresholds:
     """The bounds that fit a memory's distances."""
     return _EUCLIDEAN if memory.euclidean else _HAMMING
+
+
+def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Which nearest landmarks of the whole map are accepted, the clearest first.
+
+    Where the encoder was calibrated its probability decides, else the ratio of the two distances.
+
+    Args:
+        memory: what was searched.
+        distances: (q, 2) float32, to the two nearest landmarks.
+
+    Returns:
+        (k,) int64, rows of `distances`.
+    """
+    nearest, second = distances.T
+    if isinstance(memory, Prototypes) and memory.acceptance is not None:
+        doubt = 1 - memory.acceptance.probability(distances)
+        limit = 1 - _MIN_PROBABILITY
+    else:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            doubt = np.where(second > 0, nearest / second, 1.0)
+        limit = thresholds(memory).ratio
+    rows = np.flatnonzero(np.isfinite(nearest) & (doubt < limit))
+    return rows[np.lexsort((nearest[rows], doubt[rows]))]

@@ -12,7 +12,7 @@ from protomark.mapping.memory import Memory
 from protomark.mapping.nearby import near_pairs
 from protomark.mapping.pose import absolute_pose, refine_pose
 from protomark.mapping.structure import Array, Ids, Structure
-from protomark.mapping.thresholds import thresholds
+from protomark.mapping.thresholds import accepted, thresholds
 
 # Radii in which landmarks are looked for, as shares of the image's longer side: around where a
 # predicted pose puts them, and around where a pose found by RANSAC does.
@@ -135,12 +135,9 @@ class Tracker:
         return Tracked(pose, matches.where(inliers), share)
 
     def search(self, query: Query, among: Ids | None = None) -> Matches:
-        """Nearest landmark of each keypoint in the whole map, under the ratio test."""
+        """Nearest landmark of each keypoint in the whole map, where the match is clear."""
         ids, distances = self.memory.search(query.encoded, self.threads, among)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
-        rows = np.flatnonzero((ids[:, 0] >= 0) & (ratio < self.bounds.ratio))
-        rows = rows[np.lexsort((distances[rows, 0], ratio[rows]))]
+        rows = accepted(self.memory, distances)
         return _one_each(rows, ids[rows, 0])
 
     def guided(self, query: Query, pose: Array, radius: float, among: Ids | None = None) -> Matches:
