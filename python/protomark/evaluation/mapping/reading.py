@@ -17,7 +17,11 @@ def reading(results: Results) -> list[str]:
     ]
     if pairs:
         found += [_registered(pairs), _errors(pairs), _memory(pairs), _time(pairs)]
-    found += [text for text in (_beside_colmap(results), _lost(results), _drift(results)) if text]
+    found += [
+        text
+        for text in (_beside_colmap(results), _lost(results), _wrong(results), _drift(results))
+        if text
+    ]
     return found
 
 
@@ -138,6 +142,23 @@ def _lost(results: Results) -> str:
         if run.registered < 0.9 * s.frames
     ]
     return f"**Fewer than 90 % of the frames** are registered on {', '.join(weak)}." if weak else ""
+
+
+def _wrong(results: Results) -> str:
+    found = {}
+    for s in results.sequences:
+        shares = {v: (s.error(v) or 0.0) / s.extent for v in s.runs if s.extent}
+        bad = [
+            f"{LABELS.get(v, v)} {100 * share:.0f} %" for v, share in shares.items() if share > 0.05
+        ]
+        if bad:
+            found[s.name] = f"{s.name} (extent {s.extent:.2g}; {', '.join(bad)})"
+    if not found:
+        return ""
+    return (
+        "**Trajectories that are not right**, with an error above 5 % of the extent of the true "
+        f"one: {'; '.join(found.values())}. There ratios between variants say little."
+    )
 
 
 def _drift(results: Results) -> str:

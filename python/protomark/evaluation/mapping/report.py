@@ -66,8 +66,8 @@ def markdown(results: Results) -> str:
         "frame after frame. A fresh map is made at once of the observations that were added and "
         "not taken back. Sums are exact, so both must be saved in the same bytes; precision is "
         "then the same on any queries. An observation that proves wrong after its descriptor is "
-        "gone (*dropped*) leaves the geometry and stays in the prototype: by these, and by nothing "
-        "else, the map differs from one made of what the frames see at the end, from the images.",
+        "gone (*dropped*) leaves the geometry and stays in the prototype: so some landmarks are "
+        "unlike those of a map made from the images of what the frames see at the end.",
         _drift_table(results),
         "## Conditions",
         _bullets(f"{name}: {value}" for name, value in results.conditions.items()),
