@@ -275,8 +275,8 @@ def _conditions(request: Request) -> dict[str, str]:
         "pipeline": f"{base.descriptor.upper()}, at most {base.max_keypoints} keypoints an image, "
         f"window of {base.window} keyframes; poses unknown, camera known and fixed",
         "COLMAP": f"pycolmap {pycolmap.__version__}, SIFT on the CPU, its default options but "
-        "with any distortion, camera known and fixed; of more than 40 images those are matched that "
-        "lie up to ten apart or a power of two"
+        "with any distortion, camera known and fixed; of more than 40 images those are matched "
+        "that lie up to ten apart or a power of two"
         if request.colmap
         else "left out",
         "time": f"CPU seconds of the process, {request.threads} thread(s); load of the machine at "
