@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from protomark.kept import key_of
 from protomark.reproduce.plateau import Plateau
 from protomark.reproduce.scale import SCALES, Scale, find_scale
-from protomark.reproduce.store import Store, key_of
+from protomark.reproduce.store import Store
 from protomark.reproduce.trainer import Material, train
 from protomark.reproduce.training import (
     PAPER_PICK,

@@ -79,24 +79,42 @@ class BlockPacker {
   std::array<std::uint8_t, 256> quantized_{};
 };
 
-// Where the rows of a sealed map stand: as CellOrder has them, by place.
-struct Places {
-  Places(const SealedRows& rows, std::size_t cells) : cell_rows(cells, 0) {
-    for (std::size_t row = 0; row < rows.size(); ++row) ++cell_rows[rows.cell_of(row)];
+// Where the rows of a sealed map stand: cell after cell, each from a new block on.
+class Places {
+ public:
+  Places(const SealedRows& rows, std::size_t cells) : cell_rows_(cells, 0), rows_(rows.size()) {
+    for (std::size_t row = 0; row < rows_; ++row) ++cell_rows_[rows.cell_of(row)];
     std::vector<std::size_t> next(cells);
-    std::size_t end = 0;
     for (std::size_t c = 0; c < cells; ++c) {
-      next[c] = end;
-      end += (cell_rows[c] + kPackedRows - 1) / kPackedRows * kPackedRows;
+      next[c] = size_;
+      size_ += (cell_rows_[c] + kPackedRows - 1) / kPackedRows * kPackedRows;
     }
-    row_at.assign(end, kPadding);
-    for (std::size_t row = 0; row < rows.size(); ++row) {
-      row_at[next[rows.cell_of(row)]++] = static_cast<std::uint32_t>(row);
+    if (cells == 1) return;
+    row_at_.assign(size_, kPadding);
+    for (std::size_t row = 0; row < rows_; ++row) {
+      row_at_[next[rows.cell_of(row)]++] = static_cast<std::uint32_t>(row);
     }
   }
 
-  std::vector<std::uint32_t> cell_rows;  // of each cell
-  std::vector<std::uint32_t> row_at;     // of each place
+  std::size_t size() const { return size_; }
+  // The row of a place, or kPadding.
+  std::uint32_t row_at(std::size_t place) const {
+    if (!row_at_.empty()) return row_at_[place];
+    return place < rows_ ? static_cast<std::uint32_t>(place) : kPadding;
+  }
+  // Rows of a block of kPackedRows places.
+  std::array<std::uint32_t, kPackedRows> block(std::size_t number) const {
+    std::array<std::uint32_t, kPackedRows> result;
+    for (std::size_t i = 0; i < kPackedRows; ++i) result[i] = row_at(number * kPackedRows + i);
+    return result;
+  }
+  const std::vector<std::uint32_t>& cell_rows() const { return cell_rows_; }
+
+ private:
+  std::vector<std::uint32_t> cell_rows_;  // of each cell
+  std::size_t rows_;
+  std::size_t size_ = 0;
+  std::vector<std::uint32_t> row_at_;  // empty where all is one cell
 };
 
 // Offers the two nearest landmarks of each query, found in so many rows at a time, to `offer(query,
@@ -215,14 +233,14 @@ std::array<float, 3> relative(const Position& position, const Position& origin) 
 void write_order(const SealedRows& rows, const Places& places, int bits,
                  const ContainerWriter::Sink& sink) {
   constexpr std::size_t kPiece = 1 << 16;  // a multiple of 8, so that pieces follow each other
-  const std::size_t all = places.row_at.size();
+  const std::size_t all = places.size();
   std::vector<std::uint32_t> numbers;
   std::size_t first = 0;
   do {
     const std::size_t end = std::min(all, first + kPiece);
     numbers.clear();
     for (; first < end; ++first) {
-      const std::uint32_t row = places.row_at[first];
+      const std::uint32_t row = places.row_at(first);
       numbers.push_back(static_cast<std::uint32_t>(row == kPadding ? rows.landmarks().size()
                                                                    : rows.landmark_of(row)));
     }
@@ -289,10 +307,9 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
     });
   }
   if (bits == 4) file.add(section::kLevels, write_levels(half_step));
-  add_values<std::uint8_t>(file, section::kPrototypes, places.row_at.size() / kPackedRows,
-                           packer.size(), [&](std::size_t block, std::uint8_t* to) {
-                             packer.pack(&places.row_at[block * kPackedRows], to);
-                           });
+  add_values<std::uint8_t>(
+      file, section::kPrototypes, places.size() / kPackedRows, packer.size(),
+      [&](std::size_t block, std::uint8_t* to) { packer.pack(places.block(block).data(), to); });
   if (gridded) {
     file.add(section::kSteps, write_steps(grid.step));
     add_values<PositionGrid::Cell>(file, section::kPositions, n, 1,
@@ -307,9 +324,9 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
   }
   if (indexed) {
     file.add(section::kCells, std::as_bytes(std::span(cells.centroids())));
-    file.add(section::kCellRows, std::as_bytes(std::span(places.cell_rows)));
+    file.add(section::kCellRows, std::as_bytes(std::span(places.cell_rows())));
     const int number_bits = std::bit_width(std::max<std::size_t>(n, 1));
-    file.add(section::kOrder, bit_numbers_size(places.row_at.size(), number_bits),
+    file.add(section::kOrder, bit_numbers_size(places.size(), number_bits),
              [&, number_bits](const ContainerWriter::Sink& sink) {
                write_order(rows, places, number_bits, sink);
              });

@@ -12,7 +12,8 @@ import numpy as np
 
 from protomark.evaluation.methods import MethodChoice, choices
 from protomark.evaluation.run import Options, evaluate
-from protomark.reproduce.store import Store, key_of
+from protomark.kept import key_of
+from protomark.reproduce.store import Store
 from protomark.reproduce.trainer import Outcome
 from protomark.reproduce.training import SEEDS, Training
 from protomark.tracks.file import Tracks

@@ -22,8 +22,9 @@ from rich.progress import (
 )
 
 from protomark.console import progress_console
+from protomark.kept import key_of
 from protomark.reproduce.scale import Scale
-from protomark.reproduce.store import Store, key_of
+from protomark.reproduce.store import Store
 from protomark.reproduce.trainer import Material, Outcome, train
 from protomark.reproduce.training import Training
 from protomark.training.train import keep_freed_memory

@@ -1,0 +1,1 @@
+"""The incremental pipeline on whole sequences, with several memories, beside COLMAP."""
