@@ -12,7 +12,7 @@ from evaluation_scene import CAMERA, looking_inwards
 from protomark.localization import PosePrior
 from protomark.localization.absolute_pose import centre, project
 from protomark.localization.frustum import visible
-from protomark.localization.poses import _quaternion, _rotation
+from protomark.localization.poses import quaternion_of, rotation_of
 from protomark.tracks import Camera
 from tracks_scene import DISTORTED, PINHOLE, quaternion
 
@@ -64,6 +64,6 @@ def test_priors_that_are_none(distance: float, degrees: float) -> None:
 @given(st.tuples(*[st.floats(-4, 4)] * 3))
 def test_rotations_round_trip(axis: tuple[float, ...]) -> None:
     rotation = cv2.Rodrigues(np.array(axis))[0]
-    assert _rotation(_quaternion(rotation)) == pytest.approx(rotation, abs=1e-9)
+    assert rotation_of(quaternion_of(rotation)) == pytest.approx(rotation, abs=1e-9)
     if np.trace(rotation) > 0:
-        assert _quaternion(rotation) == pytest.approx(quaternion(rotation), abs=1e-9)
+        assert quaternion_of(rotation) == pytest.approx(quaternion(rotation), abs=1e-9)

@@ -305,8 +305,11 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 300"], "has 4 parameters"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 a"], "number that is none"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 32 24 30 30 16 12"], "32 x 24"),
-        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/gone.txt"], "no such file of poses"),
-        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/true/cameras.txt"], "no poses in it"),
+        (
+            ["{q}/scene.pmk", "{q}/images", "--poses", "{q}/gone.txt"],
+            "folder of poses",
+        ),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/true/cameras.txt"], "a word is no number"),
         (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/else.txt"], "is of one of the images"),
         (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/long.txt"], "is not of length 1"),
         (["{q}/images/1.png", "{q}/images"], "1.png"),

@@ -16,8 +16,8 @@ import protomark as pm
 from mapping_scene import show, walk, write_images
 from protomark.evaluation.trajectory import trajectory_error
 from protomark.localization.absolute_pose import centre
+from protomark.localization.poses import quaternion_of, read_poses
 from protomark.mapping.command import Interrupted, Request, make_map
-from protomark.mapping.given_poses import read_poses
 from protomark.mapping.mapper import Mapper, Picture
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.settings import Settings
@@ -179,8 +179,6 @@ def test_given_poses_stay_and_structure_is_built(images: Path, tmp_path: Path) -
     poses = walk(COUNT)
     lines = []
     for i, pose in enumerate(poses, 1):
-        from protomark.mapping.outputs import quaternion_of
-
         numbers = " ".join(repr(float(v)) for v in (*quaternion_of(pose[:, :3]), *pose[:, 3]))
         lines.append(f"{i} {numbers} 1 img{i}.png\n\n" if i != 4 else "")
     (tmp_path / "images.txt").write_text("".join(lines))

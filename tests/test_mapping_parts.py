@@ -2,11 +2,10 @@ import numpy as np
 import pytest
 
 import protomark as pm
+from protomark.localization.poses import quaternion_of, read_poses
 from protomark.mapping.camera import given_camera
-from protomark.mapping.given_poses import read_poses
 from protomark.mapping.memory import Descriptors, Medoids, Prototypes
 from protomark.mapping.nearby import near_pairs
-from protomark.mapping.outputs import quaternion_of
 from protomark.mapping.source import Folder, Video, open_source
 from tracks_scene import PINHOLE
 

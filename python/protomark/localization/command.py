@@ -16,7 +16,7 @@ from protomark.localization.absolute_pose import FocalLength, pose_error
 from protomark.localization.cameras import Cameras, camera_of_exif, read_cameras
 from protomark.localization.frustum import PosePrior
 from protomark.localization.localizer import Localizer
-from protomark.localization.poses import pose_of, read_poses
+from protomark.localization.poses import GivenPoses, read_poses
 from protomark.localization.results import CAMERAS, POSES, TABLE, ImageResult, Results
 from protomark.tracks.features import read_gray
 
@@ -83,20 +83,20 @@ def localize_files(
         pm.open(scene), max_keypoints=settings.max_keypoints, threads=settings.threads
     )
     cameras = read_cameras(settings.camera) if settings.camera else None
-    true_poses = read_poses(settings.true_poses) if settings.true_poses else {}
-    priors = read_poses(settings.priors) if settings.priors else {}
+    true_poses = read_poses(settings.true_poses) if settings.true_poses else GivenPoses({})
+    priors = read_poses(settings.priors) if settings.priors else GivenPoses({})
     for source, poses in ((settings.true_poses, true_poses), (settings.priors, priors)):
-        if source and all(pose_of(poses, name) is None for name, _ in found):
+        if source and all(poses.of(name) is None for name, _ in found):
             raise ValueError(
                 f"{source}: none of its {len(poses)} poses is of one of the images, {found[0][0]} "
-                f"for example; it names {next(iter(poses))}"
+                f"for example; it has {poses.example}"
             )
     output.mkdir(parents=True, exist_ok=True)
     results: list[ImageResult] = []
     interrupted = False
     try:
         for name, path in track(found, "localizing"):
-            prior = pose_of(priors, name)
+            prior = priors.of(name)
             results.append(
                 _localize(
                     localizer,
@@ -107,7 +107,7 @@ def localize_files(
                     None
                     if prior is None
                     else PosePrior(prior, settings.prior_distance, settings.prior_degrees),
-                    pose_of(true_poses, name),
+                    true_poses.of(name),
                 )
             )
     except KeyboardInterrupt:

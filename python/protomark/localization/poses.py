@@ -8,86 +8,148 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+# A time is that of a pose if they differ by less than this share of the typical step.
+_TIME_SHARE = 0.5
 
-def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Poses (3, 4) cam_from_world by image name, or by time stamp where the file is a trajectory.
 
-    Args:
-        path: a folder with a COLMAP model, an images.txt, or a TUM trajectory (a line a pose:
-            time, position and quaternion x y z w of the camera in the world).
+class GivenPoses:
+    """Poses by image name, or by time.
+
+    Attributes:
+        by_name: name -> (3, 4) cam_from_world.
+        times: (n,) float64, ascending; empty where poses go by name.
+        poses: (n, 3, 4) float64, of these times.
+    """
+
+    def __init__(
+        self,
+        by_name: Mapping[str, NDArray[np.float64]],
+        times: NDArray[np.float64] | None = None,
+        poses: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.by_name = by_name
+        self.times = np.zeros(0) if times is None else times
+        self.poses = np.zeros((0, 3, 4)) if poses is None else poses
+        steps = np.diff(self.times)
+        self._limit = _TIME_SHARE * float(np.median(steps)) if len(steps) else 0.0
+
+    def __len__(self) -> int:
+        return len(self.by_name) + len(self.times)
+
+    @property
+    def example(self) -> str:
+        """What the first pose is of."""
+        return next(iter(self.by_name), None) or f"time {self.times[0]:g}"
+
+    def of(self, name: str, time: float | None = None) -> NDArray[np.float64] | None:
+        """The pose of an image, None where none is given.
+
+        Args:
+            name: its name; one without folders serves, too.
+            time: its time in seconds; None: its name is one, such as 1305031102.175304.png.
+        """
+        path = Path(name)
+        if not len(self.times):
+            return self.by_name.get(name, self.by_name.get(path.name))
+        try:
+            time = float(path.stem) if time is None else time
+        except ValueError:
+            return None
+        at = int(np.argmin(np.abs(self.times - time)))
+        return self.poses[at] if abs(self.times[at] - time) <= self._limit else None
+
+
+def read_poses(path: Path) -> GivenPoses:
+    """Read a COLMAP model (folder), a COLMAP images.txt, or a TUM trajectory.
+
+    A trajectory has a line a pose: time, position and quaternion x y z w of the camera in the
+    world.
 
     Raises:
         FileNotFoundError: there is nothing at `path`.
-        ValueError: the file holds no poses, or a broken one.
+        ValueError: it is none of these, or a pose in it is broken.
     """
     if path.is_dir():
         from protomark.tracks.colmap import find_model, model_of, read_reconstruction
 
         folder = find_model(path)
         model = model_of(read_reconstruction(folder), folder)
-        return dict(zip(model.names, model.cam_from_world, strict=True))
+        return GivenPoses(dict(zip(model.names, model.cam_from_world, strict=True)))
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file of poses")
-    poses: dict[str, NDArray[np.float64]] = {}
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            if len(words) == 10:  # images.txt; the line of its points is a multiple of three long
-                quaternion, shift = np.array(words[1:5], float), np.array(words[5:8], float)
-                rotation = _rotation(quaternion)
-                poses[words[9]] = np.column_stack([rotation, shift])
-            elif len(words) == 8 and _numeric(words):  # TUM
-                quaternion = np.array([words[7], *words[4:7]], float)
-                rotation, center = _rotation(quaternion).T, np.array(words[1:4], float)
-                poses[words[0]] = np.column_stack([rotation, -rotation @ center])
-        except ValueError as error:
-            raise ValueError(f"{path}, line {number}: {error}") from None
-    if not poses:
-        raise ValueError(
-            f"{path}: no poses in it; give a COLMAP images.txt, a folder with a model, or a TUM "
-            "trajectory"
-        )
-    return poses
-
-
-def pose_of(poses: Mapping[str, NDArray[np.float64]], image: str) -> NDArray[np.float64] | None:
-    """The pose of an image by its name, its name without folders, or its time stamp."""
-    path = Path(image)
-    for key in (image, path.name, path.stem):
-        if key in poses:
-            return poses[key]
+        raise FileNotFoundError(f"{path}: no such file or folder of poses")
     try:
-        time = float(path.stem)
-    except ValueError:
-        return None
-    for key, pose in poses.items():
-        try:
-            if float(key) == time:
-                return pose
-        except ValueError:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(
+            f"{path}: not a text file; give a COLMAP images.txt, a folder with a model, or a TUM "
+            "trajectory"
+        ) from None
+    rows = [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
+    filled = [row for row in rows if row[1]]
+    if not filled:
+        raise ValueError(f"{path}: no poses in this file")
+    if all(len(words) == 8 for _, words in filled):
+        return _tum(path, filled)
+    return _colmap(path, rows)
+
+
+def _tum(path: Path, rows: list[tuple[int, list[str]]]) -> GivenPoses:
+    times, poses = [], []
+    for number, words in rows:
+        values = _numbers(path, number, words)
+        times.append(values[0])
+        rotation = _rotation_in(path, number, values[[7, 4, 5, 6]]).T
+        poses.append(np.column_stack([rotation, -rotation @ values[1:4]]))
+    order = np.argsort(times, kind="stable")
+    return GivenPoses({}, np.array(times)[order], np.array(poses)[order])
+
+
+def _colmap(path: Path, rows: list[tuple[int, list[str]]]) -> GivenPoses:
+    # Lines of images and of their points take turns, also where an image has no points.
+    by_name = {}
+    for number, words in rows[::2]:
+        if not words:
             continue
-    return None
+        if len(words) < 10:
+            raise ValueError(
+                f"{path}, line {number}: neither a line of COLMAP's images.txt nor of a TUM "
+                "trajectory (time tx ty tz qx qy qz qw)"
+            )
+        values = _numbers(path, number, words[1:8])
+        rotation = _rotation_in(path, number, values[:4])
+        by_name[" ".join(words[9:])] = np.column_stack([rotation, values[4:7]])
+    if not by_name:
+        raise ValueError(f"{path}: no poses in this file")
+    return GivenPoses(by_name)
+
+
+def _numbers(path: Path, line: int, words: list[str]) -> NDArray[np.float64]:
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        raise ValueError(f"{path}, line {line}: not a pose, a word is no number") from None
+    if not np.isfinite(values).all():
+        raise ValueError(f"{path}, line {line}: a number is not finite")
+    return values
+
+
+def _rotation_in(path: Path, line: int, quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    try:
+        return rotation_of(quaternion)
+    except ValueError as error:
+        raise ValueError(f"{path}, line {line}: {error}") from None
 
 
 def images_txt(poses: Mapping[str, NDArray[np.float64]], camera_ids: Mapping[str, int]) -> str:
     """COLMAP's images.txt with these poses (3, 4) by name, without keypoints."""
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and an empty line for the points"]
     for i, (name, pose) in enumerate(poses.items(), 1):
-        numbers = " ".join(f"{x:.12g}" for x in (*_quaternion(pose[:, :3]), *pose[:, 3]))
+        numbers = " ".join(f"{x:.12g}" for x in (*quaternion_of(pose[:, :3]), *pose[:, 3]))
         lines += [f"{i} {numbers} {camera_ids[name]} {name}", ""]
     return "\n".join(lines) + "\n"
 
 
-def _numeric(words: list[str]) -> bool:
-    try:
-        return len([float(word) for word in words]) > 0
-    except ValueError:
-        return False
-
-
-def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_of(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """w, x, y, z -> (3, 3)."""
     norm = np.linalg.norm(quaternion)
     if not np.isfinite(norm) or abs(norm - 1) > 0.05:
@@ -98,7 +160,7 @@ def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
 
 
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) -> w, x, y, z with w >= 0: the eigenvector of Bar-Itzhack (2000), well conditioned."""
     r = rotation
     k = np.array(

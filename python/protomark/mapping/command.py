@@ -16,9 +16,9 @@ from rich.markup import escape
 
 from protomark.console import console, progress_bar, progress_console
 from protomark.files import write_text
+from protomark.localization.poses import GivenPoses, read_poses
 from protomark.mapping import outputs
 from protomark.mapping.camera import given_camera, guessed_camera
-from protomark.mapping.given_poses import GivenPoses, read_poses
 from protomark.mapping.mapper import Mapper, Picture
 from protomark.mapping.settings import Settings
 from protomark.mapping.source import Folder, Video, open_source

@@ -10,8 +10,9 @@ import numpy as np
 
 from protomark.files import write_text
 from protomark.localization.absolute_pose import centre
+from protomark.localization.poses import quaternion_of
 from protomark.mapping.memory import Memory, Prototypes
-from protomark.mapping.structure import Array, Structure
+from protomark.mapping.structure import Structure
 from protomark.tracks.colmap import pycolmap, quiet
 
 MAP, MODEL, TRAJECTORY = "scene.pmk", "sparse", "trajectory.txt"
@@ -81,9 +82,3 @@ def write_trajectory(structure: Structure, path: Path) -> None:
         numbers = [f"{v + 0.0:.9g}" for v in (*place, x, y, z, w)]
         lines.append(" ".join([f"{frame.time:.6f}", *numbers]))
     write_text(path, "\n".join(lines) + "\n")
-
-
-def quaternion_of(rotation: Array) -> Array:
-    """w, x, y, z with w >= 0."""
-    x, y, z, w = (float(v) for v in pycolmap.Rotation3d(rotation).quat)
-    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
