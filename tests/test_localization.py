@@ -257,7 +257,11 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
         w, *v = quaternion(pose[:, :3].T)
         stamps.append(" ".join(map(str, [f"{i + 1}.0", *centre(pose), *v, w])))
     (query / "tum.txt").write_text("# time x y z q\n" + "\n".join(stamps) + "\n")
-    for camera in ("PINHOLE 320 240 300 300 160 120", str(query / "true")):
+    for camera in (
+        "PINHOLE:300,300,160,120",
+        "PINHOLE 320 240 300 300 160 120",
+        str(query / "true"),
+    ):
         done = run(
             *(query / "scene.pmk", query / "images", "-o", query / "out", "--camera", camera),
             *("--poses", query / "tum.txt", "--priors", query / "true", "--prior-distance", 0.1),

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import protomark as pm
+from protomark.localization.cameras import read_cameras
 from protomark.localization.poses import quaternion_of, read_poses
-from protomark.mapping.camera import given_camera
 from protomark.mapping.memory import Descriptors, Medoids, Prototypes
 from protomark.mapping.nearby import near_pairs
 from protomark.mapping.source import Folder, Video, open_source
@@ -92,11 +92,15 @@ def test_prototypes_of_other_dimensions(encoder):
         Prototypes(encoder, 17)
 
 
+def given_camera(text, size):
+    return read_cameras(text).find("", *size)
+
+
 def test_camera_as_text(tmp_path):
     camera = given_camera("PINHOLE:300,300,160,120", (320, 240))
     assert camera == PINHOLE
     assert given_camera("pinhole 320 240 300 300 160 120", (320, 240)) == PINHOLE
-    with pytest.raises(ValueError, match="the images have 640x480 pixels"):
+    with pytest.raises(ValueError, match="has 640 x 480 pixels"):
         given_camera("PINHOLE 320 240 300 300 160 120", (640, 480))
     file = tmp_path / "cameras.txt"
     file.write_text("# a comment\n1 PINHOLE 320 240 300 300 160 120\n")
@@ -107,7 +111,7 @@ def test_camera_as_text(tmp_path):
 @pytest.mark.parametrize(
     ("content", "say"),
     [
-        ("1 PINHOLE 640 480 300 300 160 120\n", "no cameras for images of 320x240"),
+        ("1 PINHOLE 640 480 300 300 160 120\n", "has 320 x 240 pixels, and none of the cameras"),
         ("1 PINHOLE 320 240 300 300 160\n", "line 1: not a COLMAP camera"),
         ("1 PINHOLE 320 240 0 0 160 120\n", "line 1: not a COLMAP camera"),
         ("1 LENS 320 240 300 300 160 120\n", "line 1: not a COLMAP camera"),
@@ -123,9 +127,9 @@ def test_camera_that_is_none(tmp_path, content, say):
 
 
 def test_camera_parameters_that_do_not_fit():
-    with pytest.raises(ValueError, match="not the parameters of a PINHOLE camera"):
+    with pytest.raises(ValueError, match="has 4 parameters, not 2"):
         given_camera("PINHOLE:300,300", (320, 240))
-    with pytest.raises(FileNotFoundError, match=r"takes a COLMAP cameras\.txt"):
+    with pytest.raises(FileNotFoundError, match=r"no cameras\.txt"):
         given_camera("no-such-file", (320, 240))
 
 

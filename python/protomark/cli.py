@@ -385,8 +385,9 @@ def map_(
     camera: Annotated[
         str | None,
         typer.Option(
-            help="COLMAP cameras.txt (or model folder), or such as PINHOLE:500,500,320,240. By "
-            "default the camera is calibrated along the way."
+            help="A COLMAP cameras.txt, a folder with a COLMAP model, or a camera written out: "
+            "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'. By default it is "
+            "calibrated along the way."
         ),
     ] = None,
     focal: Annotated[
@@ -502,8 +503,8 @@ def localize(
         str | None,
         typer.Option(
             help="A COLMAP cameras.txt, a folder with a COLMAP model, or a camera written out: "
-            "'PINHOLE 640 480 525 525 320 240'. By default the focal length comes from EXIF data, "
-            "or is estimated from matches."
+            "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'. By default the focal "
+            "length comes from EXIF data, or is estimated from matches."
         ),
     ] = None,
     refine_focal_length: Annotated[

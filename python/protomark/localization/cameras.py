@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from protomark.localization.absolute_pose import MODELS, check_camera
 from protomark.tracks.file import Camera
+
+_EXAMPLE = "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'"
 
 
 @dataclass(frozen=True)
@@ -15,7 +17,7 @@ class Cameras:
     """Cameras, and which image was taken by which.
 
     Attributes:
-        cameras: all of them.
+        cameras: all of them; one without a size (0 x 0) serves images of any.
         of_image: by image name, where that is known.
     """
 
@@ -31,10 +33,11 @@ class Cameras:
         for key in (name, Path(name).name):
             if key in self.of_image:
                 return self.of_image[key]
-        fitting = [c for c in self.cameras if (c.width, c.height) == (width, height)]
+        given = {replace(c, width=width, height=height) if not c.width else c for c in self.cameras}
+        fitting = [c for c in given if (c.width, c.height) == (width, height)]
         if len(fitting) == 1:
             return fitting[0]
-        sizes = ", ".join(sorted({f"{c.width} x {c.height}" for c in self.cameras}))
+        sizes = ", ".join(sorted({f"{c.width} x {c.height}" for c in given}))
         if fitting:
             raise ValueError(
                 f"{len(fitting)} of the cameras have {width} x {height} pixels and none names this "
@@ -47,23 +50,25 @@ class Cameras:
 
 
 def parse_camera(text: str) -> Camera:
-    """A camera as a line of cameras.txt says it, with or without its id.
+    """A camera written out: MODEL:PARAMETERS, or as in a line of cameras.txt with its size.
 
     Raises:
         ValueError: it is none.
     """
-    words = text.replace(",", " ").split()
-    if words and words[0].isdigit():
-        words = words[1:]
-    example = "for example PINHOLE 640 480 525 525 320 240"
-    if len(words) < 4:
-        raise ValueError(f"camera {text!r} is not MODEL WIDTH HEIGHT PARAMETERS, {example}")
+    sized = ":" not in text
+    words = text.replace(":", " ").replace(",", " ").split()
     try:
-        camera = Camera(words[0], int(words[1]), int(words[2]), tuple(map(float, words[3:])))
+        size = (int(words[1]), int(words[2])) if sized else (0, 0)
+        params = tuple(map(float, words[3 if sized else 1 :]))
+    except IndexError:
+        raise ValueError(f"camera {text!r} lacks numbers, for example {_EXAMPLE}") from None
     except ValueError:
-        raise ValueError(f"camera {text!r} has a number that is none, {example}") from None
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"camera {text!r} has no pixels, {example}")
+        raise ValueError(
+            f"camera {text!r} has a number that is none, for example {_EXAMPLE}"
+        ) from None
+    if sized and min(size) < 1:
+        raise ValueError(f"camera {text!r} has no pixels, for example {_EXAMPLE}")
+    camera = Camera(words[0].upper(), *size, params)
     check_camera(camera)
     return camera
 
@@ -74,30 +79,31 @@ def read_cameras(source: str) -> Cameras:
     Raises:
         FileNotFoundError, ValueError: it is none of these, or broken.
     """
+    if source.partition(":")[0].partition(" ")[0].upper() in MODELS:
+        return Cameras((parse_camera(source),))
     path = Path(source)
-    if path.is_dir():
-        return _of_model(path)
-    if path.is_file():
-        lines = [line.strip() for line in path.read_text(errors="replace").splitlines()]
-        try:
-            found = tuple(parse_camera(x) for x in lines if x and not x.startswith("#"))
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
-        if not found:
-            raise ValueError(f"{path}: no camera in it")
-        return Cameras(found)
-    if source.split(" ")[0] not in MODELS:
+    if not path.exists():
         raise FileNotFoundError(
             f"{source}: no cameras.txt, no folder with a COLMAP model, and no camera such as "
-            "'PINHOLE 640 480 525 525 320 240'"
+            f"{_EXAMPLE}"
         )
-    return Cameras((parse_camera(source),))
+    if path.is_dir() and not ((path / "cameras.txt").is_file() and not _has_images(path)):
+        return _of_model(path)
+    from protomark.tracks.colmap import read_cameras as cameras_of
+
+    found = tuple(cameras_of(path).values())
+    if not found:
+        raise ValueError(f"{path}: no cameras in it")
+    for camera in found:
+        check_camera(camera)
+    return Cameras(found)
+
+
+def _has_images(folder: Path) -> bool:
+    return any((folder / f"images.{ending}").is_file() for ending in ("txt", "bin"))
 
 
 def _of_model(folder: Path) -> Cameras:
-    text = folder / "cameras.txt"
-    if text.is_file() and not (folder / "images.txt").is_file():
-        return read_cameras(str(text))
     from protomark.tracks.colmap import find_model, model_of, read_reconstruction
 
     path = find_model(folder)

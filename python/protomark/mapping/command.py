@@ -16,9 +16,10 @@ from rich.markup import escape
 
 from protomark.console import console, progress_bar, progress_console
 from protomark.files import write_text
+from protomark.localization.cameras import read_cameras
 from protomark.localization.poses import GivenPoses, read_poses
 from protomark.mapping import outputs
-from protomark.mapping.camera import given_camera, guessed_camera
+from protomark.mapping.camera import guessed_camera
 from protomark.mapping.mapper import Mapper, Picture
 from protomark.mapping.settings import Settings
 from protomark.mapping.source import Folder, Video, open_source
@@ -143,9 +144,9 @@ def _begin(
     size = source.size()
     camera = None
     if request.camera:
-        camera = given_camera(request.camera, size)
+        camera = read_cameras(request.camera).find("", *size)
     elif request.poses is not None and request.poses.is_dir():
-        camera = given_camera(str(request.poses), size)
+        camera = read_cameras(str(request.poses)).find("", *size)
     if request.resume:
         mapper, facts = load_state(scene / CHECKPOINT, request.threads)
         if facts.get("input") != source.path.name:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.evaluation.trajectory import trajectory_error
-from protomark.mapping.camera import given_camera
+from protomark.localization.cameras import read_cameras
 from protomark.mapping.source import Folder, open_source
 from protomark.tracks.colmap import find_model, read_model
 from protomark.tracks.file import Camera
@@ -86,7 +86,7 @@ def open_sequence(folder: Path, every: int = 1, frames: int = 0) -> Sequence:
             f"{folder}: {len(poses)} of {len(source)} images have a pose in {path}, three are "
             "needed to compare trajectories; are the names the same?"
         )
-    camera = given_camera(str(path), source.size())
+    camera = read_cameras(str(path)).find("", *source.size())
     return Sequence(folder.resolve().name, source, available, camera, poses)
 
 
