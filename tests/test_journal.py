@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -441,3 +442,40 @@ def test_a_reader_can_be_written_from_the_format(look_bits: int, tmp_path: Path)
         whole = dict(sections(state(scene, tmp_path)))
         found = replayed(path.read_bytes(), journal_of(path).read_bytes(), look_bits)
         assert repr(sorted(found.items())) == repr(sorted(landmarks_in(whole, look_bits).items()))
+
+
+def test_a_journal_that_was_moved_takes_no_commit(encoder: pm.Encoder, tmp_path: Path) -> None:
+    path = tmp_path / "scene.pmk"
+    scene = begin(path, encoder)
+    observe(scene, 1)
+    scene.commit()
+    journal_of(path).rename(tmp_path / "away")
+    observe(scene, 2)
+    with pytest.raises(pm.FileError, match=r"scene\.pmk\.journal: was moved or deleted"):
+        scene.commit()
+    (tmp_path / "away").rename(journal_of(path))
+    assert scene.commit() > 0
+    assert state(pm.open(path), tmp_path) == state(scene, tmp_path)
+
+
+def test_a_hard_link_of_the_map_is_another_file(encoder: pm.Encoder, tmp_path: Path) -> None:
+    path, link = tmp_path / "scene.pmk", tmp_path / "link.pmk"
+    scene = begin(path, encoder)
+    link.hardlink_to(path)
+    observe(scene, 1)
+    scene.commit()
+    scene.save(link)
+    assert len(pm.open(link)) == len(scene) > 0
+    assert pm.file_journal(path)["commits"] == 1  # type: ignore[index]
+
+
+def test_named_pipes_are_refused(encoder: pm.Encoder, tmp_path: Path) -> None:
+    path = tmp_path / "scene.pmk"
+    pm.PrototypeMap(encoder).save(path)
+    os.mkfifo(journal_of(path))
+    os.mkfifo(tmp_path / "pipe.pmk")
+    for call in (pm.open, partial(pm.open, journal=True), pm.PrototypeMap(encoder).save):
+        with pytest.raises(pm.FileError, match="not a file"):
+            call(path)  # type: ignore[operator]
+    with pytest.raises(pm.FileError, match="not a file"):
+        pm.open(tmp_path / "pipe.pmk")

@@ -280,7 +280,7 @@ MappedFile::MappedFile(const std::filesystem::path& path) {
     const std::string why = system_error();
     throw FileError(path.string() + ": cannot be read: " + why);
   };
-  const int descriptor = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  const int descriptor = ::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC);
   if (descriptor < 0) fail();
   struct stat status;
   if (::fstat(descriptor, &status) != 0 || !S_ISREG(status.st_mode)) {

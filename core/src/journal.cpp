@@ -96,6 +96,7 @@ std::uint32_t checksum_of(Bytes container) {
   return result;
 }
 
+// A named pipe would keep whoever opens it waiting, unless it is opened with O_NONBLOCK.
 std::vector<std::byte> read_all(int descriptor, const std::filesystem::path& path) {
   const auto fail = [&]() {
     throw FileError(path.string() + ": cannot be read: " + system_error());
@@ -157,7 +158,7 @@ namespace {
 
 // The bytes of a journal; none where there is none.
 std::vector<std::byte> read_journal(const std::filesystem::path& path) {
-  const int descriptor = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  const int descriptor = ::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC);
   if (descriptor < 0 && (errno == ENOENT || errno == ENAMETOOLONG)) return {};
   if (descriptor < 0) throw FileError(path.string() + ": cannot be read: " + system_error());
   try {
@@ -172,7 +173,7 @@ std::vector<std::byte> read_journal(const std::filesystem::path& path) {
 
 // The identity of a file, by its first bytes; empty where it cannot be read.
 std::string read_identity(const std::filesystem::path& path) {
-  const int descriptor = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  const int descriptor = ::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC);
   if (descriptor < 0) return "";
   std::array<std::byte, kMaxHead> head;
   const ssize_t n = ::pread(descriptor, head.data(), head.size(), 0);
@@ -287,13 +288,14 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   checksum_ = content.checksum();
   tail_ = content.torn() != 0;
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
+  // Whoever made it, or compacted, may have been killed before: the map file's new name has to last
+  // before what it replaces is forgotten.
+  if (!sync_folder(path_)) fail("its folder cannot be synced: " + system_error());
   if (end_ == 0) {
     begin();
   } else if (!cut(end_) || ::fsync(descriptor_) != 0) {
     fail("cannot be written: " + system_error());
   }
-  // Whoever made it may have been killed before.
-  if (!sync_folder(path_)) fail("its folder cannot be synced: " + system_error());
 }
 
 bool Journal::cut(std::size_t size) {
@@ -321,7 +323,19 @@ void Journal::begin() {
   tail_ = false;
 }
 
+void Journal::check_owner() const {
+  if (::getpid() != process_) {
+    fail("was opened by process " + std::to_string(process_) +
+         ", of which this one is a copy (fork); only that one may commit");
+  }
+  if (!is_at(descriptor_, path_)) {
+    fail(
+        "was moved or deleted since it was opened; save to another path to keep what is in memory");
+  }
+}
+
 ContainerWriter Journal::record(FileKind kind) {
+  check_owner();
   if (end_ == 0) begin();
   ContainerWriter file(kind);
   SectionWriter chain;
@@ -331,15 +345,14 @@ ContainerWriter Journal::record(FileKind kind) {
 }
 
 void Journal::append(Bytes record) {
-  if (::getpid() != process_) {
-    fail("was opened by process " + std::to_string(process_) +
-         ", of which this one is a copy (fork); only that one may commit");
-  }
-  if (const auto now = read_identity(map_); now != base_ && now != folded_) {
+  check_owner();
+  const auto now = read_identity(map_);
+  if (now != base_ && now != folded_) {
     fail(
         "the map file beside it was replaced or deleted since it was opened; save to another "
         "path to keep what is in memory");
   }
+  base_ = now;
   const auto try_to = [&] {
     if (!cut(end_)) return false;
     tail_ = true;
@@ -374,7 +387,7 @@ void Journal::fail(const std::string& what) const { throw FileError(path_.string
 JournalGuard::JournalGuard(const std::filesystem::path& map) {
   // Not of the file that a link leads to: it is the link that will be replaced.
   const std::filesystem::path path = map.string() + ".journal";
-  descriptor_ = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  descriptor_ = ::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC);
   if (descriptor_ < 0 && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return;
   if (descriptor_ < 0) throw FileError(path.string() + ": cannot be read: " + system_error());
   try {

@@ -117,6 +117,7 @@ class Journal {
   void restart(const std::string& identity);
 
  private:
+  void check_owner() const;
   void begin();
   bool cut(std::size_t size);
   [[noreturn]] void fail(const std::string& what) const;

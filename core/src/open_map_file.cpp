@@ -1,6 +1,7 @@
 // An open map as a file, and the journal beside it.
 #include <algorithm>
 #include <mutex>
+#include <optional>
 #include <shared_mutex>
 #include <stdexcept>
 #include <string>
@@ -56,14 +57,16 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   {
     const std::scoped_lock own(store_->journal_mutex);
     std::error_code error;
-    if (store_->journal && std::filesystem::equivalent(path, store_->journal->map(), error)) {
+    // Another name of the same file (a hard link) is another file to write.
+    if (store_->journal && std::filesystem::canonical(path, error) == store_->journal->map()) {
       fold();
       return;
     }
   }
   const JournalGuard guard(path);
+  std::optional<JournalGuard> last;  // somebody may have begun a journal meanwhile
   const std::shared_lock changing(store_->changing);
-  write(path, {});
+  write(path, [&](const std::string&) { last.emplace(path); });
 }
 
 PrototypeMap PrototypeMap::read(const ContainerReader& file, const JournalContent& journal) {

@@ -7,6 +7,7 @@
 #include <cstring>
 #include <limits>
 #include <mutex>
+#include <optional>
 #include <shared_mutex>
 #include <span>
 #include <stdexcept>
@@ -267,6 +268,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
                                 std::to_string(position_bits));
   }
   const JournalGuard guard(path);
+  std::optional<JournalGuard> last;  // somebody may have begun a journal meanwhile
   const std::shared_lock changing(store_->changing);
   const SealedRows rows(*store_, prototypes);
   const std::vector<std::uint32_t>& landmarks = rows.landmarks();
@@ -332,7 +334,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
              });
     file.add(section::kProbes, std::as_bytes(std::span(probe_ranks)));
   }
-  file.write(path);
+  file.write(path, [&](const std::string&) { last.emplace(path); });
 }
 
 }  // namespace protomark
