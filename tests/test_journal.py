@@ -21,9 +21,8 @@ from hypothesis import strategies as st
 import protomark as pm
 from conftest import balanced_encoder, random_descriptors
 from map_container import container, sections
-from mutation import SEED, bounded, mutated, mutated_container
+from mutation import FILES, SEED, bounded, mutated, mutated_container
 
-FILES = 1500
 Change = Callable[[pm.PrototypeMap], object]
 
 

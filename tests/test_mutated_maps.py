@@ -11,9 +11,7 @@ import pytest
 
 import protomark as pm
 from conftest import random_descriptors
-from mutation import SEED, bounded, mutated_container
-
-FILES = 1500
+from mutation import FILES, SEED, bounded, mutated_container
 
 
 def scene(encoder: pm.Encoder, look_bits: int, cells: int = 0) -> pm.PrototypeMap:

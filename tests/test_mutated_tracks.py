@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mutation import SEED, bounded, mutated
+from mutation import FILES, SEED, bounded, mutated
 from protomark.tracks import Camera, Tracks
 from protomark.tracks.database import _features, _read
 
-FILES = 1500
 _JUNK: list[Any] = [
     *(None, True, -1, 0, 0.5, 10**30, 2**63, float("inf"), float("nan"), "", "text", "\ud800"),
     *([], {}, [[]], [1, "a", None], {"model": 3}, {"1": {}}, {"x": 1}, "[" * 30_000, "9" * 5000),
