@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from protomark.training.loss import PrototypeLoss
+from protomark.training.loss import PrototypeLoss, leave_one_out
 
 _TINY = 1e-6  # keeps the gradient of a root finite at 0
 
@@ -43,13 +43,7 @@ class SecondOrderLoss(PrototypeLoss):
     ) -> Tensor:
         """As `PrototypeLoss`."""
         first = super().forward(embeddings, landmarks, queries, dims)
-        embeddings = embeddings.float()
-        count = torch.bincount(landmarks)
-        total = embeddings.new_zeros(len(count), embeddings.shape[1])
-        total = total.index_add(0, landmarks, embeddings)
-        query, target = embeddings[queries], landmarks[queries]
-        own = (total[target] - query) / (count[target] - 1)[:, None]
-        prototype = total / count[:, None]
+        query, target, own, prototype = leave_one_out(embeddings, landmarks, queries)
         terms = [
             self._term(query[:, :d], own[:, :d], prototype[:, :d], target)
             / torch.exp(log_temperature.detach() / 2)

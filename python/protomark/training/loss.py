@@ -15,6 +15,30 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
+def leave_one_out(
+    embeddings: Tensor, landmarks: Tensor, queries: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The queries of a batch, and the prototypes that they are held against.
+
+    Args:
+        embeddings: (n, k) float, one row a view.
+        landmarks: (n,) int64, landmark of each row, numbered 0..m-1, each with a view.
+        queries: (q,) int64, rows to classify; their landmarks have at least 2 views.
+
+    Returns:
+        (q, k) float32 queries; (q,) int64 their landmarks; (q, k) means of these landmarks' other
+        views, as the support of a query is everything but itself; (m, k) means of all views of
+        each landmark.
+    """
+    embeddings = embeddings.float()
+    count = torch.bincount(landmarks)
+    total = embeddings.new_zeros(len(count), embeddings.shape[1])
+    total = total.index_add(0, landmarks, embeddings)
+    query, target = embeddings[queries], landmarks[queries]
+    own = (total[target] - query) / (count[target] - 1)[:, None]
+    return query, target, own, total / count[:, None]
+
+
 class PrototypeLoss(nn.Module):
     """Cross-entropy over the prototypes of a batch, averaged over nested prefixes.
 
@@ -48,15 +72,7 @@ class PrototypeLoss(nn.Module):
         Returns:
             Scalar: mean over prefixes and queries.
         """
-        embeddings = embeddings.float()
-        count = torch.bincount(landmarks)
-        total = embeddings.new_zeros(len(count), embeddings.shape[1])
-        total = total.index_add(0, landmarks, embeddings)
-        prototype = total / count[:, None]
-        query = embeddings[queries]
-        target = landmarks[queries]
-        # Leave-one-out mean: the support of a query is everything but itself.
-        own = (total[target] - query) / (count[target] - 1)[:, None]
+        query, target, own, prototype = leave_one_out(embeddings, landmarks, queries)
 
         losses = []
         column = target[:, None]
