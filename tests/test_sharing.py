@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import random
 import sys
 import threading
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
@@ -172,6 +173,15 @@ def test_beyond_255_two_maps_join_to_the_same_bytes_in_either_order(
     assert file_bytes(one, tmp_path) == file_bytes(other, tmp_path)
 
 
+# The quotient of a coordinate just below a border is rounded to the border.
+@example(
+    observed=[(2, 0)],
+    boundaries=[],
+    cell_size=2.0,
+    placed={2: -5e-324},
+    looks=0,
+    order=random.Random(0),
+)
 @settings(max_examples=60, deadline=None)
 @given(
     observed=observations,

@@ -27,7 +27,9 @@ constexpr double kMaxCell = 9007199254740992;  // 2^53
 Cell cell_of(const Position& position, double size) {
   Cell cell;
   for (std::size_t i = 0; i < cell.size(); ++i) {
-    const double index = std::floor(position[i] / size);
+    // A quotient alone may be rounded up to the next cell; a remainder is exact.
+    const double rest = std::fmod(position[i], size);
+    const double index = std::round((position[i] - rest) / size) - (rest < 0 ? 1 : 0);
     if (!(std::abs(index) <= kMaxCell)) {
       throw std::invalid_argument("cells of " + std::to_string(size) +
                                   " are too small for the extent of this map");
