@@ -342,8 +342,9 @@ def test_sizes_of_maps_may_be_chosen(tmp_path: Path) -> None:
     assert chosen.exact == chosen.approximate == chosen.growth == (20, 500)
     assert chosen.graphs == 500
     assert chosen.large == 0
-    assert chosen.graphs == 500
-    assert choose(**common, scratch=tmp_path, graphs=False).graphs == 0  # type: ignore[arg-type]
+    assert choose(**common, scratch=tmp_path, graphs="none").graphs == 0  # type: ignore[arg-type]
+    one = choose(**common, scratch=tmp_path, landmarks=(10**9,), graphs="one")  # type: ignore[arg-type]
+    assert 0 < one.graphs < 10**9
     common["sections"] = ("large",)
     assert choose(**common, scratch=tmp_path, landmarks=(20, 500)).large == 500  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="--landmarks 0"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -1028,8 +1028,12 @@ def bench(
         ),
     ] = "",
     graphs: Annotated[
-        bool, typer.Option(help="Also indexes that are graphs: on large maps they build for hours.")
-    ] = True,
+        Literal["all", "one", "none"],
+        typer.Option(
+            help="Which graphs are raced on maps of --landmarks, where they build for hours: all, "
+            "one (hnswlib), or none."
+        ),
+    ] = "all",
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
     scratch: Annotated[
         Path | None,
@@ -1066,7 +1070,7 @@ def bench(
     )
     flags = [f"--only {only}"] if only else []
     flags += [f"--landmarks {landmarks}"] if landmarks else []
-    flags += [] if graphs else ["--no-graphs"]
+    flags += [f"--graphs {graphs}"] if graphs != "all" else []
     flags += ["--full"] if full else ["--quick"] if quick else []
     flags += [f"--threads {threads}"] if threads != 1 else []
     repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])

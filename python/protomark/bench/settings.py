@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 from protomark.bench.race import Pace
+
+Graphs = Literal["all", "one", "none"]
 
 SECTIONS = (
     "encode",
@@ -71,18 +74,18 @@ def choose(
     quick: bool,
     scratch: Path,
     landmarks: tuple[int, ...] = (),
-    graphs: bool = True,
+    graphs: Graphs = "all",
 ) -> Settings:
     """The settings of `--full`, of `--quick` (a few seconds, for tests), or of neither.
 
-    `landmarks` are sizes of the maps that are searched, in place of these settings' own; without
-    `graphs` no graph is built.
+    `landmarks` are sizes of the maps that are searched, in place of these settings' own, with all
+    graphs, only the one that is built at any size, or none.
 
     Raises:
         ValueError: a section is unknown, both are asked for, or a map has no landmark.
     """
     chosen = _of_scale(sections, threads, build_threads, full, quick, scratch)
-    if not graphs:
+    if graphs == "none":
         chosen = replace(chosen, graphs=0)
     if any(n < 1 for n in landmarks):
         raise ValueError(f"--landmarks {min(landmarks)}: a map needs at least 1")
@@ -95,7 +98,7 @@ def choose(
         exact=sizes,
         approximate=sizes,
         growth=sizes,
-        graphs=sizes[-1] if graphs else 0,
+        graphs=sizes[-1] if graphs == "all" else chosen.graphs,
         large=large,
     )
 

@@ -202,7 +202,7 @@ def _entrants(
 
     def enter_graph(name: str, build: Builder) -> None:
         if settings.graphs == 0:
-            results.skipped.append(f"{name}, {ground.title}: --no-graphs")
+            results.skipped.append(f"{name}, {ground.title}: --graphs none")
         elif ground.section == "real" or n <= settings.graphs:
             enter(name, build, GRAPH_BYTES)
         else:
@@ -224,7 +224,7 @@ def _entrants(
         from protomark.bench.peers import hnswlib_index
 
         if settings.graphs == 0:
-            results.skipped.append(f"hnswlib, {ground.title}: --no-graphs")
+            results.skipped.append(f"hnswlib, {ground.title}: --graphs none")
         else:
             enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
     if installed("usearch"):
