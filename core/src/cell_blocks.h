@@ -28,6 +28,18 @@ class CellBlocks {
     const Cell& c = cells_[cell];
     return static_cast<std::uint32_t>(c.last * kPackedRows + (c.rows - 1) % kPackedRows);
   }
+  // Calls take(row) for each row of a cell.
+  template <typename Take>
+  void each_row(std::uint32_t cell, const Take& take) const {
+    if (cells_[cell].rows == 0) return;
+    std::size_t in_block = (cells_[cell].rows - 1) % kPackedRows + 1;
+    for (std::uint32_t b = cells_[cell].last; b != kNone; b = previous_[b]) {
+      for (std::size_t i = 0; i < in_block; ++i) {
+        take(static_cast<std::uint32_t>(b * kPackedRows + i));
+      }
+      in_block = kPackedRows;
+    }
+  }
   // Appends the blocks of a cell, the last one first.
   void list(std::uint32_t cell, std::vector<std::uint32_t>& to) const {
     for (std::uint32_t b = cells_[cell].last; b != kNone; b = previous_[b]) to.push_back(b);

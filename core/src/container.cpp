@@ -87,41 +87,60 @@ void ContainerWriter::add(std::string name, std::vector<std::byte> bytes) {
 }
 
 void ContainerWriter::add(std::string name, std::size_t size, Produce produce) {
-  sections_.push_back({std::move(name), size, std::move(produce)});
+  add_together({{std::move(name), size}},
+               [produce = std::move(produce)](std::span<const Sink> sinks) { produce(sinks[0]); });
+}
+
+void ContainerWriter::add_together(std::vector<Part> parts, ProduceAll produce) {
+  groups_.push_back({std::move(parts), std::move(produce)});
 }
 
 std::size_t ContainerWriter::head_size() const {
-  return align(sizeof(Header) + sections_.size() * sizeof(Entry));
+  std::size_t sections = 0;
+  for (const Group& group : groups_) sections += group.parts.size();
+  return align(sizeof(Header) + sections * sizeof(Entry));
 }
 
-std::vector<std::byte> ContainerWriter::emit(const Sink& sink) const {
+std::vector<std::byte> ContainerWriter::emit(const Place& place) const {
   constexpr std::array<std::byte, kAlignment> zeros{};
   std::vector<Entry> table;
   std::uint64_t offset = head_size();
-  for (const Section& section : sections_) {
-    Entry entry{};
-    std::memcpy(entry.name, section.name.data(), std::min<std::size_t>(8, section.name.size()));
-    entry.offset = offset;
-    section.produce([&](Bytes bytes) {
-      entry.crc = crc32(bytes, entry.crc);
-      entry.size += bytes.size();
-      sink(bytes);
-    });
-    if (entry.size != section.size) {
-      throw std::logic_error("section '" + section.name + "' has " + std::to_string(entry.size) +
-                             " bytes, not " + std::to_string(section.size));
+  for (const Group& group : groups_) {
+    const std::size_t first = table.size();
+    for (const auto& [name, size] : group.parts) {
+      Entry entry{};
+      std::memcpy(entry.name, name.data(), std::min(sizeof(entry.name), name.size()));
+      entry.offset = offset;
+      table.push_back(entry);
+      if (size != kUnknownSize) offset = align(offset + size);
     }
-    table.push_back(entry);
-    const std::uint64_t end = offset + entry.size;
-    offset = align(end);
-    sink(Bytes(zeros).first(offset - end));
+    std::vector<Sink> sinks;
+    for (std::size_t i = first; i < table.size(); ++i) {
+      sinks.emplace_back([&place, &entry = table[i]](Bytes bytes) {
+        entry.crc = crc32(bytes, entry.crc);
+        place(entry.offset + entry.size, bytes);
+        entry.size += bytes.size();
+      });
+    }
+    group.produce(sinks);
+    for (std::size_t i = 0; i < group.parts.size(); ++i) {
+      const auto& [name, size] = group.parts[i];
+      const Entry& entry = table[first + i];
+      if (size != kUnknownSize && entry.size != size) {
+        throw std::logic_error("section '" + name + "' has " + std::to_string(entry.size) +
+                               " bytes, not " + std::to_string(size));
+      }
+      const std::uint64_t end = entry.offset + entry.size;
+      offset = align(end);
+      place(end, Bytes(zeros).first(offset - end));
+    }
   }
   Header header{};
   std::memcpy(header.magic, kMagic, sizeof(kMagic));
   header.version = version_;
   header.kind = static_cast<std::uint32_t>(kind_);
   header.file_size = offset;
-  header.sections = static_cast<std::uint32_t>(sections_.size());
+  header.sections = static_cast<std::uint32_t>(table.size());
   header.crc = crc32(std::as_bytes(std::span(table)), crc32(as_bytes(header)));
 
   std::vector<std::byte> head(head_size());
@@ -134,8 +153,10 @@ std::vector<std::byte> ContainerWriter::emit(const Sink& sink) const {
 
 std::vector<std::byte> ContainerWriter::serialize() const {
   std::vector<std::byte> result(head_size());
-  const auto head =
-      emit([&](Bytes bytes) { result.insert(result.end(), bytes.begin(), bytes.end()); });
+  const auto head = emit([&](std::size_t offset, Bytes bytes) {
+    result.resize(std::max(result.size(), offset + bytes.size()));
+    std::copy(bytes.begin(), bytes.end(), result.begin() + static_cast<std::ptrdiff_t>(offset));
+  });
   std::copy(head.begin(), head.end(), result.begin());
   return result;
 }
@@ -143,10 +164,8 @@ std::vector<std::byte> ContainerWriter::serialize() const {
 void ContainerWriter::write(const std::filesystem::path& path,
                             const std::function<void(const std::string&)>& before) const {
   TemporaryFile file(path);
-  file.seek(head_size());
-  const auto head = emit([&](Bytes bytes) { file.write(bytes); });
-  file.seek(0);
-  file.write(head);
+  const auto head = emit([&](std::size_t offset, Bytes bytes) { file.write(offset, bytes); });
+  file.write(0, head);
   file.sync();
   if (before) before(file_identity(head));
   file.replace_target();
@@ -182,7 +201,7 @@ bool has_container_head(Bytes head) {
 
 void write_file(const std::filesystem::path& path, Bytes bytes) {
   TemporaryFile file(path);
-  file.write(bytes);
+  file.write(0, bytes);
   file.sync();
   file.replace_target();
 }

@@ -57,6 +57,16 @@ class ContainerWriter {
   // `produce` is called each time that the file is written, and must then give `size` bytes.
   void add(std::string name, std::size_t size, Produce produce);
 
+  struct Part {
+    std::string name;
+    std::size_t size;  // in bytes
+  };
+  static constexpr std::size_t kUnknownSize = SIZE_MAX;
+  using ProduceAll = std::function<void(std::span<const Sink>)>;
+  // Sections that come into being side by side: `produce` has a sink for each, and hands them their
+  // bytes in any turn. Only the last one's size may be unknown.
+  void add_together(std::vector<Part> parts, ProduceAll produce);
+
   std::vector<std::byte> serialize() const;
   // Writes the file as write_file does, without a copy of the sections. What a producer throws
   // passes through, and the old file is still there. `before` is called with the new file's
@@ -65,19 +75,20 @@ class ContainerWriter {
              const std::function<void(const std::string&)>& before = {}) const;
 
  private:
-  struct Section {
-    std::string name;
-    std::size_t size;
-    Produce produce;
+  struct Group {
+    std::vector<Part> parts;
+    ProduceAll produce;
   };
+  using Place = std::function<void(std::size_t offset, Bytes)>;
   // Where the sections begin.
   std::size_t head_size() const;
-  // Hands the sections to `sink` and returns what stands before them, which has their checksums.
-  std::vector<std::byte> emit(const Sink& sink) const;
+  // Puts the sections to their places and returns what stands before them, which has their
+  // checksums.
+  std::vector<std::byte> emit(const Place& place) const;
 
   FileKind kind_;
   std::uint32_t version_;
-  std::vector<Section> sections_;
+  std::vector<Group> groups_;
 };
 
 // The identity of a file that begins with these bytes: the SHA-256 of its header and section table,
@@ -194,21 +205,19 @@ class SectionReader {
   Bytes rest_;
 };
 
-// A section of n elements of `width` values each. `fill(i, to)` gives the values of element i.
+// Hands n elements of `width` values each to a sink. `fill(i, to)` gives the values of element i.
 template <typename T, typename Fill>
-void add_values(ContainerWriter& file, std::string name, std::size_t n, std::size_t width,
-                Fill fill) {
-  constexpr std::size_t kPiece = 1 << 18;  // bytes
+void put_values(const ContainerWriter::Sink& sink, std::size_t n, std::size_t width,
+                const Fill& fill) {
+  constexpr std::size_t kPiece = 1 << 16;  // bytes
   const std::size_t element = width * sizeof(T);
-  file.add(std::move(name), n * element, [=](const ContainerWriter::Sink& sink) {
-    const std::size_t some = std::min(n, std::max<std::size_t>(1, kPiece / element));
-    std::vector<T> values(some * width);
-    for (std::size_t first = 0; first < n; first += some) {
-      const std::size_t end = std::min(n, first + some);
-      for (std::size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
-      sink(std::as_bytes(std::span(values)).first((end - first) * element));
-    }
-  });
+  const std::size_t some = std::min(n, std::max<std::size_t>(1, kPiece / element));
+  std::vector<T> values(some * width);
+  for (std::size_t first = 0; first < n; first += some) {
+    const std::size_t end = std::min(n, first + some);
+    for (std::size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
+    sink(std::as_bytes(std::span(values)).first((end - first) * element));
+  }
 }
 
 // Collects plain values for a section.

@@ -54,12 +54,11 @@ TemporaryFile::~TemporaryFile() {
   if (!path_.empty()) ::unlink(path_.c_str());
 }
 
-void TemporaryFile::write(Bytes bytes) {
+void TemporaryFile::write(std::size_t offset, Bytes bytes) {
+  if (bytes.empty()) return;
+  if (offset != offset_ && ::lseek(descriptor_, static_cast<off_t>(offset), SEEK_SET) < 0) fail();
   if (!write_all(descriptor_, bytes)) fail();
-}
-
-void TemporaryFile::seek(std::size_t offset) {
-  if (::lseek(descriptor_, static_cast<off_t>(offset), SEEK_SET) < 0) fail();
+  offset_ = offset + bytes.size();
 }
 
 void TemporaryFile::sync() {

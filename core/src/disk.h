@@ -29,8 +29,7 @@ class TemporaryFile {
   TemporaryFile(const TemporaryFile&) = delete;
   TemporaryFile& operator=(const TemporaryFile&) = delete;
 
-  void write(Bytes bytes);
-  void seek(std::size_t offset);
+  void write(std::size_t offset, Bytes bytes);
   // Ends the writing, so that the file outlasts a power cut.
   void sync();
   // Renames the file, which is synced, over its target, and syncs the folder.
@@ -42,6 +41,7 @@ class TemporaryFile {
   std::filesystem::path target_;
   std::string path_;
   int descriptor_ = -1;
+  std::size_t offset_ = 0;  // where the descriptor stands
 };
 
 }  // namespace protomark

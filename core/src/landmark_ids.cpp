@@ -2,8 +2,6 @@
 
 #include <algorithm>
 #include <bit>
-#include <memory>
-#include <utility>
 
 #include "map_sections.h"
 #include "protomark/error.h"
@@ -54,41 +52,37 @@ bool ids_are_numbers(std::size_t n, std::int64_t last) {
   return n == 0 || last == static_cast<std::int64_t>(n) - 1;
 }
 
-void add_ids(ContainerWriter& file, std::size_t n, std::function<std::int64_t(std::size_t)> id) {
-  if (n == 0 || ids_are_numbers(n, id(n - 1))) return;
-  const auto blocks = std::make_shared<std::vector<IdBlock>>();
-  std::size_t words = 0;
-  for (std::size_t first = 0; first < n; first += kIdBlock) {
-    const std::size_t size = std::min(kIdBlock, n - first);
-    const std::int64_t base = id(first);
-    const auto most = static_cast<std::uint64_t>(id(first + size - 1) - base) - (size - 1);
-    const auto bits = static_cast<int>(std::bit_width(most));
-    blocks->push_back({base, words * kWordBits + static_cast<std::uint64_t>(bits)});
-    words += words_for(size, bits);
+void IdBlockWriter::add(std::int64_t id) {
+  ids_.push_back(id);
+  if (ids_.size() == kIdBlock) end_block();
+}
+
+void IdBlockWriter::finish() {
+  if (!ids_.empty()) end_block();
+  flush();
+}
+
+void IdBlockWriter::end_block() {
+  constexpr std::size_t kPiece = 256;  // blocks
+  const std::int64_t base = ids_.front();
+  const auto most = static_cast<std::uint64_t>(ids_.back() - base) - (ids_.size() - 1);
+  const auto bits = static_cast<int>(std::bit_width(most));
+  const std::size_t at = rests_.size(), words = words_for(ids_.size(), bits);
+  blocks_.push_back({base, words_ * kWordBits + static_cast<std::uint64_t>(bits)});
+  rests_.resize(at + words, 0);
+  for (std::size_t j = 0; j < ids_.size(); ++j) {
+    set_rest(rests_.data() + at, bits, j, static_cast<std::uint64_t>(ids_[j] - base) - j);
   }
-  file.add(section::kIdBlocks, blocks->size() * sizeof(IdBlock),
-           [blocks](const ContainerWriter::Sink& sink) {
-             sink(std::as_bytes(std::span(std::as_const(*blocks))));
-           });
-  file.add(section::kIdRests, words * sizeof(std::uint64_t),
-           [n, blocks, id = std::move(id)](const ContainerWriter::Sink& sink) {
-             constexpr std::size_t kPiece = 256;  // blocks
-             std::vector<std::uint64_t> piece;
-             for (std::size_t b = 0; b < blocks->size(); ++b) {
-               const std::size_t first = b * kIdBlock, size = std::min(kIdBlock, n - first);
-               const int bits = bits_of((*blocks)[b]);
-               const std::size_t at = piece.size();
-               piece.resize(at + words_for(size, bits), 0);
-               for (std::size_t j = 0; j < size; ++j) {
-                 const auto from_base =
-                     static_cast<std::uint64_t>(id(first + j) - (*blocks)[b].base);
-                 set_rest(piece.data() + at, bits, j, from_base - j);
-               }
-               if ((b + 1) % kPiece != 0 && b + 1 != blocks->size()) continue;
-               sink(std::as_bytes(std::span(std::as_const(piece))));
-               piece.clear();
-             }
-           });
+  words_ += words;
+  ids_.clear();
+  if (blocks_.size() == kPiece) flush();
+}
+
+void IdBlockWriter::flush() {
+  to_blocks_(std::as_bytes(std::span(blocks_)));
+  to_rests_(std::as_bytes(std::span(rests_)));
+  blocks_.clear();
+  rests_.clear();
 }
 
 LandmarkIds::LandmarkIds(const ContainerReader& file, std::size_t n) : file_(&file), n_(n) {

@@ -3,8 +3,8 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "container.h"
@@ -19,10 +19,33 @@ struct IdBlock {
 };
 inline constexpr std::size_t kIdBlock = 128;  // landmarks of a block; the last may have fewer
 
-// Adds `id(0)` to `id(n - 1)`, which ascend; nothing where they are 0 to n - 1. Takes n / 8 bytes
-// until the file is written, and `id` must hold as long.
-void add_ids(ContainerWriter& file, std::size_t n, std::function<std::int64_t(std::size_t)> id);
-// Whether it adds nothing.
+// The bytes of sections `idblocks` and `idrests`, as ids come.
+class IdBlockWriter {
+ public:
+  IdBlockWriter(ContainerWriter::Sink blocks, ContainerWriter::Sink rests)
+      : to_blocks_(std::move(blocks)), to_rests_(std::move(rests)) {}
+
+  // Ids ascend.
+  void add(std::int64_t id);
+  void finish();
+
+  // Of the section `idblocks`.
+  static constexpr std::size_t blocks_size(std::size_t landmarks) {
+    return (landmarks + kIdBlock - 1) / kIdBlock * sizeof(IdBlock);
+  }
+
+ private:
+  void end_block();
+  void flush();
+
+  ContainerWriter::Sink to_blocks_, to_rests_;
+  std::vector<std::int64_t> ids_;  // of the block
+  std::vector<IdBlock> blocks_;
+  std::vector<std::uint64_t> rests_;
+  std::size_t words_ = 0;  // of all rests
+};
+
+// Whether ids are 0 to n - 1, which are not written at all; `last` is the largest.
 bool ids_are_numbers(std::size_t n, std::int64_t last);
 
 class LandmarkIds {

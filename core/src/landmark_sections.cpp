@@ -8,40 +8,75 @@
 
 namespace protomark {
 
+LandmarkSections::LandmarkSections(const PrototypeStore& store)
+    : store_(&store), size_(store.landmarks()), rows_(store.rows()) {}
+
 LandmarkSections::LandmarkSections(const PrototypeStore& store,
                                    std::vector<std::uint32_t> landmarks)
-    : store_(&store), landmarks_(std::move(landmarks)) {
-  if (store.look_bits() != 0) rows_ = store.sorted_rows(landmarks_);
+    : store_(&store), some_(std::move(landmarks)), size_(some_->size()) {
+  for (const std::uint32_t landmark : *some_) rows_ += store.rows_of(landmark);
+}
+
+void LandmarkSections::visit(const PrototypeStore::Visit& visit) const {
+  if (some_) {
+    visit(*some_);
+  } else {
+    store_->visit_sorted_landmarks(visit);
+  }
 }
 
 void LandmarkSections::add_to(ContainerWriter& file) const {
-  const PrototypeStore& store = *store_;
-  const std::span<const std::uint32_t> landmarks = landmarks_, rows = this->rows();
-  const std::size_t n = landmarks.size(), m = rows.size(), dim = store.dim();
-  add_values<std::int64_t>(file, section::kIds, n, 1, [=, &store](std::size_t i, std::int64_t* to) {
-    *to = store.ids()[landmarks[i]];
-  });
-  if (store.look_bits() != 0) {
-    file.add(section::kLookBits, write_look_bits(store.look_bits()));
-    add_values<std::uint32_t>(file, section::kRows, n, 1,
-                              [=, &store](std::size_t i, std::uint32_t* to) {
-                                *to = static_cast<std::uint32_t>(store.rows_of(landmarks[i]));
-                              });
-    add_values<std::uint16_t>(
-        file, section::kLooks, m, 1,
-        [=, &store](std::size_t i, std::uint16_t* to) { *to = store.look(rows[i]); });
+  const std::size_t n = size_, m = rows_;
+  std::vector<ContainerWriter::Part> parts{{section::kIds, n * sizeof(std::int64_t)}};
+  if (store_->look_bits() != 0) {
+    file.add(section::kLookBits, write_look_bits(store_->look_bits()));
+    parts.push_back({section::kRows, n * sizeof(std::uint32_t)});
+    parts.push_back({section::kLooks, m * sizeof(std::uint16_t)});
   }
-  add_values<std::uint8_t>(
-      file, section::kCounts, m, 1,
-      [=, &store](std::size_t i, std::uint8_t* to) { *to = store.count(rows[i]); });
-  add_values<std::int16_t>(
-      file, section::kSums, m, dim,
-      [=, &store](std::size_t i, std::int16_t* to) { std::copy_n(store.sum(rows[i]), dim, to); });
+  parts.push_back({section::kCounts, m});
+  parts.push_back({section::kSums, m * store_->dim() * sizeof(std::int16_t)});
   // A map whose positions were all taken away equals one that never had any.
-  const auto has_none = [&](std::uint32_t l) { return is_nowhere(store.position(l)); };
-  if (std::all_of(landmarks.begin(), landmarks.end(), has_none)) return;
-  add_values<Position>(file, section::kPositions, n, 1, [=, &store](std::size_t i, Position* to) {
-    *to = store.position(landmarks[i]);
+  const auto is_placed = [&](std::uint32_t l) { return !is_nowhere(store_->position(l)); };
+  const bool placed =
+      some_ ? std::any_of(some_->begin(), some_->end(), is_placed)
+            : !std::all_of(store_->positions().begin(), store_->positions().end(), is_nowhere);
+  if (placed) parts.push_back({section::kPositions, n * sizeof(Position)});
+  file.add_together(std::move(parts), [this, placed](auto sinks) { put(sinks, placed); });
+}
+
+void LandmarkSections::put(std::span<const ContainerWriter::Sink> sinks, bool placed) const {
+  constexpr std::size_t kRows = 1 << 13;  // at a time, and those of one landmark
+  const PrototypeStore& store = *store_;
+  visit([&](std::span<const std::uint32_t> piece) {
+    for (std::size_t first = 0, end = 0; first < piece.size(); first = end) {
+      for (std::size_t rows = 0; end < piece.size() && rows < kRows; ++end) {
+        rows += store.rows_of(piece[end]);
+      }
+      const auto some = piece.subspan(first, end - first);
+      const std::vector<std::uint32_t> rows = store.sorted_rows(some);
+      auto sink = sinks.begin();
+      put_values<std::int64_t>(*sink++, some.size(), 1, [&](std::size_t i, std::int64_t* to) {
+        *to = store.ids()[some[i]];
+      });
+      if (store.look_bits() != 0) {
+        put_values<std::uint32_t>(*sink++, some.size(), 1, [&](std::size_t i, std::uint32_t* to) {
+          *to = static_cast<std::uint32_t>(store.rows_of(some[i]));
+        });
+        put_values<std::uint16_t>(*sink++, rows.size(), 1, [&](std::size_t i, std::uint16_t* to) {
+          *to = store.look(rows[i]);
+        });
+      }
+      put_values<std::uint8_t>(*sink++, rows.size(), 1, [&](std::size_t i, std::uint8_t* to) {
+        *to = store.count(rows[i]);
+      });
+      put_values<std::int16_t>(*sink++, rows.size(), store.dim(),
+                               [&](std::size_t i, std::int16_t* to) {
+                                 std::copy_n(store.sum(rows[i]), store.dim(), to);
+                               });
+      if (!placed) continue;
+      put_values<Position>(*sink, some.size(), 1,
+                           [&](std::size_t i, Position* to) { *to = store.position(some[i]); });
+    }
   });
 }
 

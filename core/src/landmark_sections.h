@@ -2,7 +2,7 @@
 #pragma once
 
 #include <cstdint>
-#include <span>
+#include <optional>
 #include <vector>
 
 #include "container.h"
@@ -11,25 +11,26 @@
 
 namespace protomark {
 
-// Some landmarks of a store, which must stay as it is for as long as this is there.
+// Landmarks of a store, which must stay as it is for as long as this is there.
 class LandmarkSections {
  public:
-  // Takes numbers of landmarks by ascending id.
+  // All of them.
+  explicit LandmarkSections(const PrototypeStore& store);
+  // Those of these numbers, by ascending id.
   LandmarkSections(const PrototypeStore& store, std::vector<std::uint32_t> landmarks);
 
-  MapShape shape() const { return {landmarks_.size(), store_->dim(), {}}; }
+  MapShape shape() const { return {size_, store_->dim(), {}}; }
   // Adds all sections but the shape to a file that is written while this is there.
   void add_to(ContainerWriter& file) const;
 
  private:
-  // Without looks a row is a landmark.
-  std::span<const std::uint32_t> rows() const {
-    return store_->look_bits() == 0 ? landmarks_ : rows_;
-  }
+  void visit(const PrototypeStore::Visit& visit) const;
+  void put(std::span<const ContainerWriter::Sink> sinks, bool placed) const;
 
   const PrototypeStore* store_;
-  std::vector<std::uint32_t> landmarks_;
-  std::vector<std::uint32_t> rows_;
+  std::optional<std::vector<std::uint32_t>> some_;  // none: all
+  std::size_t size_;
+  std::size_t rows_ = 0;
 };
 
 // Reads landmarks that the store does not have; those that it has with the same ids leave it first.

@@ -41,7 +41,7 @@ void apply(const ContainerReader& commit, const Encoder& encoder, PrototypeStore
 
 void PrototypeMap::write(const std::filesystem::path& path,
                          const std::function<void(const std::string&)>& before) const {
-  const LandmarkSections landmarks(*store_, store_->sorted_landmarks());
+  const LandmarkSections landmarks(*store_);
   const std::vector<std::int8_t>& cells = store_->cells().centroids();
 
   ContainerWriter file(FileKind::open_map, !cells.empty() ? 3 : look_bits() != 0 ? 2 : 1);

@@ -12,6 +12,7 @@
 
 #include "protomark/error.h"
 #include "rounded_mean.h"
+#include "sorted_pieces.h"
 
 namespace protomark {
 namespace {
@@ -301,14 +302,26 @@ std::uint32_t PrototypeStore::observations(std::uint32_t landmark) const {
   return n;
 }
 
+void PrototypeStore::visit_sorted_landmarks(const Visit& visit) const {
+  const auto each = [&](const auto& take) {
+    for (std::uint32_t i = 0; i < ids_.size(); ++i) {
+      if (ids_[i] >= 0) take(i);
+    }
+  };
+  visit_sorted(landmarks(), each, [&](std::uint32_t i) { return ids_[i]; }, visit);
+}
+
+void PrototypeStore::visit_sorted_rows(std::uint32_t cell, const Visit& visit) const {
+  visit_sorted(
+      blocks_.rows(cell), [&](const auto& take) { blocks_.each_row(cell, take); },
+      [&](std::uint32_t row) { return std::pair(ids_[landmark_of(row)], look(row)); }, visit);
+}
+
 std::vector<std::uint32_t> PrototypeStore::sorted_landmarks() const {
   std::vector<std::uint32_t> result;
   result.reserve(landmarks());
-  for (std::uint32_t i = 0; i < ids_.size(); ++i) {
-    if (ids_[i] >= 0) result.push_back(i);
-  }
-  std::sort(result.begin(), result.end(),
-            [&](std::uint32_t a, std::uint32_t b) { return ids_[a] < ids_[b]; });
+  visit_sorted_landmarks(
+      [&](auto piece) { result.insert(result.end(), piece.begin(), piece.end()); });
   return result;
 }
 

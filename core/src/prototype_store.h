@@ -86,6 +86,11 @@ class PrototypeStore {
   std::size_t rows_of(std::uint32_t landmark) const;
   std::uint32_t observations(std::uint32_t landmark) const;
 
+  // Hand over all landmarks by id, or the rows of a cell by id and then look, a piece at a time
+  // (sorted_pieces.h).
+  using Visit = std::function<void(std::span<const std::uint32_t>)>;
+  void visit_sorted_landmarks(const Visit& visit) const;
+  void visit_sorted_rows(std::uint32_t cell, const Visit& visit) const;
   // Landmarks by id, and rows by id and then look.
   std::vector<std::uint32_t> sorted_landmarks() const;
   std::vector<std::uint32_t> sorted_rows() const { return sorted_rows(sorted_landmarks()); }

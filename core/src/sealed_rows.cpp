@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
+#include <numeric>
 #include <queue>
 #include <span>
 #include <utility>
@@ -33,7 +34,7 @@ class Joins {
  public:
   // The cheapest first over the whole map, of equals that of the first landmark, until there are at
   // most `most` rows.
-  Joins(const PrototypeStore& store, const std::vector<std::uint32_t>& landmarks, double most)
+  Joins(const PrototypeStore& store, std::span<const std::uint32_t> landmarks, double most)
       : ends_(landmarks.size()), made_(landmarks.size()) {
     std::size_t rows = store.rows();
     using Next = std::pair<double, std::size_t>;  // cost, number of the landmark
@@ -71,69 +72,97 @@ class Joins {
 }  // namespace
 
 SealedRows::SealedRows(const PrototypeStore& store, std::optional<double> prototypes)
-    : store_(&store), landmarks_(store.sorted_landmarks()) {
+    : store_(&store) {
+  const std::size_t n = store.landmarks();
   const double all = static_cast<double>(store.rows());
-  const double most =
-      prototypes ? std::floor(*prototypes * static_cast<double>(landmarks_.size())) : all;
-  const bool fits = std::all_of(landmarks_.begin(), landmarks_.end(), [&](std::uint32_t landmark) {
-    return store.rows_of(landmark) <= kMaxRows;
-  });
-  if (!fits || all > most) {
-    join(most);
-  } else if (store.rows() != landmarks_.size()) {
-    take();
+  const double most = prototypes ? std::floor(*prototypes * static_cast<double>(n)) : all;
+  bool fits = true;
+  for (std::uint32_t i = 0; store.look_bits() != 0 && i < n; ++i) {
+    fits = fits && store.rows_of(i) <= kMaxRows;
   }
+  if (!fits || all > most) join(most);
 }
 
-std::size_t SealedRows::landmark_of(std::size_t row) const {
-  if (!several()) return row;
-  const auto next = std::upper_bound(first_rows_.begin(), first_rows_.end(), row);
-  return static_cast<std::size_t>(next - first_rows_.begin()) - 1;
+std::size_t SealedRows::rows_of(std::uint32_t landmark) const {
+  return joined_ ? sorted_rows(landmark).size() : store_->rows_of(landmark);
 }
 
-void SealedRows::code(std::size_t row, std::int8_t* to) const {
-  if (joined()) {
-    std::copy_n(&codes_[row * dim()], dim(), to);
+std::vector<std::uint32_t> SealedRows::sorted_rows(std::uint32_t landmark) const {
+  if (!joined_) return store_->sorted_rows(landmark);
+  std::vector<std::uint32_t> result;
+  for (std::uint32_t row = joined_->first_rows[landmark];
+       row < size() && joined_->landmarks[row] == landmark; ++row) {
+    result.push_back(row);
+  }
+  return result;
+}
+
+std::uint32_t SealedRows::landmark_of(std::uint32_t row) const {
+  return joined_ ? joined_->landmarks[row] : store_->landmark_of(row);
+}
+
+std::size_t SealedRows::rows_in(std::uint32_t cell) const {
+  if (!joined_) return store_->blocks().rows(cell);
+  return joined_->cell_ends[cell] - (cell == 0 ? 0 : joined_->cell_ends[cell - 1]);
+}
+
+std::uint32_t SealedRows::cell_of(std::uint32_t row) const {
+  return joined_ ? joined_->cells[row] : store_->blocks().cell_of(row);
+}
+
+void SealedRows::visit_sorted_rows(std::uint32_t cell, const PrototypeStore::Visit& visit) const {
+  if (!joined_) {
+    store_->visit_sorted_rows(cell, visit);
+    return;
+  }
+  const std::size_t n = rows_in(cell);
+  visit(std::span(joined_->by_cell).subspan(joined_->cell_ends[cell] - n, n));
+}
+
+void SealedRows::code(std::uint32_t row, std::int8_t* to) const {
+  if (joined_) {
+    std::copy_n(&joined_->codes[row * dim()], dim(), to);
   } else {
-    store_->rounded(number(row), to);
+    store_->rounded(row, to);
   }
-}
-
-void SealedRows::take() {
-  numbers_.reserve(store_->rows());
-  first_rows_.reserve(landmarks_.size() + 1);
-  for (const std::uint32_t landmark : landmarks_) {
-    first_rows_.push_back(static_cast<std::uint32_t>(numbers_.size()));
-    const auto rows = store_->sorted_rows(landmark);
-    numbers_.insert(numbers_.end(), rows.begin(), rows.end());
-  }
-  first_rows_.push_back(static_cast<std::uint32_t>(numbers_.size()));
 }
 
 void SealedRows::join(double most) {
-  const Joins joins(*store_, landmarks_, most);
+  const std::vector<std::uint32_t> landmarks = store_->sorted_landmarks();
+  const Joins joins(*store_, landmarks, most);
   const std::size_t dim = this->dim();
-  first_rows_.push_back(0);
-  for (std::size_t i = 0; i < landmarks_.size(); ++i) {
-    const LandmarkRows own(*store_, landmarks_[i]);
+  Joined result;
+  result.first_rows.resize(landmarks.size());
+  for (std::size_t i = 0; i < landmarks.size(); ++i) {
+    const LandmarkRows own(*store_, landmarks[i]);
     std::vector<std::int64_t> sums(own.sums.begin(), own.sums.end());
     std::vector<std::int64_t> counts(own.counts.begin(), own.counts.end());
     for (const Join& join : joins.made(i)) {
       for (std::size_t d = 0; d < dim; ++d) sums[join.into * dim + d] += sums[join.from * dim + d];
       counts[join.into] += std::exchange(counts[join.from], 0);
     }
+    result.first_rows[landmarks[i]] = static_cast<std::uint32_t>(result.landmarks.size());
     for (std::size_t row = 0; row < counts.size(); ++row) {
       if (counts[row] == 0) continue;
       for (std::size_t d = 0; d < dim; ++d) {
-        codes_.push_back(rounded_mean(sums[row * dim + d], counts[row]));
+        result.codes.push_back(rounded_mean(sums[row * dim + d], counts[row]));
       }
+      result.landmarks.push_back(landmarks[i]);
     }
-    first_rows_.push_back(static_cast<std::uint32_t>(codes_.size() / dim));
   }
-  const std::size_t rows = first_rows_.back();
-  if (rows == landmarks_.size()) first_rows_.clear();
-  cells_ = store_->cells().size() != 0 ? store_->cells().assign({codes_.data(), rows, dim}, 1)
-                                       : std::vector<std::uint32_t>(rows, 0);
+  const std::size_t rows = result.landmarks.size();
+  const Cells& cells = store_->cells();
+  result.cells = cells.size() != 0 ? cells.assign({result.codes.data(), rows, dim}, 1)
+                                   : std::vector<std::uint32_t>(rows, 0);
+  result.by_cell.resize(rows);
+  result.cell_ends.resize(std::max<std::size_t>(cells.size(), 1), 0);
+  for (const std::uint32_t cell : result.cells) ++result.cell_ends[cell];
+  std::partial_sum(result.cell_ends.begin(), result.cell_ends.end(), result.cell_ends.begin());
+  std::vector<std::uint32_t> next = result.cell_ends;
+  for (std::size_t row = rows; row-- > 0;) {
+    result.by_cell[--next[result.cells[row]]] = static_cast<std::uint32_t>(row);
+  }
+  joined_ = std::move(result);
 }
 
 }  // namespace protomark

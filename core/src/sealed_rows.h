@@ -6,48 +6,66 @@
 #include <optional>
 #include <vector>
 
+#include "cells.h"
 #include "prototype_store.h"
 
 namespace protomark {
 
-// Rounded prototypes in the order of landmarks, those by id, and within a landmark by look. Where
-// none had to be joined they are read from the map, which must not change meanwhile.
+// Rounded prototypes. Where none has to be joined these are the map's, which must not change
+// meanwhile, with the numbers that they have there.
 class SealedRows {
  public:
   // At most `prototypes` a landmark over the whole map, and 255 for any one.
   SealedRows(const PrototypeStore& store, std::optional<double> prototypes);
 
+  const PrototypeStore& store() const { return *store_; }
   std::size_t dim() const { return store_->dim(); }
-  // Numbers of the landmarks in the map, by id.
-  const std::vector<std::uint32_t>& landmarks() const { return landmarks_; }
-  std::size_t size() const { return first_rows_.empty() ? landmarks_.size() : first_rows_.back(); }
+  std::size_t size() const { return joined_ ? joined_->landmarks.size() : store_->rows(); }
   // Whether any landmark has more than one row.
-  bool several() const { return !first_rows_.empty(); }
-  // The first row of landmarks()[i], where those of the one before end.
-  std::size_t first_row(std::size_t i) const { return several() ? first_rows_[i] : i; }
-  // The landmark of a row, as a place in landmarks().
-  std::size_t landmark_of(std::size_t row) const;
-  // The cell of a row, 0 where there is no index.
-  std::uint32_t cell_of(std::size_t row) const {
-    return joined() ? cells_[row] : store_->blocks().cell_of(number(row));
+  bool several() const { return size() != store_->landmarks(); }
+
+  // Of a landmark of the map: how many rows it has, and which, by look.
+  std::size_t rows_of(std::uint32_t landmark) const;
+  std::vector<std::uint32_t> sorted_rows(std::uint32_t landmark) const;
+  // Calls take(row) for each of these.
+  template <typename Take>
+  void each_sorted_row(std::uint32_t landmark, const Take& take) const {
+    if (store_->look_bits() == 0) {
+      take(store_->first_row(landmark));
+    } else {
+      for (const std::uint32_t row : sorted_rows(landmark)) take(row);
+    }
   }
-  void code(std::size_t row, std::int8_t* to) const;
+  std::uint32_t landmark_of(std::uint32_t row) const;
+  // Cell 0 has all rows where there is no index.
+  std::size_t rows_in(std::uint32_t cell) const;
+  std::uint32_t cell_of(std::uint32_t row) const;
+  // Hands over the rows of a cell by id of the landmark and then look, a piece at a time.
+  void visit_sorted_rows(std::uint32_t cell, const PrototypeStore::Visit& visit) const;
+  // Calls take(row) for all rows, in no order.
+  template <typename Take>
+  void each_row(const Take& take) const {
+    const std::size_t end = joined_ ? size() : store_->places();
+    for (std::uint32_t row = 0; row < end; ++row) {
+      if (joined_ || store_->is_row(row)) take(row);
+    }
+  }
+  void code(std::uint32_t row, std::int8_t* to) const;
 
  private:
-  bool joined() const { return !codes_.empty(); }
-  std::uint32_t number(std::size_t row) const {
-    return several() ? numbers_[row] : store_->first_row(landmarks_[row]);
-  }
-  void take();
+  // Joined rows, by id and then look.
+  struct Joined {
+    std::vector<std::int8_t> codes;
+    std::vector<std::uint32_t> landmarks;   // of each row
+    std::vector<std::uint32_t> first_rows;  // of each landmark
+    std::vector<std::uint32_t> cells;       // of each row
+    std::vector<std::uint32_t> by_cell;     // rows
+    std::vector<std::uint32_t> cell_ends;   // there
+  };
   void join(double most);
 
   const PrototypeStore* store_;
-  std::vector<std::uint32_t> landmarks_;
-  std::vector<std::uint32_t> first_rows_;  // and the end; empty where each landmark has one
-  std::vector<std::uint32_t> numbers_;     // in the map; empty where first_rows_ is
-  // Joined rows; empty where these are the map's.
-  std::vector<std::int8_t> codes_;
-  std::vector<std::uint32_t> cells_;
+  std::optional<Joined> joined_;
 };
 
 }  // namespace protomark

@@ -44,24 +44,38 @@ PrototypeMap map_of(std::size_t landmarks) {
 void pieces(const fs::path& path) {
   const auto values = test::Random(4).integers<std::int32_t>(300'000, -1000, 1000);
   ContainerWriter whole(FileKind::encoder), pieced(FileKind::encoder);
-  const auto add = [&](ContainerWriter& file) {
-    add_values<std::int32_t>(file, "none", 0, 3, [](std::size_t, std::int32_t*) {});
-    add_values<std::int32_t>(
-        file, "values", values.size() / 3, 3,
-        [&](std::size_t i, std::int32_t* to) { std::copy_n(&values[3 * i], 3, to); });
-  };
+  const Bytes bytes = std::as_bytes(std::span(values));
   whole.add("none", Bytes());
-  whole.add("values", std::as_bytes(std::span(values)));
-  add(pieced);
+  whole.add("values", bytes);
+  whole.add("first", bytes.first(100));
+  whole.add("second", bytes);
+  whole.add("last", bytes);
+  pieced.add("none", 0, [](const ContainerWriter::Sink& sink) {
+    put_values<std::int32_t>(sink, 0, 3, [](std::size_t, std::int32_t*) {});
+  });
+  pieced.add("values", bytes.size(), [&](const ContainerWriter::Sink& sink) {
+    put_values<std::int32_t>(sink, values.size() / 3, 3, [&](std::size_t i, std::int32_t* to) {
+      std::copy_n(&values[3 * i], 3, to);
+    });
+  });
+  // Side by side, in any turn.
+  pieced.add_together(
+      {{"first", 100}, {"second", bytes.size()}, {"last", ContainerWriter::kUnknownSize}},
+      [&](std::span<const ContainerWriter::Sink> sinks) {
+        sinks[2](bytes.first(7));
+        sinks[1](bytes.first(1000));
+        sinks[0](bytes.first(100));
+        sinks[2](bytes.subspan(7));
+        sinks[1](bytes.subspan(1000));
+      });
   CHECK(pieced.serialize() == whole.serialize());
   pieced.write(path);
   const auto old_bytes = read(path);
   CHECK(std::ranges::equal(std::as_bytes(std::span(old_bytes)), whole.serialize()));
 
   // Whatever goes wrong in one, the old file stays.
-  add_values<std::int32_t>(pieced, "broken", 1, 1, [](std::size_t, std::int32_t*) {
-    throw std::invalid_argument("no such value");
-  });
+  pieced.add("broken", 1,
+             [](const ContainerWriter::Sink&) { throw std::invalid_argument("no such value"); });
   CHECK(check::throws<std::invalid_argument>([&] { pieced.write(path); }, "no such value"));
   CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
   for (const std::size_t size : {3u, 5u}) {

@@ -21,7 +21,15 @@ using Ids = std::vector<std::int64_t>;
 
 std::vector<std::byte> file_of(const Ids& ids) {
   ContainerWriter file(FileKind::sealed_map, 4);
-  add_ids(file, ids.size(), [&](std::size_t i) { return ids[i]; });
+  const bool numbers = ids.empty() || ids_are_numbers(ids.size(), ids.back());
+  if (numbers) return file.serialize();
+  file.add_together({{section::kIdBlocks, IdBlockWriter::blocks_size(ids.size())},
+                     {section::kIdRests, ContainerWriter::kUnknownSize}},
+                    [&](std::span<const ContainerWriter::Sink> sinks) {
+                      IdBlockWriter to(sinks[0], sinks[1]);
+                      for (const std::int64_t id : ids) to.add(id);
+                      to.finish();
+                    });
   return file.serialize();
 }
 

@@ -1,0 +1,130 @@
+// What saving and sealing take beside the map, counted by the allocations that they make.
+#include <algorithm>
+#include <atomic>
+#include <cstdlib>
+#include <filesystem>
+#include <limits>
+#include <new>
+#include <numeric>
+#include <string>
+
+#include <malloc.h>
+#include <unistd.h>
+
+#include "check.h"
+#include "protomark/map_file.h"
+#include "protomark/prototypes.h"
+#include "random.h"
+
+namespace {
+
+std::atomic<std::size_t> held{0}, most{0};
+
+void* counted(void* memory) {
+  if (memory == nullptr) throw std::bad_alloc();
+  const std::size_t now = held += malloc_usable_size(memory);
+  for (std::size_t before = most; before < now && !most.compare_exchange_weak(before, now);) {
+  }
+  return memory;
+}
+
+void release(void* memory) {
+  if (memory != nullptr) held -= malloc_usable_size(memory);
+  std::free(memory);
+}
+
+}  // namespace
+
+void* operator new(std::size_t size) { return counted(std::malloc(size)); }
+void* operator new(std::size_t size, std::align_val_t alignment) {
+  const auto a = static_cast<std::size_t>(alignment);
+  return counted(std::aligned_alloc(a, (size + a - 1) / a * a));
+}
+void operator delete(void* memory) noexcept { release(memory); }
+void operator delete(void* memory, std::size_t) noexcept { release(memory); }
+void operator delete(void* memory, std::align_val_t) noexcept { release(memory); }
+void operator delete(void* memory, std::size_t, std::align_val_t) noexcept { release(memory); }
+
+using namespace protomark;
+namespace fs = std::filesystem;
+
+namespace {
+
+const fs::path path =
+    fs::temp_directory_path() / ("protomark_saving_memory_" + std::to_string(::getpid()));
+
+enum class Ids { ascending, mixed, sparse };
+
+PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t look_bits) {
+  test::Random random(5);
+  std::vector<Layer> layers{test::random_layer(random, 64, dim)};
+  PrototypeMap map(std::make_shared<const Encoder>(
+                       Encoder({"x", "test", "none", "none", {}}, std::move(layers), {dim}, 1.0f)),
+                   dim, look_bits);
+  std::vector<std::int64_t> ids(n);
+  std::iota(ids.begin(), ids.end(), std::int64_t{0});
+  if (kind == Ids::sparse) {
+    for (std::int64_t& id : ids) id = id * 7919 + random.integer(0, 7000);
+  }
+  if (kind != Ids::ascending) {
+    for (std::size_t i = n; i > 1; --i) {
+      std::swap(ids[i - 1],
+                ids[static_cast<std::size_t>(random.integer(0, static_cast<std::int64_t>(i) - 1))]);
+    }
+  }
+  for (int times = 0; times < (look_bits == 0 ? 1 : 2); ++times) {
+    const auto codes = random.integers<std::int8_t>(n * dim, -127, 127);
+    map.add_codes(ids, {codes.data(), n, dim});
+  }
+  return map;
+}
+
+// Of a map of any size, beside the share.
+constexpr std::size_t kBuffers = 1 << 19;
+
+template <typename Save>
+void check_save(const std::string& what, std::size_t own, const Save& save) {
+  const std::size_t before = held;
+  most = before;
+  save();
+  const std::size_t more = most - before;
+  const double share = static_cast<double>(more) / static_cast<double>(own);
+  std::printf("%-60s %9zu bytes of %9zu: %.1f %%\n", what.c_str(), more, own, 100 * share);
+  CHECK(share < 0.05 || more < kBuffers + own / 25);
+}
+
+// Every dimension, kind of ids, with an index and without.
+struct Case {
+  std::size_t dim;
+  Ids ids;
+  std::size_t look_bits;
+  bool indexed;
+};
+
+constexpr Case kCases[] = {
+    {8, Ids::ascending, 0, false}, {8, Ids::mixed, 0, false},  {8, Ids::sparse, 0, false},
+    {8, Ids::mixed, 0, true},      {8, Ids::sparse, 0, true},  {8, Ids::sparse, 2, false},
+    {8, Ids::sparse, 2, true},     {16, Ids::mixed, 0, false}, {16, Ids::sparse, 0, true},
+    {32, Ids::mixed, 0, true},     {32, Ids::sparse, 2, true}, {64, Ids::sparse, 0, false},
+    {64, Ids::sparse, 0, true},
+};
+
+}  // namespace
+
+int main() {
+  constexpr std::size_t kLandmarks = 300'000;
+  for (const Case& c : kCases) {
+    const std::size_t before = held;
+    PrototypeMap map = map_of(c.dim, kLandmarks, c.ids, c.look_bits);
+    if (c.indexed) map.build_index(16);
+    const std::size_t own = held - before;
+    const std::string what = "dim " + std::to_string(c.dim) + ", ids " +
+                             std::to_string(static_cast<int>(c.ids)) + ", look bits " +
+                             std::to_string(c.look_bits) + (c.indexed ? ", index" : "");
+    check_save(what + ": save", own, [&] { map.save(path); });
+    check_save(what + ": seal", own, [&] { map.seal(path); });
+    check_save(what + ": seal, 4 bits", own, [&] { map.seal(path, 4); });
+  }
+  fs::remove(path);
+  return check::result();
+}
