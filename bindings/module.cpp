@@ -730,8 +730,10 @@ Raises:
       .def(
           "compact", &PrototypeMap::compact, ReleaseGil(), nb::sig("def compact(self) -> None"),
           "Write the map file anew, with all changes, and empty the journal. If it is interrupted, "
-          "opening gives this map or the one of the last commit. Raises FileError, and ValueError "
-          "where the map has no journal.")
+          "opening gives this map or the one of the last commit. Raises FileError where the map "
+          "file cannot be written, and ValueError where the map has no journal. Where only the "
+          "journal cannot be emptied it returns: everything is in the map file, what is left in "
+          "the journal holds nothing, and the next commit tries again.")
       .def("close", &PrototypeMap::close, ReleaseGil(), nb::sig("def close(self) -> None"),
            "Give the journal back, so that another map can be opened with it; the map stays in "
            "memory, without a journal. What was not committed is not in the file.")
@@ -888,10 +890,15 @@ Returns:
   m.def("instruction_set", &instruction_set,
         "The instruction set in use, for example avx512; the environment variable PROTOMARK_ISA "
         "chooses another one. All give the same bytes.");
-  const auto check_map = [](const auto& map, const Path& path, const Encoder* encoder,
+  // Before a journal is made for the map, or anything large is read.
+  const auto check_map = [](const Path& path, const Encoder* encoder,
                             const std::optional<std::string>& descriptor) {
-    if (encoder != nullptr) expect_encoder(*map.encoder(), *encoder, path.string());
-    if (descriptor) expect_descriptor(*map.encoder(), *descriptor, path.string());
+    if (encoder == nullptr && !descriptor) return;
+    without_gil([&] {
+      const auto own = map_encoder(path);
+      if (encoder != nullptr) expect_encoder(*own, *encoder, path.string());
+      if (descriptor) expect_descriptor(*own, *descriptor, path.string());
+    });
   };
   // What can commit is an open map, which type checkers are told.
   m.def(
@@ -899,9 +906,8 @@ Returns:
       [check_map](const Path& path, bool journal, const Encoder* encoder,
                   const std::optional<std::string>& descriptor) {
         if (!journal) throw nb::next_overload();
-        PrototypeMap map = without_gil([&] { return PrototypeMap::load(path, true); });
-        check_map(map, path, encoder, descriptor);
-        return map;
+        check_map(path, encoder, descriptor);
+        return without_gil([&] { return PrototypeMap::load(path, true); });
       },
       "path"_a, nb::kw_only(), "journal"_a, "encoder"_a.none() = nb::none(),
       "descriptor"_a = nb::none(),
@@ -911,14 +917,11 @@ Returns:
       "open",
       [check_map](const Path& path, bool, const Encoder* encoder,
                   const std::optional<std::string>& descriptor) -> nb::object {
+        check_map(path, encoder, descriptor);
         if (without_gil([&] { return map_kind(path); }) == MapKind::open) {
-          PrototypeMap map = without_gil([&] { return PrototypeMap::load(path); });
-          check_map(map, path, encoder, descriptor);
-          return nb::cast(std::move(map));
+          return nb::cast(without_gil([&] { return PrototypeMap::load(path); }));
         }
-        SealedMap map = without_gil([&] { return SealedMap(path); });
-        check_map(map, path, encoder, descriptor);
-        return nb::cast(std::move(map));
+        return nb::cast(without_gil([&] { return SealedMap(path); }));
       },
       "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),
       "descriptor"_a = nb::none(),

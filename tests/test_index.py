@@ -6,6 +6,7 @@ import os
 import struct
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -248,6 +249,8 @@ def changed(name: str, change: Callable[[bytes], bytes | None]) -> Callable[...,
         (changed("cellrows", lambda c: struct.pack("<I", 0) + c[4:]), "as many prototypes"),
         (changed("order", lambda c: c + b"\0"), "'order' has the wrong size"),
         (changed("order", lambda c: None), "lacks the section 'order'"),
+        (changed("ordersum", lambda c: c[:-1]), "'ordersum' has the wrong size"),
+        (changed("ordersum", lambda c: b""), "'ordersum' has the wrong size"),
         (changed("probes", lambda c: c[:-1]), "'probes' is impossible"),
         (changed("probes", lambda c: c[::-1]), "'probes' is impossible"),
         (changed("probes", lambda c: bytes(len(c))), "'probes' is impossible"),
@@ -295,7 +298,14 @@ def test_a_hostile_order_gives_no_landmark_that_is_not_there(
     parts = sections(path.read_bytes())
     size = len(dict(parts)["order"])
     for content in (b"\xff" * size, bytes(size)):
-        path.write_bytes(container(replaced(parts, "order", content), 3, SEALED_MAP))
+        hostile = replaced(parts, "order", content)
+        path.unlink()
+        path.write_bytes(container(hostile, 3, SEALED_MAP))
+        with pytest.raises(pm.FileError, match="'order' does not match its checksum"):
+            pm.open(path).search_codes(random_codes(50, 3))
+        path.unlink()
+        checksum = zlib.crc32(content).to_bytes(4, "little")
+        path.write_bytes(container(replaced(hostile, "ordersum", checksum), 3, SEALED_MAP))
         sealed = pm.open(path)
         known = set(sealed.ids.tolist()) | {-1}
         for options in ({}, {"probes": 10}, {"recall": 0.9}):

@@ -233,6 +233,18 @@ def test_one_map_at_a_time_may_commit(encoder: pm.Encoder, tmp_path: Path) -> No
     opened(path).close()
 
 
+def test_a_map_of_another_encoder_gets_no_journal(encoder: pm.Encoder, tmp_path: Path) -> None:
+    path = tmp_path / "scene.pmk"
+    pm.PrototypeMap(encoder).save(path)
+    with pytest.raises(ValueError, match=r"scene\.pmk: it was made with encoder"):
+        pm.open(path, journal=True, encoder=balanced_encoder())
+    with pytest.raises(ValueError, match=r"scene\.pmk: it is a map of .* descriptors, not of orb"):
+        pm.open(path, journal=True, descriptor="orb")
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.pmk"]
+    pm.open(path, journal=True, encoder=encoder).close()
+    assert journal_of(path).exists()
+
+
 def test_a_killed_process_leaves_its_commits_and_no_lock(
     encoder: pm.Encoder, tmp_path: Path
 ) -> None:

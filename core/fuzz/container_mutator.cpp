@@ -69,7 +69,7 @@ Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
   File file(bytes);
   auto& sections = file.sections;
   if (one_in(16)) return mutate_table(bytes);
-  if (one_in(16)) file.version = 1 + random() % 3;
+  if (one_in(16)) file.version = 1 + random() % 4;
   if (one_in(32)) file.kind = static_cast<FileKind>(1 + random() % 6);
   if (sections.empty()) return file.serialize();
   auto& [name, content] = sections[random() % sections.size()];

@@ -4,8 +4,7 @@
 #include <cstdint>
 #include <new>
 
-#include "id_index.h"
-#include "large_vector.h"
+#include "id_set.h"
 
 namespace protomark {
 
@@ -13,27 +12,20 @@ class Changes {
  public:
   bool empty() const { return !cells && !metadata && ids_.empty() && !incomplete_; }
   // Of landmarks that came, changed or went, each once, in no order.
-  const LargeVector<std::int64_t>& ids() const { return ids_; }
+  const LargeVector<std::int64_t>& ids() const { return ids_.ids(); }
   // Memory ran out, and some ids are missing.
   bool incomplete() const { return incomplete_; }
 
   // Never throws, so that a change that was made is never half noted.
   void insert(std::int64_t id) noexcept {
     try {
-      if (index_.find(ids_, id) != IdIndex::kNone) return;
-      ids_.push_back(id);
-      try {
-        index_.insert(ids_, static_cast<std::uint32_t>(ids_.size() - 1));
-      } catch (...) {
-        ids_.pop_back();
-        throw;
-      }
+      ids_.insert(id);
     } catch (const std::bad_alloc&) {
       incomplete_ = true;
     }
   }
   void insert(const Changes& other) noexcept {
-    for (const std::int64_t id : other.ids_) insert(id);
+    for (const std::int64_t id : other.ids()) insert(id);
     cells = cells || other.cells;
     metadata = metadata || other.metadata;
     incomplete_ = incomplete_ || other.incomplete_;
@@ -43,8 +35,7 @@ class Changes {
   bool metadata = false;
 
  private:
-  LargeVector<std::int64_t> ids_;
-  IdIndex index_;
+  IdSet ids_;
   bool incomplete_ = false;
 };
 

@@ -307,6 +307,8 @@ MappedFile::MappedFile(const std::filesystem::path& path) {
     throw FileError(path.string() + ": not a file");
   }
   size_ = static_cast<std::size_t>(status.st_size);
+  device_ = status.st_dev;
+  inode_ = status.st_ino;
   if (size_ > 0) {
     data_ = ::mmap(nullptr, size_, PROT_READ, MAP_SHARED, descriptor, 0);
     if (data_ == MAP_FAILED) {
@@ -320,6 +322,11 @@ MappedFile::MappedFile(const std::filesystem::path& path) {
 
 MappedFile::~MappedFile() {
   if (data_ != nullptr) ::munmap(data_, size_);
+}
+
+bool MappedFile::is_at(const std::filesystem::path& path) const {
+  struct stat status;
+  return ::stat(path.c_str(), &status) == 0 && status.st_dev == device_ && status.st_ino == inode_;
 }
 
 std::string SectionReader::text() {

@@ -9,6 +9,8 @@
 // Everything is little-endian. docs/format.md says what each kind holds.
 #pragma once
 
+#include <sys/types.h>
+
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
@@ -160,10 +162,14 @@ class MappedFile {
   MappedFile& operator=(const MappedFile&) = delete;
 
   Bytes bytes() const { return {static_cast<const std::byte*>(data_), size_}; }
+  // Whether this file still has that name.
+  bool is_at(const std::filesystem::path& path) const;
 
  private:
   void* data_ = nullptr;
   std::size_t size_ = 0;
+  dev_t device_ = 0;
+  ino_t inode_ = 0;
 };
 
 // Reads plain values from a section front to back; running past the end throws FileError.

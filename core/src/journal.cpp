@@ -184,12 +184,17 @@ std::string read_identity(const std::filesystem::path& path) {
 }  // namespace
 
 JournaledFile::JournaledFile(const std::filesystem::path& map) {
+  constexpr int kTries = 100;
   const auto path = journal_path(map);
-  do {  // the map may be compacted between the two
+  // The map may be compacted between the two, to an equal one in the end whose journal was another
+  // meanwhile. Not every file system gives a file the same number each time.
+  for (int tries = 0;; ++tries) {
     mapped_ = std::make_unique<MappedFile>(map);
     file_ = std::make_unique<ContainerReader>(mapped_->bytes(), map.string());
     bytes_ = read_journal(path);
-  } while (read_identity(map) != file_->identity());
+    const bool equal = read_identity(map) == file_->identity();
+    if (equal && (mapped_->is_at(map) || tries >= kTries)) break;
+  }
   journal_ = JournalContent(bytes_, path.string());
 }
 
@@ -247,11 +252,17 @@ std::span<const JournalContent::Commit> JournalContent::commits(const std::strin
   for (auto base = bases_.rbegin(); base != bases_.rend(); ++base) {
     if (base->identity == identity) return std::span(commits_).subspan(base->commits);
   }
-  const std::size_t lost = commits_.size() - (bases_.empty() ? 0 : bases_.back().commits);
-  if (lost == 0) return {};
-  throw FileError(name_ + ": holds " + std::to_string(lost) +
-                  " commits to another map file than the one beside it: bring that one back, or "
-                  "move the journal away to do without them");
+  const std::size_t folded = bases_.empty() ? 0 : bases_.back().commits;
+  if (commits_.size() == folded) return {};
+  std::string what =
+      std::to_string(commits_.size()) + " commits to another map file than the one beside it";
+  if (folded != 0) {
+    what += ", of which the first ";
+    what += std::to_string(folded);
+    what += " may be in that file already";
+  }
+  throw FileError(name_ + ": holds " + what +
+                  ": bring that one back, or move the journal away to do without them");
 }
 
 Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
@@ -260,7 +271,9 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   if (error) throw FileError(map.string() + ": cannot be read: " + error.message());
   path_ = map_.string() + ".journal";
   for (;;) {
-    descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0666);
+    descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    made_ = descriptor_ >= 0;
+    if (!made_) descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0666);
     if (descriptor_ < 0) fail("cannot be written: " + system_error());
     if (::flock(descriptor_, LOCK_EX | LOCK_NB) != 0) {
       const bool taken = errno == EWOULDBLOCK;
@@ -377,9 +390,17 @@ void Journal::fold(const std::string& identity) {
   folded_ = identity;
 }
 
-void Journal::restart(const std::string& identity) {
-  base_ = identity;
-  begin();
+void Journal::restart(const std::string& identity) noexcept {
+  try {
+    base_ = identity;
+    begin();
+  } catch (const std::exception&) {  // as after a power cut at this moment
+  }
+}
+
+void Journal::abandon() noexcept {
+  // Whoever has opened it meanwhile finds it gone when they have the lock, and makes another one.
+  if (made_ && is_at(descriptor_, path_)) ::unlink(path_.c_str());
 }
 
 void Journal::fail(const std::string& what) const { throw FileError(path_.string() + ": " + what); }
@@ -387,26 +408,30 @@ void Journal::fail(const std::string& what) const { throw FileError(path_.string
 JournalGuard::JournalGuard(const std::filesystem::path& map) {
   // Not of the file that a link leads to: it is the link that will be replaced.
   const std::filesystem::path path = map.string() + ".journal";
-  descriptor_ = ::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC);
-  if (descriptor_ < 0 && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return;
-  if (descriptor_ < 0) throw FileError(path.string() + ": cannot be read: " + system_error());
-  try {
-    if (::flock(descriptor_, LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
-      throw FileError(map.string() + ": cannot be written: its journal is held by " +
-                      holder(descriptor_) + "; close it there, or save to another path");
+  for (;;) {
+    descriptor_ = ::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC);
+    if (descriptor_ < 0 && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return;
+    if (descriptor_ < 0) throw FileError(path.string() + ": cannot be read: " + system_error());
+    try {
+      if (::flock(descriptor_, LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
+        throw FileError(map.string() + ": cannot be written: its journal is held by " +
+                        holder(descriptor_) + "; close it there, or save to another path");
+      }
+      const auto bytes = read_all(descriptor_, path);
+      const std::size_t commits =
+          JournalContent(bytes, path.string()).commits(read_identity(map)).size();
+      if (commits > 0) {
+        throw FileError(map.string() + ": cannot be written: its journal holds " +
+                        std::to_string(commits) +
+                        " commits, which would be lost; open it with journal and compact it, or "
+                        "save to another path");
+      }
+    } catch (...) {
+      ::close(descriptor_);
+      throw;
     }
-    const auto bytes = read_all(descriptor_, path);
-    const std::size_t commits =
-        JournalContent(bytes, path.string()).commits(read_identity(map)).size();
-    if (commits > 0) {
-      throw FileError(map.string() + ": cannot be written: its journal holds " +
-                      std::to_string(commits) +
-                      " commits, which would be lost; open it with journal and compact it, or "
-                      "save to another path");
-    }
-  } catch (...) {
-    ::close(descriptor_);
-    throw;
+    if (is_at(descriptor_, path)) return;
+    ::close(descriptor_);  // somebody has deleted it since
   }
 }
 

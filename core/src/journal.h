@@ -112,9 +112,12 @@ class Journal {
   // Appends that everything up to here is in a map file of this identity, which is to take the
   // place of the present one.
   void fold(const std::string& identity);
-  // The map file is now the one of this identity: forgets all commits. Where it throws FileError,
-  // later commits are safe all the same.
-  void restart(const std::string& identity);
+  // The map file is now the one of this identity: forgets all commits. Where that fails they stay,
+  // behind them that they are in the map file, or a part of a header: nothing is to be applied, and
+  // the next commit tries again.
+  void restart(const std::string& identity) noexcept;
+  // Nobody is to commit after all: takes the file away again where it was made here.
+  void abandon() noexcept;
 
  private:
   void check_owner() const;
@@ -124,6 +127,7 @@ class Journal {
 
   std::filesystem::path map_, path_;
   int descriptor_ = -1;
+  bool made_ = false;  // the file was not there
   pid_t process_;
   std::string base_;    // identity of the map file
   std::string folded_;  // and of the one that may have taken its place

@@ -80,7 +80,8 @@ void LandmarkSections::put(std::span<const ContainerWriter::Sink> sinks, bool pl
   });
 }
 
-void read_landmarks(const ContainerReader& file, const MapShape& shape, PrototypeStore& store) {
+void read_landmarks(const ContainerReader& file, const MapShape& shape, const IdSet& known,
+                    PrototypeStore& store) {
   const std::size_t n = shape.landmarks, dim = shape.dim, look_bits = store.look_bits();
   const auto ids = read_section<std::int64_t>(file, section::kIds, n);
   check_ids(file, ids);
@@ -99,18 +100,13 @@ void read_landmarks(const ContainerReader& file, const MapShape& shape, Prototyp
     positions = read_section<Position>(file, section::kPositions, n);
   }
 
-  if (store.landmarks() == 0) {
-    store.reserve(n, m);
-  } else {
-    // All of them before the first comes: numbers of landmarks hold only until one goes.
-    for (const std::int64_t id : ids) {
-      if (store.find(id) != PrototypeStore::kNone) store.erase(id);
-    }
-  }
+  // Of many small commits each would move all that is there.
+  if (m > store.rows()) store.reserve(store.landmarks() + n, store.rows() + m);
   std::vector<std::uint32_t> landmarks;  // where there are positions
   landmarks.reserve(positions.size());
   for (std::size_t i = 0, next = 0; i < n; ++i) {
-    const std::uint32_t landmark = store.create_landmark(ids[i]);
+    const bool wanted = known.empty() || !known.contains(ids[i]);
+    const std::uint32_t landmark = wanted ? store.create_landmark(ids[i]) : PrototypeStore::kNone;
     const std::size_t end = next + (look_bits != 0 ? rows_of[i] : 1);
     for (const std::size_t first = next; next < end; ++next) {
       const int count = counts[next];
@@ -123,6 +119,7 @@ void read_landmarks(const ContainerReader& file, const MapShape& shape, Prototyp
           (looks[next] >> look_bits != 0 || (next > first && looks[next] <= looks[next - 1]))) {
         file.fail("the looks of landmark " + std::to_string(ids[i]) + " do not ascend");
       }
+      if (!wanted) continue;
       const std::uint32_t row = store.create_row(landmark, look_bits != 0 ? looks[next] : 0);
       std::copy_n(sum, dim, store.sum(row));
       store.set_count(row, count);
@@ -138,7 +135,7 @@ void read_landmarks(const ContainerReader& file, const MapShape& shape, Prototyp
   }
   // After the landmarks, so that room for positions is made once.
   for (std::size_t i = 0; i < positions.size(); ++i) {
-    store.set_position(landmarks[i], positions[i]);
+    if (landmarks[i] != PrototypeStore::kNone) store.set_position(landmarks[i], positions[i]);
   }
 }
 

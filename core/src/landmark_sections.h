@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "container.h"
+#include "id_set.h"
 #include "map_sections.h"
 #include "prototype_store.h"
 
@@ -33,8 +34,9 @@ class LandmarkSections {
   std::size_t rows_ = 0;
 };
 
-// Reads landmarks that the store does not have; those that it has with the same ids leave it first.
-// Throws FileError.
-void read_landmarks(const ContainerReader& file, const MapShape& shape, PrototypeStore& store);
+// Reads landmarks, but those that are `known`, of which the store has none otherwise; all are
+// checked. Throws FileError.
+void read_landmarks(const ContainerReader& file, const MapShape& shape, const IdSet& known,
+                    PrototypeStore& store);
 
 }  // namespace protomark

@@ -7,13 +7,13 @@
 #include <optional>
 #include <stdexcept>
 
-#include "bit_numbers.h"
 #include "cell_search.h"
 #include "cells.h"
 #include "container.h"
 #include "journal.h"
 #include "landmark_ids.h"
 #include "map_sections.h"
+#include "order_numbers.h"
 #include "position_grid.h"
 #include "probe_ranks.h"
 #include "protomark/error.h"
@@ -45,6 +45,13 @@ MapKind map_kind(const std::filesystem::path& path) {
   if (file.kind() == FileKind::open_map) return MapKind::open;
   file.expect(FileKind::sealed_map);
   return MapKind::sealed;
+}
+
+std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path) {
+  const MappedFile mapped(path);
+  const ContainerReader file(mapped.bytes(), path.string());
+  if (file.kind() != FileKind::open_map) file.expect(FileKind::sealed_map);
+  return read_encoder(file);
 }
 
 std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path) {
@@ -95,8 +102,7 @@ struct SealedMap::Content {
     std::size_t places = rows;
     if (file.map_if_there(section::kCells)) {
       places = read_index();
-      landmarks.packed_of_row = order;
-      landmarks.bits = order_bits();
+      landmarks.order = &*order;
       landmarks.end = static_cast<std::uint32_t>(n);
     } else {
       landmarks.rows_of = rows_of;
@@ -173,7 +179,8 @@ struct SealedMap::Content {
     }
     if (all != rows) file.fail("its cells do not have as many prototypes as the map");
     const std::size_t places = std::size_t{first_blocks.back()} * kPackedRows;
-    order = map<std::uint8_t>(section::kOrder, bit_numbers_size(places, order_bits()));
+    // Numbers of landmarks and, for padding, the next one.
+    order.emplace(file, places, std::bit_width(std::max<std::size_t>(shape.landmarks, 1)));
     const auto bytes = file.read(section::kProbes);
     ranks.resize(bytes.size() / sizeof(std::uint32_t));
     SectionReader(file, section::kProbes).copy(ranks.data(), ranks.size());
@@ -187,10 +194,6 @@ struct SealedMap::Content {
 
   bool indexed() const { return !centroids.empty(); }
   std::size_t index_cells() const { return cell_rows.size(); }
-  // Numbers of landmarks and, for padding, the next one.
-  int order_bits() const {
-    return static_cast<int>(std::bit_width(std::max<std::size_t>(shape.landmarks, 1)));
-  }
 
   // The place of a row. With an index places are looked for once, in all of the order.
   std::size_t place(std::size_t row) const {
@@ -200,7 +203,7 @@ struct SealedMap::Content {
       const std::size_t all = std::size_t{first_blocks.back()} * kPackedRows;
       std::size_t total = 0;
       for (std::size_t p = 0; p < all; ++p) {
-        const std::uint32_t landmark = bit_number(order, order_bits(), p);
+        const std::uint32_t landmark = (*order)[p];
         if (landmark >= shape.landmarks) continue;
         const auto [first, end] = rows_at(landmark);
         if (first + taken[landmark] == end) file.fail("its order names a landmark too often");
@@ -263,7 +266,7 @@ struct SealedMap::Content {
   std::vector<CodeVector> packed_centroids;
   std::span<const std::uint32_t> cell_rows;
   std::vector<std::uint32_t> first_blocks;  // of each cell, and the end
-  const std::uint8_t* order = nullptr;      // landmark of each place, in order_bits()
+  std::optional<OrderNumbers> order;        // landmark of each place
   ProbeRanks ranks;
   mutable std::once_flag places_found;
   mutable std::vector<std::uint32_t> places;  // of each row

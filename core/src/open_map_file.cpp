@@ -11,34 +11,10 @@
 #include "journal.h"
 #include "landmark_sections.h"
 #include "map_sections.h"
-#include "protomark/error.h"
+#include "open_map_content.h"
 #include "prototype_store.h"
 
 namespace protomark {
-namespace {
-
-// Makes the landmarks and cells what they were when this was committed.
-void apply(const ContainerReader& commit, const Encoder& encoder, PrototypeStore& store,
-           std::vector<std::int8_t>& cells) {
-  const MapShape shape = read_shape(commit, encoder);
-  if (shape.dim != store.dim() || read_look_bits(commit, shape.dim) != store.look_bits()) {
-    commit.fail("its dimension or look bits are not the map's");
-  }
-  if (const auto bytes = commit.map_if_there(section::kGone)) {
-    const auto gone = read_section<std::int64_t>(commit, section::kGone, bytes->size() / 8);
-    check_ids(commit, gone);
-    for (const std::int64_t id : gone) {
-      if (store.find(id) != PrototypeStore::kNone) store.erase(id);
-    }
-  }
-  read_landmarks(commit, shape, store);
-  if (const auto bytes = commit.map_if_there(section::kCells)) {
-    cells = bytes->empty() ? std::vector<std::int8_t>() : read_cells(commit, shape.dim);
-  }
-}
-
-}  // namespace
-
 void PrototypeMap::write(const std::filesystem::path& path,
                          const std::function<void(const std::string&)>& before) const {
   const LandmarkSections landmarks(*store_);
@@ -75,16 +51,11 @@ PrototypeMap PrototypeMap::read(const ContainerReader& file, const JournalConten
   const MapShape shape = read_shape(file, *encoder);
   PrototypeMap map(encoder, shape.dim, read_look_bits(file, shape.dim));
   Store& store = *map.store_;
-  store.metadata = read_metadata(file);
-  read_landmarks(file, shape, store);
-  std::vector<std::int8_t> cells = read_cells(file, shape.dim);
-  for (const auto& [bytes, offset] : journal.commits(file.identity())) {
-    const std::string name = journal.name() + ": record at byte " + std::to_string(offset);
-    const ContainerReader commit(bytes, name);
-    apply(commit, *encoder, store, cells);
-    if (commit.map_if_there(section::kMetadata)) store.metadata = read_metadata(commit);
+  OpenMapContent content = read_open_map(file, journal, *encoder, store);
+  store.metadata = std::move(content.metadata);
+  if (!content.cells.empty()) {
+    store.replace(store.with_cells({std::move(content.cells), shape.dim}, 1));
   }
-  if (!cells.empty()) store.replace(store.with_cells({std::move(cells), shape.dim}, 1));
   return map;
 }
 
@@ -105,15 +76,20 @@ PrototypeMap PrototypeMap::load_with_journal(const std::filesystem::path& path) 
     ContainerReader(mapped.bytes(), path.string()).expect(FileKind::open_map);
   }
   auto journal = std::make_unique<Journal>(path);
-  const MappedFile mapped(path);
-  const ContainerReader file(mapped.bytes(), path.string());
-  const auto bytes = journal->read();
-  const JournalContent commits(bytes, journal_path(path).string());
-  PrototypeMap map = read(file, commits);
-  journal->resume(commits, file.identity());
-  map.store_->track_changes();
-  map.store_->journal = std::move(journal);
-  return map;
+  try {
+    const MappedFile mapped(path);
+    const ContainerReader file(mapped.bytes(), path.string());
+    const auto bytes = journal->read();
+    const JournalContent commits(bytes, journal_path(path).string());
+    PrototypeMap map = read(file, commits);
+    journal->resume(commits, file.identity());
+    map.store_->track_changes();
+    map.store_->journal = std::move(journal);
+    return map;
+  } catch (...) {
+    if (journal) journal->abandon();  // nor for one that is broken
+    throw;
+  }
 }
 
 bool PrototypeMap::has_journal() const {

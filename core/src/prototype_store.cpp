@@ -205,7 +205,7 @@ std::uint32_t PrototypeStore::create_row(std::uint32_t landmark, std::uint16_t l
 // The head or link that leads to a row.
 std::uint32_t* PrototypeStore::link_to(std::uint32_t row) {
   std::uint32_t* link = &heads_[owners_[row]];
-  while (*link != row) link = &next_[*link];
+  for (; *link != row; ++steps_) link = &next_[*link];
   return link;
 }
 
@@ -262,6 +262,7 @@ void PrototypeStore::erase_landmark(std::uint32_t landmark) {
     heads_[landmark] = heads_[last];
     for (std::uint32_t row = heads_[landmark]; row != kNone; row = next_[row]) {
       owners_[row] = landmark;
+      ++steps_;
     }
   }
   ids_.pop_back();
@@ -303,6 +304,24 @@ std::uint32_t PrototypeStore::observations(std::uint32_t landmark) const {
 }
 
 void PrototypeStore::visit_sorted_landmarks(const Visit& visit) const {
+  std::int64_t largest = -1;
+  bool ascending = true;
+  for (const std::int64_t id : ids_) {
+    ascending = ascending && (id < 0 || id > largest);
+    largest = std::max(largest, id);
+  }
+  // To ask for all that there may be is quicker than to sort those that are there.
+  if (!ascending && static_cast<std::size_t>(largest) < 2 * landmarks()) {
+    constexpr std::size_t kPiece = 1 << 13;
+    std::vector<std::uint32_t> piece;
+    for (std::int64_t id = 0; id <= largest; ++id) {
+      if (const std::uint32_t landmark = find(id); landmark != kNone) piece.push_back(landmark);
+      if (piece.size() < kPiece && id < largest) continue;
+      visit(piece);
+      piece.clear();
+    }
+    return;
+  }
   const auto each = [&](const auto& take) {
     for (std::uint32_t i = 0; i < ids_.size(); ++i) {
       if (ids_[i] >= 0) take(i);

@@ -68,6 +68,8 @@ class PrototypeStore {
   // reads the map, but within `alone(swap)`, which calls swap() while nobody else reads.
   using Alone = std::function<void(const std::function<void()>& swap)>;
   void make_room(std::span<const std::int64_t> landmarks, std::size_t rows, const Alone& alone);
+  // Rows that were stepped over to find or renumber those of a landmark when others went.
+  std::size_t steps() const { return steps_; }
   // With its last row a landmark leaves.
   void erase_row(std::uint32_t row);
   void erase(std::int64_t id);
@@ -192,6 +194,7 @@ class PrototypeStore {
   std::size_t cells_version_ = 0;
   std::vector<Key> unsettled_;
   std::size_t changes_ = 0;
+  std::size_t steps_ = 0;
   std::unique_ptr<Changes> uncommitted_;  // nullptr: nobody commits
 };
 

@@ -1,18 +1,24 @@
 // Journals: what is committed is there when the map is opened, a broken tail is left out, and
 // anything else that is wrong is refused.
+#include <fcntl.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
 #include <cmath>
+#include <cstdarg>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
+#include <functional>
 #include <iterator>
 #include <optional>
 
 #include "check.h"
 #include "container.h"
 #include "crc32.h"
+#include "journal.h"
+#include "open_map_content.h"
 #include "protomark/error.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"
@@ -21,6 +27,20 @@
 namespace fs = std::filesystem;
 
 using namespace protomark;
+
+namespace {
+// What happens before a file is opened.
+std::function<void(const std::string&)> before_open;
+}  // namespace
+
+extern "C" int open(const char* file, int flags, ...) {
+  va_list rest;
+  va_start(rest, flags);
+  const mode_t mode = (flags & O_CREAT) != 0 ? va_arg(rest, mode_t) : 0;
+  va_end(rest);
+  if (const auto hook = before_open) hook(file);
+  return static_cast<int>(syscall(SYS_openat, AT_FDCWD, file, flags, mode));
+}
 
 namespace {
 
@@ -390,6 +410,140 @@ void one_writer() {
   PrototypeMap::load(path, true);
 }
 
+// A map file that is compacted twice while it is read, to an equal one in the end: its journal was
+// that of the one in between.
+void compacted_twice_meanwhile() {
+  begin(0);
+  PrototypeMap map = PrototypeMap::load(path, true);
+  add(map, 1);
+  map.compact();
+  const Content expected = bytes_of(map);
+  const std::vector<std::int64_t> id = {500};
+  const std::vector<std::int8_t> code(12, 3);
+  int maps = 0;
+  bool other = false;
+  before_open = [&](const std::string& file) {
+    const auto hook = std::exchange(before_open, {});
+    if (file == journal && !other) {
+      other = true;
+      map.add_codes(id, {code.data(), 1, 12});
+      map.compact();
+      map.set_metadata({{"n", "1"}});
+      map.commit();
+    } else if (file == path && ++maps == 2) {
+      map.set_metadata({});
+      map.discard(id);
+      map.compact();
+      CHECK(read(path) == expected);
+    }
+    before_open = hook;
+  };
+  CHECK(bytes_of(PrototypeMap::load(path)) == expected);
+  CHECK(other && maps > 2);
+  before_open = {};
+}
+
+// A map that cannot be opened gets no journal.
+void nothing_is_left_behind() {
+  begin(0);
+  {
+    PrototypeMap map = PrototypeMap::load(path);
+    add(map, 1);
+    map.save(path);
+  }
+  Content broken = read(path);
+  broken[broken.size() - 100] = static_cast<char>(broken[broken.size() - 100] ^ 1);
+  write(path, broken);
+  CHECK(check::throws<FileError>([] { PrototypeMap::load(path, true); }, "checksum"));
+  CHECK(!fs::exists(journal));
+  // One that was there stays.
+  begin(0);
+  PrototypeMap::load(path, true).close();
+  const Content head = read(journal);
+  write(path, broken);
+  CHECK(check::throws<FileError>([] { PrototypeMap::load(path, true); }, "checksum"));
+  CHECK(read(journal) == head);
+}
+
+// How many commits stand in the way, where a fold may have taken place or not.
+void commits_to_other_map_files() {
+  const Commits c(0);
+  const auto all = std::span<const char>(c.whole);
+  ContainerWriter fold(FileKind::fold);
+  SectionWriter chain;
+  std::uint32_t checksum;
+  std::memcpy(&checksum, &c.whole[c.lengths[1] + 28], 4);
+  chain.value(std::uint64_t{3});
+  chain.value(checksum);
+  chain.value(std::uint32_t{0});
+  fold.add("chain", chain.take());
+  fold.add("base", std::vector<std::byte>(64, std::byte{'a'}));
+  const auto bytes = fold.serialize();
+  Content folded(all.begin(), all.begin() + static_cast<std::ptrdiff_t>(c.lengths[2]));
+  const auto* data = reinterpret_cast<const char*>(bytes.data());
+  folded.insert(folded.end(), data, data + bytes.size());
+  const auto third = with_container(all.subspan(c.lengths[2]),
+                                    [&](const std::string& name, std::vector<std::byte>& content) {
+                                      if (name != "chain") return;
+                                      const std::uint64_t number = 4;
+                                      std::memcpy(content.data(), &number, 8);
+                                      std::memcpy(&content[8], &bytes[28], 4);
+                                    });
+  Content longer = folded;
+  longer.insert(longer.end(), third.begin(), third.end());
+
+  CHECK(c.opened(longer) == c.states[3]);  // the fold did not take place
+  CHECK(c.opened(folded) == c.states[2]);
+  PrototypeMap other(test::random_encoder());
+  add(other, 99);
+  other.save(folder / "other.pmk");
+  write(path, read(folder / "other.pmk"));
+  write(journal, longer);
+  CHECK(check::throws<FileError>([] { PrototypeMap::load(path); },
+                                 "holds 3 commits to another map file than the one beside it, of "
+                                 "which the first 2 may be in that file already"));
+  write(journal, folded);
+  CHECK(bytes_of(PrototypeMap::load(path)) == bytes_of(other));
+}
+
+// Files that are made to be slow to read: landmarks with thousands of looks, and others that come
+// and go beside them. Rows are counted, not time.
+void thousands_of_looks() {
+  begin(12);
+  PrototypeMap map = PrototypeMap::load(path, true);
+  std::vector<std::int8_t> codes;
+  for (int look = 0; look < 1 << 12; ++look) {
+    for (int d = 0; d < 12; ++d) codes.push_back((look >> d & 1) != 0 ? 5 : -5);
+  }
+  const auto grow = [&](std::int64_t id) {
+    map.add_codes(std::vector<std::int64_t>(codes.size() / 12, id),
+                  {codes.data(), codes.size() / 12, 12});
+    map.commit();
+  };
+  constexpr std::int64_t kSmall = 200;
+  for (std::int64_t id = kSmall; id > 0; --id) {
+    map.add_codes(std::vector{id}, {codes.data(), 1, 12});
+    map.commit();
+  }
+  for (const std::int64_t id : {1000, 1001, 1000, 1001, 999}) grow(id);
+  std::vector<std::int64_t> gone;
+  for (std::int64_t id = 1; id <= kSmall; ++id) gone.push_back(id);
+  map.discard(gone);
+  map.commit();
+  grow(1000);
+  const Content expected = bytes_of(map);
+
+  const Content file_bytes = read(path), journal_bytes = read(journal);
+  const ContainerReader file(std::as_bytes(std::span(file_bytes)), "map");
+  const JournalContent commits(std::as_bytes(std::span(journal_bytes)), "map.journal");
+  PrototypeStore store(12, 12);
+  read_open_map(file, commits, *map.encoder(), store);
+  CHECK(store.landmarks() == 3 && store.rows() == 3 * (1 << 12));
+  CHECK(store.steps() <= store.rows());
+  map.close();
+  CHECK(bytes_of(PrototypeMap::load(path)) == expected);
+}
+
 // Its cost follows what changed.
 void cost() {
   begin(0);
@@ -414,6 +568,10 @@ int main() {
   refused();
   other_map_files();
   one_writer();
+  compacted_twice_meanwhile();
+  nothing_is_left_behind();
+  commits_to_other_map_files();
+  thousands_of_looks();
   cost();
   fs::remove_all(folder);
   return check::result();

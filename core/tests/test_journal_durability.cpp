@@ -170,6 +170,10 @@ void check_world(const PowerCuts::World& world, const std::set<Content>& states)
   }
 }
 
+std::size_t files_beside() {
+  return static_cast<std::size_t>(std::distance(fs::directory_iterator(path.parent_path()), {}));
+}
+
 void power_cuts(Action action) {
   Session session;
   std::set<PowerCuts::World> during, after;
@@ -183,6 +187,71 @@ void power_cuts(Action action) {
   for (const auto& world : after) check_world(world, {session.changed});
   std::printf("%zu states of the disk, %zu when it had returned\n", during.size(), after.size());
   CHECK(during.size() > 3);
+}
+
+// Where the journal could not be emptied, the map file counts, and so do commits after that.
+void power_cuts_after_a_failure() {
+  for (long step = 4; step > 0; --step) {
+    long all = 0;
+    {
+      Session session;
+      disk = {};
+      compact(*session.map);
+      all = disk.steps;
+    }
+    Session other;
+    disk = {};
+    disk.fails_at = all - step;
+    disk.broken = true;
+    compact(*other.map);
+    disk = {};
+    add(*other.map, 6, 50, 10);
+    const Content next = bytes_of(*other.map);
+    std::set<PowerCuts::World> before, during, after;
+    {
+      PowerCuts cuts;
+      before = cuts.take();
+      commit(*other.map);
+      during = cuts.take();
+      after = cuts.take();
+    }
+    for (const auto& world : before) check_world(world, {other.changed});
+    for (const auto& world : during) check_world(world, {other.changed, next});
+    for (const auto& world : after) check_world(world, {next});
+  }
+}
+
+// Somebody opens the map with a journal after `save` onto its file has begun: their commits are not
+// saved over, be the journal open or closed by then.
+void journal_begun_while_saving() {
+  for (const bool sealed : {false, true}) {
+    for (const bool closed : {false, true}) {
+      Session session;
+      session.map->compact();
+      session.map->close();
+      fs::remove(path.string() + ".journal");
+      PrototypeMap other(test::random_encoder(), 0, 2);
+      add(other, 7, 0, 30);
+      std::optional<PrototypeMap> late;
+      Content committed;
+      disk = {};
+      bool begun = false;
+      disk.before_step = [&] {
+        if (std::exchange(begun, true)) return;
+        late.emplace(PrototypeMap::load(path, true));
+        add(*late, 8, 40, 5);
+        late->commit();
+        committed = bytes_of(*late);
+        if (closed) late->close();
+      };
+      const std::string why =
+          closed ? "its journal holds 1 commits" : "its journal is held by another map";
+      CHECK(check::throws<FileError>([&] { sealed ? other.seal(path) : other.save(path); }, why));
+      disk = {};
+      CHECK(late && bytes_of(PrototypeMap::load(path)) == committed);
+      CHECK(files_beside() == 2);
+    }
+  }
 }
 
 // Opening begins a journal, cuts a torn one, or begins it anew behind another map file.
@@ -214,8 +283,15 @@ void power_cuts_at_opening() {
   }
 }
 
-void failing_steps(Action action) {
-  long steps = 0;
+// The last `quiet` steps only empty the journal: a compaction that fails there has been made.
+void failing_steps(Action action, long quiet) {
+  long steps = 0, all = 0;
+  {
+    Session session;
+    disk = {};
+    action(*session.map);
+    all = disk.steps;
+  }
   for (bool done = false; !done; ++steps) {
     for (const bool broken : {false, true}) {
       for (const int error : {EIO, ENOSPC}) {
@@ -232,10 +308,17 @@ void failing_steps(Action action) {
           CHECK(std::string(e.what()).find(std::strerror(error)) != std::string::npos);
         }
         done = disk.steps <= steps;
-        CHECK(done == !threw);
+        CHECK(done == (steps >= all));
+        CHECK(threw == (steps < all - quiet));
         disk = {};
         const Content there = bytes_of(PrototypeMap::load(path));
         CHECK(there == session.changed || (threw && there == session.committed));
+        if (quiet != 0 && !threw) {
+          CHECK(read(path) == session.changed);
+          const auto left = file_journal(path);
+          CHECK(!left || left->commits == 0);
+          CHECK(session.map->commit() == 0);
+        }
         CHECK(bytes_of(*session.map) == session.changed);
         // What failed may be tried again, in any way.
         if (broken) compact(*session.map);
@@ -284,9 +367,11 @@ int main() {
   order_of_steps();
   for (const Action action : {commit, compact}) {
     power_cuts(action);
-    failing_steps(action);
+    failing_steps(action, action == compact ? 4 : 0);
   }
+  power_cuts_after_a_failure();
   power_cuts_at_opening();
+  journal_begun_while_saving();
   fs::remove_all(folder);
   return check::result();
 }

@@ -87,7 +87,9 @@ def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]
     width = {8: 4, 4: 8}[scene.code_bits]  # dimensions in 4 bytes
     blocks = -(-scene.prototype_count // 16)
     packed = blocks * 16 * -(-scene.dim // width) * 4
-    own = sum(sections[name] for name in ("cells", "cellrows", "order", "probes"))
+    own = sum(
+        sections.get(name, 0) for name in ("cells", "cellrows", "order", "ordersum", "probes")
+    )
     return (own + sections["protos"] - packed) / max(1, len(scene))
 
 

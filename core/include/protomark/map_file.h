@@ -32,6 +32,9 @@ void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
 // What a map file holds, by its header. Throws FileError where it is no map.
 MapKind map_kind(const std::filesystem::path& path);
 
+// The encoder of a map file, of which nothing else is read. Throws FileError.
+std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path);
+
 // Names and sizes in bytes of the sections of a model or map file. Throws FileError.
 std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path);
 

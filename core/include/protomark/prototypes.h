@@ -172,7 +172,9 @@ class PrototypeMap {
   // does compact.
   std::size_t commit();
   // Writes the map file anew, as save does, and empties the journal. Whatever happens, the two of
-  // them give this map or what was committed last. Throws FileError.
+  // them give this map or what was committed last. Throws FileError where the map file cannot be
+  // written. Where only the journal cannot be emptied this returns, as everything is in the map
+  // file: what stands in the journal holds nothing then, and the next commit tries again.
   void compact();
   // Gives the journal back, and what was not committed stays in memory only.
   void close();

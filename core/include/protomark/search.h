@@ -10,15 +10,15 @@
 
 namespace protomark {
 
+class OrderNumbers;
+
 // Which landmark each row is of, where that is not its number; at most one of the pointers is set.
 struct RowLandmarks {
   const std::uint32_t* of_row = nullptr;  // number of the landmark of each row
   // Number of rows of each landmark, at least 1; a landmark's rows follow each other.
   const std::uint8_t* rows_of = nullptr;
-  // Number of the landmark of each row in `bits` bits, 1 to 32, one after the other, least
-  // significant first, and 7 bytes behind them.
-  const std::uint8_t* packed_of_row = nullptr;
-  int bits = 0;
+  // As a sealed map with an index has them (core/src/order_numbers.h).
+  const OrderNumbers* order = nullptr;
   std::uint32_t end = UINT32_MAX;  // numbers from this on are of no landmark: rows are padding
 };
 
