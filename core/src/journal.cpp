@@ -394,7 +394,8 @@ void Journal::restart(const std::string& identity) noexcept {
   try {
     base_ = identity;
     begin();
-  } catch (const std::exception&) {  // as after a power cut at this moment
+  } catch (const std::exception&) {
+    tail_ = true;  // as after a power cut at this moment
   }
 }
 

@@ -102,7 +102,7 @@ struct SealedMap::Content {
     std::size_t places = rows;
     if (file.map_if_there(section::kCells)) {
       places = read_index();
-      landmarks.order = &*order;
+      landmarks.order = order.get();
       landmarks.end = static_cast<std::uint32_t>(n);
     } else {
       landmarks.rows_of = rows_of;
@@ -180,7 +180,8 @@ struct SealedMap::Content {
     if (all != rows) file.fail("its cells do not have as many prototypes as the map");
     const std::size_t places = std::size_t{first_blocks.back()} * kPackedRows;
     // Numbers of landmarks and, for padding, the next one.
-    order.emplace(file, places, std::bit_width(std::max<std::size_t>(shape.landmarks, 1)));
+    order = std::make_unique<const OrderNumbers>(
+        file, places, std::bit_width(std::max<std::size_t>(shape.landmarks, 1)));
     const auto bytes = file.read(section::kProbes);
     ranks.resize(bytes.size() / sizeof(std::uint32_t));
     SectionReader(file, section::kProbes).copy(ranks.data(), ranks.size());
@@ -265,8 +266,8 @@ struct SealedMap::Content {
   std::vector<std::int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
   std::span<const std::uint32_t> cell_rows;
-  std::vector<std::uint32_t> first_blocks;  // of each cell, and the end
-  std::optional<OrderNumbers> order;        // landmark of each place
+  std::vector<std::uint32_t> first_blocks;    // of each cell, and the end
+  std::unique_ptr<const OrderNumbers> order;  // landmark of each place
   ProbeRanks ranks;
   mutable std::once_flag places_found;
   mutable std::vector<std::uint32_t> places;  // of each row
