@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.mapping.memory import Memory
-from protomark.mapping.nearby import near_pairs
 from protomark.mapping.pose import absolute_pose, refine_pose, reprojection_error
 from protomark.mapping.structure import Array, Ids, Structure
 from protomark.mapping.thresholds import accepted, thresholds
+from protomark.tracks.nearby import near_pairs
 
 # Radii in which landmarks are looked for, as shares of the image's longer side: around where a
 # predicted pose puts them, and around where a pose found by RANSAC does.

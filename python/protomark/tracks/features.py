@@ -10,10 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.tracks.nearby import near_pairs
+
 # Two keypoints closer than this (pixels) are one place in the image, found twice: at two pyramid
 # levels, or at two corners of one edge. Both would become landmarks that look alike and lie within
 # the error of each other, so that no one could say which of them a query should find.
 MIN_DISTANCE = 4.0
+# What AKAZE finds with the first threshold is, but for a keypoint or two, what it finds with the
+# second one and such responses; the share of keypoints allowed for that.
+_AKAZE_THRESHOLDS = (1e-3, 1e-4)
+_STRICT_SLACK = 0.01
 
 
 @dataclass(frozen=True)
@@ -138,6 +144,8 @@ class Extractor:
                 "this OpenCV lacks xfeatures2d: pip install opencv-contrib-python-headless"
             )
         extra: Any = cv2.xfeatures2d
+        # Whether the strict threshold alone gave enough keypoints in the last image.
+        self._strict_suffices = False
         # Strict first, then a lower threshold for images with little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
         brisk = getattr(extra, "BRISK_create", None) or cv2.BRISK_create  # type: ignore[attr-defined]
@@ -149,7 +157,8 @@ class Extractor:
         if self.kind.name in ("freak", "brisk"):
             self._detect = [brisk(thresh=t, octaves=3).detect for t in (30, 18, 10)]
         elif self.kind.name == "akaze":
-            self._detect = [akaze(threshold=t).detect for t in (1e-3, 1e-4)]
+            self._both = akaze(threshold=_AKAZE_THRESHOLDS[-1]).detectAndCompute
+            self._detect = [akaze(threshold=t).detect for t in _AKAZE_THRESHOLDS]
         else:
             self._detect = [o.detect for o in orb]
         self._compute = {
@@ -164,13 +173,7 @@ class Extractor:
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """Features of a (height, width) uint8 image, in a fixed order: strongest first."""
-        for detect in self._detect:
-            found = detect(image)
-            chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
-            if len(chosen) >= self.max_keypoints:
-                break
-        # Descriptors drop keypoints near the border (FREAK without a word): take what comes back.
-        described, descriptors = self._compute(image, [found[i] for i in chosen])
+        described, descriptors = self._at_once(image) or self._in_turn(image)
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
@@ -198,6 +201,37 @@ class Extractor:
             octaves[order],
             descriptors[order],
         )
+
+    def _in_turn(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
+        """Keypoints, and descriptors of those chosen."""
+        for detect in self._detect:
+            found = detect(image)
+            chosen = self._chosen(found, image)
+            self._strict_suffices = detect is self._detect[0] and len(chosen) >= self.max_keypoints
+            if len(chosen) >= self.max_keypoints:
+                break
+        # Descriptors drop keypoints near the border (FREAK without a word): take what comes back.
+        described, descriptors = self._compute(image, [found[i] for i in chosen])
+        return described, descriptors
+
+    def _at_once(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any] | None:
+        """The same in a third of the time; None where strict detection may find enough.
+
+        AKAZE's scale space costs most, and each call of OpenCV makes it anew.
+        """
+        if self.kind.name != "akaze" or self._strict_suffices:
+            return None
+        found, descriptors = self._both(image, None)
+        strong = [k for k in found if k.response > _AKAZE_THRESHOLDS[0]]
+        if len(strong) >= self.max_keypoints:
+            few = (1 - _STRICT_SLACK) * self.max_keypoints
+            if len(self._chosen(strong, image)) >= few:
+                return None
+        chosen = self._chosen(found, image)
+        return [found[i] for i in chosen], None if descriptors is None else descriptors[chosen]
+
+    def _chosen(self, found: Sequence[Any], image: NDArray[np.uint8]) -> list[int]:
+        return _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:
@@ -227,18 +261,17 @@ def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[i
 
 def _apart(xy: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
     """Indices of the points left when each point removes all later ones closer than `distance`."""
-    taken: dict[tuple[int, int], list[tuple[float, float]]] = {}
-    keep = []
-    limit = distance * distance
-    cells = np.floor(xy / distance).astype(np.int64).tolist()
-    for i, ((x, y), (column, row)) in enumerate(zip(xy.tolist(), cells, strict=True)):
-        near = (
-            point
-            for c in (column - 1, column, column + 1)
-            for r in (row - 1, row, row + 1)
-            for point in taken.get((c, r), ())
-        )
-        if all((x - px) ** 2 + (y - py) ** 2 >= limit for px, py in near):
-            taken.setdefault((column, row), []).append((x, y))
-            keep.append(i)
-    return np.array(keep, np.int64)
+    later, earlier = near_pairs(xy, xy, distance)
+    close = (earlier < later) & (((xy[later] - xy[earlier]) ** 2).sum(1) < distance * distance)
+    later, earlier = later[close], earlier[close]
+    left = np.ones(len(xy), bool)
+    while len(later):
+        # A point that no other one left can remove stays, and what it removes goes.
+        open_ = np.zeros(len(xy), bool)
+        open_[later] = True
+        gone = np.zeros(len(xy), bool)
+        gone[later[~open_[earlier]]] = True
+        left &= ~gone
+        unsure = open_[earlier] & ~gone[earlier] & ~gone[later]
+        later, earlier = later[unsure], earlier[unsure]
+    return np.flatnonzero(left)
