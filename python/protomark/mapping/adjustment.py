@@ -60,8 +60,9 @@ def _shared(structure: Structure, ids: Ids) -> dict[int, int]:
     """For each keyframe that sees some of the landmarks, how many."""
     wanted = np.zeros(len(structure.positions), bool)
     wanted[ids] = True
-    counts = {i: int(wanted[structure.frames[i].seen].sum()) for i in structure.keyframes()}
-    return {i: count for i, count in counts.items() if count}
+    frames, landmarks = structure.pairs(structure.keyframes())
+    counts = np.bincount(frames[wanted[landmarks]], minlength=len(structure.frames))
+    return {i: int(counts[i]) for i in np.flatnonzero(counts).tolist()}
 
 
 def adjust(

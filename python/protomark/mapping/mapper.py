@@ -429,7 +429,7 @@ class Mapper:
     def _measure(self, entry: Entry) -> None:
         structure = self.structure
         entry.landmarks = len(structure.ids)
-        entry.observations = sum(len(f.seen) for f in structure.frames)
+        entry.observations = len(structure.pairs()[0])
         entry.memory_bytes = self.memory.bytes
         entry.descriptor_bytes = self.width * entry.observations
         entry.window_bytes = self.width * sum(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # Rows that are no longer anyone's are dropped when they are this share of all.
 _DEAD_SHARE = 0.25
 _CHUNK = 256
+_PAIRS = 4096
 _SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
@@ -161,9 +162,18 @@ class Prototypes(Memory):
         """See `Memory.distances`."""
         if not len(rows):
             return np.zeros(0, np.float32)
-        known, inverse = np.unique(ids, return_inverse=True)
-        difference = self._rounded(known)[inverse] - encoded[rows]
-        return np.sqrt(np.einsum("pd,pd->p", difference, difference), dtype=np.float32)
+        at = np.zeros(int(ids.max()) + 1, np.int64)
+        at[ids] = 1
+        known = np.flatnonzero(at)
+        at[known] = np.arange(len(known))
+        codes, places = encoded.astype(np.float32), self._rounded(known)
+        squares = np.empty(len(rows), np.float32)
+        # What stays in the processor's cache is several times faster.
+        for a in range(0, len(rows), _PAIRS):
+            b = a + _PAIRS
+            difference = places[at[ids[a:b]]] - codes[rows[a:b]]
+            squares[a:b] = np.einsum("pd,pd->p", difference, difference)
+        return np.sqrt(squares)
 
     def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """See `Memory.known`."""

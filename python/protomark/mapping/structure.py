@@ -168,10 +168,11 @@ class Structure:
     def _look(self, centers: Array, ids: Ids) -> None:
         toward = centers - self.positions[ids]
         distance = np.linalg.norm(toward, axis=1)
-        np.add.at(self.directions, ids, toward / np.maximum(distance, 1e-12)[:, None])
-        np.add.at(self.looks, ids, 1)
-        np.minimum.at(self.distances[:, 0], ids, distance)
-        np.maximum.at(self.distances[:, 1], ids, distance)
+        # A frame sees a landmark once: no id is here twice.
+        self.directions[ids] += toward / np.maximum(distance, 1e-12)[:, None]
+        self.looks[ids] += 1
+        self.distances[ids, 0] = np.minimum(self.distances[ids, 0], distance)
+        self.distances[ids, 1] = np.maximum(self.distances[ids, 1], distance)
 
     def look_again(self) -> None:
         """Directions and distances anew, after poses and positions have moved."""
@@ -183,15 +184,20 @@ class Structure:
     def discard(self, ids: Ids) -> None:
         """Take landmarks away, and all that saw them."""
         self.positions[ids] = np.nan
-        gone = ~self.alive
-        for frame in self.frames:
+        gone = np.zeros(len(self.positions), bool)
+        gone[ids] = True
+        places, landmarks = self.pairs()
+        for i in np.unique(places[gone[landmarks]]).tolist():
+            frame = self.frames[i]
             frame.landmarks[gone[frame.landmarks] & (frame.landmarks >= 0)] = -1
 
     def merge(self, into: Ids, source: Ids) -> None:
         """Give what saw each source landmark to the one in `into`; the sources are gone."""
         target = np.arange(len(self.positions))
         target[source] = into
-        for frame in self.frames:
+        places, landmarks = self.pairs()
+        for i in np.unique(places[target[landmarks] != landmarks]).tolist():
+            frame = self.frames[i]
             seen = frame.landmarks >= 0
             frame.landmarks[seen] = target[frame.landmarks[seen]]
         self.directions[into] += self.directions[source]
@@ -244,6 +250,15 @@ class Structure:
         inside = ((pixels > -margin) & (pixels < size + margin)).all(1)
         return ids[inside], pixels[inside]
 
+    def pairs(self, frames: Sequence[int] | None = None) -> tuple[Ids, Ids]:
+        """Place of the frame and landmark (n,) of each observation, of some frames or all."""
+        chosen = range(len(self.frames)) if frames is None else frames
+        rows = [self.frames[i].landmarks for i in chosen]
+        places = np.repeat(np.array(chosen, np.int64), [len(r) for r in rows])
+        landmarks = np.concatenate([np.zeros(0, np.int64), *rows])
+        seen = landmarks >= 0
+        return places[seen], landmarks[seen]
+
     def observations(self, frames: Sequence[int] | None = None) -> Observations:
         """All observations of some frames (places in the list), or of all keyframes."""
         chosen = self.keyframes() if frames is None else list(frames)
@@ -269,11 +284,8 @@ class Structure:
 
     def counts(self, keyframes_only: bool = True) -> Ids:
         """(l,) how many frames see each id."""
-        out = np.zeros(len(self.positions), np.int64)
-        for frame in self.frames:
-            if frame.keyframe or not keyframes_only:
-                np.add.at(out, frame.seen, 1)
-        return out
+        _, landmarks = self.pairs(self.keyframes() if keyframes_only else None)
+        return np.bincount(landmarks, minlength=len(self.positions))
 
     def set_camera(self, camera_id: int, camera: Camera) -> None:
         """Change a camera's parameters; rays of its frames follow."""
