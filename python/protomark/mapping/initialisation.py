@@ -84,14 +84,25 @@ class Initialiser:
         rows = match(one, other)
         if len(rows) < _MIN_MATCHES:
             return None
+        rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
+        # Most pairs of a video end here, for little time.
+        if _turned(np.eye(3), *rays, self.max_error / self._focal) > _MAX_TURNED:
+            return None
         candidates = self._candidates(one, other, rows)
         if not candidates:
+            return None
+        parallax = [self._parallax(pose, *rays) for pose in candidates]
+        if max(parallax) < _MIN_PARALLAX:
+            self.best_parallax = max(self.best_parallax, *parallax)
             return None
         witnesses = self._witnesses(first, second)
         scores = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
         best = int(np.argmax([support for support, _ in scores]))
         support, share = scores[best]
-        if share < _MIN_SUPPORT or not self._is_wide(candidates[best], one, other, rows):
+        if share < _MIN_SUPPORT:
+            return None
+        self.best_parallax = max(self.best_parallax, parallax[best])
+        if parallax[best] < _MIN_PARALLAX:
             return None
         lead = _LEAD if len(witnesses) > _FEW else _LEAD_OF_FEW
         for pose, (rival, _) in zip(candidates, scores, strict=True):
@@ -137,12 +148,10 @@ class Initialiser:
                 out.append(pose)
         return out
 
-    def _is_wide(self, pose: Array, one: Sighting, other: Sighting, rows: Ids) -> bool:
-        """Whether matches are seen under wide enough angles."""
-        good, _, angle = self._good(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
-        parallax = float(np.degrees(np.median(angle[good])))
-        self.best_parallax = max(self.best_parallax, parallax)
-        return parallax >= _MIN_PARALLAX
+    def _parallax(self, pose: Array, ray_a: Array, ray_b: Array) -> float:
+        """Median angle between the two rays of a match, degrees."""
+        good, _, angle = self._good(pose, ray_a, ray_b)
+        return float(np.degrees(np.median(angle[good])))
 
     def _good(
         self, pose: Array, ray_a: Array, ray_b: Array
