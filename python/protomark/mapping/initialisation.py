@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import protomark as pm
+from protomark.localization.absolute_pose import MAX_ITERATIONS, MIN_ITERATIONS
 from protomark.mapping.pose import absolute_pose, reprojection_error
 from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Ids
@@ -116,7 +117,8 @@ class Initialiser:
 
         camera, focal = self.camera.as_dict(), self._focal
         a, b = (s.keypoints[rows[:, k]].astype(np.float64) for k, s in enumerate((one, other)))
-        options = {"max_epipolar_error": self.max_error, "seed": 0, "max_iterations": 2000}
+        sampling = {"min_iterations": MIN_ITERATIONS, "max_iterations": MAX_ITERATIONS, "seed": 0}
+        options = {"max_epipolar_error": self.max_error, **sampling}
         found, facts = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
         inliers = np.asarray(facts["inliers"], bool)
         if inliers.sum() < _MIN_MATCHES or inliers.mean() < 0.5:
@@ -127,7 +129,7 @@ class Initialiser:
         if _turned(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_TURNED:
             return []
         plane, facts = poselib.estimate_homography(
-            focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, "seed": 0}, {}
+            focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, **sampling}, {}
         )
         starts = [found]
         if np.asarray(facts["inliers"], bool).sum() >= _MIN_COMMON:
