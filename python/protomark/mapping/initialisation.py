@@ -33,6 +33,8 @@ _WITNESSES = 4
 _MIN_COMMON = 40
 # When more wait, every second one goes; it is looked for at the end.
 _MAX_WAITING = 40
+# A new frame is tried with so many of them at most, from the oldest to the newest.
+_PARTNERS = 10
 
 
 @dataclass
@@ -66,15 +68,21 @@ class Initialiser:
         self.waiting: list[Sighting] = []
         self.best_parallax = 0.0
         self._focal = focal_length(camera)
+        self._matches: dict[tuple[str, str], Ids] = {}
 
     def push(self, sighting: Sighting) -> TwoView | None:
-        """Try the new frame with those that wait, the oldest first; it then waits, too."""
+        """Try the new frame with those that wait, the oldest first; it then waits, too.
+
+        With many that wait, some spread evenly over them are tried.
+        """
         self.waiting.append(sighting)
         if len(self.waiting) > _MAX_WAITING:
             # Not the oldest: a slow video needs a long way back.
             del self.waiting[1:-1:2]
+            self._matches.clear()
         last = len(self.waiting) - 1
-        for first in range(last):
+        partners = np.linspace(0, last - 1, min(last, _PARTNERS)).round().astype(int)
+        for first in partners.tolist():
             pose = self._relative_pose(first, last)
             if pose is not None:
                 return TwoView(first, last, pose)
@@ -82,7 +90,7 @@ class Initialiser:
 
     def _relative_pose(self, first: int, second: int) -> Array | None:
         one, other = self.waiting[first], self.waiting[second]
-        rows = match(one, other)
+        rows = self._match(one, other)
         if len(rows) < _MIN_MATCHES:
             return None
         rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
@@ -172,7 +180,13 @@ class Initialiser:
         at = np.linspace(0, len(between) - 1, min(_WITNESSES, len(between))).round().astype(int)
         chosen = [between[k] for k in at] + near[: max(0, _WITNESSES - len(at))]
         one = self.waiting[first]
-        return [(self.waiting[i], match(one, self.waiting[i])) for i in chosen]
+        return [(self.waiting[i], self._match(one, self.waiting[i])) for i in chosen]
+
+    def _match(self, one: Sighting, other: Sighting) -> Ids:
+        key = one.name, other.name
+        if key not in self._matches:
+            self._matches[key] = match(one, other)
+        return self._matches[key]
 
     def _support(
         self,
