@@ -231,6 +231,12 @@ class Structure:
         local = at @ pose[:, :3].T + pose[:, 3]
         front = local[:, 2] > 0
         ids, at, local = ids[front], at[front], local[front]
+        camera = self.cameras[camera_id]
+        # Distortion is only defined within the image: rays that a pinhole sends far out may bend
+        # back into it.
+        bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
+        inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
+        ids, at, local = ids[inside], at[inside], local[inside]
         toward = centre(pose) - at
         distance = np.linalg.norm(toward, axis=1)
         mean = self.directions[ids]
@@ -239,12 +245,6 @@ class Structure:
         fits = cosine > _MAX_VIEWING_COSINE
         fits &= (distance * _MAX_SCALE_CHANGE > near) & (distance < far * _MAX_SCALE_CHANGE)
         ids, local = ids[fits], local[fits]
-        camera = self.cameras[camera_id]
-        # Distortion is only defined within the image: rays that a pinhole sends far out may bend
-        # back into it.
-        bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
-        inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
-        ids, local = ids[inside], local[inside]
         pixels = project(camera, local)
         size = np.array([camera.width, camera.height])
         inside = ((pixels > -margin) & (pixels < size + margin)).all(1)
