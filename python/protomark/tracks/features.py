@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 # the error of each other, so that no one could say which of them a query should find.
 MIN_DISTANCE = 4.0
 
+_AKAZE = (1e-3, 1e-4)  # thresholds: strict, then for images with little contrast
+
 
 @dataclass(frozen=True)
 class DescriptorKind:
@@ -140,6 +142,8 @@ class Extractor:
         extra: Any = cv2.xfeatures2d
         # Strict first, then a lower threshold for images with little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
+        self._at_once: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
+        self._rich = False
         brisk = getattr(extra, "BRISK_create", None) or cv2.BRISK_create  # type: ignore[attr-defined]
         akaze = getattr(extra, "AKAZE_create", None) or cv2.AKAZE_create  # type: ignore[attr-defined]
         orb = [
@@ -149,7 +153,8 @@ class Extractor:
         if self.kind.name in ("freak", "brisk"):
             self._detect = [brisk(thresh=t, octaves=3).detect for t in (30, 18, 10)]
         elif self.kind.name == "akaze":
-            self._detect = [akaze(threshold=t).detect for t in (1e-3, 1e-4)]
+            self._detect = [akaze(threshold=t).detect for t in _AKAZE]
+            self._at_once = akaze(threshold=_AKAZE[-1]).detectAndCompute
         else:
             self._detect = [o.detect for o in orb]
         self._compute = {
@@ -164,13 +169,8 @@ class Extractor:
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """Features of a (height, width) uint8 image, in a fixed order: strongest first."""
-        for detect in self._detect:
-            found = detect(image)
-            chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
-            if len(chosen) >= self.max_keypoints:
-                break
         # Descriptors drop keypoints near the border (FREAK without a word): take what comes back.
-        described, descriptors = self._compute(image, [found[i] for i in chosen])
+        described, descriptors = self._describe(image)
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
@@ -198,6 +198,41 @@ class Extractor:
             octaves[order],
             descriptors[order],
         )
+
+    def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
+        """Keypoints, few enough and spread, and their descriptors."""
+        if self._at_once is not None:
+            return self._describe_at_once(image, self._at_once)
+        for detect in self._detect:
+            found, enough = self._few(detect(image), image)
+            if enough:
+                break
+        return self._compute(image, found)
+
+    def _describe_at_once(
+        self, image: NDArray[np.uint8], at_once: Callable[[Any, None], tuple[Sequence[Any], Any]]
+    ) -> tuple[Sequence[Any], Any]:
+        """The same of AKAZE, whose scale space is most of the work.
+
+        Where the last threshold is needed it is built once, not for each threshold and for the
+        descriptors, too. Whether it will be, the image before tells, mostly.
+        """
+        strict = _AKAZE[0]
+        if not self._rich:
+            every, descriptors = at_once(image, None)
+            _, self._rich = self._few([k for k in every if k.response > strict], image)
+        if self._rich:
+            found, self._rich = self._few(self._detect[0](image), image)
+            if self._rich:
+                return self._compute(image, found)
+            every, descriptors = at_once(image, None)
+        chosen = _spread(every, image.shape[1], image.shape[0], self.max_keypoints)
+        return [every[i] for i in chosen], descriptors[chosen] if chosen else None
+
+    def _few(self, found: Sequence[Any], image: NDArray[np.uint8]) -> tuple[list[Any], bool]:
+        """The keypoints to keep, and whether they are as many as there may be."""
+        chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
+        return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:
