@@ -16,10 +16,8 @@ from protomark.tracks.nearby import near_pairs
 # levels, or at two corners of one edge. Both would become landmarks that look alike and lie within
 # the error of each other, so that no one could say which of them a query should find.
 MIN_DISTANCE = 4.0
-# What AKAZE finds with the first threshold is, but for a keypoint or two, what it finds with the
-# second one and such responses; the share of keypoints allowed for that.
-_AKAZE_THRESHOLDS = (1e-3, 1e-4)
-_STRICT_SLACK = 0.01
+
+_AKAZE = (1e-3, 1e-4)  # thresholds: strict, then for images with little contrast
 
 
 @dataclass(frozen=True)
@@ -144,10 +142,10 @@ class Extractor:
                 "this OpenCV lacks xfeatures2d: pip install opencv-contrib-python-headless"
             )
         extra: Any = cv2.xfeatures2d
-        # Whether the strict threshold alone gave enough keypoints in the last image.
-        self._strict_suffices = False
         # Strict first, then a lower threshold for images with little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
+        self._at_once: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
+        self._rich = False
         brisk = getattr(extra, "BRISK_create", None) or cv2.BRISK_create  # type: ignore[attr-defined]
         akaze = getattr(extra, "AKAZE_create", None) or cv2.AKAZE_create  # type: ignore[attr-defined]
         orb = [
@@ -157,8 +155,8 @@ class Extractor:
         if self.kind.name in ("freak", "brisk"):
             self._detect = [brisk(thresh=t, octaves=3).detect for t in (30, 18, 10)]
         elif self.kind.name == "akaze":
-            self._both = akaze(threshold=_AKAZE_THRESHOLDS[-1]).detectAndCompute
-            self._detect = [akaze(threshold=t).detect for t in _AKAZE_THRESHOLDS]
+            self._detect = [akaze(threshold=t).detect for t in _AKAZE]
+            self._at_once = akaze(threshold=_AKAZE[-1]).detectAndCompute
         else:
             self._detect = [o.detect for o in orb]
         self._compute = {
@@ -173,7 +171,8 @@ class Extractor:
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """Features of a (height, width) uint8 image, in a fixed order: strongest first."""
-        described, descriptors = self._at_once(image) or self._in_turn(image)
+        # Descriptors drop keypoints near the border (FREAK without a word): take what comes back.
+        described, descriptors = self._describe(image)
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
@@ -202,36 +201,40 @@ class Extractor:
             descriptors[order],
         )
 
-    def _in_turn(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
-        """Keypoints, and descriptors of those chosen."""
+    def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
+        """Keypoints, few enough and spread, and their descriptors."""
+        if self._at_once is not None:
+            return self._describe_at_once(image, self._at_once)
         for detect in self._detect:
-            found = detect(image)
-            chosen = self._chosen(found, image)
-            self._strict_suffices = detect is self._detect[0] and len(chosen) >= self.max_keypoints
-            if len(chosen) >= self.max_keypoints:
+            found, enough = self._few(detect(image), image)
+            if enough:
                 break
-        # Descriptors drop keypoints near the border (FREAK without a word): take what comes back.
-        described, descriptors = self._compute(image, [found[i] for i in chosen])
-        return described, descriptors
+        return self._compute(image, found)
 
-    def _at_once(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any] | None:
-        """The same in a third of the time; None where strict detection may find enough.
+    def _describe_at_once(
+        self, image: NDArray[np.uint8], at_once: Callable[[Any, None], tuple[Sequence[Any], Any]]
+    ) -> tuple[Sequence[Any], Any]:
+        """The same of AKAZE, whose scale space is most of the work.
 
-        AKAZE's scale space costs most, and each call of OpenCV makes it anew.
+        Where the last threshold is needed it is built once, not for each threshold and for the
+        descriptors, too. Whether it will be, the image before tells, mostly.
         """
-        if self.kind.name != "akaze" or self._strict_suffices:
-            return None
-        found, descriptors = self._both(image, None)
-        strong = [k for k in found if k.response > _AKAZE_THRESHOLDS[0]]
-        if len(strong) >= self.max_keypoints:
-            few = (1 - _STRICT_SLACK) * self.max_keypoints
-            if len(self._chosen(strong, image)) >= few:
-                return None
-        chosen = self._chosen(found, image)
-        return [found[i] for i in chosen], None if descriptors is None else descriptors[chosen]
+        strict = _AKAZE[0]
+        if not self._rich:
+            every, descriptors = at_once(image, None)
+            _, self._rich = self._few([k for k in every if k.response > strict], image)
+        if self._rich:
+            found, self._rich = self._few(self._detect[0](image), image)
+            if self._rich:
+                return self._compute(image, found)
+            every, descriptors = at_once(image, None)
+        chosen = _spread(every, image.shape[1], image.shape[0], self.max_keypoints)
+        return [every[i] for i in chosen], descriptors[chosen] if chosen else None
 
-    def _chosen(self, found: Sequence[Any], image: NDArray[np.uint8]) -> list[int]:
-        return _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
+    def _few(self, found: Sequence[Any], image: NDArray[np.uint8]) -> tuple[list[Any], bool]:
+        """The keypoints to keep, and whether they are as many as there may be."""
+        chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
+        return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:
