@@ -5,8 +5,8 @@ import protomark as pm
 from protomark.localization.cameras import read_cameras
 from protomark.localization.poses import quaternion_of, read_poses
 from protomark.mapping.memory import Descriptors, Medoids, Prototypes
-from protomark.mapping.nearby import near_pairs
 from protomark.mapping.source import Folder, Video, open_source
+from protomark.tracks.nearby import near_pairs
 from tracks_scene import PINHOLE
 
 

@@ -11,9 +11,9 @@ import pytest
 
 from protomark.tracks import Tracks
 from protomark.tracks.extract import Settings, Source, extract, find_source, fingerprint, is_done
-from protomark.tracks.features import DESCRIPTORS
+from protomark.tracks.features import DESCRIPTORS, Extractor
 from protomark.tracks.summary import reprojection_errors, summarise
-from tracks_scene import DISTORTED, PINHOLE, poses, write_model, write_sequence
+from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,19 @@ def test_same_tracks_on_any_number_of_threads(sequence: Path, orb: Tracks) -> No
         if isinstance(value, np.ndarray):
             assert np.array_equal(value, getattr(again, name)), name
     assert again.info == orb.info
+
+
+def test_akaze_at_once_finds_what_threshold_after_threshold_finds() -> None:
+    rich, poor = texture(480), cv2.convertScaleAbs(texture(480, 5), alpha=0.15, beta=100)
+    at_once, plain = Extractor("akaze", 500), Extractor("akaze", 500)
+    plain._at_once = None
+    before = []
+    for image in (rich, poor, poor, rich, rich, np.zeros((480, 480), np.uint8)):
+        found, expected = at_once(image), plain(image)
+        for name, value in vars(expected).items():
+            np.testing.assert_array_equal(getattr(found, name), value)
+        before.append(at_once._rich)
+    assert before == [True, False, False, True, True, False], "both ways were to be taken"
 
 
 def test_keyframes_are_in_order_of_capture(tmp_path: Path) -> None:

@@ -60,8 +60,9 @@ def _shared(structure: Structure, ids: Ids) -> dict[int, int]:
     """For each keyframe that sees some of the landmarks, how many."""
     wanted = np.zeros(len(structure.positions), bool)
     wanted[ids] = True
-    counts = {i: int(wanted[structure.frames[i].seen].sum()) for i in structure.keyframes()}
-    return {i: count for i, count in counts.items() if count}
+    frames, landmarks = structure.pairs(structure.keyframes())
+    counts = np.bincount(frames[wanted[landmarks]], minlength=len(structure.frames))
+    return {i: int(counts[i]) for i in np.flatnonzero(counts).tolist()}
 
 
 def adjust(
@@ -136,6 +137,8 @@ def _problem(structure: Structure, seen: Observations) -> Any:
             keypoints=frame.keypoints[seen.rows[mine]].astype(np.float64),
         )
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.pose))
+    # Each look-up in the reconstruction takes longer than all else that an observation needs.
+    images = {i + 1: reconstruction.images[i + 1] for i in places}
     order = np.argsort(seen.landmarks, kind="stable")
     ids, starts = np.unique(seen.landmarks[order], return_index=True)
     frames, index = (seen.frames[order] + 1).tolist(), index[order].tolist()
@@ -146,7 +149,7 @@ def _problem(structure: Structure, seen: Observations) -> Any:
             point, pycolmap.Point3D(xyz=structure.positions[point], track=track)
         )
         for k in range(a, b):
-            reconstruction.images[frames[k]].set_point3D_for_point2D(index[k], point)
+            images[frames[k]].set_point3D_for_point2D(index[k], point)
     return reconstruction
 
 

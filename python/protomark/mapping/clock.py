@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-STAGES = ("detect", "encode", "match", "triangulate", "adjust", "other")
+STAGES = ("detect", "encode", "initialise", "match", "triangulate", "adjust", "other")
 
 
 class Clock:

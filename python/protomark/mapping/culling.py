@@ -90,15 +90,11 @@ def _angles(structure: Structure, ids: Ids) -> np.ndarray[tuple[int], np.dtype[n
     """(n,) widest angle between two rays of each landmark, radians."""
     place = np.full(len(structure.positions), -1)
     place[ids] = np.arange(len(ids))
-    landmarks, centers = [], []
-    for i in structure.keyframes():
-        frame = structure.frames[i]
-        mine = place[frame.seen]
-        mine = mine[mine >= 0]
-        landmarks.append(mine)
-        centers.append(np.repeat(centre(frame.pose)[None], len(mine), axis=0))
-    if not landmarks:
+    frames, landmarks = structure.pairs(structure.keyframes())
+    landmark = place[landmarks]
+    frames, landmark = frames[landmark >= 0], landmark[landmark >= 0]
+    if not len(landmark):
         return np.zeros(len(ids))
-    landmark, center = np.concatenate(landmarks), np.concatenate(centers)
+    centers = centre(np.array([frame.pose for frame in structure.frames]))
     order = np.argsort(landmark, kind="stable")
-    return widest_angle(structure.positions[ids], landmark[order], center[order])
+    return widest_angle(structure.positions[ids], landmark[order], centers[frames[order]])

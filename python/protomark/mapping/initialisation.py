@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import protomark as pm
+from protomark.localization.absolute_pose import MAX_ITERATIONS, MIN_ITERATIONS
 from protomark.mapping.pose import absolute_pose, reprojection_error
 from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Ids
@@ -32,6 +33,8 @@ _WITNESSES = 4
 _MIN_COMMON = 40
 # When more wait, every second one goes; it is looked for at the end.
 _MAX_WAITING = 40
+# A new frame is tried with so many of them at most, from the oldest to the newest.
+_PARTNERS = 10
 
 
 @dataclass
@@ -65,15 +68,21 @@ class Initialiser:
         self.waiting: list[Sighting] = []
         self.best_parallax = 0.0
         self._focal = focal_length(camera)
+        self._matches: dict[tuple[str, str], Ids] = {}
 
     def push(self, sighting: Sighting) -> TwoView | None:
-        """Try the new frame with those that wait, the oldest first; it then waits, too."""
+        """Try the new frame with those that wait, the oldest first; it then waits, too.
+
+        With many that wait, some spread evenly over them are tried.
+        """
         self.waiting.append(sighting)
         if len(self.waiting) > _MAX_WAITING:
             # Not the oldest: a slow video needs a long way back.
             del self.waiting[1:-1:2]
+            self._matches.clear()
         last = len(self.waiting) - 1
-        for first in range(last):
+        partners = np.linspace(0, last - 1, min(last, _PARTNERS)).round().astype(int)
+        for first in partners.tolist():
             pose = self._relative_pose(first, last)
             if pose is not None:
                 return TwoView(first, last, pose)
@@ -81,17 +90,28 @@ class Initialiser:
 
     def _relative_pose(self, first: int, second: int) -> Array | None:
         one, other = self.waiting[first], self.waiting[second]
-        rows = match(one, other)
+        rows = self._match(one, other)
         if len(rows) < _MIN_MATCHES:
+            return None
+        rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
+        # Most pairs of a video end here, for little time.
+        if _turned(np.eye(3), *rays, self.max_error / self._focal) > _MAX_TURNED:
             return None
         candidates = self._candidates(one, other, rows)
         if not candidates:
+            return None
+        parallax = [self._parallax(pose, *rays) for pose in candidates]
+        if max(parallax) < _MIN_PARALLAX:
+            self.best_parallax = max(self.best_parallax, *parallax)
             return None
         witnesses = self._witnesses(first, second)
         scores = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
         best = int(np.argmax([support for support, _ in scores]))
         support, share = scores[best]
-        if share < _MIN_SUPPORT or not self._is_wide(candidates[best], one, other, rows):
+        if share < _MIN_SUPPORT:
+            return None
+        self.best_parallax = max(self.best_parallax, parallax[best])
+        if parallax[best] < _MIN_PARALLAX:
             return None
         lead = _LEAD if len(witnesses) > _FEW else _LEAD_OF_FEW
         for pose, (rival, _) in zip(candidates, scores, strict=True):
@@ -105,7 +125,8 @@ class Initialiser:
 
         camera, focal = self.camera.as_dict(), self._focal
         a, b = (s.keypoints[rows[:, k]].astype(np.float64) for k, s in enumerate((one, other)))
-        options = {"max_epipolar_error": self.max_error, "seed": 0, "max_iterations": 2000}
+        sampling = {"min_iterations": MIN_ITERATIONS, "max_iterations": MAX_ITERATIONS, "seed": 0}
+        options = {"max_epipolar_error": self.max_error, **sampling}
         found, facts = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
         inliers = np.asarray(facts["inliers"], bool)
         if inliers.sum() < _MIN_MATCHES or inliers.mean() < 0.5:
@@ -116,7 +137,7 @@ class Initialiser:
         if _turned(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_TURNED:
             return []
         plane, facts = poselib.estimate_homography(
-            focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, "seed": 0}, {}
+            focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, **sampling}, {}
         )
         starts = [found]
         if np.asarray(facts["inliers"], bool).sum() >= _MIN_COMMON:
@@ -137,12 +158,10 @@ class Initialiser:
                 out.append(pose)
         return out
 
-    def _is_wide(self, pose: Array, one: Sighting, other: Sighting, rows: Ids) -> bool:
-        """Whether matches are seen under wide enough angles."""
-        good, _, angle = self._good(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
-        parallax = float(np.degrees(np.median(angle[good])))
-        self.best_parallax = max(self.best_parallax, parallax)
-        return parallax >= _MIN_PARALLAX
+    def _parallax(self, pose: Array, ray_a: Array, ray_b: Array) -> float:
+        """Median angle between the two rays of a match, degrees."""
+        good, _, angle = self._good(pose, ray_a, ray_b)
+        return float(np.degrees(np.median(angle[good])))
 
     def _good(
         self, pose: Array, ray_a: Array, ray_b: Array
@@ -161,7 +180,13 @@ class Initialiser:
         at = np.linspace(0, len(between) - 1, min(_WITNESSES, len(between))).round().astype(int)
         chosen = [between[k] for k in at] + near[: max(0, _WITNESSES - len(at))]
         one = self.waiting[first]
-        return [(self.waiting[i], match(one, self.waiting[i])) for i in chosen]
+        return [(self.waiting[i], self._match(one, self.waiting[i])) for i in chosen]
+
+    def _match(self, one: Sighting, other: Sighting) -> Ids:
+        key = one.name, other.name
+        if key not in self._matches:
+            self._matches[key] = match(one, other)
+        return self._matches[key]
 
     def _support(
         self,

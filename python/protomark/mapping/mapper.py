@@ -170,7 +170,7 @@ class Mapper:
     # The first two frames.
 
     def _initialise(self, sighting: Sighting, entry: Entry) -> None:
-        with self.clock.stage("match"):
+        with self.clock.stage("initialise"):
             found = self.initialiser.push(sighting)
         if found is None:
             entry.outcome = "before the first two frames with enough parallax"
@@ -198,7 +198,7 @@ class Mapper:
         self.history.events.append(
             f"{second.name}: the map begins, with {first.name} and this frame"
         )
-        self.initialiser.waiting = []
+        self._start_over()
         self.lost_in_row = 0
         return None
 
@@ -429,7 +429,7 @@ class Mapper:
     def _measure(self, entry: Entry) -> None:
         structure = self.structure
         entry.landmarks = len(structure.ids)
-        entry.observations = sum(len(f.seen) for f in structure.frames)
+        entry.observations = len(structure.pairs()[0])
         entry.memory_bytes = self.memory.bytes
         entry.descriptor_bytes = self.width * entry.observations
         entry.window_bytes = self.width * sum(

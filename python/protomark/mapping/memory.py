@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # Rows that are no longer anyone's are dropped when they are this share of all.
 _DEAD_SHARE = 0.25
 _CHUNK = 256
+_PAIRS = 4096
 _SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
@@ -161,9 +162,18 @@ class Prototypes(Memory):
         """See `Memory.distances`."""
         if not len(rows):
             return np.zeros(0, np.float32)
-        known, inverse = np.unique(ids, return_inverse=True)
-        difference = self._rounded(known)[inverse] - encoded[rows]
-        return np.sqrt(np.einsum("pd,pd->p", difference, difference), dtype=np.float32)
+        at = np.zeros(int(ids.max()) + 1, np.int64)
+        at[ids] = 1
+        known = np.flatnonzero(at)
+        at[known] = np.arange(len(known))
+        codes, places = encoded.astype(np.float32), self._rounded(known)
+        squares = np.empty(len(rows), np.float32)
+        # What stays in the processor's cache is several times faster.
+        for a in range(0, len(rows), _PAIRS):
+            b = a + _PAIRS
+            difference = places[at[ids[a:b]]] - codes[rows[a:b]]
+            squares[a:b] = np.einsum("pd,pd->p", difference, difference)
+        return np.sqrt(squares)
 
     def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """See `Memory.known`."""
@@ -201,6 +211,7 @@ class Descriptors(Memory):
         self._descriptors = np.zeros((0, width), np.uint8)
         self._owners = np.zeros(0, np.int64)
         self._sorted: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
+        self._padded: tuple[NDArray[np.uint8], NDArray[np.uint64]] | None = None
 
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
         """See `Memory.encode`."""
@@ -273,14 +284,24 @@ class Descriptors(Memory):
         """See `Memory.distances`."""
         if not len(rows):
             return np.zeros(0, np.float32)
-        owners, descriptors = self.table()
-        first, last = (np.searchsorted(owners, ids, side) for side in ("left", "right"))
-        counts = last - first
+        owners, _ = self.table()
+        many = np.bincount(owners, minlength=int(ids.max()) + 1)
+        counts = many[ids]
         starts = np.cumsum(counts) - counts
         pair = np.repeat(np.arange(len(ids)), counts)
-        row = first[pair] + np.arange(len(pair)) - starts[pair]
-        bits = _set_bits(encoded[rows[pair]] ^ descriptors[row])
+        row = np.arange(len(pair)) + np.repeat((np.cumsum(many) - many)[ids] - starts, counts)
+        words, others = _words(encoded), self._table_words()
+        bits = np.empty(len(pair), np.int32)
+        for a in range(0, len(pair), _PAIRS):
+            b = a + _PAIRS
+            bits[a:b] = _set_bits(words[rows[pair[a:b]]] ^ others[row[a:b]])
         return np.minimum.reduceat(bits, starts).astype(np.float32)
+
+    def _table_words(self) -> NDArray[np.uint64]:
+        descriptors = self.table()[1]
+        if self._padded is None or self._padded[0] is not descriptors:
+            self._padded = descriptors, _words(descriptors)
+        return self._padded[1]
 
     def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """See `Memory.known`."""
@@ -375,11 +396,19 @@ class Medoids(Descriptors):
         return len(self._medoids) * int(self._descriptors.shape[1])
 
 
-def _set_bits(values: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """(n, bytes) uint8 -> (n,) how many bits are set."""
+def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """(n, bytes) uint8 -> (n, ceil(bytes / 8)), the same bits and zeros."""
+    many, width = descriptors.shape
+    padded = np.zeros((many, -(-width // 8) * 8), np.uint8)
+    padded[:, :width] = descriptors
+    return padded.view(np.uint64)
+
+
+def _set_bits(words: NDArray[np.uint64]) -> NDArray[np.int32]:
+    """(n, words) -> (n,) how many bits are set."""
     if hasattr(np, "bitwise_count"):
-        return np.asarray(np.bitwise_count(values).sum(1, dtype=np.int32))
-    return np.asarray(_SET_BITS[values].sum(1, dtype=np.int32))
+        return np.asarray(np.bitwise_count(words).sum(1, dtype=np.int32))
+    return np.asarray(_SET_BITS[words.view(np.uint8)].sum(1, dtype=np.int32))
 
 
 MEMORIES = ("prototypes", "medoids", "descriptors")

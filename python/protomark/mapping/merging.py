@@ -61,13 +61,14 @@ def _disjoint(structure: Structure, pairs: list[tuple[int, int]]) -> Ids:
 
 
 def _seen_together(structure: Structure, pairs: Ids) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    which = np.full(len(structure.positions), -1)
+    which[pairs] = np.arange(len(pairs))[:, None]
+    frames, landmarks = structure.pairs()
+    pair = which[landmarks]
+    # A frame has each landmark once: where a pair is there twice, both are.
+    key, count = np.unique((frames * len(pairs) + pair)[pair >= 0], return_counts=True)
     together = np.zeros(len(pairs), bool)
-    mark = np.zeros(len(structure.positions), bool)
-    for frame in structure.frames:
-        seen = frame.seen
-        mark[seen] = True
-        together |= mark[pairs].all(1)
-        mark[seen] = False
+    together[key[count > 1] % len(pairs)] = True
     return together
 
 
@@ -79,7 +80,8 @@ def _joint(
     """Joint positions (n, 3), and whether each fits its observations."""
     place = np.full(len(structure.positions), -1)
     place[into] = place[source] = np.arange(len(into))
-    seen = structure.observations()
+    frames, landmarks = structure.pairs(structure.keyframes())
+    seen = structure.observations(np.unique(frames[place[landmarks] >= 0]).tolist())
     seen = seen.where(place[seen.landmarks] >= 0)
     which = place[seen.landmarks]
     counts = structure.counts().astype(np.float64)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = ("#0f766e", "#0369a1", "#b45309", "#7c3aed", "#be123c", "#9ca3af")
+_COLOURS = ("#0f766e", "#0369a1", "#4d7c0f", "#b45309", "#7c3aed", "#be123c", "#9ca3af")
 _LANDMARKS_SHOWN = 20_000
 _NAMES_SHOWN = 20
 

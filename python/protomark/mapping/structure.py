@@ -168,10 +168,11 @@ class Structure:
     def _look(self, centers: Array, ids: Ids) -> None:
         toward = centers - self.positions[ids]
         distance = np.linalg.norm(toward, axis=1)
-        np.add.at(self.directions, ids, toward / np.maximum(distance, 1e-12)[:, None])
-        np.add.at(self.looks, ids, 1)
-        np.minimum.at(self.distances[:, 0], ids, distance)
-        np.maximum.at(self.distances[:, 1], ids, distance)
+        # A frame sees a landmark once: no id is here twice.
+        self.directions[ids] += toward / np.maximum(distance, 1e-12)[:, None]
+        self.looks[ids] += 1
+        self.distances[ids, 0] = np.minimum(self.distances[ids, 0], distance)
+        self.distances[ids, 1] = np.maximum(self.distances[ids, 1], distance)
 
     def look_again(self) -> None:
         """Directions and distances anew, after poses and positions have moved."""
@@ -183,15 +184,20 @@ class Structure:
     def discard(self, ids: Ids) -> None:
         """Take landmarks away, and all that saw them."""
         self.positions[ids] = np.nan
-        gone = ~self.alive
-        for frame in self.frames:
+        gone = np.zeros(len(self.positions), bool)
+        gone[ids] = True
+        places, landmarks = self.pairs()
+        for i in np.unique(places[gone[landmarks]]).tolist():
+            frame = self.frames[i]
             frame.landmarks[gone[frame.landmarks] & (frame.landmarks >= 0)] = -1
 
     def merge(self, into: Ids, source: Ids) -> None:
         """Give what saw each source landmark to the one in `into`; the sources are gone."""
         target = np.arange(len(self.positions))
         target[source] = into
-        for frame in self.frames:
+        places, landmarks = self.pairs()
+        for i in np.unique(places[target[landmarks] != landmarks]).tolist():
+            frame = self.frames[i]
             seen = frame.landmarks >= 0
             frame.landmarks[seen] = target[frame.landmarks[seen]]
         self.directions[into] += self.directions[source]
@@ -225,6 +231,12 @@ class Structure:
         local = at @ pose[:, :3].T + pose[:, 3]
         front = local[:, 2] > 0
         ids, at, local = ids[front], at[front], local[front]
+        camera = self.cameras[camera_id]
+        # Distortion is only defined within the image: rays that a pinhole sends far out may bend
+        # back into it.
+        bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
+        inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
+        ids, at, local = ids[inside], at[inside], local[inside]
         toward = centre(pose) - at
         distance = np.linalg.norm(toward, axis=1)
         mean = self.directions[ids]
@@ -233,16 +245,19 @@ class Structure:
         fits = cosine > _MAX_VIEWING_COSINE
         fits &= (distance * _MAX_SCALE_CHANGE > near) & (distance < far * _MAX_SCALE_CHANGE)
         ids, local = ids[fits], local[fits]
-        camera = self.cameras[camera_id]
-        # Distortion is only defined within the image: rays that a pinhole sends far out may bend
-        # back into it.
-        bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
-        inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
-        ids, local = ids[inside], local[inside]
         pixels = project(camera, local)
         size = np.array([camera.width, camera.height])
         inside = ((pixels > -margin) & (pixels < size + margin)).all(1)
         return ids[inside], pixels[inside]
+
+    def pairs(self, frames: Sequence[int] | None = None) -> tuple[Ids, Ids]:
+        """Place of the frame and landmark (n,) of each observation, of some frames or all."""
+        chosen = range(len(self.frames)) if frames is None else frames
+        rows = [self.frames[i].landmarks for i in chosen]
+        places = np.repeat(np.array(chosen, np.int64), [len(r) for r in rows])
+        landmarks = np.concatenate([np.zeros(0, np.int64), *rows])
+        seen = landmarks >= 0
+        return places[seen], landmarks[seen]
 
     def observations(self, frames: Sequence[int] | None = None) -> Observations:
         """All observations of some frames (places in the list), or of all keyframes."""
@@ -269,11 +284,8 @@ class Structure:
 
     def counts(self, keyframes_only: bool = True) -> Ids:
         """(l,) how many frames see each id."""
-        out = np.zeros(len(self.positions), np.int64)
-        for frame in self.frames:
-            if frame.keyframe or not keyframes_only:
-                np.add.at(out, frame.seen, 1)
-        return out
+        _, landmarks = self.pairs(self.keyframes() if keyframes_only else None)
+        return np.bincount(landmarks, minlength=len(self.positions))
 
     def set_camera(self, camera_id: int, camera: Camera) -> None:
         """Change a camera's parameters; rays of its frames follow."""

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.mapping.memory import Memory
-from protomark.mapping.nearby import near_pairs
 from protomark.mapping.pose import absolute_pose, refine_pose, reprojection_error
 from protomark.mapping.structure import Array, Ids, Structure
 from protomark.mapping.thresholds import accepted, thresholds
+from protomark.tracks.geometry import group
+from protomark.tracks.nearby import near_pairs
 
 # Radii in which landmarks are looked for, as shares of the image's longer side: around where a
 # predicted pose puts them, and around where a pose found by RANSAC does.
@@ -167,20 +168,21 @@ class Tracker:
         if not len(rows):
             return Matches(rows, rows)
         distance = self.memory.distances(query.encoded, rows, ids[near])
-        # First of each keypoint, and the next one that is at another place.
-        order = np.lexsort((ids[near], distance, rows))
-        rows, near, distance = rows[order], near[order], distance[order]
-        starts = np.flatnonzero(np.diff(rows, prepend=-1))
-        run = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows))))
-        best = near[starts]
-        other = ((places[near] - places[best][run]) ** 2).sum(1) > _SAME_PLACE**2
-        second = np.full(len(starts), np.inf)
-        np.minimum.at(second, run[other], distance[other])
-        first = distance[starts]
+        # Of each keypoint the nearest (of equals the lowest id: a run of pairs ascends in it), and
+        # the nearest of those at another place.
+        starts, lengths = group(rows)
+        run = np.repeat(np.arange(len(starts)), lengths)
+        first = np.minimum.reduceat(distance, starts)
+        nearest = np.flatnonzero(distance == first[run])
+        best = near[nearest[group(run[nearest])[0]]]
+        x, y = places.T
+        off = (x[near] - x[best][run]) ** 2 + (y[near] - y[best][run]) ** 2
+        other = np.where(off > _SAME_PLACE**2, distance.astype(np.float64), np.inf)
+        second = np.minimum.reduceat(other, starts)
         with np.errstate(invalid="ignore"):
             fits = first < self.bounds.guided_ratio * second
         fits &= first < self.bounds.max_distance * self._typical_distance(query, ids)
-        rows, best, first = rows[starts][fits], best[fits], first[fits]
+        rows, best, first = rows[starts[fits]], best[fits], first[fits]
         order = np.lexsort((rows, first))
         return _one_each(rows[order], ids[best[order]])
 

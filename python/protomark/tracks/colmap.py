@@ -16,6 +16,7 @@ import re
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -242,6 +243,7 @@ def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
+@lru_cache(maxsize=64)
 def focal_length(camera: Camera) -> float:
     """Mean focal length in pixels."""
     return float(_camera(camera).mean_focal_length())

@@ -10,10 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.tracks.nearby import near_pairs
+
 # Two keypoints closer than this (pixels) are one place in the image, found twice: at two pyramid
 # levels, or at two corners of one edge. Both would become landmarks that look alike and lie within
 # the error of each other, so that no one could say which of them a query should find.
 MIN_DISTANCE = 4.0
+
+_AKAZE = (1e-3, 1e-4)  # thresholds: strict, then for images with little contrast
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,8 @@ class Extractor:
         extra: Any = cv2.xfeatures2d
         # Strict first, then a lower threshold for images with little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
+        self._at_once: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
+        self._rich = False
         brisk = getattr(extra, "BRISK_create", None) or cv2.BRISK_create  # type: ignore[attr-defined]
         akaze = getattr(extra, "AKAZE_create", None) or cv2.AKAZE_create  # type: ignore[attr-defined]
         orb = [
@@ -149,7 +155,8 @@ class Extractor:
         if self.kind.name in ("freak", "brisk"):
             self._detect = [brisk(thresh=t, octaves=3).detect for t in (30, 18, 10)]
         elif self.kind.name == "akaze":
-            self._detect = [akaze(threshold=t).detect for t in (1e-3, 1e-4)]
+            self._detect = [akaze(threshold=t).detect for t in _AKAZE]
+            self._at_once = akaze(threshold=_AKAZE[-1]).detectAndCompute
         else:
             self._detect = [o.detect for o in orb]
         self._compute = {
@@ -164,13 +171,8 @@ class Extractor:
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """Features of a (height, width) uint8 image, in a fixed order: strongest first."""
-        for detect in self._detect:
-            found = detect(image)
-            chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
-            if len(chosen) >= self.max_keypoints:
-                break
         # Descriptors drop keypoints near the border (FREAK without a word): take what comes back.
-        described, descriptors = self._compute(image, [found[i] for i in chosen])
+        described, descriptors = self._describe(image)
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
@@ -198,6 +200,41 @@ class Extractor:
             octaves[order],
             descriptors[order],
         )
+
+    def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
+        """Keypoints, few enough and spread, and their descriptors."""
+        if self._at_once is not None:
+            return self._describe_at_once(image, self._at_once)
+        for detect in self._detect:
+            found, enough = self._few(detect(image), image)
+            if enough:
+                break
+        return self._compute(image, found)
+
+    def _describe_at_once(
+        self, image: NDArray[np.uint8], at_once: Callable[[Any, None], tuple[Sequence[Any], Any]]
+    ) -> tuple[Sequence[Any], Any]:
+        """The same of AKAZE, whose scale space is most of the work.
+
+        Where the last threshold is needed it is built once, not for each threshold and for the
+        descriptors, too. Whether it will be, the image before tells, mostly.
+        """
+        strict = _AKAZE[0]
+        if not self._rich:
+            every, descriptors = at_once(image, None)
+            _, self._rich = self._few([k for k in every if k.response > strict], image)
+        if self._rich:
+            found, self._rich = self._few(self._detect[0](image), image)
+            if self._rich:
+                return self._compute(image, found)
+            every, descriptors = at_once(image, None)
+        chosen = _spread(every, image.shape[1], image.shape[0], self.max_keypoints)
+        return [every[i] for i in chosen], descriptors[chosen] if chosen else None
+
+    def _few(self, found: Sequence[Any], image: NDArray[np.uint8]) -> tuple[list[Any], bool]:
+        """The keypoints to keep, and whether they are as many as there may be."""
+        chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
+        return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:
@@ -227,18 +264,17 @@ def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[i
 
 def _apart(xy: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
     """Indices of the points left when each point removes all later ones closer than `distance`."""
-    taken: dict[tuple[int, int], list[tuple[float, float]]] = {}
-    keep = []
-    limit = distance * distance
-    cells = np.floor(xy / distance).astype(np.int64).tolist()
-    for i, ((x, y), (column, row)) in enumerate(zip(xy.tolist(), cells, strict=True)):
-        near = (
-            point
-            for c in (column - 1, column, column + 1)
-            for r in (row - 1, row, row + 1)
-            for point in taken.get((c, r), ())
-        )
-        if all((x - px) ** 2 + (y - py) ** 2 >= limit for px, py in near):
-            taken.setdefault((column, row), []).append((x, y))
-            keep.append(i)
-    return np.array(keep, np.int64)
+    later, earlier = near_pairs(xy, xy, distance)
+    close = (earlier < later) & (((xy[later] - xy[earlier]) ** 2).sum(1) < distance * distance)
+    later, earlier = later[close], earlier[close]
+    left = np.ones(len(xy), bool)
+    while len(later):
+        # A point that no other one left can remove stays, and what it removes goes.
+        open_ = np.zeros(len(xy), bool)
+        open_[later] = True
+        gone = np.zeros(len(xy), bool)
+        gone[later[~open_[earlier]]] = True
+        left &= ~gone
+        unsure = open_[earlier] & ~gone[earlier] & ~gone[later]
+        later, earlier = later[unsure], earlier[unsure]
+    return np.flatnonzero(left)

@@ -90,9 +90,12 @@ def refine_points(
     # Only landmarks with observations from here on, one run of rows each.
     at = points[present]
     run = np.repeat(np.arange(len(present)), lengths)
+    # Columns that follow each other in memory, for the loop below.
+    rotation = np.ascontiguousarray(poses[:, :, :3])
+    columns = np.ascontiguousarray(rotation.transpose(1, 2, 0))
 
     def cost(at: Array) -> tuple[Array, Array, Array, Array, Array]:
-        local = np.einsum("nij,nj->ni", poses[:, :, :3], at[run]) + poses[:, :, 3]
+        local = np.einsum("nij,nj->ni", rotation, at[run]) + poses[:, :, 3]
         depth = local[:, 2]
         local = local / np.where(depth > 0, depth, 1.0)[:, None]
         difference = (local[:, :2] - seen) * focal[:, None]
@@ -103,11 +106,14 @@ def refine_points(
     best, difference, error, depth, local = cost(at)
     for _ in range(iterations):
         weight = np.minimum(1.0, huber / np.maximum(error, 1e-12)) * (depth > 0)
-        scale = (focal / np.where(depth > 0, depth, 1.0))[:, None]
-        x, y = (scale * (poses[:, k, :3] - local[:, k, None] * poses[:, 2, :3]) for k in (0, 1))
-        products = [x[:, i] * x[:, j] + y[:, i] * y[:, j] for i in range(3) for j in range(i, 3)]
-        products += [x[:, i] * difference[:, 0] + y[:, i] * difference[:, 1] for i in range(3)]
-        sums = np.add.reduceat(np.stack(products, axis=1) * weight[:, None], starts, axis=0)
+        scale = focal / np.where(depth > 0, depth, 1.0)
+        x, y = (
+            [scale * (columns[k, i] - local[:, k] * columns[2, i]) for i in range(3)]
+            for k in (0, 1)
+        )
+        products = [x[i] * x[j] + y[i] * y[j] for i in range(3) for j in range(i, 3)]
+        products += [x[i] * difference[:, 0] + y[i] * difference[:, 1] for i in range(3)]
+        sums = np.stack([np.add.reduceat(p * weight, starts) for p in products], axis=1)
         normal = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         trace = np.trace(normal, axis1=1, axis2=2)
         normal = normal + (1e-6 * trace + 1e-12)[:, None, None] * np.eye(3)

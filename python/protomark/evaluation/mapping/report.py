@@ -47,8 +47,9 @@ def markdown(results: Results) -> str:
         "box around the true cameras. KB: what matching needs of all landmarks at the end (their "
         "positions left out), 1 KB = 1000 bytes. Milliseconds are CPU time, all stages, last "
         "adjustment and second looks included; matching is encoding, searching, and the pose of a "
-        "frame; whole search is a frame's descriptors against the whole map of the end, encoding "
-        "included. Pixels: mean reprojection error. COLMAP's times are of "
+        "frame in the map, the search for the first two frames left out; whole search is a "
+        "frame's descriptors against the whole map of the end, encoding included. Pixels: mean "
+        "reprojection error. COLMAP's times are of "
         "features, matching of image pairs, and mapping; it keeps every descriptor of every image, "
         "128 bytes each.",
         *(_sequence(s) for s in results.sequences),

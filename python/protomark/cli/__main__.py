@@ -1,0 +1,5 @@
+"""`python -m protomark.cli`."""
+
+from protomark.cli import main
+
+main()
