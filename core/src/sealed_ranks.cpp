@@ -1,6 +1,9 @@
 #include "sealed_ranks.h"
 
+#include <algorithm>
 #include <array>
+#include <cmath>
+#include <optional>
 
 #include "large_vector.h"
 #include "prototype_store.h"
@@ -10,10 +13,10 @@ namespace protomark {
 namespace {
 
 // Offers the two nearest landmarks of each query, found in so many rows at a time, to `offer(query,
-// id of the landmark, distance)`.
-template <typename Offer>
+// id of the landmark)`; none further away than farthest() says before each time.
+template <typename Offer, typename Farthest>
 void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes queries,
-                      const Offer& offer) {
+                      const Offer& offer, const Farthest& farthest) {
   constexpr std::size_t kPiece = 1 << 13;
   const PrototypeStore& store = rows.store();
   LargeVector<std::uint8_t> packed(kPiece / kPackedRows * packer.size());
@@ -34,9 +37,11 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
     RowLandmarks numbers;
     numbers.of_row = itself.data();
     const MatrixView<std::int64_t> nearest{ids.data(), queries.rows, 2};
-    const MatrixView<float> far{distances.data(), queries.rows, 2};
+    const MatrixView<float> unused{distances.data(), queries.rows, 2};
+    SearchOptions options;
+    options.max_distance = farthest();
     const auto find = [&](const auto& prototypes) {
-      search(prototypes, queries, {}, nearest, far);
+      search(prototypes, queries, options, nearest, unused);
     };
     if (packer.half_step() == 0) {
       const auto* codes = reinterpret_cast<const std::int8_t*>(packed.data());
@@ -46,7 +51,7 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
                              numbers});
     }
     for (std::size_t i = 0; i < ids.size(); ++i) {
-      if (ids[i] >= 0) offer(i / 2, ids[i], distances[i]);
+      if (ids[i] >= 0) offer(i / 2, ids[i]);
     }
     piece.clear();
     landmarks.clear();
@@ -88,11 +93,17 @@ ProbeRanks sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
     for (std::size_t q = 0; q < queries.rows; ++q) {
       best.emplace_back(ids.row(q), &distances[2 * q], 2, INT32_MAX - 1);
     }
-    search_in_pieces(rows, packer, queries, [&](std::size_t q, std::int64_t id, double distance) {
-      // Floats do not tell all distances apart, but those that are far too large.
-      if (distance * distance > 1.000001 * best[q].limit()) return;
+    // Floats do not tell all distances apart, but those that are too large for any query.
+    const auto offer = [&](std::size_t q, std::int64_t id) {
       best[q].offer_distinct(nearest_row(id, queries.row(q)).distance, id);
-    });
+    };
+    const auto farthest = [&]() -> std::optional<float> {
+      std::int32_t most = 0;
+      for (const TopK& one : best) most = std::max(most, one.limit());
+      if (most >= INT32_MAX - 1) return std::nullopt;
+      return std::sqrt(static_cast<float>(most)) * 1.00001f;
+    };
+    search_in_pieces(rows, packer, queries, offer, farthest);
   };
   const auto cell_of = [&](std::int64_t id, const std::int8_t* query) {
     return rows.cell_of(nearest_row(id, query).row);
