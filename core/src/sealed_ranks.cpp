@@ -13,20 +13,22 @@ namespace protomark {
 namespace {
 
 // Offers the two nearest landmarks of each query, found in so many rows at a time, to `offer(query,
-// id of the landmark)`; none further away than farthest() says before each time.
+// id of the landmark, distance)`; none further away than farthest() says before each time.
 template <typename Offer, typename Farthest>
 void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes queries,
                       const Offer& offer, const Farthest& farthest) {
-  constexpr std::size_t kPiece = 1 << 13;
+  // As much memory as is little beside the map.
+  const std::size_t some =
+      std::max<std::size_t>(1 << 12, rows.size() / 32 / kPackedRows * kPackedRows);
   const PrototypeStore& store = rows.store();
-  LargeVector<std::uint8_t> packed(kPiece / kPackedRows * packer.size());
+  LargeVector<std::uint8_t> packed(some / kPackedRows * packer.size());
   std::vector<std::uint32_t> piece;
   std::vector<std::int64_t> ids(2 * queries.rows), landmarks;
   std::vector<float> distances(ids.size());
-  std::vector<std::uint32_t> itself(kPiece);  // several rows may have the same id
+  std::vector<std::uint32_t> itself(some);  // several rows may have the same id
   std::iota(itself.begin(), itself.end(), 0u);
-  piece.reserve(kPiece);
-  landmarks.reserve(kPiece);
+  piece.reserve(some);
+  landmarks.reserve(some);
   const auto search_piece = [&] {
     const std::size_t n = piece.size();
     if (n == 0) return;
@@ -37,11 +39,11 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
     RowLandmarks numbers;
     numbers.of_row = itself.data();
     const MatrixView<std::int64_t> nearest{ids.data(), queries.rows, 2};
-    const MatrixView<float> unused{distances.data(), queries.rows, 2};
+    const MatrixView<float> far{distances.data(), queries.rows, 2};
     SearchOptions options;
     options.max_distance = farthest();
     const auto find = [&](const auto& prototypes) {
-      search(prototypes, queries, options, nearest, unused);
+      search(prototypes, queries, options, nearest, far);
     };
     if (packer.half_step() == 0) {
       const auto* codes = reinterpret_cast<const std::int8_t*>(packed.data());
@@ -51,7 +53,7 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
                              numbers});
     }
     for (std::size_t i = 0; i < ids.size(); ++i) {
-      if (ids[i] >= 0) offer(i / 2, ids[i]);
+      if (ids[i] >= 0) offer(i / 2, ids[i], distances[i]);
     }
     piece.clear();
     landmarks.clear();
@@ -59,7 +61,7 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
   rows.each_row([&](std::uint32_t row) {
     piece.push_back(row);
     landmarks.push_back(store.ids()[rows.landmark_of(row)]);
-    if (piece.size() == kPiece) search_piece();
+    if (piece.size() == some) search_piece();
   });
   search_piece();
 }
@@ -93,8 +95,9 @@ ProbeRanks sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
     for (std::size_t q = 0; q < queries.rows; ++q) {
       best.emplace_back(ids.row(q), &distances[2 * q], 2, INT32_MAX - 1);
     }
-    // Floats do not tell all distances apart, but those that are too large for any query.
-    const auto offer = [&](std::size_t q, std::int64_t id) {
+    // Floats do not tell all distances apart, but those that are far too large.
+    const auto offer = [&](std::size_t q, std::int64_t id, double distance) {
+      if (distance * distance > 1.00001 * best[q].limit()) return;
       best[q].offer_distinct(nearest_row(id, queries.row(q)).distance, id);
     };
     const auto farthest = [&]() -> std::optional<float> {
