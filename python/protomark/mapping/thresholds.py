@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.mapping.memory import Memory, Prototypes
+from protomark.mapping.memory import Medoids, Memory, Prototypes
 
 # As `protomark localize` accepts.
 _MIN_PROBABILITY = 0.2
@@ -33,11 +33,16 @@ class Thresholds:
 # A Hamming distance is a squared Euclidean one, so its ratios are squares.
 _EUCLIDEAN = Thresholds(ratio=0.85, guided_ratio=0.9, max_distance=0.75)
 _HAMMING = Thresholds(ratio=0.8, guided_ratio=0.85, max_distance=0.6)
+# One descriptor is further from a new view than the nearest of all: with the bounds above, medoids
+# lose `hololens` in its middle.
+_MEDOID = Thresholds(ratio=0.9, guided_ratio=0.92, max_distance=0.75)
 
 
 def thresholds(memory: Memory) -> Thresholds:
     """The bounds that fit a memory's distances."""
-    return _EUCLIDEAN if memory.euclidean else _HAMMING
+    if memory.euclidean:
+        return _EUCLIDEAN
+    return _MEDOID if isinstance(memory, Medoids) else _HAMMING
 
 
 def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64]:
