@@ -215,6 +215,35 @@ def test_an_unknown_camera_is_calibrated_along_the_way(images: Path, tmp_path: P
     assert figures["camera"]["model"] == "SIMPLE_RADIAL"
     # Begun with 1.2 times 320, that is 384.
     assert figures["camera"]["params"][0] == pytest.approx(300, rel=0.1)
+    events = json.loads((tmp_path / "scene/report.json").read_text())["events"]
+    assert "not 384 pixels" in events[0], "what the wrong focal length made is thrown away"
+    assert error_of(tmp_path / "scene", walk(COUNT)) < 0.02
+
+
+@pytest.mark.parametrize("beginning", [1, 2])
+def test_resumed_with_an_unknown_camera(
+    beginning: int, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it is stopped before the map begins again or after."""
+    add = Mapper.add
+    begun = 0
+
+    def stop_after(self: Mapper, picture: Picture) -> object:
+        nonlocal begun
+        begun += picture.index == 0
+        if picture.index == 10 and begun == beginning:
+            os.kill(os.getpid(), signal.SIGINT)
+        return add(self, picture)
+
+    make_map(Request(images, tmp_path / "whole", SETTINGS))
+    monkeypatch.setattr(Mapper, "add", stop_after)
+    with pytest.raises(Interrupted):
+        make_map(Request(images, tmp_path / "scene", SETTINGS))
+    monkeypatch.setattr(Mapper, "add", add)
+    make_map(Request(images, tmp_path / "scene", SETTINGS, resume=True))
+    for name in ("scene.pmk", "trajectory.txt"):
+        whole = (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "scene" / name).read_bytes() == whole
 
 
 def test_black_blurred_and_broken_frames_are_named_and_cost_nothing_else(

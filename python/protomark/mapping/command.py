@@ -94,7 +94,7 @@ def make_map(request: Request) -> dict[str, Any]:
     view = _view(request)
     facts = {"input": source.path.name, "prefix": prefix, "inputs": inputs}
     inputs[str(source.path.resolve())] = prefix
-    stopped = _frames(request, mapper, source, poses, cursor, facts, view)
+    mapper, stopped = _frames(request, mapper, source, poses, cursor, facts, view)
     if not stopped:
         _finish(mapper, source, prefix)
     if not mapper.structure.frames and not stopped:
@@ -222,14 +222,23 @@ def _frames(
     cursor: int,
     facts: dict[str, Any],
     view: View | None,
-) -> bool:
-    """Put frame after frame into the map; whether Ctrl-C stopped it."""
-    pictures = _pictures(source, facts["prefix"], poses, source.pictures(cursor))
+) -> tuple[Mapper, bool]:
+    """Put frame after frame into the map; the map, and whether Ctrl-C stopped it."""
     saved = time.monotonic()
     started, first = time.monotonic(), cursor
     with progress_bar() as bar, _stop_on_interrupt() as stop:
         task = bar.add_task("map", total=len(source), completed=cursor)
-        for picture in pictures:
+        pictures = _pictures(source, facts["prefix"], poses, source.pictures(cursor))
+        while True:
+            picture = next(pictures, None)
+            if mapper.misjudged(ended=picture is None):
+                # What was made with the guess is bent: from the first frame on with what it told.
+                mapper, cursor, first, started = mapper.begin_again(), 0, 0, time.monotonic()
+                progress_console.print(mapper.history.events[-1], highlight=False, soft_wrap=True)
+                pictures = _pictures(source, facts["prefix"], poses, source.pictures())
+                continue
+            if picture is None:
+                break
             if picture.name not in mapper.history.entries:
                 mapper.add(picture)
             cursor = picture.index + 1
@@ -247,9 +256,10 @@ def _frames(
                 save_checkpoint(mapper, request.output, {**facts, "cursor": cursor})
                 saved = time.monotonic()
             if stop:
-                return True
+                return mapper, True
+    mapper.guess = 0.0
     save_checkpoint(mapper, request.output, {**facts, "cursor": cursor})
-    return False
+    return mapper, False
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Array, Frame, Structure
 from protomark.mapping.tracking import Matches, Tracked, Tracker
 from protomark.mapping.triangulation import remember, triangulate
-from protomark.tracks.colmap import rays
+from protomark.tracks.colmap import focal_length, rays
 from protomark.tracks.features import Extractor
 from protomark.tracks.file import Camera
 
@@ -40,6 +40,11 @@ _YOUNG_LOSSES = 3
 # A pose under which less of what is in view is seen is held against one from the whole map.
 _DOUBTFUL = 0.3
 _LOOP_EVERY = 3
+# A guessed focal length that the map finds to be off by more than this made a bad beginning. So
+# many keyframes tell, or all there are: from the first ones of `hololens` it comes out at 530 to
+# 790 pixels and is 495.
+_GUESS_OFF = 0.05
+_CALIBRATED = 196
 _LOOP_SCALE = 8.0
 
 
@@ -84,6 +89,9 @@ class Mapper:
         self.next_global = _FIRST_GLOBAL
         self.lost_in_row = 0
         self.looking_again = False
+        # Focal length that the map began with, 0 where that is settled; whether it has begun again.
+        self.guess = focal_length(camera) if settings.calibrate else 0.0
+        self.begun_again = False
         self._extractor = Extractor(settings.descriptor, settings.max_keypoints)
         self._start_over()
 
@@ -110,6 +118,32 @@ class Mapper:
 
     def _pixels(self, share: float) -> float:
         return self.structure.tolerance(self.camera_id, share)
+
+    # The camera.
+
+    def misjudged(self, ended: bool = False) -> bool:
+        """Whether the camera is so unlike the guess that the map should begin again with it.
+
+        Args:
+            ended: no frame is left, so what keyframes there are must tell.
+        """
+        if not self.guess or self.begun_again:
+            return False
+        keyframes = len(self.structure.keyframes())
+        if keyframes < (_FIRST_GLOBAL if ended else _CALIBRATED):
+            return False
+        if ended:
+            self._adjust_all(2)
+        return abs(focal_length(self.camera) / self.guess - 1) > _GUESS_OFF
+
+    def begin_again(self) -> Mapper:
+        """An empty map with the camera as it was found."""
+        new = Mapper(self.settings, self.camera, self.threads)
+        new.begun_again = True
+        new.history.events.append(
+            f"the map begins again: focal length {new.guess:.0f}, not {self.guess:.0f} pixels"
+        )
+        return new
 
     # One frame.
 
@@ -343,11 +377,13 @@ class Mapper:
     def _adjust_all(self, rounds: int) -> None:
         """Global bundle adjustment, with the camera if it is being calibrated, and culling."""
         structure, s = self.structure, self.settings
+        # What all frames told is not given up for what the first ones say.
+        held = self.begun_again and self.guess and len(structure.keyframes()) < _CALIBRATED
         with self.clock.stage("adjust"):
             for _ in range(rounds):
                 adjustment.adjust_global(
                     structure,
-                    intrinsics=s.calibrate,
+                    intrinsics=s.calibrate and not held,
                     poses=not s.fixed_poses,
                     threads=self.threads,
                 )

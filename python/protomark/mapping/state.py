@@ -27,7 +27,7 @@ from protomark.tracks.colmap import rays
 from protomark.tracks.file import Camera
 
 STATE, CHECKPOINT = "state.safetensors", "checkpoint"
-_FORMAT, _VERSION = "protomark-mapping", "2"
+_FORMAT, _VERSION = "protomark-mapping", "3"
 
 
 def save_checkpoint(mapper: Mapper, scene: Path, facts: dict[str, Any]) -> None:
@@ -82,6 +82,8 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         "best_parallax": mapper.initialiser.best_parallax,
         "next_global": mapper.next_global,
         "lost_in_row": mapper.lost_in_row,
+        "guess": mapper.guess,
+        "begun_again": mapper.begun_again,
         "history": mapper.history.as_dict(),
         "facts": facts,
     }
@@ -226,4 +228,5 @@ def _restore(mapper: Mapper, arrays: dict[str, NDArray[Any]], told: dict[str, An
         raise ValueError("its landmarks are not those of its map")
     mapper.initialiser.best_parallax = told["best_parallax"]
     mapper.next_global, mapper.lost_in_row = told["next_global"], told["lost_in_row"]
+    mapper.guess, mapper.begun_again = float(told["guess"]), bool(told["begun_again"])
     mapper.history = History.from_dict(told["history"])
