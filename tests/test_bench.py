@@ -340,15 +340,14 @@ def test_sizes_of_maps_may_be_chosen(tmp_path: Path) -> None:
     common = {"sections": (), "threads": 1, "build_threads": 1, "full": False, "quick": False}
     chosen = choose(**common, scratch=tmp_path, landmarks=(500, 20, 500))  # type: ignore[arg-type]
     assert chosen.exact == chosen.approximate == chosen.growth == (20, 500)
-    assert chosen.graphs == 500
+    assert chosen.graphs_to == 500
     assert chosen.large == 0
-    assert choose(**common, scratch=tmp_path, graphs="none").graphs == 0  # type: ignore[arg-type]
-    one = choose(**common, scratch=tmp_path, landmarks=(10**9,), graphs="one")  # type: ignore[arg-type]
-    assert 0 < one.graphs < 10**9
     common["sections"] = ("large",)
     assert choose(**common, scratch=tmp_path, landmarks=(20, 500)).large == 500  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="--landmarks 0"):
         choose(**common, scratch=tmp_path, landmarks=(0,))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="--graphs tree"):
+        choose(**common, scratch=tmp_path, graphs=("hnswlib", "tree"))  # type: ignore[arg-type]
 
 
 def test_runs_are_joined_only_where_machine_and_data_are_the_same() -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from protomark.bench.race import Pace
 
-Graphs = Literal["all", "one", "none"]
+GRAPHS = ("faiss", "hnswlib", "usearch-int8", "usearch-float32")
 
 SECTIONS = (
     "encode",
@@ -39,12 +38,13 @@ class Settings:
         exact: landmarks of exact searches.
         approximate: landmarks of approximate searches.
         hashed: most landmarks whose bits go into FLANN's LSH.
-        graphs: most grown landmarks for which every graph is built, memory allowing; beyond it only
-            one, with 0 none, and none of real ones.
+        graphs: which of `GRAPHS` are raced, memory allowing.
+        graphs_to: most grown landmarks for which all these are; beyond it only hnswlib's.
         map: landmarks of the map of the sections frame and add.
         growth: landmarks of the maps along the curve.
         large: landmarks of the largest map, 0 for none.
         scratch: folder for maps that are sealed and thrown away.
+        indexes: folder where peers' indexes that took long to build are kept, None for nowhere.
     """
 
     sections: tuple[str, ...] = SECTIONS
@@ -58,11 +58,13 @@ class Settings:
     exact: tuple[int, ...] = (10_000, 100_000, 1_000_000)
     approximate: tuple[int, ...] = (100_000, 1_000_000)
     hashed: int = 100_000
-    graphs: int = 100_000
+    graphs: tuple[str, ...] = GRAPHS
+    graphs_to: int = 100_000
     map: int = 1_000_000
     growth: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000)
     large: int = 0
     scratch: Path = Path()
+    indexes: Path | None = None
 
 
 def choose(
@@ -74,19 +76,22 @@ def choose(
     quick: bool,
     scratch: Path,
     landmarks: tuple[int, ...] = (),
-    graphs: Graphs = "all",
+    graphs: tuple[str, ...] = GRAPHS,
+    indexes: Path | None = None,
 ) -> Settings:
     """The settings of `--full`, of `--quick` (a few seconds, for tests), or of neither.
 
-    `landmarks` are sizes of the maps that are searched, in place of these settings' own, with all
-    graphs, only the one that is built at any size, or none.
+    `landmarks` are sizes of the maps that are searched, in place of these settings' own, beside
+    all of `graphs` at any size.
 
     Raises:
-        ValueError: a section is unknown, both are asked for, or a map has no landmark.
+        ValueError: a section or a graph is unknown, both are asked for, or a map has no landmark.
     """
     chosen = _of_scale(sections, threads, build_threads, full, quick, scratch)
-    if graphs == "none":
-        chosen = replace(chosen, graphs=0)
+    strange = [name for name in graphs if name not in GRAPHS]
+    if strange:
+        raise ValueError(f"--graphs {strange[0]}: no such graph ({', '.join(GRAPHS)}; all, none)")
+    chosen = replace(chosen, graphs=graphs, indexes=indexes)
     if any(n < 1 for n in landmarks):
         raise ValueError(f"--landmarks {min(landmarks)}: a map needs at least 1")
     if not landmarks:
@@ -98,7 +103,7 @@ def choose(
         exact=sizes,
         approximate=sizes,
         growth=sizes,
-        graphs=sizes[-1] if graphs == "all" else chosen.graphs,
+        graphs_to=sizes[-1],
         large=large,
     )
 
@@ -140,7 +145,7 @@ def _of_scale(
             default,
             approximate=(100_000, 1_000_000, 10_000_000),
             hashed=1_000_000,
-            graphs=1_000_000,
+            graphs_to=1_000_000,
             growth=(*default.growth, 3_000_000, 10_000_000),
             large=100_000_000,
         )

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from protomark.cli.options import numbers
+from protomark.cli.options import names, numbers
 
 
 def bench(
@@ -44,12 +44,19 @@ def bench(
         ),
     ] = "",
     graphs: Annotated[
-        Literal["all", "one", "none"],
+        str,
         typer.Option(
-            help="Which graphs are raced on maps of --landmarks, where they build for hours: all, "
-            "one (hnswlib), or none."
+            help="Which graphs are raced, as they take long to build: all, none, or some of faiss, "
+            "hnswlib, usearch-int8 and usearch-float32. Without --landmarks, only hnswlib's is "
+            "built for large maps."
         ),
     ] = "all",
+    indexes: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder where graphs are kept, and found by later runs on the same data."
+        ),
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
     scratch: Annotated[
         Path | None,
@@ -69,20 +76,21 @@ def bench(
     import tempfile
 
     from protomark.bench import command
-    from protomark.bench.settings import choose
+    from protomark.bench.settings import GRAPHS, choose
     from protomark.evaluation.command import check_outputs
     from protomark.evaluation.threads import available_threads
 
     check_outputs(json_file)
     settings = choose(
-        sections=tuple(name.strip() for name in only.split(",") if name.strip()),
+        sections=names(only),
         threads=threads,
         build_threads=available_threads(),
         full=full,
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
         landmarks=numbers("--landmarks", landmarks),
-        graphs=graphs,
+        graphs=GRAPHS if graphs == "all" else () if graphs == "none" else names(graphs),
+        indexes=indexes,
     )
     flags = [f"--only {only}"] if only else []
     flags += [f"--landmarks {landmarks}"] if landmarks else []

@@ -15,6 +15,11 @@ def numbers(option: str, text: str) -> tuple[int, ...]:
         raise ValueError(f"{option} {text}: not numbers with commas between them") from None
 
 
+def names(text: str) -> tuple[str, ...]:
+    """The names of a list such as toy,kitchen."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 def write_json(path: Path | None, facts: dict[str, Any]) -> None:
     """Write the facts of a command to the file of `--json`, if one was named."""
     if path is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import sqrt
+from pathlib import Path
 from typing import Any
 
 import faiss
@@ -10,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.bench.peers.index import Index, K, Search, doubling
+from protomark.bench.peers.shelf import Shelf
 
 _TRAINED_ON = 64  # rows a cell
+_MANY = 65_536
 _WHOLE = faiss.ScalarQuantizer.QT_8bit_direct_signed  # int8 as it is: nothing is lost
-_EF = 200  # as hnswlib's own; FAISS's is 40
+_M, _EF = 16, 200  # as hnswlib's own; FAISS's are 32 and 40
 
 
 def flat(rows: NDArray[np.int8], queries: NDArray[np.int8]) -> Search:
@@ -31,12 +34,22 @@ def binary_flat(rows: NDArray[np.uint8], queries: NDArray[np.uint8]) -> Search:
 
 
 def hnsw(
-    rows: NDArray[np.int8], queries: NDArray[np.int8], threads: int, build_threads: int
+    rows: NDArray[np.int8],
+    queries: NDArray[np.int8],
+    threads: int,
+    build_threads: int,
+    *,
+    shelf: Shelf,
 ) -> Index:
     """Graph over float32 rows."""
-    index = faiss.IndexHNSWFlat(rows.shape[1], 16)
-    index.hnsw.efConstruction = _EF
-    _add(index, rows, build_threads, threads)
+
+    def build() -> Any:
+        index = faiss.IndexHNSWFlat(rows.shape[1], _M)
+        index.hnsw.efConstruction = _EF
+        _add(index, rows, build_threads, threads)
+        return index
+
+    index, seconds = shelf.built(f"HNSW {_M}, {_EF}", "faiss-cpu", rows, build, _write, _read)
     asked = queries.astype(np.float32)
 
     def prepare(ef: int) -> Search:
@@ -44,7 +57,12 @@ def hnsw(
         return _search(index, asked)
 
     return Index(
-        prepare, [doubling(8, 2048)], _bytes(index), "efSearch", f"M = 16, efConstruction = {_EF}"
+        prepare,
+        [doubling(8, 2048)],
+        _bytes(index),
+        "efSearch",
+        f"M = {_M}, efConstruction = {_EF}",
+        seconds=seconds,
     )
 
 
@@ -97,6 +115,47 @@ def product_quantizer(
     return Index(prepare, lines, _bytes(base) + _bytes(refine), "probes and factor", note)
 
 
+def many_cells(
+    rows: NDArray[np.int8],
+    queries: NDArray[np.int8],
+    threads: int,
+    build_threads: int,
+    *,
+    shelf: Shelf,
+) -> Index:
+    """65,536 lists, found by a graph, as FAISS's guide has it from a million rows on.
+
+    Their centroids come from as many rows as FAISS takes without a warning, found by a graph
+    there, too: a k-means that compares all with all takes an hour on two cores.
+    """
+    dim = rows.shape[1]
+
+    def build() -> Any:
+        coarse = faiss.IndexHNSWFlat(dim, 32)
+        base = faiss.IndexIVFPQFastScan(coarse, dim, _MANY, dim, 4)
+        base.quantizer_trains_alone = 2  # clusters first, then adds the centroids to the graph
+        finder = faiss.IndexHNSWFlat(dim, 32)  # FAISS does not keep it alive
+        base.clustering_index = finder
+        index = faiss.IndexRefine(base, faiss.IndexScalarQuantizer(dim, _WHOLE, faiss.METRIC_L2))
+        _add(index, rows, build_threads, threads, 39 * _MANY)
+        base.clustering_index = None
+        return index
+
+    index, seconds = shelf.built(f"IVF {_MANY} HNSW 32", "faiss-cpu", rows, build, _write, _read)
+    base = faiss.downcast_index(index.base_index)
+    coarse = faiss.downcast_index(base.quantizer)
+    asked = queries.astype(np.float32)
+
+    def prepare(setting: tuple[int, int]) -> Search:
+        base.nprobe, index.k_factor = setting
+        coarse.hnsw.efSearch = base.nprobe
+        return _search(index, asked)
+
+    lines = [[(probes, factor) for probes in doubling(8, 2048)] for factor in (256, 64, 16, 4)]
+    note = f"{_MANY:,} cells, found by a graph; PQ{dim}x4fs, refined by whole rows"
+    return Index(prepare, lines, _bytes(index), "probes and factor", note, seconds=seconds)
+
+
 def _search(index: Any, queries: NDArray[Any]) -> Search:
     def run(n: int) -> NDArray[np.int64]:
         found: NDArray[np.int64] = index.search(queries[:n], K)[1][:, 0]
@@ -105,16 +164,30 @@ def _search(index: Any, queries: NDArray[Any]) -> Search:
     return run
 
 
-def _add(index: Any, rows: NDArray[np.int8], build_threads: int, threads: int) -> None:
+def _add(
+    index: Any,
+    rows: NDArray[np.int8],
+    build_threads: int,
+    threads: int,
+    trained_on: int | None = None,
+) -> None:
     faiss.omp_set_num_threads(build_threads)
     try:
         if not index.is_trained:
-            step = max(len(rows) // (_TRAINED_ON * _cells(len(rows))), 1)
+            step = max(len(rows) // (trained_on or _TRAINED_ON * _cells(len(rows))), 1)
             index.train(rows[::step].astype(np.float32))
         for begin in range(0, len(rows), 1 << 20):
             index.add(rows[begin : begin + (1 << 20)].astype(np.float32))
     finally:
         faiss.omp_set_num_threads(threads)
+
+
+def _write(index: Any, path: Path) -> None:
+    faiss.write_index(index, str(path))
+
+
+def _read(path: Path) -> Any:
+    return faiss.read_index(str(path))
 
 
 def _cells(n: int) -> int:

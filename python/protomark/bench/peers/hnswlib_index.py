@@ -2,21 +2,52 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import hnswlib
 import numpy as np
 from numpy.typing import NDArray
 
 from protomark.bench.peers.index import Index, K, Search, doubling
+from protomark.bench.peers.shelf import Shelf
+
+_M, _EF = 16, 200  # its defaults
 
 
 def hnsw(
-    rows: NDArray[np.int8], queries: NDArray[np.int8], threads: int, build_threads: int
+    rows: NDArray[np.int8],
+    queries: NDArray[np.int8],
+    threads: int,
+    build_threads: int,
+    *,
+    shelf: Shelf,
 ) -> Index:
-    """M = 16, efConstruction = 200, both its defaults."""
-    index = hnswlib.Index(space="l2", dim=rows.shape[1])
-    index.init_index(max_elements=len(rows), M=16, ef_construction=200, random_seed=0)
-    for begin in range(0, len(rows), 1 << 20):
-        index.add_items(rows[begin : begin + (1 << 20)].astype(np.float32), None, build_threads)
+    """The graph, kept on the shelf."""
+    n, dim = rows.shape
+
+    def build() -> hnswlib.Index:
+        index = hnswlib.Index(space="l2", dim=dim)
+        index.init_index(max_elements=n, M=_M, ef_construction=_EF, random_seed=0)
+        for begin in range(0, n, 1 << 20):
+            index.add_items(rows[begin : begin + (1 << 20)].astype(np.float32), None, build_threads)
+        return index
+
+    def write(index: hnswlib.Index, path: Path) -> None:
+        index.save_index(str(path))
+
+    def read(path: Path) -> hnswlib.Index:
+        index = hnswlib.Index(space="l2", dim=dim)
+        index.load_index(str(path))
+        return index
+
+    index, seconds = shelf.built(
+        f"{_M}, {_EF}",
+        "hnswlib",
+        rows,
+        build,
+        lambda index, path: index.save_index(str(path)),
+        read,
+    )
     asked = queries.astype(np.float32)
 
     def prepare(ef: int) -> Search:
@@ -33,5 +64,6 @@ def hnsw(
         [doubling(8, 2048)],
         index.index_file_size(),
         "efSearch",
-        "M = 16, efConstruction = 200",
+        f"M = {_M}, efConstruction = {_EF}",
+        seconds=seconds,
     )

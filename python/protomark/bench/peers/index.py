@@ -24,6 +24,7 @@ class Index:
         lines: settings, as `tuning.tune` takes them.
         bytes: of the whole index, as it would be stored.
         more: bytes a landmark beyond what an exact search needs, where that is known.
+        seconds: that it took to build, if not as long as the call that gave it.
         setting: what the settings are called.
         note: how it was built.
     """
@@ -34,6 +35,7 @@ class Index:
     setting: str
     note: str = ""
     more: float | None = None
+    seconds: float | None = None
 
 
 class Builder(Protocol):

@@ -17,6 +17,7 @@ from protomark.bench.grown import map_of, prototypes_of
 from protomark.bench.machine import lacks
 from protomark.bench.peers import installed
 from protomark.bench.peers.index import Builder, Index, Search
+from protomark.bench.peers.shelf import Shelf
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race, turns
 from protomark.bench.results import Contest, Results
@@ -24,8 +25,8 @@ from protomark.bench.tuning import Trial, tune
 from protomark.bench.workload import Workload
 
 GOALS = (0.95, 0.98, 0.99)
-# Of a landmark, about: all indexes together but graphs; a graph while it is built.
-BYTES, GRAPH_BYTES = 1_000, 500
+BYTES = 1_000  # of a landmark, about: all indexes together but graphs
+_FEW = 1_000_000  # landmarks for which FAISS's guide has few cells
 QUERIES = 200  # that recall is measured on, unless they take over `_PATIENCE` times a trial's time
 _PATIENCE = 4
 
@@ -190,7 +191,7 @@ def _entrants(
 ) -> list[_Entrant]:
     settings = workload.settings
     threads, build_threads = settings.threads, settings.build_threads
-    rows, codes, n = ground.rows, ground.codes, len(ground.rows)
+    rows, codes, (n, dim) = ground.rows, ground.codes, ground.rows.shape
     exact, _ = ground.scene.search_codes(codes, k=1, threads=build_threads)
     near = partial(_as_near, rows, codes, _squared(rows, codes, exact[:, 0]))
     found: list[_Entrant] = []
@@ -200,38 +201,40 @@ def _entrants(
         entrant.memory = memory
         found.append(entrant)
 
-    def enter_graph(name: str, build: Builder) -> None:
-        if settings.graphs == 0:
-            results.skipped.append(f"{name}, {ground.title}: --graphs none")
-        elif ground.section == "real" or n <= settings.graphs:
-            enter(name, build, GRAPH_BYTES)
+    shelf = Shelf(settings.indexes)
+
+    def enter_graph(graph: str, name: str, build: Callable[..., Index], memory: int) -> None:
+        everywhere = ground.section == "real" or n <= settings.graphs_to or graph == "hnswlib"
+        if graph in settings.graphs and everywhere:
+            enter(name, partial(build, shelf=shelf), memory)
         else:
-            results.skipped.append(
-                f"{name}, {ground.title}: builds long; `--landmarks {n}` races it"
-            )
+            how = f"--graphs {graph} --landmarks {n}"
+            results.skipped.append(f"{name}, {ground.title}: builds long; `{how}` races it")
 
     build = partial(ours.cells, workload, rows, codes, threads, build_threads)
     found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
     if installed("faiss"):
         from protomark.bench.peers import faiss_indexes
 
-        enter_graph("FAISS HNSW", faiss_indexes.hnsw)
+        enter_graph("faiss", "FAISS HNSW", faiss_indexes.hnsw, 300)
         for parts in (settings.dim // 2, settings.dim):
             quantizer = partial(faiss_indexes.product_quantizer, parts=parts)
             enter(f"FAISS IVF, PQ{parts} fast scan", quantizer)
         enter("FAISS IVF, SQ8", faiss_indexes.scalar_quantizer)
+        if n > _FEW:
+            name = f"FAISS IVF, PQ{settings.dim} fast scan, cells by HNSW"
+            enter(name, partial(faiss_indexes.many_cells, shelf=shelf))
     if installed("hnswlib"):
         from protomark.bench.peers import hnswlib_index
 
-        if settings.graphs == 0:
-            results.skipped.append(f"hnswlib, {ground.title}: --graphs none")
-        else:
-            enter("hnswlib", hnswlib_index.hnsw, GRAPH_BYTES)
+        enter_graph("hnswlib", "hnswlib", hnswlib_index.hnsw, 300)
     if installed("usearch"):
         from protomark.bench.peers import usearch_index
 
-        enter_graph("USearch int8", usearch_index.hnsw_i8)
-        enter_graph("USearch float32", usearch_index.hnsw_f32)
+        # Beside the graph, the rows as float32 while it is built.
+        for dtype, label, memory in (("i8", "int8", 200), ("f32", "float32", 300 + 4 * dim)):
+            graph = partial(usearch_index.hnsw, dtype=dtype)
+            enter_graph(f"usearch-{label}", f"USearch {label}", graph, memory)
     if installed("cv2"):
         from protomark.bench.peers import opencv_matchers
 
@@ -268,7 +271,7 @@ def _tuned(
     """Build it, and find its setting for each goal."""
     began = time.perf_counter()
     index = entrant.build()
-    built = time.perf_counter() - began
+    built = time.perf_counter() - began if index.seconds is None else index.seconds
     trials = tune(
         index.lines,
         lambda setting: _trial(index.prepare(setting), entrant, queries, seconds),
