@@ -109,11 +109,17 @@ constexpr Case kCases[] = {
     {64, Ids::sparse, 0, true},
 };
 
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+constexpr std::size_t kLandmarks = 20'000;  // each step takes many times as long
+#else
+constexpr std::size_t kLandmarks = 200'000;
+#endif
+
 }  // namespace
 
 // test_saving_memory [landmarks]
 int main(int argc, char** argv) {
-  const std::size_t landmarks = argc > 1 ? std::strtoull(argv[1], nullptr, 10) : 200'000;
+  const std::size_t landmarks = argc > 1 ? std::strtoull(argv[1], nullptr, 10) : kLandmarks;
   for (const Case& c : kCases) {
     const std::size_t before = held;
     PrototypeMap map = map_of(c.dim, landmarks, c.ids, c.look_bits);
