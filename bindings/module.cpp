@@ -844,15 +844,23 @@ void bind_sealed_map(nb::module_& m) {
   });
 }
 
+// A path need not be UTF-8; its other bytes come back as Python keeps them.
+void raise(PyObject* type, const std::exception& error) {
+  const auto text = nb::steal(PyUnicode_DecodeFSDefault(error.what()));
+  if (text.is_valid()) PyErr_SetObject(type, text.ptr());
+}
+
 void bind_errors() {
   nb::register_exception_translator([](const std::exception_ptr& p, void*) {
     try {
       std::rethrow_exception(p);
     } catch (const FileError& error) {
       const nb::object type = nb::module_::import_("protomark.errors").attr("FileError");
-      PyErr_SetString(type.ptr(), error.what());
+      raise(type.ptr(), error);
     } catch (const UnknownLandmark& error) {
-      PyErr_SetString(PyExc_KeyError, error.what());
+      raise(PyExc_KeyError, error);
+    } catch (const std::invalid_argument& error) {
+      raise(PyExc_ValueError, error);
     }
   });
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -182,6 +183,18 @@ def test_errors_are_one_sentence(tracks: Tracks, model: Path, tmp_path: Path) ->
         assert message in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
         assert not output.exists()
+
+
+def test_errors_show_no_control_characters(tmp_path: Path) -> None:
+    for name, shown in (
+        (b"\x1b]0;title\x07.pmk", r"\x1b]0;title\x07"),
+        (b"\xff.pmk", r"\udcff.pmk"),
+    ):
+        result = protomark("info", tmp_path / os.fsdecode(name))
+        assert result.returncode == 1
+        assert result.stderr.startswith("error: ")
+        assert shown in result.stderr
+        assert result.stderr.rstrip("\n").isprintable()
 
 
 def test_split_and_join(encoder: pm.Encoder, tmp_path: Path) -> None:

@@ -41,6 +41,17 @@ def test_a_new_file_is_as_readable_as_any(tmp_path: Path) -> None:
     assert modes == [0o640, 0o600]
 
 
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    for mode in (0o600, 0o664, 0o400):
+        path.write_text("old", encoding="utf-8")
+        path.chmod(mode)
+        write_text(path, "new")
+        assert path.stat().st_mode & 0o777 == mode
+        assert path.read_text(encoding="utf-8") == "new"
+        path.unlink()
+
+
 def test_file_and_folder_are_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced = []
     monkeypatch.setattr(os, "fsync", lambda handle: synced.append(os.fstat(handle).st_ino))

@@ -10,6 +10,7 @@ import pytest
 
 import protomark as pm
 from conftest import random_descriptors, rounded
+from map_container import OPEN_MAP, container, sections
 
 
 @pytest.fixture
@@ -205,3 +206,45 @@ def test_a_failed_save_leaves_the_old_file(scene: pm.PrototypeMap, tmp_path: Pat
         signal.signal(signal.SIGXFSZ, handler)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["scene.pmk"]
+
+
+def test_paths_that_are_not_utf8(scene: pm.PrototypeMap, tmp_path: Path) -> None:
+    path = os.path.join(tmp_path, os.fsdecode(b"\xff.pmk"))
+    nowhere = os.path.join(path, "a.pmk")
+    for failing in (
+        partial(pm.open, path),
+        partial(pm.open, path, journal=True),
+        partial(pm.Encoder.load, path),
+        partial(pm.file_sections, path),
+        partial(scene.save, nowhere),
+        partial(scene.seal, nowhere),
+    ):
+        with pytest.raises(OSError, match="No such file") as error:
+            failing()
+        assert path in str(error.value)
+    try:
+        scene.save(path)
+    except pm.FileError:
+        pytest.skip("the file system takes no such name")
+    assert len(pm.open(path)) == len(scene)
+    with pytest.raises(ValueError, match="not of other") as mismatch:
+        pm.open(path, descriptor="other")
+    assert path in str(mismatch.value)
+
+
+@pytest.mark.parametrize("name", [b"\xff\xfe", b"\x1b[2J", b"a\nb"])
+def test_names_of_sections_are_printable_ascii(
+    scene: pm.PrototypeMap, tmp_path: Path, name: bytes
+) -> None:
+    path = tmp_path / "scene.pmk"
+    scene.save(path)
+    parts = sections(path.read_bytes())
+    data = container([*parts, ("12345678", b"")], version=1, kind=OPEN_MAP)
+    data = data.replace(b"12345678", name.ljust(8, b"\0"))
+    end = 64 + 32 * (len(parts) + 1)
+    crc = zlib.crc32(data[:28] + bytes(4) + data[32:end])
+    path.write_bytes(data[:28] + crc.to_bytes(4, "little") + data[32:])
+    for read in (pm.open, pm.file_sections, pm.verify_file):
+        with pytest.raises(pm.FileError, match="a name is not printable ASCII") as error:
+            read(path)
+        assert str(error.value).isprintable()

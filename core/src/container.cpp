@@ -22,6 +22,7 @@ namespace {
 
 static_assert(std::endian::native == std::endian::little,
               "the file format is little-endian; a big-endian machine needs byte swaps here");
+static_assert(sizeof(std::size_t) == 8, "sizes of maps and their products need 64 bits");
 
 constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
 constexpr std::uint32_t kNewestVersion = 4;
@@ -242,6 +243,10 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
     }
     end = entry.offset + entry.size;
     const std::string section(entry.name, ::strnlen(entry.name, sizeof(entry.name)));
+    // Names go into errors and lists, where others could say anything to a terminal.
+    if (!std::ranges::all_of(section, [](char c) { return c >= ' ' && c <= '~'; })) {
+      fail("its section table is broken: a name is not printable ASCII");
+    }
     if (find(section) != nullptr) fail("it has two sections '" + section + "'");
     sections_.push_back({section, entry.offset, entry.size, entry.crc});
   }

@@ -1,6 +1,7 @@
 #include "disk.h"
 
 #include <fcntl.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <cerrno>
@@ -36,17 +37,27 @@ bool sync_folder(const std::filesystem::path& path) {
   return synced;
 }
 
+std::optional<mode_t> permissions(const std::filesystem::path& path) {
+  struct stat status;
+  if (::stat(path.c_str(), &status) != 0) return std::nullopt;
+  return status.st_mode & 0777;
+}
+
 TemporaryFile::TemporaryFile(const std::filesystem::path& target) : target_(target) {
   // Not mkstemp, whose files only their owner may read: a map is as readable as any file.
+  const auto mode = permissions(target);
   std::random_device random;
   do {
     path_ = target.string() + "." + std::to_string(random());
-    descriptor_ = ::open(path_.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    descriptor_ =
+        ::open(path_.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode.value_or(0666));
   } while (descriptor_ < 0 && errno == EEXIST);
   if (descriptor_ < 0) {
     path_.clear();
     fail();
   }
+  // What the umask took away; where that fails, fewer may read the file, never more.
+  if (mode) ::fchmod(descriptor_, *mode);
 }
 
 TemporaryFile::~TemporaryFile() {

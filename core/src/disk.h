@@ -1,8 +1,11 @@
 // Writing so that it lasts, and that files are there whole or not at all.
 #pragma once
 
+#include <sys/types.h>
+
 #include <cstddef>
 #include <filesystem>
+#include <optional>
 #include <span>
 #include <string>
 
@@ -20,8 +23,11 @@ bool write_all(int descriptor, Bytes bytes);
 // errno set, where that fails, and not where the file system cannot or the folder is not readable.
 bool sync_folder(const std::filesystem::path& path);
 
-// A file being written beside its target; removed unless it takes the target's place. All throw
-// FileError.
+// Who may read and write a file, as chmod takes it; none where there is no such file.
+std::optional<mode_t> permissions(const std::filesystem::path& path);
+
+// A file being written beside its target, with the target's permissions where there is one; removed
+// unless it takes the target's place. All throw FileError.
 class TemporaryFile {
  public:
   explicit TemporaryFile(const std::filesystem::path& target);

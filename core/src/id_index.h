@@ -4,23 +4,35 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <random>
 #include <vector>
 
 #include "large_vector.h"
 
 namespace protomark {
 
-// Open addressing with linear probing, at most two thirds full, no tombstones.
+// Of this process: ids come from files, and nobody can choose them so that all want one slot.
+inline std::uint64_t hash_seed() {
+  static const std::uint64_t seed = [] {
+    std::random_device random;
+    return std::uint64_t{random()} << 32 | random();
+  }();
+  return seed;
+}
+
+// Open addressing with linear probing, at most two thirds full, no tombstones. Which slot a row is
+// in differs from process to process; nothing that is given out may depend on it.
 class IdIndex {
  public:
   static constexpr std::uint32_t kNone = UINT32_MAX;
 
   // The row of `id`, or kNone. `ids` is the array that rows point into.
   std::uint32_t find(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
-    if (slots_.empty()) return kNone;
-    for (std::size_t s = home(id);; s = next(s)) {
-      if (slots_[s] == kNone || ids[slots_[s]] == id) return slots_[s];
-    }
+    return slots_.empty() ? kNone : slots_[slot_of(ids, id)];
+  }
+  // Slots that `find` looks at.
+  std::size_t probes(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
+    return slots_.empty() ? 0 : ((slot_of(ids, id) - home(id)) & mask()) + 1;
   }
 
   // Ask for the memory that `find` will read: first its slot, and when that has come, the id there.
@@ -85,17 +97,18 @@ class IdIndex {
   std::size_t mask() const { return slots_.size() - 1; }
   std::size_t next(std::size_t s) const { return (s + 1) & mask(); }
 
-  // The finaliser of SplitMix64 (Steele et al. 2014): neighbouring ids end far apart.
+  // SplitMix64 (Steele et al. 2014): neighbouring ids end far apart.
   std::size_t home(std::int64_t id) const {
-    auto x = static_cast<std::uint64_t>(id) + 0x9e3779b97f4a7c15u;
+    auto x = static_cast<std::uint64_t>(id) + seed_;
     x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
     x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
     return static_cast<std::size_t>(x ^ (x >> 31)) & mask();
   }
 
+  // Of the id, or the free one where the search for it ends.
   std::size_t slot_of(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
     std::size_t s = home(id);
-    while (ids[slots_[s]] != id) s = next(s);
+    while (slots_[s] != kNone && ids[slots_[s]] != id) s = next(s);
     return s;
   }
 
@@ -107,6 +120,7 @@ class IdIndex {
 
   LargeVector<std::uint32_t> slots_;
   std::size_t used_ = 0;
+  std::uint64_t seed_ = hash_seed();
 };
 
 }  // namespace protomark

@@ -10,6 +10,7 @@
 #include <cerrno>
 #include <cstring>
 #include <fstream>
+#include <new>
 #include <optional>
 #include <sstream>
 #include <utility>
@@ -53,20 +54,58 @@ std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& n
   }
 }
 
+// What the container that bytes begin with says of its size; none without a right header.
+std::optional<std::uint64_t> stated_size(Bytes bytes) {
+  if (!begins_container(bytes) || !has_container_head(bytes)) return std::nullopt;
+  std::uint64_t size;
+  std::memcpy(&size, bytes.data() + 16, sizeof(size));
+  return size;
+}
+
 // Throws FileError where bytes begin with a container that is whole and yet not one to be read: it
 // is not a power cut that made it so.
 void check_known(Bytes bytes, const std::string& name) {
-  if (!begins_container(bytes) || !has_container_head(bytes)) return;
-  std::uint64_t size;
-  std::memcpy(&size, bytes.data() + 16, sizeof(size));
-  if (size <= bytes.size()) ContainerReader(bytes.first(size), name);
+  const auto size = stated_size(bytes);
+  if (size && *size <= bytes.size()) ContainerReader(bytes.first(*size), name);
 }
 
-// Where the first container begins that has a right header, or the size of the bytes. Of what a
-// commit that was interrupted leaves, only its beginning is one.
-std::size_t find_container(Bytes bytes, std::size_t from) {
-  for (std::size_t at = from; at < bytes.size(); at += kAlignment) {
-    if (begins_container(bytes.subspan(at)) && has_container_head(bytes.subspan(at))) return at;
+bool is_record(const ContainerReader& file) {
+  return file.kind() == FileKind::commit || file.kind() == FileKind::fold;
+}
+
+Chain read_chain(const ContainerReader& record) {
+  SectionReader in(record, section::kChain);
+  const auto chain = in.value<Chain>();
+  in.finish();
+  return chain;
+}
+
+// The number of the record that bytes begin with; 0 where they do not.
+std::uint64_t record_number(Bytes bytes) {
+  const auto size = stated_size(bytes);
+  if (!size || *size > bytes.size()) return 0;
+  try {
+    const ContainerReader file(bytes.first(*size), "");
+    const auto chain = file.map_if_there(section::kChain);
+    // The size first: many that overlap would take long to be checked.
+    if (!is_record(file) || !chain || chain->size() != sizeof(Chain)) return 0;
+    return read_chain(file).record;
+  } catch (const FileError&) {
+    return 0;
+  }
+}
+
+// Where something begins that was written after the record at `broken`, which is not whole, or the
+// size of the bytes. Within that record anything may stand, such as a text that is a container. So
+// the search begins behind it; where its header does not say where that is, only a record with a
+// number above those of the ones before counts.
+std::size_t find_later(Bytes bytes, std::size_t broken, std::uint64_t records) {
+  const auto size = stated_size(bytes.subspan(broken));
+  if (size && *size > bytes.size() - broken) return bytes.size();
+  const std::uint64_t own = size ? (*size + kAlignment - 1) / kAlignment * kAlignment : kAlignment;
+  for (std::size_t at = broken + own; at < bytes.size(); at += kAlignment) {
+    const Bytes rest = bytes.subspan(at);
+    if (size ? stated_size(rest).has_value() : record_number(rest) > records) return at;
   }
   return bytes.size();
 }
@@ -77,6 +116,12 @@ bool is_unfinished_head(Bytes bytes) {
   const Bytes magic = bytes.first(std::min(bytes.size(), kMagicSize));
   return std::memcmp(magic.data(), kMagic, magic.size()) == 0 ||
          std::all_of(bytes.begin(), bytes.end(), [](std::byte b) { return b == std::byte{0}; });
+}
+
+// Throws FileError with what is wrong with the header of a journal.
+[[noreturn]] void refuse_head(Bytes bytes, const std::string& name) {
+  ContainerReader(bytes.first(std::min(bytes.size(), kHeadSize)), name).verify();
+  throw FileError(name + ": not a journal");
 }
 
 std::string read_identity(const ContainerReader& file) {
@@ -96,26 +141,38 @@ std::uint32_t checksum_of(Bytes container) {
   return result;
 }
 
+// A journal, of which whoever writes it may cut something off meanwhile. What is none is not read.
 // A named pipe would keep whoever opens it waiting, unless it is opened with O_NONBLOCK.
 std::vector<std::byte> read_all(int descriptor, const std::filesystem::path& path) {
-  const auto fail = [&]() {
-    throw FileError(path.string() + ": cannot be read: " + system_error());
+  const auto fail = [&](const std::string& why) {
+    throw FileError(path.string() + ": cannot be read: " + why);
   };
   struct stat status;
-  if (::fstat(descriptor, &status) != 0) fail();
+  if (::fstat(descriptor, &status) != 0) fail(system_error());
   if (!S_ISREG(status.st_mode)) throw FileError(path.string() + ": not a file");
-  std::vector<std::byte> result(static_cast<std::size_t>(status.st_size));
-  std::size_t size = 0;
-  // A writer may cut the file meanwhile.
-  while (size < result.size()) {
-    const ssize_t n =
-        ::pread(descriptor, result.data() + size, result.size() - size, static_cast<off_t>(size));
-    if (n < 0 && errno == EINTR) continue;
-    if (n < 0) fail();
-    if (n == 0) break;
-    size += static_cast<std::size_t>(n);
+  const auto size = static_cast<std::size_t>(status.st_size);
+  const auto read = [&](std::span<std::byte> to) {
+    std::size_t done = 0;
+    while (done < to.size()) {
+      const ssize_t n =
+          ::pread(descriptor, to.data() + done, to.size() - done, static_cast<off_t>(done));
+      if (n < 0 && errno == EINTR) continue;
+      if (n < 0) fail(system_error());
+      if (n == 0) break;
+      done += static_cast<std::size_t>(n);
+    }
+    return to.first(done);
+  };
+  std::array<std::byte, kMaxHead> space;
+  const Bytes head = read(std::span(space).first(std::min(size, space.size())));
+  if (head.size() > kHeadSize && !stated_size(head)) refuse_head(head, path.string());
+  std::vector<std::byte> result;
+  try {
+    result.resize(size);
+  } catch (const std::bad_alloc&) {
+    fail("its " + std::to_string(size) + " bytes do not fit into memory");
   }
-  result.resize(size);
+  result.resize(read(result).size());
   return result;
 }
 
@@ -207,9 +264,7 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
       check_known(bytes, name_);
       return;
     }
-    // Says what is wrong with it.
-    ContainerReader(bytes.first(std::min(bytes.size(), kHeadSize)), name_).verify();
-    throw FileError(name_ + ": not a journal");
+    refuse_head(bytes, name_);
   }
   head->expect(FileKind::journal);
   bases_.push_back({read_identity(*head), 0});
@@ -220,19 +275,15 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
     const auto record = whole_container(bytes.subspan(end_), where);
     if (!record) {
       check_known(bytes.subspan(end_), where);
-      const std::size_t next = find_container(bytes, end_ + kAlignment);
+      const std::size_t next = find_later(bytes, end_, records_);
       if (next == size_) return;
       throw FileError(where + " is broken, and there are others behind it, at byte " +
                       std::to_string(next) +
                       ": it was not a power cut that did this; to go on with the commits up to " +
                       "here, cut the journal there (truncate --size=" + std::to_string(end_) + ")");
     }
-    if (record->kind() != FileKind::commit && record->kind() != FileKind::fold) {
-      record->fail(std::string("it is ") + describe(record->kind()));
-    }
-    SectionReader in(*record, section::kChain);
-    const auto chain = in.value<Chain>();
-    in.finish();
+    if (!is_record(*record)) record->fail(std::string("it is ") + describe(record->kind()));
+    const Chain chain = read_chain(*record);
     if (chain.record != records_ + 1 || chain.previous != checksum_) {
       record->fail("it does not follow the one before it");
     }
@@ -270,10 +321,13 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   map_ = std::filesystem::canonical(map, error);
   if (error) throw FileError(map.string() + ": cannot be read: " + error.message());
   path_ = map_.string() + ".journal";
+  // Whoever may not read the map may not read what is committed to it.
+  const mode_t mode = permissions(map_).value_or(0) | S_IRUSR | S_IWUSR;
   for (;;) {
-    descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, mode);
     made_ = descriptor_ >= 0;
-    if (!made_) descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0666);
+    if (made_) ::fchmod(descriptor_, mode);  // the umask may be another one
+    if (!made_) descriptor_ = ::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, mode);
     if (descriptor_ < 0) fail("cannot be written: " + system_error());
     if (::flock(descriptor_, LOCK_EX | LOCK_NB) != 0) {
       const bool taken = errno == EWOULDBLOCK;

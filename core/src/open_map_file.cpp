@@ -30,14 +30,11 @@ void PrototypeMap::write(const std::filesystem::path& path,
 }
 
 void PrototypeMap::save(const std::filesystem::path& path) const {
-  {
+  std::error_code error;
+  // Another name of the same file (a hard link) is another file to write.
+  if (std::filesystem::canonical(path, error) == store_->journaled && !error) {
     const std::scoped_lock own(store_->journal_mutex);
-    std::error_code error;
-    // Another name of the same file (a hard link) is another file to write.
-    if (store_->journal && std::filesystem::canonical(path, error) == store_->journal->map()) {
-      fold();
-      return;
-    }
+    if (store_->journal) return fold();
   }
   const JournalGuard guard(path);
   std::optional<JournalGuard> last;  // somebody may have begun a journal meanwhile
@@ -84,6 +81,7 @@ PrototypeMap PrototypeMap::load_with_journal(const std::filesystem::path& path) 
     PrototypeMap map = read(file, commits);
     journal->resume(commits, file.identity());
     map.store_->track_changes();
+    map.store_->journaled = journal->map();
     map.store_->journal = std::move(journal);
     return map;
   } catch (...) {

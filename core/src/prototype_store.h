@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <filesystem>
 #include <functional>
 #include <memory>
 #include <mutex>
@@ -240,6 +241,9 @@ struct PrototypeMap::Store : PrototypeStore {
   // Of the journal; before the other two.
   std::mutex journal_mutex;
   std::unique_ptr<Journal> journal;  // nullptr: there is none
+  // The map file whose journal this is or was; empty where it never had one. Needs no lock, as it
+  // never changes once others have the map.
+  std::filesystem::path journaled;
 
  private:
   void alone(const std::function<void()>& swap);

@@ -8,6 +8,7 @@
 #include <string>
 #include <unordered_map>
 
+#include "id_set.h"
 #include "map_sections.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
@@ -195,11 +196,11 @@ void PrototypeMap::remove_codes(std::span<const std::int64_t> landmarks, Codes c
 void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std::int64_t> source) {
   check_pairs(into.size(), source.size(), "sources");
   const std::unique_lock changing(store_->changing);
-  std::unordered_map<std::int64_t, bool> gone;
+  IdSet gone;
   for (std::size_t i = 0; i < into.size(); ++i) {
     for (const std::int64_t id : {into[i], source[i]}) {
       store_->at(id);
-      if (gone[id]) {
+      if (gone.contains(id)) {
         throw std::invalid_argument("landmark " + std::to_string(id) +
                                     " was merged into another earlier in the same call");
       }
@@ -208,7 +209,7 @@ void PrototypeMap::merge(std::span<const std::int64_t> into, std::span<const std
       throw std::invalid_argument("landmark " + std::to_string(into[i]) +
                                   " cannot be merged into itself");
     }
-    gone[source[i]] = true;
+    gone.insert(source[i]);
   }
   store_->in_pieces(into.size(), [&](std::size_t begin, std::size_t end) {
     for (std::size_t i = begin; i < end; ++i) {

@@ -5,13 +5,16 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdarg>
+#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
 #include <functional>
 #include <iterator>
+#include <new>
 #include <optional>
 
 #include "check.h"
@@ -41,6 +44,14 @@ extern "C" int open(const char* file, int flags, ...) {
   if (const auto hook = before_open) hook(file);
   return static_cast<int>(syscall(SYS_openat, AT_FDCWD, file, flags, mode));
 }
+
+// A machine without memory for what no test needs.
+void* operator new(std::size_t size) {
+  void* memory = size > std::size_t{1} << 30 ? nullptr : std::malloc(size);
+  return memory != nullptr ? memory : throw std::bad_alloc();
+}
+void operator delete(void* memory) noexcept { std::free(memory); }
+void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
 
 namespace {
 
@@ -317,6 +328,76 @@ void refused() {
   fails(joined({head, record(0), impossible}), "has an impossible prototype");
 }
 
+// Whatever stands within a commit that was interrupted, it is not what stands behind it.
+void containers_within_a_torn_record() {
+  const Commits c(0);
+  const auto all = std::span<const char>(c.whole);
+  const auto commit = [](std::uint64_t number, const Content& text) {
+    SectionWriter chain;
+    chain.value(number);
+    chain.value(std::uint64_t{0});
+    ContainerWriter file(FileKind::commit);
+    file.add("chain", chain.take());
+    file.add("metadata", std::as_bytes(std::span(text)));
+    const auto bytes = file.serialize();
+    const auto* data = reinterpret_cast<const char*>(bytes.data());
+    return Content(data, data + bytes.size());
+  };
+  const Content earlier(c.whole.begin(), c.whole.begin() + static_cast<long>(c.lengths[1]));
+  const Content later = commit(5, {});
+  for (const Content& text : {earlier, later}) {
+    const Content record = commit(4, text);
+    for (std::size_t size = 0; size < record.size(); size += 16) {
+      CHECK(c.opened(joined({all, std::span(record).first(size)})) == c.states[3]);
+    }
+    Content broken = record;
+    broken[128] = 0;  // the chain
+    CHECK(c.opened(joined({all, broken})) == c.states[3]);
+    CHECK(check::throws<FileError>(
+        [&] { c.opened(joined({all, broken, later})); },
+        "there are others behind it, at byte " + std::to_string(all.size() + record.size())));
+  }
+  // Where its header did not reach the disk, no record of before stands behind it.
+  Content broken = commit(4, earlier);
+  std::fill_n(broken.begin(), 64, 0);
+  CHECK(c.opened(joined({all, broken})) == c.states[3]);
+  CHECK(check::throws<FileError>([&] { c.opened(joined({all, broken, later})); },
+                                 "at byte " + std::to_string(all.size() + broken.size())));
+}
+
+// Files that are large because nothing was ever written to most of them.
+void holes() {
+  begin(0);
+  PrototypeMap::load(path, true).close();
+  const Content head = read(journal);
+  const PrototypeMap other(test::random_encoder());
+  const auto refused = [&](const Content& content, const std::string& why) {
+    write(journal, content);
+    fs::resize_file(journal, std::uintmax_t{8} << 30);
+    CHECK(check::throws<FileError>([] { PrototypeMap::load(path); }, why));
+    CHECK(check::throws<FileError>([] { PrototypeMap::load(path, true); }, why));
+    CHECK(check::throws<FileError>([&] { other.save(path); }, why));
+  };
+  refused({}, "map.pmk.journal: not a Protomark file");
+  refused(Content(head.begin(), head.begin() + 64), "map.pmk.journal: ");
+  refused(head, "map.pmk.journal: cannot be read: its 8589934592 bytes do not fit into memory");
+  fs::remove(journal);
+}
+
+// Who may not read the map may not read its journal, nor the map once it is compacted.
+void permissions_of_the_map() {
+  for (const auto mode : {fs::perms(0600), fs::perms(0664)}) {
+    begin(0);
+    fs::permissions(path, mode);
+    PrototypeMap map = PrototypeMap::load(path, true);
+    add(map, 1);
+    map.commit();
+    CHECK(fs::status(journal).permissions() == mode);
+    map.compact();
+    CHECK(fs::status(path).permissions() == mode && fs::status(journal).permissions() == mode);
+  }
+}
+
 void other_map_files() {
   const Commits c(0);
   PrototypeMap other(test::random_encoder());
@@ -566,6 +647,9 @@ int main() {
     torn_tails(look_bits);
   }
   refused();
+  containers_within_a_torn_record();
+  holes();
+  permissions_of_the_map();
   other_map_files();
   one_writer();
   compacted_twice_meanwhile();

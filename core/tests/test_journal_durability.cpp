@@ -1,9 +1,11 @@
 // What a commit and a compaction do to the disk: the order of steps, each step that fails, and each
 // moment at which a process is killed or the power goes.
 #include <cerrno>
+#include <chrono>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
+#include <future>
 #include <iterator>
 #include <map>
 #include <optional>
@@ -336,6 +338,22 @@ void failing_steps(Action action, long quiet) {
   std::printf("%ld steps that fail\n", steps - 1);
 }
 
+// A map is saved to another file while it is being compacted, which may take long.
+void saved_while_compacting() {
+  Session session;
+  std::future<void> saved;
+  disk = {};
+  disk.before_step = [&] {
+    disk.before_step = {};
+    saved = std::async(std::launch::async, [&] { session.map->save(folder / "other.pmk"); });
+    CHECK(saved.wait_for(std::chrono::seconds(30)) == std::future_status::ready);
+  };
+  session.map->compact();
+  saved.get();
+  CHECK(read(folder / "other.pmk") == session.changed && read(path) == session.changed);
+  disk = {};
+}
+
 void order_of_steps() {
   using Calls = std::vector<std::string>;
   Session session;
@@ -372,6 +390,7 @@ int main() {
   power_cuts_after_a_failure();
   power_cuts_at_opening();
   journal_begun_while_saving();
+  saved_while_compacting();
   fs::remove_all(folder);
   return check::result();
 }

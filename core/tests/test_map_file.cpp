@@ -7,6 +7,7 @@
 #include <fstream>
 
 #include "check.h"
+#include "container.h"
 #include "protomark/error.h"
 #include "random.h"
 
@@ -98,6 +99,14 @@ int main() {
 
   test_four_bits(map, queries, folder / "map.4.pmk");
   CHECK(SealedMap(folder / "map.4.pmk").positions(std::span(ids).first(1))[0] == here);
+
+  for (const std::string name : {"\xff\xfe", "\x1b[2J", "a\tb", "caf\xc3\xa9"}) {
+    ContainerWriter named(FileKind::open_map);
+    named.add(name, Bytes());
+    named.write(folder / "named.pmk");
+    CHECK(check::throws<FileError>([&] { file_sections(folder / "named.pmk"); },
+                                   "named.pmk: its section table is broken: a name is not"));
+  }
 
   std::ofstream(folder / "text.pmk") << "no map";
   CHECK(check::throws<FileError>([&] { map_kind(folder / "text.pmk"); }, "not a Protomark file"));

@@ -22,6 +22,13 @@ console = Console()
 progress_console = Console(stderr=True)
 
 
+def printable(text: str) -> str:
+    """The text without anything that would control a terminal, or that no terminal can show."""
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
+
+
 def progress_bar(transient: bool = True) -> Progress:
     """A progress bar with counts, elapsed and remaining time, on stderr."""
     return Progress(

@@ -6,7 +6,7 @@ import errno
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,14 +17,20 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     On an error, Ctrl-C included, what was there before stays and nothing is left behind. When the
     block has ended, the new file outlasts a power cut. A process that is killed may leave
-    `.<name>.<random>` behind, which nobody reads.
+    `.<name>.<random>` behind, which nobody reads. A file that was there keeps its permission bits.
     """
     target = Path(path).absolute()
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     # Not tempfile, whose files only their owner may read.
-    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    mode = _permissions(target)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    handle = os.open(temporary, flags, 0o666 if mode is None else mode)
     try:
         with os.fdopen(handle, "wb") as file:
+            if mode is not None:
+                # What the umask took away; where that fails, fewer may read the file, never more.
+                with suppress(OSError):
+                    os.fchmod(handle, mode)
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -33,6 +39,14 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         os.unlink(temporary)
         raise
     _sync_folder(target.parent)
+
+
+def _permissions(path: Path) -> int | None:
+    """Who may read and write a file; None where there is none."""
+    try:
+        return path.stat().st_mode & 0o777
+    except OSError:
+        return None
 
 
 def _sync_folder(folder: Path) -> None:

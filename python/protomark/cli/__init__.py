@@ -73,12 +73,12 @@ def main() -> None:
     """Run the command; an expected error becomes one sentence on stderr and exit code 1."""
     from rich.markup import escape
 
-    from protomark.console import progress_console
+    from protomark.console import printable, progress_console
 
     try:
         app()
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        message = f"[bold red]error:[/] {escape(str(text))}"
+        message = f"[bold red]error:[/] {escape(printable(str(text)))}"
         progress_console.print(message, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
