@@ -219,7 +219,7 @@ def test_paths_that_are_not_utf8(scene: pm.PrototypeMap, tmp_path: Path) -> None
         partial(scene.save, nowhere),
         partial(scene.seal, nowhere),
     ):
-        with pytest.raises(OSError, match="No such file|neither a model") as error:
+        with pytest.raises(OSError, match=r"No such file|neither a model") as error:
             failing()
         assert path in str(error.value)
     try:
