@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <stdexcept>
 
 #include "arrays.h"
 #include "protomark/encoder.h"
