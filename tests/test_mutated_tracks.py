@@ -12,36 +12,14 @@ import numpy as np
 import pytest
 
 from mutation import FILES, SEED, bounded, mutated
-from protomark.tracks import Camera, Tracks
+from protomark.tracks import Tracks
 from protomark.tracks.database import _features, _read
+from small_tracks import small_tracks
 
 _JUNK: list[Any] = [
     *(None, True, -1, 0, 0.5, 10**30, 2**63, float("inf"), float("nan"), "", "text", "\ud800"),
     *([], {}, [[]], [1, "a", None], {"model": 3}, {"1": {}}, {"x": 1}, "[" * 30_000, "9" * 5000),
 ]
-
-
-def tracks() -> Tracks:
-    rng = np.random.default_rng(0)
-    n, landmarks = 40, 10
-    return Tracks(
-        descriptor="orb",
-        cameras={1: Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))},
-        keyframe_names=["a.png", "b.png"],
-        keyframe_camera=np.ones(2, np.int32),
-        cam_from_world=np.tile(np.eye(3, 4), (2, 1, 1)),
-        offsets=np.array([0, 20, n]),
-        keypoints=rng.uniform(0, 480, (n, 2)).astype(np.float32),
-        sizes=np.ones(n, np.float32),
-        angles=np.zeros(n, np.float32),
-        responses=np.ones(n, np.float32),
-        octaves=np.zeros(n, np.int32),
-        descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
-        landmark_of_keypoint=rng.integers(-1, landmarks, n),
-        landmark_ids=np.arange(landmarks),
-        landmark_positions=rng.normal(size=(landmarks, 3)),
-        info={"sequence": "test", "settings": {"descriptor": "orb"}},
-    )
 
 
 def mutated_json(value: Any, rng: np.random.Generator) -> Any:
@@ -88,7 +66,7 @@ def test_broken_tracks_files_are_refused_or_read(tmp_path: Path) -> None:
     print(f"PROTOMARK_SEED={SEED}")
     rng = np.random.default_rng(SEED)
     path = tmp_path / "a.orb.safetensors"
-    tracks().save(path)
+    small_tracks().save(path)
     whole = path.read_bytes()
     Tracks.load(path)
     refused = 0
