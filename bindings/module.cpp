@@ -249,7 +249,10 @@ Returns:
     Euclidean in code units, infinite where there is none.
 
 Raises:
-    ValueError: recall or probes is given where the map has no index (PrototypeMap.build_index).)")
+    TypeError: descriptors are not (q, bits / 8) uint8.
+    ValueError: descriptors are of another size than the encoder's; k, threads or probes is below 1;
+        max_distance is negative; ratio or recall is out of its range; recall and probes are both
+        given, or one of them where the map has no index (PrototypeMap.build_index).)")
       .def("search_codes", &search_codes<Map>, "codes"_a, "k"_a = 2, "max_distance"_a = nb::none(),
            "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
            "probes"_a = nb::none(),
@@ -257,7 +260,8 @@ Raises:
                    "max_distance: float | None = None, ratio: float | None = None, "
                    "threads: int = 1, recall: float | None = None, probes: int | None = None) -> "
                    "tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
-           "Like search, for descriptors that are encoded already: (q, dim) int8.");
+           "Like search, for descriptors that are encoded already: (q, dim) int8. ValueError where "
+           "they have another length.");
 }
 
 Layer to_layer(nb::dict d) {
@@ -376,7 +380,12 @@ Args:
     threads: threads to use.
 
 Returns:
-    (n, dim) int8, -127 to 127.)")
+    (n, dim) int8, -127 to 127.
+
+Raises:
+    TypeError: descriptors are not (n, bits / 8) uint8.
+    ValueError: they are of another size than the encoder's, dim is none of `dims`, or threads is
+        below 1.)")
       .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor.")
       .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
       .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")
@@ -544,7 +553,12 @@ Args:
     descriptors: (n, bits / 8) uint8.
     threads: threads to encode on.
 
-A landmark with 255 observations has its sum and count halved before one more is added.)")
+A landmark with 255 observations has its sum and count halved before one more is added.
+
+Raises:
+    TypeError: descriptors are not (n, bits / 8) uint8, or ids not integers.
+    ValueError: descriptors are of another size than the encoder's, there are not as many ids, an id
+        is negative, or threads is below 1. The map stays as it was.)")
       .def("remove", change(&PrototypeMap::remove), "landmark_ids"_a, "descriptors"_a,
            "threads"_a = 1,
            nb::sig("def remove(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
@@ -697,12 +711,13 @@ Raises:
     ValueError: cells is none of these, or the map is empty.)")
       .def("drop_index", &PrototypeMap::drop_index, ReleaseGil(),
            nb::sig("def drop_index(self) -> None"), "Forget the cells.")
-      .def("probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1, ReleaseGil(),
-           nb::sig("def probes(self, recall: float, threads: int = 1) -> int"),
-           "Number of cells that are searched for a recall in (0, 1], as measured on the map: the "
-           "nearest landmark to a landmark's prototype, itself left out, is in one of them that "
-           "often. Measured once, and again when a tenth of the map has changed. Raises ValueError "
-           "for another recall, and without an index.")
+      .def(
+          "probes", &PrototypeMap::probes, "recall"_a, "threads"_a = 1, ReleaseGil(),
+          nb::sig("def probes(self, recall: float, threads: int = 1) -> int"),
+          "Number of cells that are searched for a recall in (0, 1], as measured on the map: "
+          "prototypes are searched for among those of other landmarks, and codes as far from them "
+          "as observations are among all (docs/index.md). Measured once, and again when a tenth of "
+          "the map has changed. Raises ValueError for another recall, and without an index.")
       .def(
           "save", &PrototypeMap::save, "path"_a, ReleaseGil(),
           nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
@@ -886,7 +901,12 @@ Args:
 
 Returns:
     Rows of database, or landmark ids, (q, k) int64, nearest first, ties to the smaller, -1 where
-    there is none; and distances (q, k) int32, bits + 1 where there is none.)");
+    there is none; and distances (q, k) int32, bits + 1 where there is none.
+
+Raises:
+    TypeError: queries or database are not (rows, bits / 8) uint8.
+    ValueError: queries and database are of different sizes, landmarks does not have an id for each
+        row, k or threads is below 1, or max_distance is negative.)");
   m.def("instruction_set", &instruction_set,
         "The instruction set in use, for example avx512; the environment variable PROTOMARK_ISA "
         "chooses another one. All give the same bytes.");

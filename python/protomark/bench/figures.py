@@ -93,10 +93,7 @@ def draw_growth(results: Results) -> Figure | None:
     n = results.large.get("landmarks")
     for bits in (8, 4):
         if n and f"{bits} bits: file bytes" in results.large:
-            note = f"sealed, {bits} bits"
-            seconds = results.large[f"{bits} bits: 1,000 queries, seconds"]
-            times.plot(n, seconds, "D", color=_COLOURS["approximate"])
-            times.annotate(note, (n, seconds), fontsize=7, ha="right")
+            note = f"sealed file, {bits} bits"
             size = results.large[f"{bits} bits: file bytes"] / 2**20
             memory.plot(n, size, "D", color=_COLOURS["approximate"])
             memory.annotate(note, (n, size), fontsize=7, ha="right")

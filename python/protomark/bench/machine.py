@@ -7,6 +7,7 @@ import gc
 import platform
 import shutil
 import sys
+from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -25,6 +26,7 @@ def describe() -> dict[str, str]:
         "system": f"{platform.system()} {platform.machine()}",
         "Python": platform.python_version(),
         "protomark": pm.__version__,
+        "measured on": datetime.now(timezone.utc).date().isoformat(),
     }
     memory = memory_bytes("MemTotal")
     if memory is not None:

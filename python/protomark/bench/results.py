@@ -64,6 +64,7 @@ class Contest:
         recall: least recall@1 of every contender, None where all are exact.
         work: multiply-adds, and bytes read, of one unit of ours, where a ceiling applies to them.
         timings: the contenders, ours first.
+        share: our part of the ceiling, of the machine as it was in that run; see `Results.share`.
     """
 
     section: str
@@ -74,6 +75,7 @@ class Contest:
     recall: float | None = None
     work: dict[str, float] = field(default_factory=dict)
     timings: list[Timing] = field(default_factory=list)
+    share: float | None = None
 
     @property
     def ours(self) -> Timing | None:
@@ -119,7 +121,7 @@ class Results:
     command: str = "protomark bench"
 
     def extend(self, later: Results) -> None:
-        """Take what another run on this machine measured, where it is no share of a ceiling.
+        """Take what another run on this machine measured.
 
         Raises:
             ValueError: it was another machine, or data of another kind.
@@ -132,7 +134,6 @@ class Results:
         known = {(c.section, c.title, c.threads, c.recall) for c in self.contests}
         for contest in later.contests:
             if (contest.section, contest.title, contest.threads, contest.recall) not in known:
-                contest.work = {}
                 self.contests.append(contest)
         curve = {(p["landmarks"], p["method"]): p for p in later.growth + self.growth}
         self.growth = sorted(curve.values(), key=lambda p: (p["landmarks"], p["method"] != "exact"))
@@ -153,8 +154,8 @@ class Results:
         Of multiply-adds: of the vector ceiling of all threads. Of bytes: of what one thread reads.
         """
         ours = contest.ours
-        if ours is None:
-            return None
+        if contest.share is not None or ours is None:
+            return contest.share
         if "multiply_adds" in contest.work and self.vector_ceiling is not None:
             rate = contest.work["multiply_adds"] / ours.median
             return rate / (self.vector_ceiling * contest.threads)
@@ -164,6 +165,8 @@ class Results:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the JSON, whole or not at all."""
+        for contest in self.contests:
+            contest.share = self.share(contest)
         document = {"format": FORMAT, "version": VERSION, **asdict(self)}
         write_text(path, json.dumps(document, indent=1) + "\n")
 

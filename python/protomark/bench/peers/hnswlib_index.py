@@ -40,14 +40,7 @@ def hnsw(
         index.load_index(str(path))
         return index
 
-    index, seconds = shelf.built(
-        f"{_M}, {_EF}",
-        "hnswlib",
-        rows,
-        build,
-        lambda index, path: index.save_index(str(path)),
-        read,
-    )
+    index, seconds = shelf.built(f"{_M}, {_EF}", "hnswlib", rows, build, write, read)
     asked = queries.astype(np.float32)
 
     def prepare(ef: int) -> Search:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark import PrototypeMap
+from protomark import PrototypeMap, SealedMap
 from protomark.bench.grown import map_of
 from protomark.bench.machine import allocated_bytes, lacks
 from protomark.bench.peers.index import K
@@ -45,7 +45,7 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
             _point(
                 n,
                 "exact",
-                _seconds(scene, codes, settings),
+                seconds_of_query(scene, codes, settings),
                 used,
                 recall=1.0,
                 threads=settings.threads,
@@ -57,28 +57,26 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
         scene.build_index(threads=settings.build_threads)
         built = time.perf_counter() - began
         found = scene.search_codes(codes, k=1, threads=settings.build_threads, recall=RECALL)[1]
-        recall = _recall(found, exact)
+        facts = {"recall": _recall(found, exact), "build": built}
+        seconds = seconds_of_query(scene, codes, settings, recall=RECALL)
+        used = _since(before)
+        scene.drop_index()
+        plain = _since(before)
+        if used is not None and plain is not None:
+            facts["index"] = (used - plain) / n
         results.growth.append(
-            _point(
-                n,
-                "approximate",
-                _seconds(scene, codes, settings, recall=RECALL),
-                _since(before),
-                recall=recall,
-                build=built,
-                threads=settings.threads,
-            )
+            _point(n, "approximate", seconds, used, threads=settings.threads, **facts)
         )
         del scene, rows  # what is freed later would be missing from the next map's memory
 
 
-def _seconds(
-    scene: PrototypeMap,
+def seconds_of_query(
+    scene: PrototypeMap | SealedMap,
     codes: NDArray[np.int8],
     settings: Settings,
     recall: float | None = None,
 ) -> float:
-    """Of a query, exactly or at a recall."""
+    """Seconds of one of many queries, exactly or at a recall, on `settings.threads`."""
 
     def search(q: int) -> None:
         scene.search_codes(codes[:q], k=K, threads=settings.threads, recall=recall)
