@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,8 +87,18 @@ def sampled(name: str, landmarks: int, seconds: float) -> list[tuple[float, str]
             child.wait()
         report = ["perf", "report", "-q", "--stdio", "--sort", "symbol", "-i", data]
         text = subprocess.run(report, check=True, capture_output=True, text=True).stdout
-    rows = re.findall(r"^\s*([\d.]+)%\s+\[.\] (.+?)\s*$", text, re.MULTILINE)
-    return [(float(share) / 100, symbol) for share, symbol in rows]
+    rows = re.findall(r"^\s*([\d.]+)%\s+\[.\] (.+)$", text, re.MULTILINE)
+    shares: Counter[str] = Counter()
+    for share, symbol in rows:
+        shares[short(symbol)] += float(share) / 100
+    return [(share, name) for name, share in shares.most_common()]
+
+
+def short(symbol: str) -> str:
+    """A function's name without what it is a template of."""
+    name = symbol.replace("(anonymous namespace)::", "")
+    ours = re.search(r"protomark::[\w:]+", name)
+    return ours.group().removeprefix("protomark::") if ours else name.split()[0]
 
 
 def main() -> int:

@@ -148,20 +148,17 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
 // -|p|^2 - 256 sum(p), see avx512_hits.h.
 void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
                  std::int32_t* biases) {
-  const __m512i ones = _mm512_set1_epi8(1), most = _mm512_set1_epi8(127);
-  const __m512i top_bit = _mm512_set1_epi8(-128);
+  const __m512i ones = _mm512_set1_epi8(1), top_bit = _mm512_set1_epi8(-128);
   for (std::size_t b = 0; b < blocks; ++b) {
-    __m512i norm = _mm512_setzero_si512();
+    __m512i products = _mm512_setzero_si512();
     __m512i sum = _mm512_setzero_si512();
     for (std::size_t d = 0; d < dim; d += 4, packed += 64) {
       const __m512i p = _mm512_loadu_si512(packed);
-      // Second factors are signed, so that the 128 of a broken map's -128 is 127 there, and 1 more.
-      const __m512i magnitude = _mm512_abs_epi8(p);
-      norm = _mm512_dpbusd_epi32(norm, magnitude, _mm512_min_epu8(magnitude, most));
-      norm = _mm512_dpbusd_epi32(norm, _mm512_and_si512(magnitude, top_bit), ones);
+      // p (p + 128): one product of an unsigned and a signed byte in place of p p.
+      products = _mm512_dpbusd_epi32(products, _mm512_xor_si512(p, top_bit), p);
       sum = _mm512_dpbusd_epi32(sum, ones, p);
     }
-    const __m512i offset = _mm512_add_epi32(norm, _mm512_slli_epi32(sum, 8));
+    const __m512i offset = _mm512_add_epi32(products, _mm512_slli_epi32(sum, 7));
     _mm512_storeu_si512(biases + b * kCodeRows, _mm512_sub_epi32(_mm512_setzero_si512(), offset));
   }
 }
