@@ -49,15 +49,17 @@ test-arm: .venv-test/installed
 	.venv-test/bin/cmake --build build/arm -j$(JOBS)
 	.venv-test/bin/ctest --test-dir build/arm --output-on-failure
 
-# The C++ tests under each set of sanitizers, then the Python tests of the core, each in a module that
-# was built with it.
+# The C++ tests under each set of sanitizers, then the Python tests that need none of the larger
+# packages, each in a module that was built with it.
 comma := ,
 sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$(1)
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
-CORE_TESTS := $(addprefix tests/test_,encoder.py example_reader.py files.py four_bit_maps.py \
-  hamming.py index.py journal.py limits.py looks.py map_file.py mutated_maps.py prototypes.py \
-  sharing.py)
+CORE_TESTS := $(addprefix tests/test_,bench_shelf.py cli.py encoder.py evaluation_protocol.py \
+  example_reader.py features.py files.py four_bit_maps.py hamming.py index.py journal.py limits.py \
+  looks.py map_file.py metadata.py mutated_maps.py mutated_tracks.py prototypes.py \
+  reproduce_sequences.py sealed_sections.py sharing.py subset.py tracks_file.py \
+  training_sampling.py)
 sanitize: sanitize-memory sanitize-threads sanitize-python-memory sanitize-python-threads
 
 # Python itself was built without them, so the sanitizer's library has to come first.
@@ -70,7 +72,7 @@ sanitize-python-memory sanitize-python-threads: sanitize-python-%: build/sanitiz
 	PYTHONPATH=$(dir $<)packages \
 	  .venv-sanitize/bin/python -m pytest -p no:cacheprovider $(CORE_TESTS)
 
-# Without most of what the package needs: the core's tests do not.
+# Without most of what the package needs: these tests do not.
 build/sanitize-python/%/installed: $(SOURCES) .venv-sanitize/tools
 	.venv-sanitize/bin/pip install --quiet -c constraints.txt scikit-build-core nanobind numpy \
 	  safetensors rich typer hypothesis pytest

@@ -1,7 +1,9 @@
-"""What many tests share: a small encoder with random weights, and how its codes are defined."""
+"""What many tests share: a small encoder with random weights, its codes, and the command."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +17,15 @@ import protomark as pm
 # A busy machine is no failure of a property.
 settings.register_profile("protomark", deadline=None)
 settings.load_profile("protomark")
+
+
+def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    """The command as users run it."""
+    return subprocess.run(
+        [sys.executable, "-m", "protomark.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+    )
 
 
 def random_layers(

@@ -7,23 +7,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import protomark as pm
-from conftest import balanced_encoder, random_descriptors
+from conftest import balanced_encoder, protomark, random_descriptors, random_layers
 from protomark.build import build_map
 from protomark.tracks import Camera, Tracks
-
-
-def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "protomark.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-    )
 
 
 @pytest.fixture
@@ -151,6 +142,41 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
 def row(output: str, name: str) -> str:
     """The line of the facts that begins with a name."""
     return next(line for line in output.splitlines() if line.startswith(name))
+
+
+def test_notes_of_an_encoder_cannot_pass_for_facts(tmp_path: Path) -> None:
+    notes = dict.fromkeys(["kind", "bits", "bytes", "checksums", "notes"], "tracks")
+    notes |= {"identity": "0" * 64, "acceptance_data": "a\nkind  tracks"}
+    layers = random_layers([64, 12])
+    encoder = pm.Encoder(layers, [12], name="tiny", descriptor="test", scale=0.02, notes=notes)
+    scene = pm.PrototypeMap(encoder)
+    scene.add([1], random_descriptors(1))
+    model, facts_file = tmp_path / "t.pme", tmp_path / "facts.json"
+    encoder.save(model)
+    scene.save(tmp_path / "t.pmk")
+    done = protomark("info", model, "--verify", "--json", facts_file)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(facts_file.read_text())
+    assert (facts["kind"], facts["checksums"], facts["name"]) == ("encoder", "all right", "tiny")
+    assert (facts["identity"], facts["bits"]) == (encoder.identity, 64)
+    assert (facts["bytes"], facts["notes"]) == (model.stat().st_size, notes)
+    # Long values go on in the next line.
+    assert row(done.stdout, "identity").split()[-1] in encoder.identity
+    assert row(done.stdout, "notes: identity").split()[-1] in "0" * 64
+    assert sum(line.startswith("kind") for line in done.stdout.splitlines()) == 1
+
+    done = protomark("info", tmp_path / "t.pmk", "--json", facts_file)
+    facts = json.loads(facts_file.read_text())["encoder"]
+    assert (facts["identity"], facts["notes"]) == (encoder.identity, notes)
+    assert row(done.stdout, "encoder: identity").split()[-1] in encoder.identity
+    assert row(done.stdout, "encoder: notes: identity").split()[-1] in "0" * 64
+
+
+def test_verifying_tracks_says_that_they_have_no_checksums(tracks: Tracks, tmp_path: Path) -> None:
+    tracks.save(tmp_path / "t.safetensors")
+    done = protomark("info", tmp_path / "t.safetensors", "--verify")
+    assert done.returncode == 0, done.stderr
+    assert "none in a tracks file" in row(done.stdout, "checksums")
 
 
 def test_landmarks_seen_too_rarely_are_left_out(tracks: Tracks, encoder: pm.Encoder) -> None:

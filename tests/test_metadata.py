@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from conftest import random_descriptors, random_layers
+from conftest import protomark, random_descriptors, random_layers
 from map_container import SEALED_MAP, container, sections
-from test_cli import protomark
 
 CREATED = "2026-11-23T03:39:41Z"
 

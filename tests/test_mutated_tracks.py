@@ -12,36 +12,14 @@ import numpy as np
 import pytest
 
 from mutation import FILES, SEED, bounded, mutated
-from protomark.tracks import Camera, Tracks
+from protomark.tracks import Tracks
 from protomark.tracks.database import _features, _read
+from small_tracks import small_tracks
 
 _JUNK: list[Any] = [
     *(None, True, -1, 0, 0.5, 10**30, 2**63, float("inf"), float("nan"), "", "text", "\ud800"),
     *([], {}, [[]], [1, "a", None], {"model": 3}, {"1": {}}, {"x": 1}, "[" * 30_000, "9" * 5000),
 ]
-
-
-def tracks() -> Tracks:
-    rng = np.random.default_rng(0)
-    n, landmarks = 40, 10
-    return Tracks(
-        descriptor="orb",
-        cameras={1: Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))},
-        keyframe_names=["a.png", "b.png"],
-        keyframe_camera=np.ones(2, np.int32),
-        cam_from_world=np.tile(np.eye(3, 4), (2, 1, 1)),
-        offsets=np.array([0, 20, n]),
-        keypoints=rng.uniform(0, 480, (n, 2)).astype(np.float32),
-        sizes=np.ones(n, np.float32),
-        angles=np.zeros(n, np.float32),
-        responses=np.ones(n, np.float32),
-        octaves=np.zeros(n, np.int32),
-        descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
-        landmark_of_keypoint=rng.integers(-1, landmarks, n),
-        landmark_ids=np.arange(landmarks),
-        landmark_positions=rng.normal(size=(landmarks, 3)),
-        info={"sequence": "test", "settings": {"descriptor": "orb"}},
-    )
 
 
 def mutated_json(value: Any, rng: np.random.Generator) -> Any:
@@ -88,7 +66,7 @@ def test_broken_tracks_files_are_refused_or_read(tmp_path: Path) -> None:
     print(f"PROTOMARK_SEED={SEED}")
     rng = np.random.default_rng(SEED)
     path = tmp_path / "a.orb.safetensors"
-    tracks().save(path)
+    small_tracks().save(path)
     whole = path.read_bytes()
     Tracks.load(path)
     refused = 0
@@ -186,6 +164,80 @@ def test_broken_databases_are_refused_or_read(
                 refused += 1
     print(f"{refused} of {files} refused")
     assert files / 10 < refused < files
+
+
+@pytest.mark.parametrize("table", ["images", "keypoints", "descriptors"])
+@pytest.mark.parametrize("image_id", [1, None, "1", 0.5])
+def test_an_image_has_one_row_in_each_table(table: str, image_id: Any, database: Path) -> None:
+    connection = sqlite3.connect(database)
+    # A stranger's table needs no primary key.
+    connection.execute(f"ALTER TABLE {table} RENAME TO old")
+    connection.execute(f"CREATE TABLE {table} AS SELECT * FROM old")
+    connection.commit()
+    read_database(database)
+    connection.execute(f"INSERT INTO {table} SELECT * FROM old WHERE image_id = 1")
+    connection.execute(
+        f"UPDATE {table} SET image_id = ? WHERE rowid = (SELECT max(rowid) FROM {table})",
+        (image_id,),
+    )
+    connection.commit()
+    connection.close()
+    with pytest.raises(ValueError, match=rf"database\.db: .*{table}.* image_id"):
+        read_database(database)
+
+
+def test_images_have_names_of_their_own(database: Path) -> None:
+    connection = sqlite3.connect(database)
+    connection.execute("UPDATE images SET name = '0.png' WHERE image_id = 1")
+    connection.commit()
+    connection.close()
+    with pytest.raises(ValueError, match=r"two images have the name 0\.png"):
+        read_database(database)
+
+
+def test_rows_may_not_share_their_bytes(database: Path) -> None:
+    connection = sqlite3.connect(database)
+    (page_size,) = connection.execute("PRAGMA page_size").fetchone()
+    connection.execute("UPDATE keypoints SET rows = 20000, cols = 2, data = zeroblob(160000)")
+    connection.commit()
+    connection.execute("VACUUM")
+    find_root = "SELECT rootpage FROM sqlite_master WHERE name = 'keypoints'"
+    root = (connection.execute(find_root).fetchone()[0] - 1) * page_size
+    connection.close()
+    data = bytearray(database.read_bytes())
+    # A cell of the table's one page ends in the number of the first page of the rest of its blob
+    # (https://www.sqlite.org/fileformat2.html#b_tree_pages); here all get the first one's.
+    starts = [int.from_bytes(data[root + a : root + a + 2], "big") for a in (8, 10, 12)]
+    length = starts[0] - starts[1]
+    ends = [root + start + length for start in starts]
+    pages = [int.from_bytes(data[end - 4 : end], "big") for end in ends]
+    assert root < page_size * pages[0] < page_size * pages[1] < page_size * pages[2] < len(data)
+    for end in ends:
+        data[end - 4 : end] = pages[0].to_bytes(4, "big")
+    data = data[: (pages[1] - 1) * page_size]
+    data[28:32] = (len(data) // page_size).to_bytes(4, "big")
+    database.write_bytes(data)
+    with pytest.raises(ValueError, match="keypoints has more in it than the file can hold"):
+        read_database(database)
+
+
+def test_a_small_database_does_not_take_long(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
+    connection.executemany("INSERT INTO images VALUES (1, ?)", [(str(i),) for i in range(500)])
+    for table in ("keypoints", "descriptors"):
+        connection.execute(
+            f"CREATE TABLE {table} (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)"
+        )
+        connection.execute(
+            f"INSERT INTO {table} SELECT 1, 0, {2 if table == 'keypoints' else 32}, x'' FROM images"
+        )
+    connection.commit()
+    connection.close()
+    # Joined, it has 125 million rows.
+    with bounded(seconds=60), pytest.raises(ValueError, match="image_id '1' is there twice"):
+        read_database(path)
 
 
 @pytest.mark.parametrize(

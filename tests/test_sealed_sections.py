@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
-from conftest import random_descriptors, random_layers
+from conftest import protomark, random_descriptors, random_layers
 from map_container import SEALED_MAP, container, sections
-from test_cli import protomark
 
 OLD = Path(__file__).parent / "data"
 MOST = 2**63 - 1

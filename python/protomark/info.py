@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,18 @@ from protomark.tracks import Tracks
 _BARS = "▁▂▃▄▅▆▇█"
 
 
+def is_tracks(path: Path) -> bool:
+    """Whether `describe` reads a file as tracks, which its name says."""
+    return path.suffix == ".safetensors"
+
+
 def describe(path: Path) -> dict[str, Any]:
     """Facts about a file as JSON values; `kind` says what it is.
 
     Raises:
         OSError, ValueError: the file cannot be read, or is none of Protomark's.
     """
-    if path.suffix == ".safetensors":
+    if is_tracks(path):
         return _describe_tracks(path)
     kinds = dict(pm.file_sections(path))
     if "network" in kinds:
@@ -55,7 +61,7 @@ def _encoder_facts(encoder: pm.Encoder) -> dict[str, Any]:
         "identity": encoder.identity,
         "data": encoder.data,
         "licence": encoder.licence,
-        **encoder.notes,
+        "notes": dict(encoder.notes),
     }
 
 
@@ -166,11 +172,22 @@ def show(facts: dict[str, Any]) -> None:
         elif key == "bytes_per_landmark_by_section":
             continue
         elif isinstance(value, dict):
-            for inner, v in value.items():
-                table.add_row(escape(_text(f"{name}: {inner.replace('_', ' ')}")), escape(_text(v)))
+            for label, text in _rows(name, value):
+                table.add_row(escape(label), escape(text))
         else:
             table.add_row(name, escape(_text(value)))
     console.print(table)
+
+
+def _rows(name: str, values: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """A line for each value, under its own name and that of what it belongs to."""
+    for key, value in values.items():
+        label = f"{name}: {key.replace('_', ' ')}"
+        if key == "notes" and isinstance(value, dict):
+            for note, text in value.items():
+                yield _text(f"{label}: {note.replace('_', ' ')}"), _text(text)
+        else:
+            yield _text(label), _text(value)
 
 
 def _vector(values: list[float]) -> str:

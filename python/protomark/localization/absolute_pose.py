@@ -16,16 +16,16 @@ MIN_ITERATIONS = 100
 # Whether a camera's focal length is right, roughly right and to be refined, or to be estimated.
 FocalLength = Literal["known", "rough", "unknown"]
 
-# Camera models that both COLMAP and PoseLib know, and how many parameters they have.
-MODELS = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "FULL_OPENCV": 12,
-    "OPENCV_FISHEYE": 8,
-}
+# Camera models that both COLMAP and PoseLib know.
+MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+)
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,8 @@ def check_camera(camera: Camera) -> None:
             f"camera model {camera.model} is not one that poses can be found for: undistort the "
             f"images to one of {', '.join(MODELS)}"
         )
-    wanted = MODELS[camera.model]
-    if len(camera.params) != wanted:
-        raise ValueError(
-            f"a camera of model {camera.model} has {wanted} parameters, not {len(camera.params)}"
-        )
-    if not np.isfinite(camera.params).all() or camera.params[0] <= 0:
+    camera.check_params()
+    if camera.params[0] <= 0:
         raise ValueError(f"camera {camera.model} {camera.params} has no valid focal length")
 
 

@@ -24,7 +24,7 @@ from protomark.mapping.settings import Settings
 from protomark.mapping.sighting import Sighting
 from protomark.mapping.structure import Frame
 from protomark.tracks.colmap import rays
-from protomark.tracks.file import Camera
+from protomark.tracks.file import Camera, cameras_of
 
 STATE, CHECKPOINT = "state.safetensors", "checkpoint"
 _FORMAT, _VERSION = "protomark-mapping", "3"
@@ -112,10 +112,7 @@ def load_state(
     try:
         arrays, told = _read(path)
         settings = Settings(**told["settings"])
-        cameras = {
-            int(k): Camera(c["model"], c["width"], c["height"], tuple(c["params"]))
-            for k, c in told["cameras"].items()
-        }
+        cameras = cameras_of(told["cameras"])
         scene = None
         if settings.memory == "prototypes":
             opened = pm.open(folder / MAP)
@@ -127,7 +124,7 @@ def load_state(
         mapper.structure.cameras = cameras
         mapper.camera_id = told["camera_id"]
         _restore(mapper, arrays, told)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
         raise FileError(f"{path}: not a map to go on with, or a broken one ({error})") from None
     if camera is not None and camera != mapper.camera:
         mapper.camera_id = max(cameras) + 1

@@ -178,10 +178,7 @@ def read_cameras(path: Path) -> dict[int, Camera]:
         try:
             params = tuple(float(word) for word in words[4:])
             camera = Camera(words[1], int(words[2]), int(words[3]), params)
-            ours = _camera(camera)
-            if not (np.isfinite(params).all() and ours.verify_params()):
-                raise ValueError
-            if not ours.mean_focal_length() > 0:
+            if not _camera(camera).mean_focal_length() > 0:
                 raise ValueError
         except (ValueError, IndexError, KeyError, RuntimeError, OverflowError, TypeError):
             raise ValueError(
@@ -223,7 +220,15 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 
 def _camera(camera: Camera) -> Any:
-    return pycolmap.Camera(camera.as_dict())
+    """As pycolmap has it, which reads past the end of too few parameters: ValueError."""
+    camera.check_params()
+    try:
+        ours = pycolmap.Camera(camera.as_dict())
+    except (RuntimeError, ValueError):
+        raise ValueError(f"this pycolmap does not know camera model {camera.model}") from None
+    if not ours.verify_params():
+        raise ValueError(f"{camera.params} are no parameters of camera model {camera.model}")
+    return ours
 
 
 def rays(camera: Camera, pixels: NDArray[Any]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,46 +131,73 @@ def from_database(database: Path, model_path: Path, descriptor: str, name: str =
 
 
 def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
-    images = {}
+    """Keypoints and descriptors by the name of their image."""
     try:
         # Read-only, and never created: a database that is open elsewhere stays as it is.
         connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
         try:
             _check_tables(connection, database)
-            rows = connection.execute(
-                "SELECT i.name, k.rows, k.cols, k.data, d.rows, d.cols, d.data FROM images i "
-                "LEFT JOIN keypoints k ON k.image_id = i.image_id "
-                "LEFT JOIN descriptors d ON d.image_id = i.image_id ORDER BY i.image_id"
-            )
-            for name, kr, kc, kd, dr, dc, dd in rows:
-                kr, kc, kd = kr or 0, kc or 2, kd or b""
-                dr, dc, dd = dr or 0, dc or width, dd or b""
-                numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
-                if not (numbers_fit and isinstance(name, str) and type(kd) is type(dd) is bytes):
-                    raise ValueError(f"{database}: not a COLMAP database, or a broken one")
-                if dr and dc != width:
-                    guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
-                    raise ValueError(
-                        f"{database}: image {name} has descriptors of {dc} bytes, {descriptor} has "
-                        f"{width}; name the right one with -d"
-                        + (f" ({' or '.join(guess)})" if guess else "")
-                    )
-                if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
-                    raise ValueError(
-                        f"{database}: image {name} has {kr} keypoints and {dr} descriptors that do "
-                        "not fit together, extract its features anew"
-                    )
-                keypoints = np.frombuffer(kd, "<f4").reshape(kr, kc)
-                if not (np.abs(keypoints) < _FAR).all():
-                    raise ValueError(
-                        f"{database}: image {name} has keypoints that are not in any image"
-                    )
-                images[name] = _Image(keypoints, np.frombuffer(dd, np.uint8).reshape(dr, dc))
+            names = _by_image(connection, database, "images", "name")
+            keypoints = _by_image(connection, database, "keypoints", "rows, cols, data")
+            descriptors = _by_image(connection, database, "descriptors", "rows, cols, data")
         finally:
             connection.close()
     except sqlite3.Error as error:
         raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
+    images: dict[str, _Image] = {}
+    none = (None, None, None)
+    for image_id, (name,) in names.items():
+        kr, kc, kd = keypoints.get(image_id, none)
+        dr, dc, dd = descriptors.get(image_id, none)
+        kr, kc, kd = kr or 0, kc or 2, kd or b""
+        dr, dc, dd = dr or 0, dc or width, dd or b""
+        numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
+        if not (numbers_fit and isinstance(name, str) and type(kd) is type(dd) is bytes):
+            raise ValueError(f"{database}: not a COLMAP database, or a broken one")
+        if name in images:
+            raise ValueError(f"{database}: two images have the name {name}")
+        if dr and dc != width:
+            guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
+            raise ValueError(
+                f"{database}: image {name} has descriptors of {dc} bytes, {descriptor} has "
+                f"{width}; name the right one with -d"
+                + (f" ({' or '.join(guess)})" if guess else "")
+            )
+        if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
+            raise ValueError(
+                f"{database}: image {name} has {kr} keypoints and {dr} descriptors that do "
+                "not fit together, extract its features anew"
+            )
+        points = np.frombuffer(kd, "<f4").reshape(kr, kc)
+        if not (np.abs(points) < _FAR).all():
+            raise ValueError(f"{database}: image {name} has keypoints that are not in any image")
+        images[name] = _Image(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
     return images
+
+
+def _by_image(
+    connection: sqlite3.Connection, database: Path, table: str, columns: str
+) -> dict[int, tuple[Any, ...]]:
+    """The rows of a table by image_id, which must be unique: a stranger's table need not say so.
+
+    One table at a time: joined on ids that repeat, rows would multiply.
+    """
+    # Rows of a broken file may share their bytes, so that all together are more than it holds.
+    room = math.prod(
+        connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")
+    )
+    rows: dict[int, tuple[Any, ...]] = {}
+    for image_id, *row in connection.execute(f"SELECT image_id, {columns} FROM {table}"):
+        if type(image_id) is not int or image_id in rows:
+            raise ValueError(
+                f"{database}: not a COLMAP database, in {table} the image_id "
+                f"{str(image_id)[:40]!r} is {'there twice' if image_id in rows else 'no number'}"
+            )
+        room -= sum(len(cell) for cell in row if isinstance(cell, (bytes, str)))
+        if room < 0:
+            raise ValueError(f"{database}: {table} has more in it than the file can hold")
+        rows[image_id] = tuple(row)
+    return rows
 
 
 def _check_tables(connection: sqlite3.Connection, database: Path) -> None:

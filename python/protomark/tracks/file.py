@@ -8,8 +8,11 @@ that is not an array (cameras, image names, provenance) is JSON in the file's me
 from __future__ import annotations
 
 import json
+import math
 import os
+import re
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,28 @@ _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "landmark_positions": (np.float64, ("l", 3)),
 }
 
+# How many parameters a camera of each of COLMAP's models has (src/colmap/sensor/models.h there).
+CAMERA_MODELS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -55,6 +80,28 @@ class Camera:
             "height": self.height,
             "params": list(self.params),
         }
+
+    def check(self) -> None:
+        """Raise ValueError unless model, size and parameters are those of a COLMAP camera."""
+        for size in (self.width, self.height):
+            if type(size) is not int or not 0 < size < 2**31:
+                raise ValueError(f"{str(size)[:40]!r} is no number of pixels")
+        self.check_params()
+
+    def check_params(self) -> None:
+        """Raise ValueError unless the model is one of COLMAP's and the parameters are its own."""
+        wanted = CAMERA_MODELS.get(self.model) if isinstance(self.model, str) else None
+        if wanted is None:
+            raise ValueError(
+                f"camera model {str(self.model)[:40]!r} is none of COLMAP's: "
+                f"{', '.join(CAMERA_MODELS)}"
+            )
+        if len(self.params) != wanted:
+            raise ValueError(
+                f"a camera of model {self.model} has {wanted} parameters, not {len(self.params)}"
+            )
+        if not all(isinstance(p, Real) and math.isfinite(p) for p in self.params):
+            raise ValueError(f"the parameters {self.params} are not all finite numbers")
 
 
 @dataclass
@@ -128,6 +175,11 @@ class Tracks:
 
     def check(self) -> None:
         """Raise ValueError, naming the array, if shapes, types or indices do not fit together."""
+        names = self.keyframe_names
+        if not isinstance(names, list) or not all(map(_is_text, names)):
+            raise ValueError("tracks: keyframe_names are not a list of texts")
+        if not _is_text(self.descriptor):
+            raise ValueError("tracks: descriptor is no text")
         sizes = {
             "m": len(self.keyframe_names),
             "m+1": len(self.keyframe_names) + 1,
@@ -160,17 +212,18 @@ class Tracks:
             raise ValueError(
                 "tracks: landmark_of_keypoint names a landmark that landmark_ids lacks"
             )
-        for name in ("cam_from_world", "keypoints", "landmark_positions"):
-            if not np.isfinite(getattr(self, name)).all():
+        for name, (dtype, _) in _ARRAYS.items():
+            if issubclass(dtype, np.floating) and not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"tracks: {name} contains NaN or infinity")
-        if not all(isinstance(name, str) for name in (self.descriptor, *self.keyframe_names)):
-            raise ValueError("tracks: descriptor and keyframe_names are texts")
-        if not isinstance(self.info, dict):
-            raise ValueError("tracks: info is not a JSON object")
+        if not isinstance(self.info, dict) or not _is_text(
+            json.dumps(self.info, ensure_ascii=False)
+        ):
+            raise ValueError("tracks: info is not a JSON object of texts and numbers")
         for number, c in self.cameras.items():
-            sizes_fit = all(type(size) is int and 0 < size < 2**31 for size in (c.width, c.height))
-            if not isinstance(c.model, str) or not sizes_fit or not np.isfinite(c.params).all():
-                raise ValueError(f"tracks: camera {number} is {str(c)[:200]}")
+            try:
+                c.check()
+            except ValueError as error:
+                raise ValueError(f"tracks: camera {number}: {error}") from None
         for i, camera in enumerate(self.keyframe_camera):
             if int(camera) not in self.cameras:
                 raise ValueError(
@@ -213,20 +266,16 @@ class Tracks:
                 header = file.metadata() or {}
                 if header.get("format") != FORMAT:
                     raise ValueError("a safetensors file, but not a Protomark tracks file")
-                if int(header["version"]) > VERSION:
-                    raise ValueError(
-                        f"tracks version {header['version']}, this Protomark reads up to "
-                        f"{VERSION}; update it"
-                    )
+                _check_version(header["version"])
                 missing = set(_ARRAYS) - set(file.keys())
                 if missing:
                     raise ValueError(f"tracks file lacks {', '.join(sorted(missing))}")
                 arrays = {name: file.get_tensor(name) for name in _ARRAYS}
             tracks = cls(
                 descriptor=header["descriptor"],
-                cameras=_cameras(json.loads(header["cameras"])),
-                keyframe_names=json.loads(header["keyframe_names"]),
-                info=json.loads(header["info"]),
+                cameras=cameras_of(_json(header, "cameras")),
+                keyframe_names=_json(header, "keyframe_names"),
+                info=_json(header, "info"),
                 **arrays,
             )
             tracks.check()
@@ -239,14 +288,45 @@ class Tracks:
         return tracks
 
 
-def _cameras(value: Any) -> dict[int, Camera]:
-    """Cameras as the header has them in JSON."""
+def cameras_of(value: Any) -> dict[int, Camera]:
+    """Cameras that were kept as JSON: id to `Camera.as_dict`.
+
+    Raises:
+        ValueError: they are something else, or one of them is no COLMAP camera.
+    """
     if not isinstance(value, dict):
-        raise TypeError("cameras are not a JSON object")
-    return {
-        int(k): Camera(c["model"], c["width"], c["height"], tuple(map(float, c["params"])))
-        for k, c in value.items()
-    }
+        raise ValueError("cameras are not a JSON object")
+    cameras = {}
+    for number, c in value.items():
+        try:
+            params = c["params"]
+            if not isinstance(params, list) or any(type(p) not in (int, float) for p in params):
+                raise ValueError("params are not a list of numbers")
+            camera = Camera(c["model"], c["width"], c["height"], tuple(map(float, params)))
+            camera.check()
+            cameras[int(number)] = camera
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"cameras: {number[:20]!r}: {error}") from None
+    return cameras
+
+
+def _check_version(text: str) -> None:
+    if not re.fullmatch("[1-9][0-9]{0,8}", text):
+        raise ValueError(f"version {text[:20]!r} is none that a tracks file can have")
+    if int(text) > VERSION:
+        raise ValueError(f"tracks version {text}, this Protomark reads up to {VERSION}; update it")
+
+
+def _json(header: dict[str, str], name: str) -> Any:
+    try:
+        return json.loads(header[name])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{name} cannot be read as JSON ({error})") from None
+
+
+def _is_text(value: Any) -> bool:
+    # JSON may hold halves of characters (lone surrogates), which no file or terminal takes.
+    return isinstance(value, str) and not re.search("[\ud800-\udfff]", value)
 
 
 def sequence_name(path: Path) -> str:
