@@ -20,7 +20,7 @@ from protomark.bench.machine import allocated_bytes, last_level_cache
 from protomark.bench.peers.network import bits_of, float_layers, selu
 from protomark.bench.race import Contender, Pace, race
 from protomark.bench.real import Observations
-from protomark.bench.results import Contest, Results, Timing
+from protomark.bench.results import NOT_ASKED_FOR, Contest, Results, Timing
 from protomark.bench.settings import Settings, choose
 from protomark.bench.targets import outcomes
 from protomark.bench.tuning import tune
@@ -388,6 +388,14 @@ def test_runs_are_joined_only_where_machine_and_data_are_the_same(tmp_path: Path
     shares = [(c.landmarks, results.share(c)) for c in results.contests]
     assert shares == [(10, 0.5), (20, 0.25)]  # each of its own run's ceiling
     assert results.command.split("\n    ") == ["bench 10", "bench 10", "bench 20"]
+    alone = run(20)
+    alone.skipped = ["peer, 20 landmarks: not asked for", "other, 20 landmarks: not asked for"]
+    beside = run(20)
+    beside.contests[0].timings.append(Timing("peer", False, [2.0], 1))
+    beside.contests[0].title = "recall@1 of at least 0.98, 20 landmarks"
+    alone.extend(beside)
+    assert [len(c.timings) for c in alone.contests] == [1, 2]
+    assert alone.skipped == ["other, 20 landmarks: not asked for"]
     with pytest.raises(ValueError, match="two machines"):
         results.extend(run(30, cpu="b"))
     other = run(30)
@@ -477,7 +485,7 @@ def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
             assert min(timing.seconds) > 0
             assert timing.facts.get("recall", 1.0) >= (contest.recall or 0.0)
     assert not any("failed" in note for note in results.skipped), results.skipped
-    assert not any("builds long" in note for note in results.skipped)
+    assert not any(NOT_ASKED_FOR in note for note in results.skipped)
     assert {point["landmarks"] for point in results.growth} == {1_000, 3_000}
     assert results.large["8 bits: recall of the nearest of 8 bits"] >= 0.9
     assert results.large["4 bits: file bytes"] < results.large["8 bits: file bytes"]

@@ -12,6 +12,7 @@ from typing import Any
 from protomark.files import write_text
 
 FORMAT, VERSION = "protomark-bench", 1
+NOT_ASKED_FOR = "not asked for"  # why something was left out that another run may have
 
 
 @dataclass
@@ -78,6 +79,12 @@ class Contest:
     share: float | None = None
 
     @property
+    def key(self) -> tuple[object, ...]:
+        """What was measured, and who took part: a run that had others is another contest."""
+        names = tuple(timing.name for timing in self.timings)
+        return (self.section, self.title, self.threads, self.recall, names)
+
+    @property
     def ours(self) -> Timing | None:
         """The fastest of ours."""
         own = [timing for timing in self.timings if timing.ours]
@@ -131,14 +138,18 @@ class Results:
                 raise ValueError(f"runs of two machines: {name} {later.machine.get(name)}")
         if self.data != later.data:
             raise ValueError(f"runs on different data: {later.data}")
-        known = {(c.section, c.title, c.threads, c.recall) for c in self.contests}
-        for contest in later.contests:
-            if (contest.section, contest.title, contest.threads, contest.recall) not in known:
-                self.contests.append(contest)
+        known = {contest.key for contest in self.contests}
+        self.contests += [contest for contest in later.contests if contest.key not in known]
         curve = {(p["landmarks"], p["method"]): p for p in later.growth + self.growth}
         self.growth = sorted(curve.values(), key=lambda p: (p["landmarks"], p["method"] != "exact"))
         self.large |= later.large
         self.skipped += [note for note in later.skipped if note not in self.skipped]
+        raced = {
+            f"{timing.name}, {contest.title.partition(', ')[2]}: {NOT_ASKED_FOR}"
+            for contest in self.contests
+            for timing in contest.timings
+        }
+        self.skipped = [note for note in self.skipped if not note.startswith(tuple(raced))]
         self.interrupted |= later.interrupted
         self.command += f"\n    {later.command}"
 

@@ -20,7 +20,7 @@ from protomark.bench.peers.index import Builder, Index, Search
 from protomark.bench.peers.shelf import Shelf
 from protomark.bench.progress import Bar
 from protomark.bench.race import Contender, race, turns
-from protomark.bench.results import Contest, Results
+from protomark.bench.results import NOT_ASKED_FOR, Contest, Results
 from protomark.bench.tuning import Trial, tune
 from protomark.bench.workload import Workload
 
@@ -209,7 +209,7 @@ def _entrants(
             enter(name, partial(build, shelf=shelf), memory)
         else:
             how = f"--graphs {graph} --landmarks {n}"
-            results.skipped.append(f"{name}, {ground.title}: builds long; `{how}` races it")
+            results.skipped.append(f"{name}, {ground.title}: {NOT_ASKED_FOR} (`{how}`)")
 
     build = partial(ours.cells, workload, rows, codes, threads, build_threads)
     found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
