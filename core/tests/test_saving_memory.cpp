@@ -79,8 +79,13 @@ PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t look_b
   return map;
 }
 
-// Of a map of any size, beside the share.
-constexpr std::size_t kBuffers = 1 << 19;
+// Landmarks by default, and memory beside the share.
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+// Each step takes many times as long; of small maps, what does not grow with them is most.
+constexpr std::size_t kLandmarks = 20'000, kBuffers = 5 << 18;
+#else
+constexpr std::size_t kLandmarks = 200'000, kBuffers = 1 << 19;
+#endif
 
 template <typename Save>
 void check_save(const std::string& what, std::size_t own, const Save& save) {
@@ -108,12 +113,6 @@ constexpr Case kCases[] = {
     {32, Ids::mixed, 0, true},     {32, Ids::sparse, 2, true}, {64, Ids::sparse, 0, false},
     {64, Ids::sparse, 0, true},
 };
-
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr std::size_t kLandmarks = 20'000;  // each step takes many times as long
-#else
-constexpr std::size_t kLandmarks = 200'000;
-#endif
 
 }  // namespace
 
