@@ -7,7 +7,7 @@ from pathlib import Path
 
 from protomark.bench.race import Pace
 
-GRAPHS = ("faiss", "hnswlib", "usearch-int8", "usearch-float32")
+GRAPHS = ("faiss", "faiss-cells", "hnswlib", "usearch-int8", "usearch-float32")
 
 SECTIONS = (
     "encode",

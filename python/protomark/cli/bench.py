@@ -47,6 +47,7 @@ def bench(
         str,
         typer.Option(
             help="Which graphs are raced, as they take long to build: all, none, or some of faiss, "
+            "faiss-cells (65,536 inverted lists that a graph finds, beyond a million landmarks), "
             "hnswlib, usearch-int8 and usearch-float32. Without --landmarks, only hnswlib's is "
             "built for large maps."
         ),

@@ -223,7 +223,7 @@ def _entrants(
         enter("FAISS IVF, SQ8", faiss_indexes.scalar_quantizer)
         if n > _FEW:
             name = f"FAISS IVF, PQ{settings.dim} fast scan, cells by HNSW"
-            enter(name, partial(faiss_indexes.many_cells, shelf=shelf))
+            enter_graph("faiss-cells", name, faiss_indexes.many_cells, 100)
     if installed("hnswlib"):
         from protomark.bench.peers import hnswlib_index
 
