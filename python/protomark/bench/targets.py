@@ -157,8 +157,9 @@ def _large(results: Results) -> Iterator[Outcome]:
         size = figures[label + "file bytes"]
         opening = figures[label + "open seconds"]
         asking = figures[label + "1,000 queries, seconds"]
-        recall = figures[label + "recall of the nearest of 8 bits"]
-        own = figures[label + "recall of this file's nearest"]
+        # Runs of before 23 November 2026 know only the second, and call it "recall".
+        own = figures.get(label + "recall of this file's nearest", figures.get(label + "recall", 0))
+        recall = figures.get(label + "recall of the nearest of 8 bits", own if bits == 8 else None)
         yield Outcome(
             f"{what}: file",
             f"{size / 1e9:.2f} GB",
@@ -173,10 +174,10 @@ def _large(results: Results) -> Iterator[Outcome]:
         )
         yield Outcome(
             f"{what}: 1,000 queries, 2 threads",
-            f"{asking:.3f} s, recall {recall:.3f}"
-            + ("" if bits == 8 else f" of the nearest of 8 bits, {own:.3f} of 4 bits"),
+            f"{asking:.3f} s, recall {own:.3f} of this file's nearest"
+            + ("" if recall is None else f", {recall:.3f} of the nearest of 8 bits"),
             target="≤ 0.5 s, recall ≥ 0.95",
-            met=_if(counts, asking <= 0.5 and recall >= 0.95),
+            met=_if(counts and recall is not None, asking <= 0.5 and (recall or 0) >= 0.95),
         )
 
 
