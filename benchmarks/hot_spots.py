@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,13 +85,13 @@ def sampled(name: str, landmarks: int, seconds: float) -> list[tuple[float, str]
         finally:
             child.kill()
             child.wait()
-        report = ["perf", "report", "-q", "--stdio", "--sort", "symbol", "-i", data]
+        report = ["perf", "report", "-q", "--stdio", "--sort", "symbol", "-i", str(data)]
         text = subprocess.run(report, check=True, capture_output=True, text=True).stdout
     rows = re.findall(r"^\s*([\d.]+)%\s+\[.\] (.+)$", text, re.MULTILINE)
-    shares: Counter[str] = Counter()
+    shares: dict[str, float] = defaultdict(float)
     for share, symbol in rows:
         shares[short(symbol)] += float(share) / 100
-    return [(share, name) for name, share in shares.most_common()]
+    return sorted(((share, name) for name, share in shares.items()), reverse=True)
 
 
 def short(symbol: str) -> str:
