@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from protomark.cli.options import names, numbers
+from protomark.cli.options import listed, numbers
 
 
 def bench(
@@ -83,14 +83,14 @@ def bench(
 
     check_outputs(json_file)
     settings = choose(
-        sections=names(only),
+        sections=listed(only),
         threads=threads,
         build_threads=available_threads(),
         full=full,
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
         landmarks=numbers("--landmarks", landmarks),
-        graphs=GRAPHS if graphs == "all" else () if graphs == "none" else names(graphs),
+        graphs=GRAPHS if graphs == "all" else () if graphs == "none" else listed(graphs),
         indexes=indexes,
     )
     flags = [f"--only {only}"] if only else []

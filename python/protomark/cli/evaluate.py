@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from protomark.cli.options import listed
+
 
 def evaluate(
     tracks: Annotated[
@@ -83,7 +85,7 @@ def evaluate(
             seeds=range(seeds), pose_frames=pose_frames, threads=threads or available_threads()
         ),
         encoders=encoder or [],
-        methods=[name.strip() for name in methods.split(",") if name.strip()],
+        methods=list(listed(methods)),
         discriminant_from=discriminant_from or [],
         inputs=chosen(upright, sized),
     )

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from protomark.cli.options import listed
+
 
 def evaluate_mapping(
     sequences: Annotated[
@@ -95,7 +97,7 @@ def evaluate_mapping(
     request = command.Request(
         sequences=sequences,
         output=output,
-        variants=choose([name.strip() for name in variants.split(",") if name.strip()]),
+        variants=choose(list(listed(variants))),
         base=Settings(descriptor=descriptor, encoder=encoder, max_keypoints=max_keypoints),
         colmap=colmap,
         every=every,

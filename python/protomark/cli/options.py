@@ -15,7 +15,7 @@ def numbers(option: str, text: str) -> tuple[int, ...]:
         raise ValueError(f"{option} {text}: not numbers with commas between them") from None
 
 
-def names(text: str) -> tuple[str, ...]:
+def listed(text: str) -> tuple[str, ...]:
     """The names of a list such as toy,kitchen."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
