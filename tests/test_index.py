@@ -20,6 +20,7 @@ import protomark as pm
 from conftest import balanced_encoder
 from map_container import SEALED_MAP, Section, container, sections
 from protomark import sample
+from protomark.bench.machine import allocated_bytes
 from protomark.build import build_file, build_map
 from protomark.evaluation.protocol import split
 from protomark.info import describe
@@ -142,6 +143,31 @@ def test_cells_do_not_depend_on_history_or_threads(
         a.add_codes(ids[:300], more)
         for i in order[order < 300]:
             b.add_codes(ids[i : i + 1], more[i : i + 1])
+
+
+@pytest.mark.skipif(allocated_bytes() in (None, 0), reason="malloc does not tell")
+@pytest.mark.parametrize("landmarks", [5_000, 20_000, 60_000])
+@pytest.mark.parametrize(("look_bits", "positions"), [(0, False), (0, True), (4, True)])
+def test_an_index_takes_at_most_4_bytes_a_prototype(
+    coder: pm.Encoder, tmp_path: Path, landmarks: int, look_bits: int, positions: bool
+) -> None:
+    """A regression: half-filled blocks of small open maps took up to 5.6."""
+    scene = pm.PrototypeMap(coder, look_bits=look_bits)
+    ids = np.arange(landmarks)
+    scene.add_codes(ids, random_codes(landmarks, 1))
+    if positions:
+        scene.set_positions(ids, np.random.default_rng(2).normal(size=(landmarks, 3)))
+    scene.build_index()
+    scene.search_codes(random_codes(10, 3), recall=0.9)
+    assert scene.index_cells > 1
+    sealed = scene.seal(tmp_path / "with.pmk")
+    assert sealed.index_cells == scene.index_cells
+    used = allocated_bytes()
+    scene.drop_index()
+    scene.seal(tmp_path / "without.pmk")
+    assert used - allocated_bytes() <= 4 * landmarks
+    sizes = [(tmp_path / f"{name}.pmk").stat().st_size for name in ("with", "without")]
+    assert sizes[0] - sizes[1] <= 4 * landmarks
 
 
 @pytest.mark.parametrize(("bits", "prototypes"), [(8, None), (4, None), (8, 1.5), (4, 2.0)])

@@ -177,15 +177,18 @@ Cells Cells::learn(Codes codes, std::size_t cells, int threads) {
   return {k_means(codes, cells, assign), codes.columns};
 }
 
-std::size_t Cells::number_for(std::size_t prototypes, std::size_t dim) {
-  const auto n = static_cast<double>(prototypes);
-  // What docs/format.md has: numbers of landmarks, ranks, and for each cell its centroid, its
-  // number of rows and half a block of padding, somewhat rounded up.
-  const double left =
-      n * (4 - std::bit_width(prototypes) / 8.0) -
-      static_cast<double>(std::min(prototypes, kTestQueries) * sizeof(std::uint32_t));
-  const double cell = 9.5 * static_cast<double>(packed_dim(dim)) + 4;
-  const double cells = std::min(4 * std::sqrt(n), left / cell);
+std::size_t Cells::number_for(std::size_t prototypes, std::size_t dim, std::size_t place) {
+  const auto n = static_cast<double>(prototypes), k = static_cast<double>(packed_dim(dim));
+  constexpr double kBytes = 4;
+  // A sealed map has what docs/format.md has: numbers of landmarks, ranks, and for each cell its
+  // centroid, its number of rows and half a block of padding, somewhat rounded up.
+  const double ranks = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
+  const double sealed = (n * (kBytes - std::bit_width(prototypes) / 8.0) - ranks) / (9.5 * k + 4);
+  // An open one has for each cell its centroid three times, half a block of places and half of the
+  // 12 bytes of a block.
+  const double half = static_cast<double>(kPackedRows * place) / 2 + 6;
+  const double open = (n * kBytes - ranks) / (half + 3 * k + 16);
+  const double cells = std::min({4 * std::sqrt(n), sealed, open});
   return static_cast<std::size_t>(std::clamp(cells, 1.0, static_cast<double>(kMaxCells)));
 }
 

@@ -23,7 +23,7 @@ void PrototypeMap::build_index(std::optional<std::size_t> cells, int threads) {
   const std::unique_lock changing(store_->changing);
   const std::size_t rows = store_->rows();
   if (rows == 0) throw std::invalid_argument("a map without landmarks has no cells to learn");
-  const std::size_t number = cells.value_or(Cells::number_for(rows, dim_));
+  const std::size_t number = cells.value_or(Cells::number_for(rows, dim_, store_->place_bytes()));
   const std::size_t most = std::min(rows, Cells::kMaxCells);
   if (number < 1 || number > most) {
     throw std::invalid_argument("this map can have 1 to " + std::to_string(most) + " cells, not " +

@@ -45,6 +45,11 @@ class PrototypeStore {
   const LargeVector<std::int64_t>& ids() const { return ids_; }
   // Row numbers are below.
   std::size_t places() const { return blocks_.blocks() * kPackedRows; }
+  std::size_t place_bytes() const {
+    const std::size_t row = dim_ * sizeof(sums_[0]) + packed_dim(dim_) + sizeof(counts_[0]);
+    if (look_bits_ != 0) return row + sizeof(looks_[0]) + sizeof(owners_[0]) + sizeof(next_[0]);
+    return row + sizeof(ids_[0]) + (positions_.empty() ? 0 : sizeof(Position));
+  }
   bool is_row(std::size_t place) const {
     return look_bits_ == 0 ? ids_[place] >= 0 : owners_[place] != kNone;
   }

@@ -114,7 +114,8 @@ void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path&
 
   const States states(cycle, queries, PrototypeMap(encoder, kDim, look_bits));
 
-  const fs::path journaled = folder / "journaled.pmk";
+  // A path of its own: where the last commits are not folded in, nothing else may be saved there.
+  const fs::path journaled = folder / ("journaled" + std::to_string(look_bits) + ".pmk");
   {
     PrototypeMap first(encoder, kDim, look_bits);
     cycle.start(first);

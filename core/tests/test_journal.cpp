@@ -45,13 +45,13 @@ extern "C" int open(const char* file, int flags, ...) {
   return static_cast<int>(syscall(SYS_openat, AT_FDCWD, file, flags, mode));
 }
 
-// A machine without memory for what no test needs.
-void* operator new(std::size_t size) {
+// A machine without memory for what no test needs. Inlined, they look mismatched to g++.
+[[gnu::noinline]] void* operator new(std::size_t size) {
   void* memory = size > std::size_t{1} << 30 ? nullptr : std::malloc(size);
   return memory != nullptr ? memory : throw std::bad_alloc();
 }
-void operator delete(void* memory) noexcept { std::free(memory); }
-void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
+[[gnu::noinline]] void operator delete(void* memory) noexcept { std::free(memory); }
+[[gnu::noinline]] void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
 
 namespace {
 
