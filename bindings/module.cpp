@@ -698,8 +698,9 @@ Raises:
           "an "
           "unknown id.")
       .def("build_index", &PrototypeMap::build_index, "cells"_a = nb::none(), "threads"_a = 1,
-           ReleaseGil(),
-           nb::sig("def build_index(self, cells: int | None = None, threads: int = 1) -> None"),
+           "in_place"_a = false, ReleaseGil(),
+           nb::sig("def build_index(self, cells: int | None = None, threads: int = 1, "
+                   "in_place: bool = False) -> None"),
            R"(Learn coarse cells from the map's prototypes, for search with recall or probes.
 
 Prototypes are kept by cell from then on, through every change. Once more: learns anew.
@@ -707,9 +708,14 @@ Prototypes are kept by cell from then on, through every change. Once more: learn
 Args:
     cells: number of cells, 1 to 65536 and at most that of prototypes; None: one that fits the map.
     threads: threads to use.
+    in_place: False: prototypes are put into cells beside the map, which takes as much memory again,
+        and searches go on. True: they change places within it, which takes some 5 bytes a
+        prototype, and once the map's largest array (2 dim bytes a prototype) where that has no room
+        for half-filled blocks; searches wait while they do. The result is the same.
 
 Raises:
-    ValueError: cells is none of these, or the map is empty.)")
+    ValueError: cells is none of these, or the map is empty.
+    MemoryError: memory ran out; the map is as before.)")
       .def("drop_index", &PrototypeMap::drop_index, ReleaseGil(),
            nb::sig("def drop_index(self) -> None"), "Forget the cells.")
       .def(

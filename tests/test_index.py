@@ -107,7 +107,8 @@ def test_all_cells_are_the_exact_answer_under_any_history(
             for m in (scene, plain):
                 m.update(other)
         elif step == "learn":
-            scene.build_index(min(cells, scene.prototype_count), threads=2)
+            in_place = bool(rng.integers(2))
+            scene.build_index(min(cells, scene.prototype_count), threads=2, in_place=in_place)
         elif step == "drop":
             scene.drop_index()
             assert scene.index_cells == 0

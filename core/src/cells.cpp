@@ -118,9 +118,11 @@ std::vector<CodeVector> pack_codes(Codes codes) {
   return result;
 }
 
-CellOrder::CellOrder(const std::vector<std::uint32_t>& cell_of_row, std::size_t cells)
-    : rows(cells, 0), first_blocks(cells + 1, 0), places(cell_of_row.size()) {
-  for (const std::uint32_t cell : cell_of_row) ++rows[cell];
+CellOrder::CellOrder(std::vector<std::uint32_t> cell_of_row, std::size_t cells)
+    : rows(cells, 0), first_blocks(cells + 1, 0), places(std::move(cell_of_row)) {
+  for (const std::uint32_t cell : places) {
+    if (cell != kNone) ++rows[cell];
+  }
   for (std::size_t c = 0; c < cells; ++c) {
     first_blocks[c + 1] =
         first_blocks[c] + static_cast<std::uint32_t>((rows[c] + kPackedRows - 1) / kPackedRows);
@@ -129,7 +131,9 @@ CellOrder::CellOrder(const std::vector<std::uint32_t>& cell_of_row, std::size_t 
   for (std::size_t c = 0; c < cells; ++c) {
     next[c] = first_blocks[c] * static_cast<std::uint32_t>(kPackedRows);
   }
-  for (std::size_t row = 0; row < places.size(); ++row) places[row] = next[cell_of_row[row]]++;
+  for (std::uint32_t& cell_or_place : places) {
+    if (cell_or_place != kNone) cell_or_place = next[cell_or_place]++;
+  }
 }
 
 Cells::Cells(std::vector<std::int8_t> centroids, std::size_t dim)

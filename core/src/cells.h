@@ -62,9 +62,11 @@ class Cells {
 };
 
 // Where rows stand when cells follow each other, each from a new block on, rows in the order in
-// which they come.
+// which they come. A row of cell kNone is none, and stands nowhere: kNone.
 struct CellOrder {
-  CellOrder(const std::vector<std::uint32_t>& cell_of_row, std::size_t cells);
+  static constexpr std::uint32_t kNone = UINT32_MAX;
+
+  CellOrder(std::vector<std::uint32_t> cell_of_row, std::size_t cells);
 
   std::vector<std::uint32_t> rows;          // of each cell
   std::vector<std::uint32_t> first_blocks;  // of each cell, and the end

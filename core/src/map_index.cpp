@@ -18,7 +18,7 @@ constexpr std::size_t kStaleShare = 10;
 
 }  // namespace
 
-void PrototypeMap::build_index(std::optional<std::size_t> cells, int threads) {
+void PrototypeMap::build_index(std::optional<std::size_t> cells, int threads, bool in_place) {
   if (threads < 1) throw std::invalid_argument("threads must be at least 1");
   const std::unique_lock changing(store_->changing);
   const std::size_t rows = store_->rows();
@@ -29,18 +29,20 @@ void PrototypeMap::build_index(std::optional<std::size_t> cells, int threads) {
     throw std::invalid_argument("this map can have 1 to " + std::to_string(most) + " cells, not " +
                                 std::to_string(number));
   }
-  // By id, so that cells do not depend on how the map came about.
-  const std::vector<std::uint32_t> sorted = store_->sorted_rows();
-  std::vector<std::uint32_t> sample(std::min(rows, Cells::sample_for(number)));
-  for (std::size_t i = 0; i < sample.size(); ++i) sample[i] = sorted[i * rows / sample.size()];
-  const std::vector<std::int8_t> codes = store_->rounded(sample);
-  Cells learned = Cells::learn({codes.data(), sample.size(), dim_}, number, threads);
-  store_->replace(store_->with_cells(std::move(learned), threads));
+  store_->put_into_cells(store_->learn_cells(number, threads), threads, in_place);
 }
 
 void PrototypeMap::drop_index() {
   const std::unique_lock changing(store_->changing);
-  store_->replace(store_->with_cells({}, 1));
+  store_->put_into_cells({}, 1, false);
+}
+
+// By id, so that cells do not depend on how the map came about.
+Cells PrototypeMap::Store::learn_cells(std::size_t number, int threads) const {
+  std::vector<std::size_t> sample(std::min(rows(), Cells::sample_for(number)));
+  for (std::size_t i = 0; i < sample.size(); ++i) sample[i] = i * rows() / sample.size();
+  const std::vector<std::int8_t> codes = rounded(rows_at(sample));
+  return Cells::learn({codes.data(), sample.size(), dim()}, number, threads);
 }
 
 std::size_t PrototypeMap::index_cells() const {
@@ -103,13 +105,9 @@ void PrototypeMap::Store::measure(int threads, bool wait) const {
     return;
   }
   if (cells().size() == 0 || (ranks_ && !is_stale(*ranks_))) return;
-  const std::vector<std::uint32_t> sorted = sorted_rows();
-  std::vector<std::uint32_t> rows;
+  const std::vector<std::uint32_t> rows = rows_at(test_rows(this->rows()));
   std::vector<std::int64_t> own;
-  for (const std::size_t i : test_rows(sorted.size())) {
-    rows.push_back(sorted[i]);
-    own.push_back(ids()[landmark_of(sorted[i])]);
-  }
+  for (const std::uint32_t row : rows) own.push_back(ids()[landmark_of(row)]);
   const std::vector<std::int8_t> codes = rounded(rows);
   const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids,
                               MatrixView<float> distances) {

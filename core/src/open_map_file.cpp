@@ -51,7 +51,8 @@ PrototypeMap PrototypeMap::read(const ContainerReader& file, const JournalConten
   OpenMapContent content = read_open_map(file, journal, *encoder, store);
   store.metadata = std::move(content.metadata);
   if (!content.cells.empty()) {
-    store.replace(store.with_cells({std::move(content.cells), shape.dim}, 1));
+    // Nobody searches yet.
+    store.put_into_cells({std::move(content.cells), shape.dim}, 1, true);
   }
   return map;
 }

@@ -4,10 +4,8 @@
 #include <array>
 #include <cmath>
 #include <cstring>
-#include <limits>
 #include <numeric>
 #include <stdexcept>
-#include <type_traits>
 #include <utility>
 
 #include "protomark/error.h"
@@ -17,8 +15,6 @@
 namespace protomark {
 namespace {
 
-constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-constexpr Position kNowhere = {kNaN, kNaN, kNaN};
 // Rows that are put into cells at a time.
 constexpr std::size_t kSettleChunk = 1 << 16;
 
@@ -86,6 +82,14 @@ void make_room_in(Vector& v, std::size_t more) {
   if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
 }
 
+template <typename Vector>
+void enlarge(Vector& v, std::size_t capacity, const PrototypeStore::Alone& alone) {
+  Vector larger;
+  larger.reserve(capacity);
+  larger.assign(v.begin(), v.end());
+  alone([&] { v.swap(larger); });
+}
+
 }  // namespace
 
 std::uint32_t PrototypeStore::find_or_create_row(std::int64_t id, std::uint16_t look) {
@@ -151,16 +155,18 @@ void PrototypeStore::make_room(std::span<const std::int64_t> landmarks, std::siz
       landmarks.begin(), landmarks.end(), [&](std::int64_t id) { return find(id) == kNone; }));
   for_each_array(unknown, places_of(look_bits_ == 0 ? unknown : rows),
                  [&](auto& v, std::size_t more) {
-                   if (has_room(v, more)) return;
-                   std::remove_reference_t<decltype(v)> larger;
-                   larger.reserve(larger_capacity(v, more));
-                   larger.assign(v.begin(), v.end());
-                   alone([&] { v.swap(larger); });
+                   if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), alone);
                  });
   if (!index_.has_room(unknown)) {
     IdIndex larger = index_.with_room(ids_, unknown);
     alone([&] { std::swap(index_, larger); });
   }
+}
+
+void PrototypeStore::make_places(std::size_t places, const Alone& alone) {
+  for_each_array(0, places, [&](auto& v, std::size_t n) {
+    if (v.capacity() < n) enlarge(v, n, alone);
+  });
 }
 
 void PrototypeStore::resize_rows(std::size_t places) {
@@ -209,34 +215,66 @@ std::uint32_t* PrototypeStore::link_to(std::uint32_t row) {
   return link;
 }
 
-// A row moves to a place that is free and leaves its own free.
-void PrototypeStore::relocate(std::uint32_t from, std::uint32_t to) {
-  std::copy_n(sum(from), dim_, sum(to));
-  counts_[to] = counts_[from];
+void PrototypeStore::read(std::uint32_t place, Row& row) const {
+  std::copy_n(sum(place), dim_, row.sum.data());
+  row.count = counts_[place];
   for (std::size_t d = 0; d < dim_; d += 4) {
-    std::copy_n(packed() + packed_index(from, d, dim_), 4, packed() + packed_index(to, d, dim_));
+    std::memcpy(&row.rounded[d], packed() + packed_index(place, d, dim_), 4);
   }
   if (look_bits_ == 0) {
+    row.id = ids_[place];
+    if (!positions_.empty()) row.position = positions_[place];
+  } else {
+    row.look = looks_[place];
+    row.owner = owners_[place];
+    row.next = next_[place];
+  }
+}
+
+void PrototypeStore::write(std::uint32_t place, const Row& row) {
+  std::copy_n(row.sum.data(), dim_, sum(place));
+  counts_[place] = row.count;
+  for (std::size_t d = 0; d < dim_; d += 4) {
+    std::memcpy(packed() + packed_index(place, d, dim_), &row.rounded[d], 4);
+  }
+  if (look_bits_ == 0) {
+    ids_[place] = row.id;
+    if (!positions_.empty()) positions_[place] = row.position;
+  } else {
+    looks_[place] = row.look;
+    owners_[place] = row.owner;
+    next_[place] = row.next;
+  }
+}
+
+// No row has this place any more.
+void PrototypeStore::vacate(std::uint32_t place) {
+  if (look_bits_ == 0) {
+    ids_[place] = -1;
+    if (!positions_.empty()) positions_[place] = kNowhere;
+  } else {
+    owners_[place] = kNone;
+    next_[place] = kNone;
+  }
+}
+
+// A row moves to a place that is free and leaves its own free.
+void PrototypeStore::relocate(std::uint32_t from, std::uint32_t to) {
+  if (look_bits_ == 0) {
     index_.move(ids_, ids_[from], to);
-    ids_[to] = std::exchange(ids_[from], -1);
-    if (!positions_.empty()) positions_[to] = std::exchange(positions_[from], kNowhere);
   } else {
     *link_to(from) = to;
-    next_[to] = next_[from];
-    looks_[to] = looks_[from];
-    owners_[to] = std::exchange(owners_[from], kNone);
   }
+  Row row;
+  read(from, row);
+  write(to, row);
+  vacate(from);
 }
 
 // The last row of its cell takes the place of a row that is gone; where a block becomes empty, the
 // last block takes its place.
 void PrototypeStore::close_gap(std::uint32_t row) {
-  if (look_bits_ == 0) {
-    ids_[row] = -1;
-    if (!positions_.empty()) positions_[row] = kNowhere;
-  } else {
-    owners_[row] = kNone;
-  }
+  vacate(row);
   const std::uint32_t cell = blocks_.cell_of(row);
   if (const std::uint32_t last = blocks_.last(cell); last != row) relocate(last, row);
   const std::uint32_t gone = blocks_.pop(cell);
@@ -341,6 +379,24 @@ std::vector<std::uint32_t> PrototypeStore::sorted_landmarks() const {
   result.reserve(landmarks());
   visit_sorted_landmarks(
       [&](auto piece) { result.insert(result.end(), piece.begin(), piece.end()); });
+  return result;
+}
+
+std::vector<std::uint32_t> PrototypeStore::rows_at(std::span<const std::size_t> ranks) const {
+  std::vector<std::size_t> ascending(ranks.size());
+  std::iota(ascending.begin(), ascending.end(), std::size_t{0});
+  std::sort(ascending.begin(), ascending.end(),
+            [&](std::size_t a, std::size_t b) { return ranks[a] < ranks[b]; });
+  std::vector<std::uint32_t> result(ranks.size());
+  std::size_t seen = 0;
+  auto next = ascending.begin();
+  visit_sorted_landmarks([&](std::span<const std::uint32_t> landmarks) {
+    const std::vector<std::uint32_t> rows = sorted_rows(landmarks);
+    for (; next != ascending.end() && ranks[*next] < seen + rows.size(); ++next) {
+      result[*next] = rows[ranks[*next] - seen];
+    }
+    seen += rows.size();
+  });
   return result;
 }
 
@@ -506,83 +562,6 @@ void PrototypeStore::settle(int threads) {
   unsettled_.clear();
 }
 
-namespace {
-
-// Elements of `size` values each, those at `from` put to `to`, padding between them; none of none.
-template <typename Vector>
-Vector moved(const Vector& v, std::size_t size, const std::vector<std::uint32_t>& from,
-             const std::vector<std::uint32_t>& to, std::size_t places,
-             const typename Vector::value_type& padding) {
-  if (v.empty()) return {};
-  Vector result(places * size, padding);
-  for (std::size_t i = 0; i < from.size(); ++i) {
-    std::copy_n(&v[from[i] * size], size, &result[to[i] * size]);
-  }
-  return result;
-}
-
-}  // namespace
-
-PrototypeStore PrototypeStore::with_cells(Cells cells, int threads) const {
-  std::vector<std::uint32_t> rows;
-  rows.reserve(rows_);
-  for (std::uint32_t row = 0; row < places(); ++row) {
-    if (is_row(row)) rows.push_back(row);
-  }
-  std::vector<std::uint32_t> cell_of_row(rows.size(), 0);
-  for (std::size_t first = 0; cells.size() != 0 && first < rows.size(); first += kSettleChunk) {
-    const auto some = std::span(rows).subspan(first, std::min(kSettleChunk, rows.size() - first));
-    const std::vector<std::int8_t> codes = rounded(some);
-    const auto own = cells.assign({codes.data(), some.size(), dim_}, threads);
-    std::copy(own.begin(), own.end(), cell_of_row.begin() + static_cast<std::ptrdiff_t>(first));
-  }
-  const std::size_t number_of_cells = std::max<std::size_t>(cells.size(), 1);
-  const CellOrder order(cell_of_row, number_of_cells);
-  const std::vector<std::uint32_t>& to = order.places;
-  const std::size_t end = order.first_blocks.back() * kPackedRows;
-
-  PrototypeStore result(dim_, look_bits_);
-  result.rows_ = rows_;
-  result.changes_ = changes_ + rows_;
-  result.cells_version_ = cells_version_ + 1;
-  result.cells_ = std::move(cells);
-  result.blocks_ = CellBlocks(number_of_cells);
-  result.blocks_.reserve(order.first_blocks.back());
-  for (std::uint32_t c = 0; c < number_of_cells; ++c) {
-    for (std::size_t i = 0; i < order.rows[c]; ++i) result.blocks_.append(c);
-  }
-  result.sums_ = moved(sums_, dim_, rows, to, end, 0);
-  result.counts_ = moved(counts_, 1, rows, to, end, 0);
-  result.packed_.resize(packed_size(end, dim_) / sizeof(CodeVector));
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    for (std::size_t d = 0; d < dim_; d += 4) {
-      std::memcpy(result.packed() + packed_index(to[i], d, dim_),
-                  packed() + packed_index(rows[i], d, dim_), 4);
-    }
-  }
-  std::vector<std::uint32_t> number(places(), kNone);
-  for (std::size_t i = 0; i < rows.size(); ++i) number[rows[i]] = to[i];
-  result.index_ = index_;
-  if (look_bits_ == 0) {
-    result.ids_ = moved(ids_, 1, rows, to, end, -1);
-    result.positions_ = moved(positions_, 1, rows, to, end, kNowhere);
-    result.index_.renumber(number);
-    return result;
-  }
-  result.ids_ = ids_;
-  result.positions_ = positions_;
-  result.heads_ = heads_;
-  result.looks_ = moved(looks_, 1, rows, to, end, 0);
-  result.owners_ = moved(owners_, 1, rows, to, end, kNone);
-  result.next_ = moved(next_, 1, rows, to, end, kNone);
-  for (auto* links : {&result.heads_, &result.next_}) {
-    for (std::uint32_t& row : *links) {
-      if (row != kNone) row = number[row];
-    }
-  }
-  return result;
-}
-
 void PrototypeStore::make_room_for_positions(const Alone& alone) {
   if (!positions_.empty()) return;
   std::vector<Position> fresh(ids_.size(), kNowhere);
@@ -629,10 +608,18 @@ void PrototypeMap::Store::alone(const std::function<void()>& swap) {
 }
 
 // What was there before goes when the lock has.
-void PrototypeMap::Store::replace(PrototypeStore other) {
-  const std::unique_lock lock(mutex);
-  other.take_notes_of(*this);
-  std::swap(static_cast<PrototypeStore&>(*this), other);
+void PrototypeMap::Store::put_into_cells(Cells cells, int threads, bool in_place) {
+  Arrangement to = arrange(std::move(cells), threads);
+  if (in_place) {
+    make_places(to.places(), [&](const auto& swap) { alone(swap); });
+    alone([&] { rearrange(to); });
+    return;
+  }
+  PrototypeStore other = arranged(to);
+  alone([&] {
+    other.take_notes_of(*this);
+    std::swap(static_cast<PrototypeStore&>(*this), other);
+  });
 }
 
 PackedPrototypes PrototypeStore::view() const {

@@ -2,10 +2,12 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <shared_mutex>
@@ -24,6 +26,12 @@
 #include "protomark/prototypes.h"
 
 namespace protomark {
+
+// Of landmarks that have no position.
+inline constexpr Position kNowhere = {std::numeric_limits<double>::quiet_NaN(),
+                                      std::numeric_limits<double>::quiet_NaN(),
+                                      std::numeric_limits<double>::quiet_NaN()};
+bool is_nowhere(const Position& position);
 
 // Neither landmarks nor rows are sorted. Without looks a row is a landmark and has its number; with
 // them, the rows of a landmark are a chain.
@@ -99,9 +107,10 @@ class PrototypeStore {
   using Visit = std::function<void(std::span<const std::uint32_t>)>;
   void visit_sorted_landmarks(const Visit& visit) const;
   void visit_sorted_rows(std::uint32_t cell, const Visit& visit) const;
-  // Landmarks by id, and rows by id and then look.
+  // Landmarks by id.
   std::vector<std::uint32_t> sorted_landmarks() const;
-  std::vector<std::uint32_t> sorted_rows() const { return sorted_rows(sorted_landmarks()); }
+  // The rows of these ranks among all rows by id and then look.
+  std::vector<std::uint32_t> rows_at(std::span<const std::size_t> ranks) const;
   // Rows of some landmarks, in their order and then by look.
   std::vector<std::uint32_t> sorted_rows(std::span<const std::uint32_t> landmarks) const;
   // Rows of one landmark by look.
@@ -132,8 +141,22 @@ class PrototypeStore {
   const CellBlocks& blocks() const { return blocks_; }
   // A number that every set of cells has for itself.
   std::size_t cells_version() const { return cells_version_; }
-  // The same map with these cells.
-  PrototypeStore with_cells(Cells cells, int threads) const;
+  // Where rows will stand by other cells.
+  struct Arrangement {
+    Cells cells;
+    CellBlocks blocks;
+    std::vector<std::uint32_t> to;  // of each place; kNone where no row stands
+
+    std::size_t places() const { return blocks.blocks() * kPackedRows; }
+  };
+  // By these cells; none: drops the index.
+  Arrangement arrange(Cells cells, int threads) const;
+  // The same map so arranged; takes the arrangement's cells.
+  PrototypeStore arranged(Arrangement& arrangement) const;
+  // This map itself; needs `make_places` for it before, and uses up the arrangement.
+  void rearrange(Arrangement& arrangement) noexcept;
+  // Room for so many places in all, as make_room makes it.
+  void make_places(std::size_t places, const Alone& alone);
   // Puts rows that were created or refreshed into their cells; ends every change.
   void settle(int threads);
   // A number that grows with each row that came, changed or went while there was an index.
@@ -165,10 +188,29 @@ class PrototypeStore {
     std::uint16_t look;
   };
 
+  // What a place holds, apart from what leads to it: `id` and `position` without looks, with them
+  // `look`, `owner` and `next`.
+  struct Row {
+    std::array<std::int16_t, 256> sum;
+    std::array<std::int8_t, 256> rounded;
+    Position position;
+    std::int64_t id;
+    std::uint32_t owner, next;
+    std::uint16_t look;
+    std::uint8_t count;
+  };
+
   const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
   std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
   void add(std::uint32_t row, const std::int8_t* code);
   void prefetch_rounded(std::uint32_t row) const;
+  void read(std::uint32_t place, Row& row) const;
+  void write(std::uint32_t place, const Row& row);
+  void vacate(std::uint32_t place);
+  void prefetch(std::uint32_t place) const;
+  void permute(std::vector<std::uint32_t>& to);
+  void renumber_rows(const std::vector<std::uint32_t>& to);
+  void adopt(Arrangement& arrangement);
   template <typename Do>
   void for_each_array(std::size_t landmarks, std::size_t places, const Do& todo);
   std::uint32_t* link_to(std::uint32_t row);
@@ -229,7 +271,11 @@ struct PrototypeMap::Store : PrototypeStore {
   void add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes, int threads);
   void make_room(std::span<const std::int64_t> landmarks, std::size_t rows);
   void make_room_for_positions();
-  void replace(PrototypeStore other);
+  Cells learn_cells(std::size_t number, int threads) const;
+  // Rows go by these cells: beside the map, which takes as much memory again, or within it, which
+  // takes 5 bytes a place, and what else the largest array that is to grow has, but lets searches
+  // wait.
+  void put_into_cells(Cells cells, int threads, bool in_place);
 
   // As measured on the map, now or when it was much the same; where others measure or change the
   // map, with these cells at least. `lock` is one of `mutex`, and is let go while ranks are
@@ -259,7 +305,5 @@ struct PrototypeMap::Store : PrototypeStore {
   mutable std::mutex ranks_mutex_;  // last
   mutable std::shared_ptr<const MeasuredRanks> ranks_;
 };
-
-bool is_nowhere(const Position& position);
 
 }  // namespace protomark

@@ -180,6 +180,11 @@ void learning() {
         std::vector<std::uint32_t>(n, 0));
 }
 
+std::vector<std::byte> content(const fs::path& path) {
+  const MappedFile file(path);
+  return {file.bytes().begin(), file.bytes().end()};
+}
+
 // Whatever happens to a map with an index, it answers as one without.
 void histories(std::size_t look_bits) {
   const auto encoder = test::random_encoder();
@@ -257,11 +262,9 @@ void histories(std::size_t look_bits) {
     const PrototypeMap again = PrototypeMap::load(path);
     CHECK(again.index_cells() == 16);
     CHECK(search(again, queries, 3, with_probes(2)) == search(with, queries, 3, with_probes(2)));
-    const auto bytes = MappedFile(path);
-    const std::vector<std::byte> first(bytes.bytes().begin(), bytes.bytes().end());
+    const auto bytes = content(path);
     again.save(path);
-    const auto second = MappedFile(path);
-    CHECK(std::ranges::equal(first, second.bytes()));
+    CHECK(content(path) == bytes);
     fs::remove(path);
     if (round == 6) {
       with.drop_index();
@@ -275,6 +278,77 @@ void histories(std::size_t look_bits) {
   CHECK(search(with, queries, 2, with_probes(4)).ids == std::vector<std::int64_t>(128, -1));
   add(300, 100);
   check_exact(with, search(without, queries, 3), queries);
+}
+
+// Rows that change places within the map end where they would beside it.
+void ways(std::size_t look_bits, bool placed) {
+  const auto encoder = test::random_encoder();
+  const fs::path path =
+      fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
+  PrototypeMap beside(encoder, kDim, look_bits), within(encoder, kDim, look_bits);
+  test::Random random(12);
+  const auto codes = clumped(random, 64);
+  const Codes queries{codes.data(), 64, kDim};
+  const auto both = [&](const auto& change) {
+    change(beside);
+    change(within);
+  };
+  const auto add = [&](std::size_t n, std::int64_t first) {
+    const auto landmarks = random.integers<std::int64_t>(n, first, first + 499);
+    const auto more = clumped(random, n);
+    both([&](PrototypeMap& map) { map.add_codes(landmarks, {more.data(), n, kDim}); });
+    const std::vector<Position> positions(1, {1, 2, static_cast<double>(first)});
+    const std::vector<std::int64_t> one = {landmarks[0]};
+    if (placed) both([&](PrototypeMap& map) { map.set_positions(one, positions); });
+  };
+  const auto check_equal = [&] {
+    CHECK(within.index_cells() == beside.index_cells());
+    CHECK(within.prototype_count() == beside.prototype_count());
+    const auto ids = within.ids();
+    CHECK(ids == beside.ids());
+    CHECK(within.counts(ids) == beside.counts(ids));
+    CHECK(search(within, queries, 3) == search(beside, queries, 3));
+    for (const std::size_t probes : {1, 3}) {
+      if (within.index_cells() == 0) continue;
+      CHECK(search(within, queries, 3, with_probes(probes)) ==
+            search(beside, queries, 3, with_probes(probes)));
+      CHECK(search(within, queries, 3, with_recall(0.9)) ==
+            search(beside, queries, 3, with_recall(0.9)));
+    }
+    beside.save(path);
+    const auto saved = content(path);
+    within.save(path);
+    CHECK(content(path) == saved);
+    beside.seal(path);
+    const auto sealed = content(path);
+    within.seal(path);
+    CHECK(content(path) == sealed);
+  };
+  add(900, 0);
+  // More cells, fewer, as many, one, and none in between.
+  for (const std::size_t cells : {7, 60, 60, 3, 1, 200}) {
+    beside.build_index(cells);
+    within.build_index(cells, 1, true);
+    check_equal();
+    // Of cells in which rows are gone, and others have come.
+    const auto ids = beside.ids();
+    const std::vector<std::int64_t> gone(ids.begin() + 40, ids.begin() + 200);
+    both([&](PrototypeMap& map) { map.discard(gone); });
+    check_equal();
+    add(300, static_cast<std::int64_t>(cells) * 10);
+    check_equal();
+    if (cells == 60) both([](PrototypeMap& map) { map.drop_index(); });
+    check_equal();
+  }
+  both([](PrototypeMap& map) {
+    auto ids = map.ids();
+    ids.pop_back();
+    map.discard(ids);
+  });
+  beside.build_index(1);
+  within.build_index(1, 1, true);
+  check_equal();
+  fs::remove(path);
 }
 
 void sealed(std::size_t look_bits, int bits, std::optional<double> prototypes,
@@ -366,6 +440,9 @@ int main() {
   learning();
   histories(0);
   histories(5);
+  for (const std::size_t look_bits : {0, 5}) {
+    for (const bool placed : {false, true}) ways(look_bits, placed);
+  }
   sealed(0, 8, std::nullopt);
   sealed(0, 4, std::nullopt);
   sealed(5, 8, std::nullopt);

@@ -285,7 +285,7 @@ void test_searches_while_an_index_is_built() {
       });
     }
     for (int round = 0; round < 20 || searches < 100; ++round) {
-      map.build_index(4 + round % 13);
+      map.build_index(4 + round % 13, 1, round % 2 == 1);
       map.add_codes(some.ids, some.view());
       map.remove_codes(some.ids, some.view());
       if (round % 4 == 3) map.drop_index();

@@ -1,49 +1,18 @@
 // What saving and sealing take beside the map, counted by the allocations that they make.
 #include <algorithm>
-#include <atomic>
 #include <cstdlib>
 #include <filesystem>
 #include <limits>
-#include <new>
 #include <numeric>
 #include <string>
 
-#include <malloc.h>
 #include <unistd.h>
 
 #include "check.h"
+#include "counted_memory.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"
 #include "random.h"
-
-namespace {
-
-std::atomic<std::size_t> held{0}, most{0};
-
-void* counted(void* memory) {
-  if (memory == nullptr) throw std::bad_alloc();
-  const std::size_t now = held += malloc_usable_size(memory);
-  for (std::size_t before = most; before < now && !most.compare_exchange_weak(before, now);) {
-  }
-  return memory;
-}
-
-void release(void* memory) {
-  if (memory != nullptr) held -= malloc_usable_size(memory);
-  std::free(memory);
-}
-
-}  // namespace
-
-void* operator new(std::size_t size) { return counted(std::malloc(size)); }
-void* operator new(std::size_t size, std::align_val_t alignment) {
-  const auto a = static_cast<std::size_t>(alignment);
-  return counted(std::aligned_alloc(a, (size + a - 1) / a * a));
-}
-void operator delete(void* memory) noexcept { release(memory); }
-void operator delete(void* memory, std::size_t) noexcept { release(memory); }
-void operator delete(void* memory, std::align_val_t) noexcept { release(memory); }
-void operator delete(void* memory, std::size_t, std::align_val_t) noexcept { release(memory); }
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -89,10 +58,7 @@ constexpr std::size_t kLandmarks = 200'000, kBuffers = 1 << 19;
 
 template <typename Save>
 void check_save(const std::string& what, std::size_t own, const Save& save) {
-  const std::size_t before = held;
-  most = before;
-  save();
-  const std::size_t more = most - before;
+  const std::size_t more = test::memory_of(save);
   const double share = static_cast<double>(more) / static_cast<double>(own);
   std::printf("%-60s %9zu bytes of %9zu: %.1f %%\n", what.c_str(), more, own, 100 * share);
   CHECK(more < kBuffers + own / 25);
@@ -120,10 +86,10 @@ constexpr Case kCases[] = {
 int main(int argc, char** argv) {
   const std::size_t landmarks = argc > 1 ? std::strtoull(argv[1], nullptr, 10) : kLandmarks;
   for (const Case& c : kCases) {
-    const std::size_t before = held;
+    const std::size_t before = test::held;
     PrototypeMap map = map_of(c.dim, landmarks, c.ids, c.look_bits);
     if (c.indexed) map.build_index(16);
-    const std::size_t own = held - before;
+    const std::size_t own = test::held - before;
     const std::string what = "dim " + std::to_string(c.dim) + ", ids " +
                              std::to_string(static_cast<int>(c.ids)) + ", look bits " +
                              std::to_string(c.look_bits) + (c.indexed ? ", index" : "");

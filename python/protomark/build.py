@@ -117,7 +117,7 @@ def build_file(
     )
     scene.metadata = metadata or {}
     if index:
-        scene.build_index(threads=threads)
+        scene.build_index(threads=threads, in_place=True)  # nobody searches yet
     if seal:
         scene.seal(output, bits=code_bits, prototypes=prototypes, position_bits=position_bits)
     else:

@@ -135,7 +135,14 @@ class PrototypeMap {
   // many as there are prototypes; by default a number that fits the map. Prototypes are kept by
   // cell from then on, through every change, and search may take `recall` or `probes`. Once more:
   // learns anew. Throws std::invalid_argument for other `cells`, and for a map without landmarks.
-  void build_index(std::optional<std::size_t> cells = std::nullopt, int threads = 1);
+  //
+  // Searches go on meanwhile, as prototypes are put into their cells beside the map, which takes as
+  // much memory again. With `in_place` they change places within it: that takes some 5 bytes a
+  // prototype (and once the largest of the map's arrays where that has no room for half-filled
+  // blocks), but searches wait while they do. Cells and answers are the same. Memory that runs out
+  // leaves the map as it was either way.
+  void build_index(std::optional<std::size_t> cells = std::nullopt, int threads = 1,
+                   bool in_place = false);
   void drop_index();
   // Number of cells; 0: there is no index.
   std::size_t index_cells() const;

@@ -59,7 +59,7 @@ def run(workload: Workload, results: Results, bar: Bar) -> None:
     figures = {"landmarks": float(n), "grow seconds": time.perf_counter() - began}
     bar.advance("index")
     began = time.perf_counter()
-    scene.build_index(threads=settings.build_threads)
+    scene.build_index(threads=settings.build_threads, in_place=True)
     figures["index seconds"] = time.perf_counter() - began
     landmarks = np.random.default_rng(7).integers(0, n, settings.queries)
     codes = workload.codes(grown.queries(landmarks))
