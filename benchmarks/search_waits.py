@@ -137,7 +137,11 @@ def things_to_do(
         "seal": lambda: scene.seal(folder / "scene.sealed.pmk"),
         "ids": lambda: scene.ids,
         **(
-            {"add an eighth and measure probes": measure_probes, "build_index": scene.build_index}
+            {
+                "add an eighth and measure probes": measure_probes,
+                "build_index": scene.build_index,
+                "build_index in place": partial(scene.build_index, in_place=True),
+            }
             if indexed
             else {}
         ),
