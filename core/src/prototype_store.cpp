@@ -47,7 +47,8 @@ void PrototypeStore::for_each_array(std::size_t landmarks, std::size_t places, c
 }
 
 void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
-  const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows;
+  // And the one that make_room_for_row wants to be free.
+  const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows + 1;
   for_each_array(landmarks, blocks * kPackedRows, [](auto& v, std::size_t n) { v.reserve(n); });
   blocks_.reserve(blocks);
 }

@@ -25,7 +25,7 @@ RECALL = 0.95
 THREADS = 2
 CODE_BITS = (8, 4)
 # About, of a landmark: an open map while it is built and sealed; files of both kinds together.
-OPEN_BYTES, FILE_BYTES = 190, 70
+OPEN_BYTES, FILE_BYTES = 140, 70
 OBSERVATIONS = 2  # of a landmark here, so that making them takes minutes, not hours
 _PART = 1 << 20
 _FINER = f"recall of the nearest of 8 bits, asked for {growth.RECALL}"
