@@ -98,7 +98,7 @@ int main(int argc, char** argv) {
     // A regression: with the last landmark all arrays grew to twice their size.
     const std::size_t closed = test::held;
     const PrototypeMap opened = PrototypeMap::load(path);
-    CHECK(test::held - closed < own + own / 50 + kBuffers);
+    CHECK(test::held - closed < own + own / 4 + kBuffers);
     check_save(what + ": seal", own, [&] { map.seal(path); });
     check_save(what + ": seal, 4 bits", own, [&] { map.seal(path, 4); });
   }
