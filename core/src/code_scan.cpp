@@ -68,8 +68,11 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
       unsigned_codes_(queries.rows * dim_, 128),
       best_ids_(queries.rows * kept_),
       best_distances_(queries.rows * kept_),
+      head_(dim_),
+      tails_(queries.rows, 0),
       chunk_rows_(rows_of_chunk(queries.rows, dim_)),
       biases_(chunk_rows_),
+      head_biases_(chunk_rows_),
       hits_(kernels::kHitRoom) {
   best_.reserve(queries.rows);
   for (std::size_t q = 0; q < queries.rows; ++q) {
@@ -78,6 +81,21 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
       unsigned_codes_[q * dim_ + d] = static_cast<std::uint8_t>(code[d] + 128);
     }
     best_.emplace_back(&best_ids_[q * kept_], &best_distances_[q * kept_], kept_, kNoLimit);
+  }
+}
+
+void CodeScan::look_at_heads(std::size_t met) {
+  // Few queries wait for memory, which is read whole. The more rows were met, the nearer are the
+  // neighbours, and the fewer dimensions tell.
+  constexpr std::size_t kFewQueries = 4, kManyRows = std::size_t{1} << 18;
+  if (queries() < kFewQueries) return;
+  const std::size_t eighths = met < kManyRows ? 6 : 5;
+  const std::size_t head = (dim_ * eighths / 8 + 3) / 4 * 4;
+  if (head == head_) return;
+  head_ = head;
+  const std::size_t compared = std::min(head, codes_.columns);
+  for (std::size_t q = 0; q < codes_.rows; ++q) {
+    tails_[q] = squared_norm(codes_.row(q) + compared, codes_.columns - compared);
   }
 }
 
@@ -91,15 +109,19 @@ void CodeScan::gather(std::span<const std::uint32_t> queries) {
 void CodeScan::start_chunk(const std::int8_t* packed, std::size_t rows) {
   packed_ = packed;
   blocks_ = (rows + kPackedRows - 1) / kPackedRows;
-  kernels::active().code_biases(packed_, blocks_, dim_, biases_.data());
+  kernels::active().code_biases(packed_, blocks_, dim_, head_, biases_.data(), head_biases_.data());
 }
 
 std::size_t CodeScan::scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
                                  std::size_t* block) {
-  std::int32_t limits[kernels::kScanQueries];
-  for (std::size_t i = 0; i < group.size(); ++i) limits[i] = best_[group[i]].limit();
-  return kernels::active().code_scan({&gathered_[first * dim_], limits, group.size()},
-                                     {packed_, biases_.data(), blocks_, dim_}, block, hits_.data());
+  std::int32_t limits[kernels::kScanQueries], tails[kernels::kScanQueries];
+  for (std::size_t i = 0; i < group.size(); ++i) {
+    limits[i] = best_[group[i]].limit();
+    tails[i] = tails_[group[i]];
+  }
+  return kernels::active().code_scan(
+      {&gathered_[first * dim_], limits, tails, group.size()},
+      {packed_, biases_.data(), head_biases_.data(), blocks_, dim_, head_}, block, hits_.data());
 }
 
 void CodeScan::merge(const CodeScan& other) {

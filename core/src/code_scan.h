@@ -37,6 +37,11 @@ class CodeScan {
   // packed blocks as it goes had best make at a time.
   std::size_t chunk_rows() const { return chunk_rows_; }
 
+  // For scans of many rows, of which `met` were compared before: from now on a row is first
+  // compared in some dimensions only. Encoders put those first that tell most, so that a distance
+  // over them mostly shows that a row is not among the nearest.
+  void look_at_heads(std::size_t met);
+
   // Compares the queries of these indices with the first `rows` rows of `packed`, blocks of 16 rows
   // as in PackedPrototypes, and calls offer(TopK& best, std::int32_t distance, std::size_t row) for
   // those that may be among the k nearest. `offer` calls best.offer(distance, id of the row), or
@@ -84,12 +89,14 @@ class CodeScan {
   std::vector<std::int64_t> best_ids_;
   std::vector<std::int32_t> best_distances_;
   std::vector<TopK> best_;
+  std::size_t head_;                 // dimensions that are compared first
+  std::vector<std::int32_t> tails_;  // squared norm of each query's other dimensions
 
   std::vector<std::uint8_t> gathered_;   // codes of the queries that are compared
   std::size_t chunk_rows_;               // compared with all queries at a time
   const std::int8_t* packed_ = nullptr;  // the chunk
   std::size_t blocks_ = 0;
-  std::vector<std::int32_t> biases_;
+  std::vector<std::int32_t> biases_, head_biases_;
   std::vector<kernels::Hit> hits_;
 };
 

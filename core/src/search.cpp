@@ -65,6 +65,7 @@ void scan_rows(const Prototypes& prototypes, const Chunk& chunk, SearchPieces::R
   for (std::size_t row = rows.begin; row < rows.end; row += scan.chunk_rows()) {
     const std::size_t n = std::min(scan.chunk_rows(), rows.end - row);
     const std::int8_t* packed = chunk(row, n, room);
+    scan.look_at_heads(row - rows.begin);
     if (prototypes.landmarks.rows_of == nullptr) {
       scan.compare(all, packed, n, [&](TopK& best, std::int32_t distance, std::size_t i) {
         numbers.offer(best, distance, row + i, prototypes.ids);

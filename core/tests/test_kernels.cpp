@@ -174,8 +174,8 @@ std::vector<kernels::Hit> expected_hits(const std::vector<std::vector<std::int32
   return hits;
 }
 
-void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, std::size_t blocks,
-                   std::size_t n, int style) {
+void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, std::size_t head,
+                   std::size_t blocks, std::size_t n, int style) {
   const std::size_t rows = 16 * blocks;
   const auto packed = values<std::int8_t>(random, rows * dim, style, -128, 127);
   const auto queries = values<std::uint8_t>(random, n * dim, random.integer(0, 2), 1, 255);
@@ -188,13 +188,20 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
       }
     }
   }
-  std::vector<std::int32_t> biases(rows);
-  set.code_biases(packed.data(), blocks, dim, biases.data());
+  std::vector<std::int32_t> tails(n);
+  for (std::size_t q = 0; q < n; ++q) {
+    for (std::size_t d = head; d < dim; ++d) {
+      tails[q] += (queries[q * dim + d] - 128) * (queries[q * dim + d] - 128);
+    }
+  }
+  std::vector<std::int32_t> biases(rows), head_biases(rows);
+  set.code_biases(packed.data(), blocks, dim, head, biases.data(), head_biases.data());
   for (int repeat = 0; repeat < 3; ++repeat) {
     const auto limits = some_limits(random, distances);
     const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
-      return set.code_scan({queries.data(), limits.data(), n},
-                           {packed.data(), biases.data(), blocks, dim}, block, hits);
+      return set.code_scan({queries.data(), limits.data(), tails.data(), n},
+                           {packed.data(), biases.data(), head_biases.data(), blocks, dim, head},
+                           block, hits);
     });
     CHECK(found == expected_hits(distances, limits));
   }
@@ -254,7 +261,9 @@ void compare_code_scans(const Kernels& set, test::Random& random) {
     for (std::size_t dim = 4; dim <= 256; dim += dim < 72 ? 4 : 28) {
       for (const std::size_t n : {1, 3, 6, 16}) {
         const auto blocks = static_cast<std::size_t>(random.integer(0, 13));
-        compare_codes(set, random, dim, blocks, n, style);
+        const auto head =
+            4 * static_cast<std::size_t>(random.integer(1, static_cast<int>(dim / 4)));
+        compare_codes(set, random, dim, head, blocks, n, style);
       }
     }
   }

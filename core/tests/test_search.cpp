@@ -123,6 +123,44 @@ void check_codes(test::Random& random, std::size_t rows, std::size_t dim, std::s
   }
 }
 
+// Rows for which fewer dimensions are compared first. These tell much, nothing, or as much as all.
+void check_heads(test::Random& random) {
+  constexpr std::size_t kRows = 270'000, kDim = 12, kQueries = 21;
+  for (const auto& [head, tail] : {std::pair(100, 10), {0, 100}, {3, 3}}) {
+    const auto value = [&](std::size_t i) {
+      const int span = i % kDim < kDim / 2 ? head : tail;
+      return static_cast<std::int8_t>(random.integer(-span, span));
+    };
+    std::vector<std::int8_t> codes(kRows * kDim), queries(kQueries * kDim);
+    for (std::size_t i = 0; i < codes.size(); ++i) codes[i] = value(i);
+    for (std::size_t i = 0; i < queries.size(); ++i) queries[i] = value(i);
+    std::vector<std::int8_t> packed(packed_size(kRows, kDim), 0);
+    for (std::size_t i = 0; i < codes.size(); ++i) {
+      packed[packed_index(i / kDim, i % kDim, kDim)] = codes[i];
+    }
+    std::vector<std::int64_t> ids(2 * kQueries);
+    std::vector<float> distances(2 * kQueries);
+    search(PackedPrototypes{packed.data(), kRows, kDim}, {queries.data(), kQueries, kDim}, {},
+           {ids.data(), kQueries, 2}, {distances.data(), kQueries, 2});
+    for (std::size_t q = 0; q < kQueries; ++q) {
+      std::vector<std::pair<int, std::int64_t>> expected;
+      for (std::size_t r = 0; r < kRows; ++r) {
+        int sum = 0;
+        for (std::size_t d = 0; d < kDim; ++d) {
+          const int difference = codes[r * kDim + d] - queries[q * kDim + d];
+          sum += difference * difference;
+        }
+        expected.emplace_back(sum, static_cast<std::int64_t>(r));
+      }
+      std::partial_sort(expected.begin(), expected.begin() + 2, expected.end());
+      for (std::size_t j = 0; j < 2; ++j) {
+        CHECK(ids[2 * q + j] == expected[j].second);
+        CHECK(distances[2 * q + j] == std::sqrt(static_cast<float>(expected[j].first)));
+      }
+    }
+  }
+}
+
 void check_codes4(test::Random& random, std::size_t rows, std::size_t dim, std::size_t n) {
   Map map = random_map(random, rows, dim, true, 127);
   const int half_step = static_cast<int>(random.integer(1, kMaxHalfStep));
@@ -211,6 +249,7 @@ int main() {
   check_codes4(random, 9000, 9, 3);
   check_hamming(random, 9000, 9, 3);
   check_hamming(random, 900, 8, 150);
+  check_heads(random);
   // The largest distances.
   check_codes(random, 50, 256, 20, 127);
   const std::vector<std::int8_t> low(packed_size(1, 256), -127), high(256, 127);

@@ -1,6 +1,7 @@
 // AVX2: x86 since Haswell and Zen.
 #include <immintrin.h>
 
+#include "heads.h"
 #include "kernels.h"
 
 namespace protomark::kernels {
@@ -189,19 +190,20 @@ __m256i products(__m256i even, __m256i odd, __m256i other_even, __m256i other_od
 }
 
 // |p|^2 + 256 sum(p)
-void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                 std::int32_t* biases) {
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t head,
+                 std::int32_t* biases, std::int32_t* head_biases) {
   const __m256i weight = _mm256_set1_epi16(256);
   for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
     for (std::size_t half = 0; half < 2; ++half) {
       __m256i sum = _mm256_setzero_si256();
       for (std::size_t d = 0; d < dim; d += 4) {
+        if (d == head) store(head_biases + b * kCodeRows + 8 * half, sum);
         const __m256i p = load(packed + d * kCodeRows + 32 * half);
         const __m256i even = even_dims(p), odd = odd_dims(p);
         sum = _mm256_add_epi32(sum, products(even, odd, _mm256_add_epi16(even, weight),
                                              _mm256_add_epi16(odd, weight)));
       }
-      _mm256_storeu_si256(reinterpret_cast<__m256i*>(biases + b * kCodeRows + 8 * half), sum);
+      store(biases + b * kCodeRows + 8 * half, sum);
     }
   }
 }
@@ -212,16 +214,16 @@ struct QueryPairs {
   std::int32_t odd;
 };
 
+// Distances over the first `dims` dimensions. Inlined, so that they stay in registers.
 template <int Queries>
-std::size_t scan_tile(const QueryPairs* queries, const std::int32_t* limits,
-                      const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
-                      Hit* hits) {
-  __m256i acc[Queries][2];
+[[gnu::always_inline]] inline void sum_up(const QueryPairs* queries, const PackedCodes& rows,
+                                          std::size_t first_row, const std::int32_t* biases,
+                                          std::size_t dims, __m256i (&acc)[Queries][2]) {
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) acc[q][0] = acc[q][1] = _mm256_setzero_si256();
   const std::int8_t* p = rows.codes + first_row * rows.dim;
   const std::size_t steps = rows.dim / 4;
-  for (std::size_t s = 0; s < steps; ++s, p += 4 * kCodeRows) {
+  for (std::size_t s = 0; s < dims / 4; ++s, p += 4 * kCodeRows) {
     const __m256i first = load(p), second = load(p + 32);
     const __m256i even[2] = {even_dims(first), even_dims(second)};
     const __m256i odd[2] = {odd_dims(first), odd_dims(second)};
@@ -234,16 +236,32 @@ std::size_t scan_tile(const QueryPairs* queries, const std::int32_t* limits,
       }
     }
   }
-  const std::int32_t* biases = rows.biases + first_row;
-  const __m256i bias[2] = {load(biases), load(biases + 8)};
+  const __m256i bias[2] = {load(biases + first_row), load(biases + first_row + 8)};
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    for (int h = 0; h < 2; ++h) {
+      acc[q][h] = _mm256_sub_epi32(bias[h], _mm256_slli_epi32(acc[q][h], 1));
+    }
+  }
+}
+
+// All bits where a distance is above the limit.
+__m256i both_far(const __m256i (&distances)[2], std::int32_t limit) {
+  const __m256i above = _mm256_set1_epi32(limit);
+  return _mm256_and_si256(_mm256_cmpgt_epi32(distances[0], above),
+                          _mm256_cmpgt_epi32(distances[1], above));
+}
+
+template <int Queries>
+std::size_t scan_tile(const QueryPairs* queries, const std::int32_t* limits,
+                      const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
+                      Hit* hits) {
+  __m256i acc[Queries][2];
+  sum_up(queries, rows, first_row, rows.biases, rows.dim, acc);
   __m256i all_far = _mm256_set1_epi32(-1);
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
-    const __m256i limit = _mm256_set1_epi32(limits[q]);
-    for (int h = 0; h < 2; ++h) {
-      acc[q][h] = _mm256_sub_epi32(bias[h], _mm256_slli_epi32(acc[q][h], 1));
-      all_far = _mm256_and_si256(all_far, _mm256_cmpgt_epi32(acc[q][h], limit));
-    }
+    all_far = _mm256_and_si256(all_far, both_far(acc[q], limits[q]));
   }
   if (_mm256_movemask_epi8(all_far) == -1) [[likely]]
     return 0;
@@ -255,7 +273,7 @@ std::size_t scan_tile(const QueryPairs* queries, const std::int32_t* limits,
     const __m256i limit = _mm256_set1_epi32(limits[q]);
     unsigned near = 0;
     for (int h = 0; h < 2; ++h) {
-      _mm256_storeu_si256(reinterpret_cast<__m256i*>(distances + 8 * h), acc[q][h]);
+      store(distances + 8 * h, acc[q][h]);
       const __m256i far = _mm256_cmpgt_epi32(acc[q][h], limit);
       near |= (~static_cast<unsigned>(_mm256_movemask_ps(_mm256_castsi256_ps(far))) & 0xff)
               << (8 * h);
@@ -269,6 +287,25 @@ std::size_t scan_tile(const QueryPairs* queries, const std::int32_t* limits,
   return found;
 }
 
+// Appends to `found` which queries from `first_query` on may be within their limits of a block, by
+// their heads.
+template <int Queries>
+std::size_t near_by_heads(const QueryPairs* pairs, const std::int32_t* head_limits,
+                          const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
+                          std::uint8_t* found) {
+  __m256i acc[Queries][2];
+  sum_up(pairs, rows, first_row, rows.head_biases, rows.head, acc);
+  std::size_t size = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    // No branch: which ones are near cannot be foretold.
+    found[size] = static_cast<std::uint8_t>(first_query + static_cast<std::size_t>(q));
+    const __m256i far = both_far(acc[q], head_limits[q]);
+    size += _mm256_movemask_epi8(far) != -1;
+  }
+  return size;
+}
+
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
   constexpr std::size_t kTile = 4;
@@ -278,16 +315,25 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
     const std::uint8_t* u = queries.codes + 4 * i;
     pairs[i] = {u[0] | u[2] << 16, u[1] | u[3] << 16};
   }
+  Heads heads(queries, rows);
   std::size_t found = 0;
+  const auto scan = [&]<int Queries>(std::size_t q, std::size_t row) {
+    found += scan_tile<Queries>(pairs + q * steps, queries.limits + q, rows, q, row, hits + found);
+  };
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
     std::size_t q = 0;
-    for (; q + kTile <= queries.n; q += kTile) {
-      found += scan_tile<kTile>(pairs + q * steps, queries.limits + q, rows, q, row, hits + found);
+    if (heads.now()) {
+      std::uint8_t likely[kScanQueries];
+      std::size_t n = 0;
+      for (; q + kTile <= queries.n; q += kTile) {
+        n += near_by_heads<kTile>(pairs + q * steps, heads.limits() + q, rows, q, row, likely + n);
+      }
+      heads.left(n);
+      for (std::size_t i = 0; i < n; ++i) scan.template operator()<1>(likely[i], row);
     }
-    for (; q < queries.n; ++q) {
-      found += scan_tile<1>(pairs + q * steps, queries.limits + q, rows, q, row, hits + found);
-    }
+    for (; q + kTile <= queries.n; q += kTile) scan.template operator()<kTile>(q, row);
+    for (; q < queries.n; ++q) scan.template operator()<1>(q, row);
   }
   return found;
 }

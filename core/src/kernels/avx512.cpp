@@ -2,6 +2,7 @@
 #include <immintrin.h>
 
 #include "avx512_hits.h"
+#include "heads.h"
 #include "kernels.h"
 
 namespace protomark::kernels {
@@ -146,20 +147,25 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
 }
 
 // -|p|^2 - 256 sum(p), see avx512_hits.h.
-void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                 std::int32_t* biases) {
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t head,
+                 std::int32_t* biases, std::int32_t* head_biases) {
   const __m512i ones = _mm512_set1_epi8(1), top_bit = _mm512_set1_epi8(-128);
   for (std::size_t b = 0; b < blocks; ++b) {
     __m512i products = _mm512_setzero_si512();
     __m512i sum = _mm512_setzero_si512();
-    for (std::size_t d = 0; d < dim; d += 4, packed += 64) {
-      const __m512i p = _mm512_loadu_si512(packed);
-      // p (p + 128): one product of an unsigned and a signed byte in place of p p.
-      products = _mm512_dpbusd_epi32(products, _mm512_xor_si512(p, top_bit), p);
-      sum = _mm512_dpbusd_epi32(sum, ones, p);
-    }
-    const __m512i offset = _mm512_add_epi32(products, _mm512_slli_epi32(sum, 7));
-    _mm512_storeu_si512(biases + b * kCodeRows, _mm512_sub_epi32(_mm512_setzero_si512(), offset));
+    const auto add = [&](std::size_t begin, std::size_t end) {
+      for (std::size_t d = begin; d < end; d += 4, packed += 64) {
+        const __m512i p = _mm512_loadu_si512(packed);
+        // p (p + 128): one product of an unsigned and a signed byte in place of p p.
+        products = _mm512_dpbusd_epi32(products, _mm512_xor_si512(p, top_bit), p);
+        sum = _mm512_dpbusd_epi32(sum, ones, p);
+      }
+      const __m512i offset = _mm512_add_epi32(products, _mm512_slli_epi32(sum, 7));
+      return _mm512_sub_epi32(_mm512_setzero_si512(), offset);
+    };
+    const __m512i first = add(0, head);
+    if (head < dim) _mm512_storeu_si512(head_biases + b * kCodeRows, first);
+    _mm512_storeu_si512(biases + b * kCodeRows, add(head, dim));
   }
 }
 
@@ -194,27 +200,42 @@ void add_products(__m512i& acc, __m512i u, __m512i s) {
   __asm__("vpdpbusd %2, %1, %0" : "+v"(acc) : "v"(u), "v"(s));
 }
 
+// Some queries, and rows from one on.
 struct CodeTile {
   const std::uint8_t* queries;
   const std::int32_t* limits;
+  const std::int32_t* head_limits;
   const std::int8_t* rows;
   const std::int32_t* biases;
+  const std::int32_t* head_biases;
   std::size_t dim;
+  std::size_t head;
   std::size_t first_query;
   std::size_t first_row;
+
+  CodeTile from_query(std::size_t q) const {
+    CodeTile t = *this;
+    t.queries += q * dim;
+    t.limits += q;
+    t.head_limits += q;
+    t.first_query += q;
+    return t;
+  }
 };
 
+// Half the negated distances over the first `dims` dimensions, see avx512_hits.h. Inlined, so that
+// they stay in registers.
 template <int Queries, int Blocks>
-std::size_t scan_tile(const CodeTile& t, Hit* hits) {
-  __m512i acc[Queries][Blocks];
+[[gnu::always_inline]] inline void sum_up(const CodeTile& t, const std::int32_t* biases,
+                                          std::size_t dims, __m512i (&acc)[Queries][Blocks]) {
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
-    const __m512i half = _mm512_srai_epi32(_mm512_loadu_si512(t.biases + b * kCodeRows), 1);
+    const __m512i half = _mm512_srai_epi32(_mm512_loadu_si512(biases + b * kCodeRows), 1);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) acc[q][b] = half;
   }
   const std::int8_t* p = t.rows;
-  for (std::size_t d = 0; d < t.dim; d += 4, p += 64) {
+  for (std::size_t d = 0; d < dims; d += 4, p += 64) {
     __m512i codes[Blocks];
 #pragma GCC unroll 8
     for (int b = 0; b < Blocks; ++b) codes[b] = _mm512_loadu_si512(p + b * kCodeRows * t.dim);
@@ -225,14 +246,24 @@ std::size_t scan_tile(const CodeTile& t, Hit* hits) {
       for (int b = 0; b < Blocks; ++b) add_products(acc[q][b], query, codes[b]);
     }
   }
+}
+
+// Whether one of the rows may be within the limit of a query.
+template <int Blocks>
+[[gnu::always_inline]] inline unsigned near(const __m512i (&acc)[Blocks], std::int32_t limit) {
+  __m512i best = acc[0];
+#pragma GCC unroll 8
+  for (int b = 1; b < Blocks; ++b) best = _mm512_max_epi32(best, acc[b]);
+  return _mm512_cmpge_epi32_mask(best, _mm512_set1_epi32(threshold(limit)));
+}
+
+template <int Queries, int Blocks>
+std::size_t scan_tile(const CodeTile& t, Hit* hits) {
+  __m512i acc[Queries][Blocks];
+  sum_up(t, t.biases, t.dim, acc);
   unsigned any = 0;
 #pragma GCC unroll 8
-  for (int q = 0; q < Queries; ++q) {
-    __m512i best = acc[q][0];
-#pragma GCC unroll 8
-    for (int b = 1; b < Blocks; ++b) best = _mm512_max_epi32(best, acc[q][b]);
-    any |= _mm512_cmpge_epi32_mask(best, _mm512_set1_epi32(threshold(t.limits[q])));
-  }
+  for (int q = 0; q < Queries; ++q) any |= near(acc[q], t.limits[q]);
   if (any == 0) [[likely]]
     return 0;
 
@@ -252,48 +283,84 @@ std::size_t scan_tile(const CodeTile& t, Hit* hits) {
   return found;
 }
 
-template <int Blocks>
-std::size_t scan_blocks(CodeTile t, std::size_t n, Hit* hits) {
-  std::size_t found = 0;
+// Calls take<Queries>(tile), so many queries at a time, for all n.
+template <typename Take>
+void each_tile(const CodeTile& t, std::size_t n, const Take& take) {
   constexpr int kTile = 4;
   std::size_t q = 0;
-  for (; q + kTile <= n; q += kTile) {
-    found += scan_tile<kTile, Blocks>(t, hits + found);
-    t.queries += kTile * t.dim;
-    t.limits += kTile;
-    t.first_query += kTile;
-  }
+  for (; q + kTile <= n; q += kTile) take.template operator()<kTile>(t.from_query(q));
   switch (n - q) {
     case 1:
-      return found + scan_tile<1, Blocks>(t, hits + found);
+      return take.template operator()<1>(t.from_query(q));
     case 2:
-      return found + scan_tile<2, Blocks>(t, hits + found);
+      return take.template operator()<2>(t.from_query(q));
     case 3:
-      return found + scan_tile<3, Blocks>(t, hits + found);
+      return take.template operator()<3>(t.from_query(q));
     default:
-      return found;
+      return;
   }
+}
+
+template <int Blocks>
+std::size_t scan_blocks(const CodeTile& all, std::size_t n, Hit* hits) {
+  std::size_t found = 0;
+  each_tile(all, n, [&]<int Queries>(const CodeTile& t) {
+    found += scan_tile<Queries, Blocks>(t, hits + found);
+  });
+  return found;
+}
+
+// Blocks that are compared at a time.
+constexpr std::size_t kStep = 4;
+
+// The queries that may be within their limits of one of kStep blocks, by their heads.
+std::size_t near_by_heads(const CodeTile& all, std::size_t n, std::uint8_t* found) {
+  std::size_t size = 0;
+  each_tile(all, n, [&]<int Queries>(const CodeTile& t) {
+    __m512i acc[Queries][kStep];
+    sum_up(t, t.head_biases, t.head, acc);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) {
+      // No branch: which ones are near cannot be foretold.
+      found[size] = static_cast<std::uint8_t>(t.first_query + static_cast<std::size_t>(q));
+      size += near(acc[q], t.head_limits[q]) != 0;
+    }
+  });
+  return size;
 }
 
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
+  Heads heads(queries, rows);
   std::size_t found = 0;
   std::size_t b = *block;
   while (b < rows.blocks && found < kHitsEnough) {
     const CodeTile tile = {queries.codes,
                            queries.limits,
+                           heads.limits(),
                            rows.codes + b * kCodeRows * rows.dim,
                            rows.biases + b * kCodeRows,
+                           rows.head_biases + b * kCodeRows,
                            rows.dim,
+                           rows.head,
                            0,
                            b * kCodeRows};
-    if (b + 4 <= rows.blocks) {
-      found += scan_blocks<4>(tile, queries.n, hits + found);
-      b += 4;
-    } else {
+    if (b + kStep > rows.blocks) {
       found += scan_blocks<1>(tile, queries.n, hits + found);
       b += 1;
+      continue;
     }
+    if (heads.now()) {
+      std::uint8_t likely[kScanQueries];
+      const std::size_t n = near_by_heads(tile, queries.n, likely);
+      for (std::size_t i = 0; i < n; ++i) {
+        found += scan_tile<1, kStep>(tile.from_query(likely[i]), hits + found);
+      }
+      heads.left(n);
+    } else {
+      found += scan_blocks<kStep>(tile, queries.n, hits + found);
+    }
+    b += kStep;
   }
   *block = b;
   return found;

@@ -45,16 +45,20 @@ inline constexpr std::size_t kHitRoom = kHitsEnough + kScanQueries * 64;
 struct CodeQueries {
   const std::uint8_t* codes;
   const std::int32_t* limits;
+  const std::int32_t* tails;  // squared norm of each without its head
   std::size_t n;
 };
 
 // Codes p, -127 to 127, in blocks of 16 rows: for every 4 dimensions, 16 rows x 4 codes. `dim` is a
-// multiple of 4, 256 at most.
+// multiple of 4, 256 at most. `head`, a multiple of 4 up to dim, says of how many dimensions the
+// distance is likely to show that a row is too far away; a set may make use of it.
 struct PackedCodes {
   const std::int8_t* codes;
   const std::int32_t* biases;  // from code_biases of the same set
+  const std::int32_t* head_biases;
   std::size_t blocks;
   std::size_t dim;
+  std::size_t head;
 };
 
 // n x words; n is 1 to kScanQueries.
@@ -99,9 +103,10 @@ struct Kernels {
   void (*activate32)(const Activation& activation, const std::int32_t* sums, std::size_t n,
                      std::uint8_t* next, std::size_t stride) = nullptr;
 
-  // What code_scan of the same set starts from, a number a row.
+  // What code_scan of the same set starts from, a number a row for all dimensions and one for the
+  // first `head`, where the set makes use of it.
   void (*code_biases)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                      std::int32_t* biases) = nullptr;
+                      std::size_t head, std::int32_t* biases, std::int32_t* head_biases) = nullptr;
 
   // 4-bit numbers u as codes half_step * (2 u - 15), packed as code_scan takes them, `dim` rounded
   // up to a multiple of 4 with zeros, whatever `packed` holds there. They are packed in blocks of

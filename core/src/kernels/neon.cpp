@@ -1,6 +1,7 @@
 // NEON with dot products (ARMv8.2 and later): phones since 2018, Apple silicon, Graviton 2.
 #include <arm_neon.h>
 
+#include "heads.h"
 #include "kernels.h"
 
 namespace protomark::kernels {
@@ -155,12 +156,13 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
 }
 
 // |p|^2: queries are made signed again.
-void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                 std::int32_t* biases) {
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t head,
+                 std::int32_t* biases, std::int32_t* head_biases) {
   for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
     for (std::size_t part = 0; part < 4; ++part) {
       int32x4_t sum = vdupq_n_s32(0);
       for (std::size_t d = 0; d < dim; d += 4) {
+        if (d == head) vst1q_s32(head_biases + b * kCodeRows + 4 * part, sum);
         const int8x16_t p = vld1q_s8(packed + d * kCodeRows + 16 * part);
         sum = vdotq_s32(sum, p, p);
       }
@@ -169,16 +171,16 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
   }
 }
 
+// Distances over the first `dims` dimensions. Inlined, so that they stay in registers.
 template <int Queries>
-std::size_t scan_tile(const std::int8_t* queries, const std::int32_t* limits,
-                      const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
-                      Hit* hits) {
-  int32x4_t acc[Queries][4];
+[[gnu::always_inline]] inline void sum_up(const std::int8_t* queries, const PackedCodes& rows,
+                                          std::size_t first_row, const std::int32_t* biases,
+                                          std::size_t dims, int32x4_t (&acc)[Queries][4]) {
   for (int q = 0; q < Queries; ++q) {
     for (int part = 0; part < 4; ++part) acc[q][part] = vdupq_n_s32(0);
   }
   const std::int8_t* p = rows.codes + first_row * rows.dim;
-  for (std::size_t d = 0; d < rows.dim; d += 4, p += 4 * kCodeRows) {
+  for (std::size_t d = 0; d < dims; d += 4, p += 4 * kCodeRows) {
     const int8x16_t codes[4] = {vld1q_s8(p), vld1q_s8(p + 16), vld1q_s8(p + 32), vld1q_s8(p + 48)};
     for (int q = 0; q < Queries; ++q) {
       std::int32_t bytes;
@@ -189,15 +191,30 @@ std::size_t scan_tile(const std::int8_t* queries, const std::int32_t* limits,
       }
     }
   }
-  uint32x4_t any = vdupq_n_u32(0);
   for (int q = 0; q < Queries; ++q) {
-    const int32x4_t limit = vdupq_n_s32(limits[q]);
     for (int part = 0; part < 4; ++part) {
-      const int32x4_t bias = vld1q_s32(rows.biases + first_row + 4 * part);
+      const int32x4_t bias = vld1q_s32(biases + first_row + 4 * part);
       acc[q][part] = vmlsq_n_s32(bias, acc[q][part], 2);
-      any = vorrq_u32(any, vcleq_s32(acc[q][part], limit));
     }
   }
+}
+
+// Bits are set where a distance is within the limit.
+uint32x4_t within(const int32x4_t (&distances)[4], std::int32_t limit) {
+  const int32x4_t most = vdupq_n_s32(limit);
+  uint32x4_t any = vdupq_n_u32(0);
+  for (const int32x4_t part : distances) any = vorrq_u32(any, vcleq_s32(part, most));
+  return any;
+}
+
+template <int Queries>
+std::size_t scan_tile(const std::int8_t* queries, const std::int32_t* limits,
+                      const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
+                      Hit* hits) {
+  int32x4_t acc[Queries][4];
+  sum_up(queries, rows, first_row, rows.biases, rows.dim, acc);
+  uint32x4_t any = vdupq_n_u32(0);
+  for (int q = 0; q < Queries; ++q) any = vorrq_u32(any, within(acc[q], limits[q]));
   if (vmaxvq_u32(any) == 0) [[likely]]
     return 0;
 
@@ -214,6 +231,23 @@ std::size_t scan_tile(const std::int8_t* queries, const std::int32_t* limits,
   return found;
 }
 
+// Appends to `found` which queries from `first_query` on may be within their limits of a block, by
+// their heads.
+template <int Queries>
+std::size_t near_by_heads(const std::int8_t* codes, const std::int32_t* head_limits,
+                          const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
+                          std::uint8_t* found) {
+  int32x4_t acc[Queries][4];
+  sum_up(codes, rows, first_row, rows.head_biases, rows.head, acc);
+  std::size_t size = 0;
+  for (int q = 0; q < Queries; ++q) {
+    // No branch: which ones are near cannot be foretold.
+    found[size] = static_cast<std::uint8_t>(first_query + static_cast<std::size_t>(q));
+    size += vmaxvq_u32(within(acc[q], head_limits[q])) != 0;
+  }
+  return size;
+}
+
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
   constexpr std::size_t kTile = 4;
@@ -221,17 +255,27 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   for (std::size_t i = 0; i < queries.n * rows.dim; ++i) {
     codes[i] = static_cast<std::int8_t>(queries.codes[i] - 128);
   }
+  Heads heads(queries, rows);
   std::size_t found = 0;
+  const auto scan = [&]<int Queries>(std::size_t q, std::size_t row) {
+    found +=
+        scan_tile<Queries>(codes + q * rows.dim, queries.limits + q, rows, q, row, hits + found);
+  };
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
     std::size_t q = 0;
-    for (; q + kTile <= queries.n; q += kTile) {
-      found +=
-          scan_tile<kTile>(codes + q * rows.dim, queries.limits + q, rows, q, row, hits + found);
+    if (heads.now()) {
+      std::uint8_t likely[kScanQueries];
+      std::size_t n = 0;
+      for (; q + kTile <= queries.n; q += kTile) {
+        n += near_by_heads<kTile>(codes + q * rows.dim, heads.limits() + q, rows, q, row,
+                                  likely + n);
+      }
+      heads.left(n);
+      for (std::size_t i = 0; i < n; ++i) scan.template operator()<1>(likely[i], row);
     }
-    for (; q < queries.n; ++q) {
-      found += scan_tile<1>(codes + q * rows.dim, queries.limits + q, rows, q, row, hits + found);
-    }
+    for (; q + kTile <= queries.n; q += kTile) scan.template operator()<kTile>(q, row);
+    for (; q < queries.n; ++q) scan.template operator()<1>(q, row);
   }
   return found;
 }

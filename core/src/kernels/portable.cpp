@@ -86,8 +86,8 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
 }
 
 // Queries come as q + 128: |p|^2 - 2 p . q = |p|^2 + 256 sum(p) - 2 p . (q + 128).
-void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                 std::int32_t* biases) {
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t,
+                 std::int32_t* biases, std::int32_t*) {
   for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
     for (std::size_t r = 0; r < kCodeRows; ++r) {
       std::int32_t sum = 0;
