@@ -126,6 +126,10 @@ def things_to_do(
         scene.add_codes(np.arange(landmarks // 8), random_codes(landmarks // 8, dim, rng))
         scene.probes(0.95)
 
+    def rearrange() -> None:
+        # Other cells than before: else no row changes its place.
+        scene.build_index(scene.index_cells - 1, in_place=True)
+
     return {
         "nothing": lambda: time.sleep(0.1),
         **{f"add {n:,}": partial(scene.add, known[:n], descriptors[:n]) for n in BATCHES},
@@ -140,7 +144,7 @@ def things_to_do(
             {
                 "add an eighth and measure probes": measure_probes,
                 "build_index": scene.build_index,
-                "build_index in place": partial(scene.build_index, in_place=True),
+                "build_index in place": rearrange,
             }
             if indexed
             else {}

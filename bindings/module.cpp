@@ -709,7 +709,7 @@ Args:
     cells: number of cells, 1 to 65536 and at most that of prototypes; None: one that fits the map.
     threads: threads to use.
     in_place: False: prototypes are put into cells beside the map, which takes as much memory again,
-        and searches go on. True: they change places within it, which takes some 5 bytes a
+        and searches go on. True: they change places within it, which takes 5 to 10 bytes a
         prototype, and once the map's largest array (2 dim bytes a prototype) where that has no room
         for half-filled blocks; searches wait while they do. The result is the same.
 

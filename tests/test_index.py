@@ -171,6 +171,21 @@ def test_an_index_takes_at_most_4_bytes_a_prototype(
     assert sizes[0] - sizes[1] <= 4 * landmarks
 
 
+def test_equal_maps_get_as_many_cells(coder: pm.Encoder, tmp_path: Path) -> None:
+    """A regression: a position that was taken away again left room for itself."""
+    a, b = (filled(coder, 20_000) for _ in range(2))
+    some = a.ids[:1]
+    a.set_positions(some, [[1.0, 2.0, 3.0]])
+    a.set_positions(some, [[np.nan] * 3])
+    for scene, name in ((a, "a.pmk"), (b, "b.pmk")):
+        scene.save(tmp_path / name)
+    assert (tmp_path / "a.pmk").read_bytes() == (tmp_path / "b.pmk").read_bytes()
+    again = pm.open(tmp_path / "a.pmk")
+    for scene in (a, b, again):
+        scene.build_index()
+    assert a.index_cells == b.index_cells == again.index_cells
+
+
 @pytest.mark.parametrize(("bits", "prototypes"), [(8, None), (4, None), (8, 1.5), (4, 2.0)])
 @pytest.mark.parametrize("look_bits", [0, 4])
 def test_a_sealed_map_keeps_the_index(

@@ -188,8 +188,8 @@ std::size_t Cells::number_for(std::size_t prototypes, std::size_t dim, std::size
   // centroid, its number of rows and half a block of padding, somewhat rounded up.
   const double ranks = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
   const double sealed = (n * (kBytes - std::bit_width(prototypes) / 8.0) - ranks) / (9.5 * k + 4);
-  // An open one has for each cell its centroid three times, half a block of places and half of the
-  // 12 bytes of a block.
+  // An open one has for each cell its centroid three times and some numbers, half a block of places
+  // and half of the 12 bytes of a block.
   const double half = static_cast<double>(kPackedRows * place) / 2 + 6;
   const double open = (n * kBytes - ranks) / (half + 3 * k + 16);
   const double cells = std::min({4 * std::sqrt(n), sealed, open});

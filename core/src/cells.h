@@ -28,8 +28,8 @@ class Cells {
   // As many cells by Lloyd's k-means, in integers; at most as many as codes.
   static Cells learn(Codes codes, std::size_t cells, int threads);
   // Where the caller names no number: cells for that many prototypes, few enough that the index of
-  // an open and that of a sealed map takes at most 4 bytes for each of them,
-  // where a place for one takes `place` bytes in the open one.
+  // an open map, in which a place takes `place` bytes, and that of a sealed one take at most 4
+  // bytes for each of them.
   static std::size_t number_for(std::size_t prototypes, std::size_t dim, std::size_t place);
   // Prototypes that suffice to learn as many cells.
   static std::size_t sample_for(std::size_t cells) { return 48 * cells; }

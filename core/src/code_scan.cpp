@@ -120,7 +120,7 @@ std::size_t CodeScan::scan_chunk(std::span<const std::uint32_t> group, std::size
     tails[i] = tails_[group[i]];
   }
   return kernels::active().code_scan(
-      {&gathered_[first * dim_], limits, tails, group.size()},
+      {&gathered_[first * dim_], limits, tails, group.size(), &put_off_},
       {packed_, biases_.data(), head_biases_.data(), blocks_, dim_, head_}, block, hits_.data());
 }
 

@@ -91,6 +91,7 @@ class CodeScan {
   std::vector<TopK> best_;
   std::size_t head_;                 // dimensions that are compared first
   std::vector<std::int32_t> tails_;  // squared norm of each query's other dimensions
+  std::size_t put_off_ = 0;          // see kernels::CodeQueries
 
   std::vector<std::uint8_t> gathered_;   // codes of the queries that are compared
   std::size_t chunk_rows_;               // compared with all queries at a time

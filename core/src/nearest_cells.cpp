@@ -26,11 +26,10 @@ class Ranking {
         blocks_((centroids.rows + kPackedRows - 1) / kPackedRows),
         queries_(kernels::kScanQueries * dim_),
         biases_(blocks_ * kPackedRows),
-        head_biases_(biases_.size()),
         hits_(kernels::kHitRoom),
         found_(kernels::kScanQueries) {
-    kernels::active().code_biases(centroids.data, blocks_, dim_, dim_, biases_.data(),
-                                  head_biases_.data());
+    // In all dimensions at once: many are wanted.
+    kernels::active().code_biases(centroids.data, blocks_, dim_, dim_, biases_.data(), nullptr);
   }
 
   // At most kScanQueries queries.
@@ -89,9 +88,8 @@ class Ranking {
   void scan(std::size_t query, std::size_t queries, std::size_t block, std::size_t end) {
     while (block < end) {
       const std::size_t n = kernels::active().code_scan(
-          {&queries_[query * dim_], &limits_[query], &tails_[query], queries},
-          {centroids_.data, biases_.data(), head_biases_.data(), end, dim_, dim_}, &block,
-          hits_.data());
+          {&queries_[query * dim_], &limits_[query], &tails_[query], queries, &put_off_},
+          {centroids_.data, biases_.data(), biases_.data(), end, dim_, dim_}, &block, hits_.data());
       for (std::size_t i = 0; i < n; ++i) {
         if (hits_[i].row >= centroids_.rows) continue;
         found_[query + hits_[i].query].push_back(
@@ -105,7 +103,8 @@ class Ranking {
   std::size_t blocks_;
   std::vector<std::uint8_t> queries_;
   std::array<std::int32_t, kernels::kScanQueries> limits_, tails_{};
-  std::vector<std::int32_t> biases_, head_biases_;
+  std::size_t put_off_ = 0;
+  std::vector<std::int32_t> biases_;
   std::vector<kernels::Hit> hits_;
   std::vector<Found> found_;  // of each query
 };

@@ -46,6 +46,13 @@ void PrototypeStore::for_each_array(std::size_t landmarks, std::size_t places, c
   todo(next_, places);
 }
 
+std::size_t PrototypeStore::place_bytes() const {
+  const std::size_t row = dim_ * sizeof(sums_[0]) + packed_dim(dim_) + sizeof(counts_[0]);
+  if (look_bits_ != 0) return row + sizeof(looks_[0]) + sizeof(owners_[0]) + sizeof(next_[0]);
+  const bool placed = !std::all_of(positions_.begin(), positions_.end(), is_nowhere);
+  return row + sizeof(ids_[0]) + (placed ? sizeof(Position) : 0);
+}
+
 void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
   // And the one that make_room_for_row wants to be free.
   const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows + 1;

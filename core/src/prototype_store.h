@@ -53,11 +53,9 @@ class PrototypeStore {
   const LargeVector<std::int64_t>& ids() const { return ids_; }
   // Row numbers are below.
   std::size_t places() const { return blocks_.blocks() * kPackedRows; }
-  std::size_t place_bytes() const {
-    const std::size_t row = dim_ * sizeof(sums_[0]) + packed_dim(dim_) + sizeof(counts_[0]);
-    if (look_bits_ != 0) return row + sizeof(looks_[0]) + sizeof(owners_[0]) + sizeof(next_[0]);
-    return row + sizeof(ids_[0]) + (positions_.empty() ? 0 : sizeof(Position));
-  }
+  // What a place takes. Positions count where a landmark has one, as in a file: the same of equal
+  // maps.
+  std::size_t place_bytes() const;
   bool is_row(std::size_t place) const {
     return look_bits_ == 0 ? ids_[place] >= 0 : owners_[place] != kNone;
   }
@@ -259,7 +257,7 @@ struct PrototypeMap::Store : PrototypeStore {
   using PrototypeStore::PrototypeStore;
 
   // Calls change(begin, end) for pieces of [0, n), each alone with the map. The caller holds
-  // `changing`, as that of make_room and replace.
+  // `changing`, as that of make_room and put_into_cells.
   template <typename Change>
   void in_pieces(std::size_t n, const Change& change) {
     for (std::size_t begin = 0; begin < n; begin += kPiece) {
@@ -273,8 +271,8 @@ struct PrototypeMap::Store : PrototypeStore {
   void make_room_for_positions();
   Cells learn_cells(std::size_t number, int threads) const;
   // Rows go by these cells: beside the map, which takes as much memory again, or within it, which
-  // takes 5 bytes a place, and what else the largest array that is to grow has, but lets searches
-  // wait.
+  // takes 5 bytes a place and, where arrays have to grow, the largest of them once more, but lets
+  // searches wait.
   void put_into_cells(Cells cells, int threads, bool in_place);
 
   // As measured on the map, now or when it was much the same; where others measure or change the

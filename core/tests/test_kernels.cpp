@@ -196,10 +196,11 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
   }
   std::vector<std::int32_t> biases(rows), head_biases(rows);
   set.code_biases(packed.data(), blocks, dim, head, biases.data(), head_biases.data());
+  std::size_t put_off = 0;
   for (int repeat = 0; repeat < 3; ++repeat) {
     const auto limits = some_limits(random, distances);
     const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
-      return set.code_scan({queries.data(), limits.data(), tails.data(), n},
+      return set.code_scan({queries.data(), limits.data(), tails.data(), n, &put_off},
                            {packed.data(), biases.data(), head_biases.data(), blocks, dim, head},
                            block, hits);
     });
@@ -266,6 +267,8 @@ void compare_code_scans(const Kernels& set, test::Random& random) {
         compare_codes(set, random, dim, head, blocks, n, style);
       }
     }
+    // A look at heads is put off, and comes again.
+    for (const std::size_t n : {4, 15, 16}) compare_codes(set, random, 32, 20, 150, n, style);
   }
 }
 

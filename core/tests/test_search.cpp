@@ -124,8 +124,9 @@ void check_codes(test::Random& random, std::size_t rows, std::size_t dim, std::s
 }
 
 // Rows for which fewer dimensions are compared first. These tell much, nothing, or as much as all.
+template <std::size_t kRows, std::size_t kQueries>
 void check_heads(test::Random& random) {
-  constexpr std::size_t kRows = 270'000, kDim = 12, kQueries = 21;
+  constexpr std::size_t kDim = 32;
   for (const auto& [head, tail] : {std::pair(100, 10), {0, 100}, {3, 3}}) {
     const auto value = [&](std::size_t i) {
       const int span = i % kDim < kDim / 2 ? head : tail;
@@ -249,7 +250,8 @@ int main() {
   check_codes4(random, 9000, 9, 3);
   check_hamming(random, 9000, 9, 3);
   check_hamming(random, 900, 8, 150);
-  check_heads(random);
+  check_heads<270'000, 7>(random);
+  check_heads<5'000, 300>(random);
   // The largest distances.
   check_codes(random, 50, 256, 20, 127);
   const std::vector<std::int8_t> low(packed_size(1, 256), -127), high(256, 127);

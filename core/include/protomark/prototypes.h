@@ -137,7 +137,7 @@ class PrototypeMap {
   // learns anew. Throws std::invalid_argument for other `cells`, and for a map without landmarks.
   //
   // Searches go on meanwhile, as prototypes are put into their cells beside the map, which takes as
-  // much memory again. With `in_place` they change places within it: that takes some 5 bytes a
+  // much memory again. With `in_place` they change places within it: that takes 5 to 10 bytes a
   // prototype (and once the largest of the map's arrays where that has no room for half-filled
   // blocks), but searches wait while they do. Cells and answers are the same. Memory that runs out
   // leaves the map as it was either way.

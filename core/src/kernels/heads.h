@@ -10,26 +10,28 @@ namespace {
 class Heads {
  public:
   Heads(const CodeQueries& queries, const PackedCodes& rows)
-      : queries_(queries.n), never_(rows.head >= rows.dim || queries.n < kTile) {
+      : queries_(queries.n),
+        never_(rows.head >= rows.dim || queries.n < kTile),
+        put_off_(queries.put_off) {
     for (std::size_t q = 0; q < queries_; ++q) {
       const std::int32_t limit = queries.limits[q], tail = queries.tails[q];
       limits_[q] = limit > INT32_MAX - tail ? INT32_MAX : limit + tail;
     }
   }
 
-  // What distances over the head, of rows within the limits, do not exceed: there a distance is at
-  // most the whole one, less what the rest of the query can add.
+  // What |p|^2 - 2 p . q over the head does not exceed for rows within the limits: the other
+  // dimensions add at least minus the squared norm of the query there.
   const std::int32_t* limits() const { return limits_; }
 
   // A look at heads pays where it leaves few queries; else it is put off for some steps.
   bool now() {
     if (never_) return false;
-    if (put_off_ == 0) return true;
-    --put_off_;
+    if (*put_off_ == 0) return true;
+    --*put_off_;
     return false;
   }
   void left(std::size_t queries) {
-    if (queries * kMany > queries_) put_off_ = kPutOff;
+    if (queries * kMany > queries_) *put_off_ = kPutOff;
   }
 
  private:
@@ -37,7 +39,7 @@ class Heads {
 
   std::size_t queries_;
   bool never_;
-  std::size_t put_off_ = 0;
+  std::size_t* put_off_;
   std::int32_t limits_[kScanQueries];
 };
 

@@ -47,11 +47,13 @@ struct CodeQueries {
   const std::int32_t* limits;
   const std::int32_t* tails;  // squared norm of each without its head
   std::size_t n;
+  std::size_t* put_off;  // what scans learn of heads, for later scans; 0 at first
 };
 
 // Codes p, -127 to 127, in blocks of 16 rows: for every 4 dimensions, 16 rows x 4 codes. `dim` is a
 // multiple of 4, 256 at most. `head`, a multiple of 4 up to dim, says of how many dimensions the
-// distance is likely to show that a row is too far away; a set may make use of it.
+// distance is likely to show that a row is too far away; a set may make use of it. Where it is dim,
+// head_biases are neither written nor read.
 struct PackedCodes {
   const std::int8_t* codes;
   const std::int32_t* biases;  // from code_biases of the same set
