@@ -257,8 +257,15 @@ template <int Blocks>
   return _mm512_cmpge_epi32_mask(best, _mm512_set1_epi32(threshold(limit)));
 }
 
+// Under ThreadSanitizer (-O1 -fPIC) g++ 12 mixes up the sums of tiles that are inlined.
+#ifdef __SANITIZE_THREAD__
+#define PROTOMARK_TILE [[gnu::noinline]]
+#else
+#define PROTOMARK_TILE
+#endif
+
 template <int Queries, int Blocks>
-std::size_t scan_tile(const CodeTile& t, Hit* hits) {
+PROTOMARK_TILE std::size_t scan_tile(const CodeTile& t, Hit* hits) {
   __m512i acc[Queries][Blocks];
   sum_up(t, t.biases, t.dim, acc);
   unsigned any = 0;
