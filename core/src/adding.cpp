@@ -48,15 +48,18 @@ void PrototypeStore::add(std::span<const std::int64_t> landmarks, Codes codes,
     const std::uint32_t row = rows[at];
     if (row == kNone) continue;
     add(row, codes.row(at));
-    // Where the next one is of the same row, that one's turn is enough.
+    // One turn is enough where the next observation is of the same row.
     if (at + 1 == n || rows[at + 1] != row) refresh(row);
   }
   // Where memory runs out, what was added so far stays, and answers.
   for (std::size_t i = 0; i < n; ++i) {
     if (rows[i] != kNone) continue;
-    const std::uint32_t row = find_or_create_row(landmarks[i], look_of(codes.row(i)));
+    const std::uint16_t look = look_of(codes.row(i));
+    const std::uint32_t row = find_or_create_row(landmarks[i], look);
     add(row, codes.row(i));
-    refresh(row);
+    const bool again =
+        i + 1 < n && landmarks[i + 1] == landmarks[i] && look_of(codes.row(i + 1)) == look;
+    if (!again) refresh(row);
   }
 }
 
