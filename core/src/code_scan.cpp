@@ -16,7 +16,8 @@ constexpr std::int32_t kNoLimit = 1 << 25;
 // Rows that are compared with all queries at a time. Many queries come back to them from the L2
 // cache; for few, rows should come from memory while the last ones are compared.
 std::size_t rows_of_chunk(std::size_t queries, std::size_t dim) {
-  const auto bytes = std::clamp<std::size_t>(256 * queries, 4096, 65536);
+  const auto bytes =
+      std::clamp<std::size_t>(256 * queries, queries <= kernels::kFewQueries ? 16384 : 8192, 65536);
   return std::max<std::size_t>(bytes / dim / kPackedRows, 1) * kPackedRows;
 }
 
@@ -87,8 +88,8 @@ CodeScan::CodeScan(Codes queries, std::size_t k, const SearchOptions& options)
 void CodeScan::look_at_heads(std::size_t met) {
   // Few queries wait for memory, which is read whole. The more rows were met, the nearer are the
   // neighbours, and the fewer dimensions tell.
-  constexpr std::size_t kFewQueries = 4, kManyRows = std::size_t{1} << 18;
-  if (queries() < kFewQueries) return;
+  constexpr std::size_t kManyRows = std::size_t{1} << 18;
+  if (queries() <= kernels::kFewQueries) return;
   const std::size_t eighths = met < kManyRows ? 6 : 5;
   const std::size_t head = (dim_ * eighths / 8 + 3) / 4 * 4;
   if (head == head_) return;
@@ -106,22 +107,25 @@ void CodeScan::gather(std::span<const std::uint32_t> queries) {
   }
 }
 
-void CodeScan::start_chunk(const std::int8_t* packed, std::size_t rows) {
+void CodeScan::start_chunk(const std::int8_t* packed, std::size_t rows, std::size_t queries) {
   packed_ = packed;
   blocks_ = (rows + kPackedRows - 1) / kPackedRows;
+  biased_ = queries > kernels::kFewQueries;
+  if (!biased_) return;
   kernels::active().code_biases(packed_, blocks_, dim_, head_, biases_.data(), head_biases_.data());
 }
 
 std::size_t CodeScan::scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
                                  std::size_t* block) {
-  std::int32_t limits[kernels::kScanQueries], tails[kernels::kScanQueries];
+  std::int32_t tails[kernels::kScanQueries];
   for (std::size_t i = 0; i < group.size(); ++i) {
-    limits[i] = best_[group[i]].limit();
+    limits_[i] = best_[group[i]].limit();
     tails[i] = tails_[group[i]];
   }
   return kernels::active().code_scan(
-      {&gathered_[first * dim_], limits, tails, group.size(), &put_off_},
-      {packed_, biases_.data(), head_biases_.data(), blocks_, dim_, head_}, block, hits_.data());
+      {&gathered_[first * dim_], limits_.data(), tails, group.size(), &put_off_},
+      {packed_, biased_ ? biases_.data() : nullptr, head_biases_.data(), blocks_, dim_, head_},
+      block, hits_.data());
 }
 
 void CodeScan::merge(const CodeScan& other) {

@@ -1,6 +1,7 @@
 // int8 queries against packed blocks of prototypes: what exact search and search by cells share.
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <span>
@@ -53,7 +54,7 @@ class CodeScan {
     gather(queries);
     for (std::size_t row = 0; row < rows; row += chunk_rows_) {
       const std::size_t chunk = std::min(chunk_rows_, rows - row);
-      start_chunk(packed + packed_size(row, codes_.columns), chunk);
+      start_chunk(packed + packed_size(row, codes_.columns), chunk, queries.size());
       for (std::size_t first = 0; first < queries.size(); first += kernels::kScanQueries) {
         const auto group =
             queries.subspan(first, std::min(kernels::kScanQueries, queries.size() - first));
@@ -61,7 +62,11 @@ class CodeScan {
           const std::size_t found = scan_chunk(group, first, &block);
           for (std::size_t i = 0; i < found; ++i) {
             const kernels::Hit& hit = hits_[i];
-            if (hit.row < chunk) offer(best_[group[hit.query]], hit.distance, row + hit.row);
+            // Those before it may have left no room for it.
+            if (hit.row >= chunk || hit.distance > limits_[hit.query]) continue;
+            TopK& best = best_[group[hit.query]];
+            offer(best, hit.distance, row + hit.row);
+            limits_[hit.query] = best.limit();
           }
         }
       }
@@ -76,7 +81,7 @@ class CodeScan {
 
  private:
   void gather(std::span<const std::uint32_t> queries);
-  void start_chunk(const std::int8_t* packed, std::size_t rows);
+  void start_chunk(const std::int8_t* packed, std::size_t rows, std::size_t queries);
   // Hits of gathered queries from `first` on, from a block of the chunk on.
   std::size_t scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
                          std::size_t* block);
@@ -97,7 +102,9 @@ class CodeScan {
   std::size_t chunk_rows_;               // compared with all queries at a time
   const std::int8_t* packed_ = nullptr;  // the chunk
   std::size_t blocks_ = 0;
+  bool biased_ = false;  // whether its biases are known
   std::vector<std::int32_t> biases_, head_biases_;
+  std::array<std::int32_t, kernels::kScanQueries> limits_;  // of the queries that were scanned last
   std::vector<kernels::Hit> hits_;
 };
 

@@ -19,9 +19,17 @@ class TopK {
   // What a candidate must not exceed to have a chance.
   std::int32_t limit() const { return std::min(limit_, distances_[k_ - 1]); }
 
-  // Takes a candidate whose id has not been offered before.
+  // Takes a candidate whose id has not been offered before. One or two places, which most searches
+  // ask for, need no loop.
   void offer(std::int32_t distance, std::int64_t id) {
-    if (before(distance, id, k_ - 1)) place(distance, id, k_ - 1);
+    if (k_ > 2) {
+      if (before(distance, id, k_ - 1)) place(distance, id, k_ - 1);
+    } else if (before(distance, id, 0)) {
+      if (k_ == 2) set(1, distances_[0], ids_[0]);
+      set(0, distance, id);
+    } else if (k_ == 2 && before(distance, id, 1)) {
+      set(1, distance, id);
+    }
   }
 
   // Takes a candidate whose id may be there already, at another distance.
@@ -42,10 +50,11 @@ class TopK {
 
   // Overwrites place i and moves the newcomer up to where it belongs.
   void place(std::int32_t distance, std::int64_t id, std::size_t i) {
-    for (; i > 0 && before(distance, id, i - 1); --i) {
-      distances_[i] = distances_[i - 1];
-      ids_[i] = ids_[i - 1];
-    }
+    for (; i > 0 && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
+    set(i, distance, id);
+  }
+
+  void set(std::size_t i, std::int32_t distance, std::int64_t id) {
     distances_[i] = distance;
     ids_[i] = id;
   }

@@ -197,12 +197,15 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
   std::vector<std::int32_t> biases(rows), head_biases(rows);
   set.code_biases(packed.data(), blocks, dim, head, biases.data(), head_biases.data());
   std::size_t put_off = 0;
-  for (int repeat = 0; repeat < 3; ++repeat) {
+  for (int repeat = 0; repeat < 6; ++repeat) {
+    // Few queries do without biases.
+    const bool biased = n > kernels::kFewQueries || repeat % 2 == 0;
     const auto limits = some_limits(random, distances);
     const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
-      return set.code_scan({queries.data(), limits.data(), tails.data(), n, &put_off},
-                           {packed.data(), biases.data(), head_biases.data(), blocks, dim, head},
-                           block, hits);
+      return set.code_scan(
+          {queries.data(), limits.data(), tails.data(), n, &put_off},
+          {packed.data(), biased ? biases.data() : nullptr, head_biases.data(), blocks, dim, head},
+          block, hits);
     });
     CHECK(found == expected_hits(distances, limits));
   }
@@ -260,7 +263,7 @@ void compare_hamming(const Kernels& set, test::Random& random, std::size_t words
 void compare_code_scans(const Kernels& set, test::Random& random) {
   for (int style = 0; style < 3; ++style) {
     for (std::size_t dim = 4; dim <= 256; dim += dim < 72 ? 4 : 28) {
-      for (const std::size_t n : {1, 3, 6, 16}) {
+      for (const std::size_t n : {1, 2, 3, 4, 6, 16}) {
         const auto blocks = static_cast<std::size_t>(random.integer(0, 13));
         const auto head =
             4 * static_cast<std::size_t>(random.integer(1, static_cast<int>(dim / 4)));

@@ -96,6 +96,8 @@ void scan_step(const CodeQueries& queries, const PackedCodes& rows, std::size_t 
 
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
+  // Few queries fill no tiles.
+  if (rows.biases == nullptr) return avx512.code_scan(queries, rows, block, hits);
   const TileConfig config = configuration(queries.n, rows.dim);
   TILE_CONFIGURE(config);
   std::size_t found = 0;

@@ -214,7 +214,8 @@ struct QueryPairs {
   std::int32_t odd;
 };
 
-// Distances over the first `dims` dimensions. Inlined, so that they stay in registers.
+// Distances over the first `dims` dimensions, whose biases in a block are given. Inlined, so that
+// they stay in registers.
 template <int Queries>
 [[gnu::always_inline]] inline void sum_up(const QueryPairs* queries, const PackedCodes& rows,
                                           std::size_t first_row, const std::int32_t* biases,
@@ -236,7 +237,7 @@ template <int Queries>
       }
     }
   }
-  const __m256i bias[2] = {load(biases + first_row), load(biases + first_row + 8)};
+  const __m256i bias[2] = {load(biases), load(biases + 8)};
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
     for (int h = 0; h < 2; ++h) {
@@ -254,10 +255,10 @@ __m256i both_far(const __m256i (&distances)[2], std::int32_t limit) {
 
 template <int Queries>
 std::size_t scan_tile(const QueryPairs* queries, const std::int32_t* limits,
-                      const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
-                      Hit* hits) {
+                      const PackedCodes& rows, const std::int32_t* biases, std::size_t first_query,
+                      std::size_t first_row, Hit* hits) {
   __m256i acc[Queries][2];
-  sum_up(queries, rows, first_row, rows.biases, rows.dim, acc);
+  sum_up(queries, rows, first_row, biases, rows.dim, acc);
   __m256i all_far = _mm256_set1_epi32(-1);
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
@@ -294,7 +295,7 @@ std::size_t near_by_heads(const QueryPairs* pairs, const std::int32_t* head_limi
                           const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
                           std::uint8_t* found) {
   __m256i acc[Queries][2];
-  sum_up(pairs, rows, first_row, rows.head_biases, rows.head, acc);
+  sum_up(pairs, rows, first_row, rows.head_biases + first_row, rows.head, acc);
   std::size_t size = 0;
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
@@ -317,11 +318,19 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   }
   Heads heads(queries, rows);
   std::size_t found = 0;
+  std::int32_t own[kCodeRows];
+  const std::int32_t* biases = own;
   const auto scan = [&]<int Queries>(std::size_t q, std::size_t row) {
-    found += scan_tile<Queries>(pairs + q * steps, queries.limits + q, rows, q, row, hits + found);
+    found += scan_tile<Queries>(pairs + q * steps, queries.limits + q, rows, biases, q, row,
+                                hits + found);
   };
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
+    if (rows.biases != nullptr) {
+      biases = rows.biases + row;
+    } else {
+      code_biases(rows.codes + row * rows.dim, 1, rows.dim, rows.dim, own, nullptr);
+    }
     std::size_t q = 0;
     if (heads.now()) {
       std::uint8_t likely[kScanQueries];

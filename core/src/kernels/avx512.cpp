@@ -146,26 +146,37 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
   }
 }
 
-// -|p|^2 - 256 sum(p), see avx512_hits.h.
+// _mm512_dpbusd_epi32 in place: of that, GCC makes two copies of every accumulator a step.
+void add_products(__m512i& acc, __m512i u, __m512i s) {
+  __asm__("vpdpbusd %2, %1, %0" : "+v"(acc) : "v"(u), "v"(s));
+}
+
+// What becomes the biases of 16 rows, -|p|^2 - 256 sum(p), see avx512_hits.h.
+class Norms {
+ public:
+  [[gnu::always_inline]] void add(__m512i p) {
+    // p (p + 128): one product of an unsigned and a signed byte in place of p p.
+    add_products(products_, _mm512_xor_si512(p, _mm512_set1_epi8(-128)), p);
+    add_products(sum_, _mm512_set1_epi8(1), p);
+  }
+  [[gnu::always_inline]] __m512i biases() const {
+    const __m512i offset = _mm512_add_epi32(products_, _mm512_slli_epi32(sum_, 7));
+    return _mm512_sub_epi32(_mm512_setzero_si512(), offset);
+  }
+
+ private:
+  __m512i products_ = _mm512_setzero_si512(), sum_ = _mm512_setzero_si512();
+};
+
 void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t head,
                  std::int32_t* biases, std::int32_t* head_biases) {
-  const __m512i ones = _mm512_set1_epi8(1), top_bit = _mm512_set1_epi8(-128);
   for (std::size_t b = 0; b < blocks; ++b) {
-    __m512i products = _mm512_setzero_si512();
-    __m512i sum = _mm512_setzero_si512();
-    const auto add = [&](std::size_t begin, std::size_t end) {
-      for (std::size_t d = begin; d < end; d += 4, packed += 64) {
-        const __m512i p = _mm512_loadu_si512(packed);
-        // p (p + 128): one product of an unsigned and a signed byte in place of p p.
-        products = _mm512_dpbusd_epi32(products, _mm512_xor_si512(p, top_bit), p);
-        sum = _mm512_dpbusd_epi32(sum, ones, p);
-      }
-      const __m512i offset = _mm512_add_epi32(products, _mm512_slli_epi32(sum, 7));
-      return _mm512_sub_epi32(_mm512_setzero_si512(), offset);
-    };
-    const __m512i first = add(0, head);
-    if (head < dim) _mm512_storeu_si512(head_biases + b * kCodeRows, first);
-    _mm512_storeu_si512(biases + b * kCodeRows, add(head, dim));
+    Norms norms;
+    std::size_t d = 0;
+    for (; d < head; d += 4, packed += 64) norms.add(_mm512_loadu_si512(packed));
+    if (head < dim) _mm512_storeu_si512(head_biases + b * kCodeRows, norms.biases());
+    for (; d < dim; d += 4, packed += 64) norms.add(_mm512_loadu_si512(packed));
+    _mm512_storeu_si512(biases + b * kCodeRows, norms.biases());
   }
 }
 
@@ -193,11 +204,6 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
       codes += 64;
     }
   }
-}
-
-// _mm512_dpbusd_epi32 in place: of that, GCC makes two copies of every accumulator a step.
-void add_products(__m512i& acc, __m512i u, __m512i s) {
-  __asm__("vpdpbusd %2, %1, %0" : "+v"(acc) : "v"(u), "v"(s));
 }
 
 // Some queries, and rows from one on.
@@ -248,6 +254,32 @@ template <int Queries, int Blocks>
   }
 }
 
+// The same over all dimensions, of rows whose biases are not known: they are found on the way. Rows
+// are read in order, which memory is fastest at.
+template <int Queries, int Blocks>
+[[gnu::always_inline]] inline void sum_up_all(const CodeTile& t, __m512i (&biases)[Blocks],
+                                              __m512i (&acc)[Queries][Blocks]) {
+  const std::int8_t* p = t.rows;
+#pragma GCC unroll 8
+  for (int b = 0; b < Blocks; ++b) {
+    Norms norms;
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) acc[q][b] = _mm512_setzero_si512();
+    for (std::size_t d = 0; d < t.dim; d += 4, p += 64) {
+      const __m512i codes = _mm512_loadu_si512(p);
+      norms.add(codes);
+#pragma GCC unroll 8
+      for (int q = 0; q < Queries; ++q) {
+        add_products(acc[q][b], _mm512_set1_epi32(load4(t.queries + q * t.dim + d)), codes);
+      }
+    }
+    biases[b] = norms.biases();
+    const __m512i half = _mm512_srai_epi32(biases[b], 1);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) acc[q][b] = _mm512_add_epi32(acc[q][b], half);
+  }
+}
+
 // Whether one of the rows may be within the limit of a query.
 template <int Blocks>
 [[gnu::always_inline]] inline unsigned near(const __m512i (&acc)[Blocks], std::int32_t limit) {
@@ -264,16 +296,11 @@ template <int Blocks>
 #define PROTOMARK_TILE
 #endif
 
+// The hits of a tile that has some, from half the negated distances.
 template <int Queries, int Blocks>
-PROTOMARK_TILE std::size_t scan_tile(const CodeTile& t, Hit* hits) {
-  __m512i acc[Queries][Blocks];
-  sum_up(t, t.biases, t.dim, acc);
-  unsigned any = 0;
-#pragma GCC unroll 8
-  for (int q = 0; q < Queries; ++q) any |= near(acc[q], t.limits[q]);
-  if (any == 0) [[likely]]
-    return 0;
-
+[[gnu::always_inline]] inline std::size_t collect(const CodeTile& t, const std::int32_t* biases,
+                                                  const __m512i (&acc)[Queries][Blocks],
+                                                  Hit* hits) {
   alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows];
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
@@ -283,11 +310,39 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile& t, Hit* hits) {
   std::size_t found = 0;
   for (std::size_t q = 0; q < Queries; ++q) {
     for (std::size_t b = 0; b < Blocks; ++b) {
-      found += collect_hits(halves[q][b], t.biases + b * kCodeRows, t.limits[q], t.first_query + q,
+      found += collect_hits(halves[q][b], biases + b * kCodeRows, t.limits[q], t.first_query + q,
                             t.first_row + b * kCodeRows, hits + found);
     }
   }
   return found;
+}
+
+template <int Queries, int Blocks>
+PROTOMARK_TILE std::size_t scan_tile(const CodeTile& t, Hit* hits) {
+  __m512i acc[Queries][Blocks];
+  sum_up(t, t.biases, t.dim, acc);
+  unsigned any = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) any |= near(acc[q], t.limits[q]);
+  if (any == 0) [[likely]]
+    return 0;
+  return collect(t, t.biases, acc, hits);
+}
+
+// The same without biases: their arithmetic costs few queries less than reading the rows twice.
+template <int Queries, int Blocks>
+PROTOMARK_TILE std::size_t scan_tile_once(const CodeTile& t, Hit* hits) {
+  __m512i acc[Queries][Blocks], biases[Blocks];
+  sum_up_all(t, biases, acc);
+  unsigned any = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) any |= near(acc[q], t.limits[q]);
+  if (any == 0) [[likely]]
+    return 0;
+  alignas(64) std::int32_t stored[Blocks][kCodeRows];
+#pragma GCC unroll 8
+  for (int b = 0; b < Blocks; ++b) _mm512_store_si512(stored[b], biases[b]);
+  return collect(t, stored[0], acc, hits);
 }
 
 // Calls take<Queries>(tile), so many queries at a time, for all n.
@@ -312,7 +367,8 @@ template <int Blocks>
 std::size_t scan_blocks(const CodeTile& all, std::size_t n, Hit* hits) {
   std::size_t found = 0;
   each_tile(all, n, [&]<int Queries>(const CodeTile& t) {
-    found += scan_tile<Queries, Blocks>(t, hits + found);
+    found += t.biases == nullptr ? scan_tile_once<Queries, Blocks>(t, hits + found)
+                                 : scan_tile<Queries, Blocks>(t, hits + found);
   });
   return found;
 }
@@ -346,7 +402,7 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
                            queries.limits,
                            heads.limits(),
                            rows.codes + b * kCodeRows * rows.dim,
-                           rows.biases + b * kCodeRows,
+                           rows.biases == nullptr ? nullptr : rows.biases + b * kCodeRows,
                            rows.head_biases + b * kCodeRows,
                            rows.dim,
                            rows.head,

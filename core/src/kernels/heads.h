@@ -11,7 +11,7 @@ class Heads {
  public:
   Heads(const CodeQueries& queries, const PackedCodes& rows)
       : queries_(queries.n),
-        never_(rows.head >= rows.dim || queries.n < kTile),
+        never_(rows.biases == nullptr || rows.head >= rows.dim || queries.n < kTile),
         put_off_(queries.put_off) {
     for (std::size_t q = 0; q < queries_; ++q) {
       const std::int32_t limit = queries.limits[q], tail = queries.tails[q];

@@ -36,6 +36,8 @@ struct Hit {
 
 // Queries that a scan takes at a time, so that they share its loads.
 inline constexpr std::size_t kScanQueries = 16;
+// So few queries need no biases: a set finds them as it compares.
+inline constexpr std::size_t kFewQueries = 4;
 // A scan stops early once it has this many hits, so that limits can follow; it may have more by
 // what kScanQueries queries can hit in 64 rows.
 inline constexpr std::size_t kHitsEnough = 64;
@@ -56,7 +58,7 @@ struct CodeQueries {
 // head_biases are neither written nor read.
 struct PackedCodes {
   const std::int8_t* codes;
-  const std::int32_t* biases;  // from code_biases of the same set
+  const std::int32_t* biases;  // from code_biases of the same set, or nullptr for kFewQueries
   const std::int32_t* head_biases;
   std::size_t blocks;
   std::size_t dim;

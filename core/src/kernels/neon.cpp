@@ -171,7 +171,8 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
   }
 }
 
-// Distances over the first `dims` dimensions. Inlined, so that they stay in registers.
+// Distances over the first `dims` dimensions, whose biases in a block are given. Inlined, so that
+// they stay in registers.
 template <int Queries>
 [[gnu::always_inline]] inline void sum_up(const std::int8_t* queries, const PackedCodes& rows,
                                           std::size_t first_row, const std::int32_t* biases,
@@ -193,7 +194,7 @@ template <int Queries>
   }
   for (int q = 0; q < Queries; ++q) {
     for (int part = 0; part < 4; ++part) {
-      const int32x4_t bias = vld1q_s32(biases + first_row + 4 * part);
+      const int32x4_t bias = vld1q_s32(biases + 4 * part);
       acc[q][part] = vmlsq_n_s32(bias, acc[q][part], 2);
     }
   }
@@ -209,10 +210,10 @@ uint32x4_t within(const int32x4_t (&distances)[4], std::int32_t limit) {
 
 template <int Queries>
 std::size_t scan_tile(const std::int8_t* queries, const std::int32_t* limits,
-                      const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
-                      Hit* hits) {
+                      const PackedCodes& rows, const std::int32_t* biases, std::size_t first_query,
+                      std::size_t first_row, Hit* hits) {
   int32x4_t acc[Queries][4];
-  sum_up(queries, rows, first_row, rows.biases, rows.dim, acc);
+  sum_up(queries, rows, first_row, biases, rows.dim, acc);
   uint32x4_t any = vdupq_n_u32(0);
   for (int q = 0; q < Queries; ++q) any = vorrq_u32(any, within(acc[q], limits[q]));
   if (vmaxvq_u32(any) == 0) [[likely]]
@@ -238,7 +239,7 @@ std::size_t near_by_heads(const std::int8_t* codes, const std::int32_t* head_lim
                           const PackedCodes& rows, std::size_t first_query, std::size_t first_row,
                           std::uint8_t* found) {
   int32x4_t acc[Queries][4];
-  sum_up(codes, rows, first_row, rows.head_biases, rows.head, acc);
+  sum_up(codes, rows, first_row, rows.head_biases + first_row, rows.head, acc);
   std::size_t size = 0;
   for (int q = 0; q < Queries; ++q) {
     // No branch: which ones are near cannot be foretold.
@@ -257,12 +258,19 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   }
   Heads heads(queries, rows);
   std::size_t found = 0;
+  std::int32_t own[kCodeRows];
+  const std::int32_t* biases = own;
   const auto scan = [&]<int Queries>(std::size_t q, std::size_t row) {
-    found +=
-        scan_tile<Queries>(codes + q * rows.dim, queries.limits + q, rows, q, row, hits + found);
+    found += scan_tile<Queries>(codes + q * rows.dim, queries.limits + q, rows, biases, q, row,
+                                hits + found);
   };
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
+    if (rows.biases != nullptr) {
+      biases = rows.biases + row;
+    } else {
+      code_biases(rows.codes + row * rows.dim, 1, rows.dim, rows.dim, own, nullptr);
+    }
     std::size_t q = 0;
     if (heads.now()) {
       std::uint8_t likely[kScanQueries];

@@ -124,6 +124,13 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   std::size_t found = 0;
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
+    std::int32_t own[kCodeRows];
+    const std::int32_t* biases = own;
+    if (rows.biases != nullptr) {
+      biases = rows.biases + row;
+    } else {
+      code_biases(rows.codes + row * dim, 1, dim, dim, own, nullptr);
+    }
     for (std::size_t q = 0; q < queries.n; ++q) {
       const std::uint8_t* query = queries.codes + q * dim;
       const std::int8_t* p = rows.codes + row * dim;
@@ -135,7 +142,7 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
         }
       }
       for (std::size_t r = 0; r < kCodeRows; ++r) {
-        const std::int32_t distance = rows.biases[row + r] - 2 * dot[r];
+        const std::int32_t distance = biases[r] - 2 * dot[r];
         if (distance <= queries.limits[q]) {
           hits[found++] = {static_cast<std::uint32_t>(q), static_cast<std::uint32_t>(row + r),
                            distance};
