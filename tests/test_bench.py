@@ -355,6 +355,9 @@ def test_sizes_of_maps_may_be_chosen(tmp_path: Path) -> None:
     assert chosen.exact == chosen.approximate == chosen.growth == (20, 500)
     assert chosen.graphs_to == 500
     assert chosen.large == 0
+    named = choose(**common, scratch=tmp_path, graphs=("faiss",))  # type: ignore[arg-type]
+    assert named.graphs == ("faiss",)
+    assert named.graphs_to == max(named.approximate)
     common["sections"] = ("large",)
     assert choose(**common, scratch=tmp_path, landmarks=(20, 500)).large == 500  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="--landmarks 0"):
@@ -465,6 +468,21 @@ def test_ctrl_c_keeps_what_is_measured(
     assert results.interrupted
     assert [contest.section for contest in results.contests] == ["add"] * 2
     assert results.ceilings["read"] > 0
+
+
+def test_figures_outlive_a_section_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setitem(command._RUN, "growth", fail)
+    settings = Settings(sections=("add", "growth"), pace=Pace(1, 0, 0.01), map=200, encoded=50)
+    with pytest.raises(MemoryError):
+        command.bench([], settings, json_path=tmp_path / "bench.json", repeat="again")
+    kept = Results.load(tmp_path / "bench.json")
+    assert [contest.section for contest in kept.contests] == ["add"] * 2
+    assert kept.command == "again"
 
 
 def test_quick_run_from_end_to_end(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@
 
 #include "kernels/kernels.h"
 #include "parallel.h"
+#include "top_k.h"
 
 namespace protomark {
 namespace {
@@ -40,11 +41,7 @@ class Ranking {
         queries_[q * dim_ + d] = static_cast<std::uint8_t>(queries.row(q)[d] + 128);
       }
     }
-    std::fill(limits_.begin(), limits_.end(), kNoLimit);
-    for (std::size_t block = 0; block < blocks_; block += kSampleStep) {
-      scan(0, queries.rows, block, block + 1);
-    }
-    for (std::size_t q = 0; q < queries.rows; ++q) limits_[q] = likely_limit(found_[q], probes);
+    guess_limits(queries.rows, probes);
     scan(0, queries.rows, 0, blocks_);
     for (std::size_t q = 0; q < queries.rows; ++q) {
       if (found_[q].size() < probes) {
@@ -61,17 +58,22 @@ class Ranking {
   // Distances above, numbers of cells below.
   using Found = std::vector<std::int64_t>;
 
-  // A limit that is likely to leave some more than `probes` cells, by the distances to a sample.
-  static std::int32_t likely_limit(Found& sample, std::size_t probes) {
-    const std::size_t rank = probes * 3 / 2 / kSampleStep + 4;
-    std::int32_t limit = kNoLimit;
-    if (rank < sample.size()) {
-      const auto at = sample.begin() + static_cast<std::ptrdiff_t>(rank);
-      std::nth_element(sample.begin(), at, sample.end());
-      limit = static_cast<std::int32_t>(*at >> 32);
+  // Limits that are likely to leave some more than `probes` cells, by the nearest of a sample.
+  void guess_limits(std::size_t queries, std::size_t probes) {
+    const std::size_t rank = probes * 3 / 2 / kSampleStep + 5;
+    sample_cells_.resize(queries * rank);
+    sample_distances_.resize(queries * rank);
+    std::vector<TopK> nearest;
+    for (std::size_t q = 0; q < queries; ++q) {
+      nearest.emplace_back(&sample_cells_[q * rank], &sample_distances_[q * rank], rank, kNoLimit);
     }
-    sample.clear();
-    return limit;
+    std::fill(limits_.begin(), limits_.end(), kNoLimit);
+    for (std::size_t block = 0; block < blocks_; block += kSampleStep) {
+      each_hit(0, queries, block, block + 1, [&](std::size_t q, const kernels::Hit& hit) {
+        nearest[q].offer(hit.distance, hit.row);
+      });
+      for (std::size_t q = 0; q < queries; ++q) limits_[q] = nearest[q].limit();
+    }
   }
 
   static void select(Found& found, std::size_t probes, std::uint32_t* to) {
@@ -86,14 +88,21 @@ class Ranking {
   }
 
   void scan(std::size_t query, std::size_t queries, std::size_t block, std::size_t end) {
+    each_hit(query, queries, block, end, [&](std::size_t q, const kernels::Hit& hit) {
+      found_[q].push_back(std::int64_t{hit.distance} * (std::int64_t{1} << 32) + hit.row);
+    });
+  }
+
+  // Calls take(query, hit) for what is within the limits in some blocks.
+  template <typename Take>
+  void each_hit(std::size_t query, std::size_t queries, std::size_t block, std::size_t end,
+                const Take& take) {
     while (block < end) {
       const std::size_t n = kernels::active().code_scan(
           {&queries_[query * dim_], &limits_[query], &tails_[query], queries, &put_off_},
           {centroids_.data, biases_.data(), biases_.data(), end, dim_, dim_}, &block, hits_.data());
       for (std::size_t i = 0; i < n; ++i) {
-        if (hits_[i].row >= centroids_.rows) continue;
-        found_[query + hits_[i].query].push_back(
-            std::int64_t{hits_[i].distance} * (std::int64_t{1} << 32) + hits_[i].row);
+        if (hits_[i].row < centroids_.rows) take(query + hits_[i].query, hits_[i]);
       }
     }
   }
@@ -106,6 +115,8 @@ class Ranking {
   std::size_t put_off_ = 0;
   std::vector<std::int32_t> biases_;
   std::vector<kernels::Hit> hits_;
+  std::vector<std::int64_t> sample_cells_;
+  std::vector<std::int32_t> sample_distances_;
   std::vector<Found> found_;  // of each query
 };
 

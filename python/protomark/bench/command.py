@@ -62,6 +62,8 @@ def bench(
 ) -> Results:
     """Measure, and write what was asked for; after Ctrl-C, what there is by then.
 
+    The figures are written after every section: a large map may end the process.
+
     Args:
         paths: tracks files of one descriptor; none: the sample that ships.
         settings: sections and sizes.
@@ -74,17 +76,21 @@ def bench(
     """
     real = Observations.load(paths)
     encoder = pm.Encoder.load(real.descriptor)
-    results = measure(Workload(real, encoder, settings))
-    results.command = repeat
-    if json_path is not None:
-        results.save(json_path)
+
+    def save(so_far: Results) -> None:
+        so_far.command = repeat
+        if json_path is not None:
+            so_far.save(json_path)
+
+    results = measure(Workload(real, encoder, settings), save)
+    save(results)
     if folder is not None:
         write_report(results, folder)
     return results
 
 
-def measure(workload: Workload) -> Results:
-    """Run the sections that the settings name."""
+def measure(workload: Workload, after: Callable[[Results], None] = lambda _: None) -> Results:
+    """Run the sections that the settings name, and call `after` each with what there is by then."""
     settings = workload.settings
     results = Results(machine=machine.describe(), data=describe_data(workload))
     results.machine |= {
@@ -110,6 +116,7 @@ def measure(workload: Workload) -> Results:
             for name in settings.sections:
                 _RUN[name](workload, results, progress)
                 progress.end()
+                after(results)
         except KeyboardInterrupt:
             results.interrupted = True
     return results

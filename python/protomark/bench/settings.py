@@ -76,22 +76,26 @@ def choose(
     quick: bool,
     scratch: Path,
     landmarks: tuple[int, ...] = (),
-    graphs: tuple[str, ...] = GRAPHS,
+    graphs: tuple[str, ...] | None = None,
     indexes: Path | None = None,
 ) -> Settings:
     """The settings of `--full`, of `--quick` (a few seconds, for tests), or of neither.
 
-    `landmarks` are sizes of the maps that are searched, in place of these settings' own, beside
-    all of `graphs` at any size.
+    `landmarks` are sizes of the maps that are searched, in place of these settings' own. `graphs`
+    that are named, and all if sizes are, are raced at any size; else only hnswlib's is at large
+    ones.
 
     Raises:
         ValueError: a section or a graph is unknown, both are asked for, or a map has no landmark.
     """
     chosen = _of_scale(sections, threads, build_threads, full, quick, scratch)
-    strange = [name for name in graphs if name not in GRAPHS]
-    if strange:
-        raise ValueError(f"--graphs {strange[0]}: no such graph ({', '.join(GRAPHS)}; all, none)")
-    chosen = replace(chosen, graphs=graphs, indexes=indexes)
+    chosen = replace(chosen, indexes=indexes)
+    if graphs is not None:
+        strange = [name for name in graphs if name not in GRAPHS]
+        if strange:
+            known = ", ".join(GRAPHS)
+            raise ValueError(f"--graphs {strange[0]}: no such graph ({known}; all, none)")
+        chosen = replace(chosen, graphs=graphs, graphs_to=max(chosen.approximate))
     if any(n < 1 for n in landmarks):
         raise ValueError(f"--landmarks {min(landmarks)}: a map needs at least 1")
     if not landmarks:

@@ -48,8 +48,9 @@ def bench(
         typer.Option(
             help="Which graphs are raced, as they take long to build: all, none, or some of faiss, "
             "faiss-cells (65,536 inverted lists that a graph finds, beyond a million landmarks), "
-            "hnswlib, usearch-int8 and usearch-float32. Without --landmarks, only hnswlib's is "
-            "built for large maps."
+            "hnswlib, usearch-int8 and usearch-float32. Those that are named, and all with "
+            "--landmarks, are raced at any size; else up to 100,000 (--full: a million) landmarks, "
+            "and hnswlib's beyond."
         ),
     ] = "all",
     indexes: Annotated[
@@ -71,13 +72,14 @@ def bench(
 
     All contenders take turns in one run, on the same data and as many threads; ratios come with
     their spread, and beside the machine's own ceilings. Peers that are not installed are left out:
-    `pip install protomark\[bench]`. Ctrl-C ends the run and keeps what is measured.
+    `pip install protomark\[bench]`. Ctrl-C ends the run and keeps what is measured; `--json` is
+    written anew after every section.
     docs/benchmarks.md holds a whole run.
     """
     import tempfile
 
     from protomark.bench import command
-    from protomark.bench.settings import GRAPHS, choose
+    from protomark.bench.settings import choose
     from protomark.evaluation.command import check_outputs
     from protomark.evaluation.threads import available_threads
 
@@ -90,7 +92,7 @@ def bench(
         quick=quick,
         scratch=scratch or Path(tempfile.gettempdir()),
         landmarks=numbers("--landmarks", landmarks),
-        graphs=GRAPHS if graphs == "all" else () if graphs == "none" else listed(graphs),
+        graphs=None if graphs == "all" else () if graphs == "none" else listed(graphs),
         indexes=indexes,
     )
     flags = [f"--only {only}"] if only else []
