@@ -113,10 +113,7 @@ void PrototypeStore::permute(std::vector<std::uint32_t>& to) {
 }
 
 void PrototypeStore::prefetch(std::uint32_t place) const {
-  __builtin_prefetch(sum(place), 1);
-  __builtin_prefetch(sum(place) + dim_ - 1, 1);
-  __builtin_prefetch(&counts_[place], 1);
-  prefetch_rounded(place);
+  prefetch_prototype(place);
   if (look_bits_ == 0) {
     __builtin_prefetch(&ids_[place], 1);
     if (!positions_.empty()) __builtin_prefetch(&positions_[place], 1);

@@ -35,14 +35,16 @@ class IdIndex {
     return slots_.empty() ? 0 : ((slot_of(ids, id) - home(id)) & mask()) + 1;
   }
 
-  // Ask for the memory that `find` will read: first its slot, and when that has come, the id there.
+  // Ask for the memory that `find` will read: first its slot, and when that has come, the ids that
+  // it may compare.
   void prefetch_slot(std::int64_t id) const {
     if (!slots_.empty()) __builtin_prefetch(&slots_[home(id)]);
   }
-  void prefetch_id(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
+  void prefetch_ids(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
     if (slots_.empty()) return;
-    const std::uint32_t row = slots_[home(id)];
-    if (row != kNone) __builtin_prefetch(&ids[row]);
+    for (std::size_t s = home(id); slots_[s] != kNone; s = next(s)) {
+      __builtin_prefetch(&ids[slots_[s]]);
+    }
   }
 
   bool has_room(std::size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }

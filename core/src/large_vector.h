@@ -25,8 +25,12 @@ struct LargePageAllocator {
     const std::size_t size = n * sizeof(T);
     void* memory = ::operator new(size, alignment(size));
 #ifdef __linux__
-    // Advice: where it is not taken, the pages are small.
-    if (size >= kLarge) madvise(memory, size, MADV_HUGEPAGE);
+    // Advice: where it is not taken, the pages are small. So are those of memory that was in use
+    // before, unless they are given back.
+    if (size >= kLarge) {
+      madvise(memory, size, MADV_HUGEPAGE);
+      madvise(memory, size / kPage * kPage, MADV_DONTNEED);
+    }
 #endif
     return static_cast<T*>(memory);
   }

@@ -96,7 +96,9 @@ void PrototypeMap::update(const PrototypeMap& other, std::span<const std::int64_
       rows += from.rows_of(landmarks[last]);
     }
     const auto piece = std::span(landmarks).subspan(first, last - first);
-    store_->make_room(ids, rows);
+    const auto unknown = static_cast<std::size_t>(std::count_if(
+        ids.begin(), ids.end(), [&](std::int64_t id) { return store_->find(id) == Store::kNone; }));
+    store_->make_room(unknown, look_bits() == 0 ? unknown : rows, rows);
     const std::unique_lock lock(store_->mutex);
     for (std::size_t i = 0; i < piece.size(); ++i) {
       for (std::uint32_t row = from.first_row(piece[i]); row != Store::kNone;

@@ -9,7 +9,6 @@
 #include <utility>
 
 #include "protomark/error.h"
-#include "rounded_mean.h"
 #include "sorted_pieces.h"
 
 namespace protomark {
@@ -147,26 +146,16 @@ void PrototypeStore::make_room_for_row() {
   for_each_array(0, kPackedRows, [](auto& v, std::size_t more) { make_room_in(v, more); });
 }
 
-void PrototypeStore::make_room(std::span<const std::int64_t> landmarks, std::size_t rows,
+void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                                const Alone& alone) {
   // New rows begin in the first cell, and each that moves may be the first of a block.
-  const std::size_t moving = cells_.size() == 0 ? 0 : std::min(rows, cells_.size());
-  const auto places_of = [&](std::size_t n) {
-    return (2 * ((n + kPackedRows - 1) / kPackedRows) + moving) * kPackedRows;
-  };
-  bool enough = index_.has_room(landmarks.size());
-  for_each_array(landmarks.size(), places_of(rows),
-                 [&](auto& v, std::size_t more) { enough = enough && has_room(v, more); });
-  if (enough) return;
-  // Most may be known.
-  const auto unknown = static_cast<std::size_t>(std::count_if(
-      landmarks.begin(), landmarks.end(), [&](std::int64_t id) { return find(id) == kNone; }));
-  for_each_array(unknown, places_of(look_bits_ == 0 ? unknown : rows),
-                 [&](auto& v, std::size_t more) {
-                   if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), alone);
-                 });
-  if (!index_.has_room(unknown)) {
-    IdIndex larger = index_.with_room(ids_, unknown);
+  const std::size_t moving = cells_.size() == 0 ? 0 : std::min(changed, cells_.size());
+  const std::size_t blocks = 2 * ((rows + kPackedRows - 1) / kPackedRows) + moving;
+  for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more) {
+    if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), alone);
+  });
+  if (!index_.has_room(landmarks)) {
+    IdIndex larger = index_.with_room(ids_, landmarks);
     alone([&] { std::swap(index_, larger); });
   }
 }
@@ -444,96 +433,6 @@ std::vector<std::int8_t> PrototypeStore::rounded(std::span<const std::uint32_t> 
   return result;
 }
 
-// In a large map nearly everything here waits for memory, so that is asked for ahead.
-void PrototypeStore::add(std::span<const std::int64_t> landmarks, Codes codes) {
-  constexpr std::size_t kChunk = 512, kAhead = 16;
-  std::array<std::uint32_t, kChunk> rows;
-  for (std::size_t first = 0; first < landmarks.size(); first += kChunk) {
-    const std::size_t n = std::min(kChunk, landmarks.size() - first);
-    const std::int64_t* ids = &landmarks[first];
-    std::size_t found = 0, added = 0;
-    const auto add_to = [&](std::size_t end) {
-      for (; added < end; ++added) add(rows[added], codes.row(first + added));
-    };
-    const auto finish = [&] {
-      add_to(found);
-      for (std::size_t i = 0; i < found; ++i) {
-        if (i + kAhead < found) prefetch_rounded(rows[i + kAhead]);
-        if (i + 1 == found || rows[i] != rows[i + 1]) refresh(rows[i]);
-      }
-    };
-    for (std::size_t i = 0; i < std::min(n, 2 * kAhead); ++i) index_.prefetch_slot(ids[i]);
-    try {
-      for (; found < n; ++found) {
-        if (found + 2 * kAhead < n) index_.prefetch_slot(ids[found + 2 * kAhead]);
-        if (found + kAhead < n) index_.prefetch_id(ids_, ids[found + kAhead]);
-        rows[found] = find_or_create_row(ids[found], look_of(codes.row(first + found)));
-        __builtin_prefetch(sum(rows[found]), 1);
-        __builtin_prefetch(sum(rows[found]) + dim_ - 1, 1);
-        __builtin_prefetch(&counts_[rows[found]], 1);
-        if (found >= kAhead) add_to(found - kAhead);
-      }
-    } catch (...) {
-      // Out of memory half-way: what was added stays, and answers.
-      finish();
-      throw;
-    }
-    finish();
-  }
-}
-
-void PrototypeStore::prefetch_rounded(std::uint32_t row) const {
-  for (std::size_t d = 0; d < dim_; d += 4) {
-    __builtin_prefetch(packed() + packed_index(row, d, dim_), 1);
-  }
-}
-
-namespace {
-
-// Half of a sum, of which `count` observations are left: a mean of 127 stays one, although half of
-// an odd count is rounded down.
-std::int16_t half(int sum, int count) {
-  return static_cast<std::int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
-}
-
-}  // namespace
-
-void PrototypeStore::add(std::uint32_t row, const std::int8_t* code) {
-  std::int16_t* s = sum(row);
-  if (counts_[row] == PrototypeMap::kMaxCount) {
-    counts_[row] /= 2;
-    for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], counts_[row]);
-  }
-  for (std::size_t d = 0; d < dim_; ++d) s[d] = static_cast<std::int16_t>(s[d] + code[d]);
-  ++counts_[row];
-}
-
-void PrototypeStore::join(std::uint32_t row, const std::int16_t* other, int other_count) {
-  const int n = counts_[row] + other_count;
-  const bool halved = n > PrototypeMap::kMaxCount;  // once is enough for 255 + 255
-  counts_[row] = static_cast<std::uint8_t>(halved ? n / 2 : n);
-  std::int16_t* s = sum(row);
-  for (std::size_t d = 0; d < dim_; ++d) {
-    const int total = s[d] + other[d];
-    s[d] = halved ? half(total, counts_[row]) : static_cast<std::int16_t>(total);
-  }
-  refresh(row);
-}
-
-void PrototypeStore::refresh(std::uint32_t row) {
-  std::array<std::int8_t, 256> mean;
-  rounded_means(sum(row), counts_[row], dim_, mean.data());
-  bool changed = false;
-  for (std::size_t d = 0; d < dim_; d += 4) {
-    std::int8_t* to = packed() + packed_index(row, d, dim_);
-    const std::size_t n = std::min<std::size_t>(4, dim_ - d);
-    changed = changed || std::memcmp(to, &mean[d], n) != 0;
-    std::memcpy(to, &mean[d], n);
-  }
-  if (uncommitted_) uncommitted_->insert(ids_[landmark_of(row)]);
-  if (changed && cells_.size() != 0) unsettled_.push_back({ids_[landmark_of(row)], look(row)});
-}
-
 // A row's key is looked up again before it moves: its number may have changed by the move of
 // another.
 void PrototypeStore::settle(int threads) {
@@ -590,20 +489,8 @@ Position PrototypeStore::position(std::uint32_t landmark) const {
   return positions_.empty() ? kNowhere : positions_[landmark];
 }
 
-void PrototypeMap::Store::add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes,
-                                        int threads) {
-  for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
-    const std::size_t n = std::min(kPiece, codes.rows - begin);
-    const auto piece = landmarks.subspan(begin, n);
-    make_room(piece, n);
-    const std::unique_lock lock(mutex);
-    add(piece, {codes.row(begin), n, codes.columns});
-    settle(threads);
-  }
-}
-
-void PrototypeMap::Store::make_room(std::span<const std::int64_t> landmarks, std::size_t rows) {
-  PrototypeStore::make_room(landmarks, rows, [&](const auto& swap) { alone(swap); });
+void PrototypeMap::Store::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed) {
+  PrototypeStore::make_room(landmarks, rows, changed, [&](const auto& swap) { alone(swap); });
 }
 
 void PrototypeMap::Store::make_room_for_positions() {

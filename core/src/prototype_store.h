@@ -76,10 +76,11 @@ class PrototypeStore {
   std::uint32_t create_row(std::uint32_t landmark, std::uint16_t look);
   // Afterwards the next create_row does not throw for want of memory.
   void make_room_for_row();
-  // Room for so many rows more of these landmarks, so that making them takes no time for it. Only
-  // reads the map, but within `alone(swap)`, which calls swap() while nobody else reads.
+  // Room for so many landmarks and rows more in a change of `changed` rows, so that it takes no
+  // time for that. Only reads the map, but within `alone(swap)`, which calls swap() while nobody
+  // else reads.
   using Alone = std::function<void(const std::function<void()>& swap)>;
-  void make_room(std::span<const std::int64_t> landmarks, std::size_t rows, const Alone& alone);
+  void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed, const Alone& alone);
   // Rows that were stepped over to find or renumber those of a landmark when others went.
   std::size_t steps() const { return steps_; }
   // With its last row a landmark leaves.
@@ -126,9 +127,13 @@ class PrototypeStore {
   // The rounded prototypes of some rows, (rows x dim).
   std::vector<std::int8_t> rounded(std::span<const std::uint32_t> rows) const;
 
+  // The rows of these landmarks' codes, kNone where there is none yet.
+  void find_rows(std::span<const std::int64_t> landmarks, Codes codes,
+                 std::span<std::uint32_t> rows) const;
   // Eq. 2 for one code after the other, with new landmarks and rows where there are none yet;
-  // rounded means follow.
-  void add(std::span<const std::int64_t> landmarks, Codes codes);
+  // rounded means follow. `rows` are those that find_rows found.
+  void add(std::span<const std::int64_t> landmarks, Codes codes,
+           std::span<const std::uint32_t> rows);
   // Adds another sum and count, and halves where the count does not fit.
   void join(std::uint32_t row, const std::int16_t* sum, int count);
   // The rounded mean follows the sum and count.
@@ -201,7 +206,15 @@ class PrototypeStore {
   const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
   std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
   void add(std::uint32_t row, const std::int8_t* code);
-  void prefetch_rounded(std::uint32_t row) const;
+  // Inlined, as GCC leaves out calls of what does nothing but this.
+  [[gnu::always_inline]] void prefetch_prototype(std::uint32_t place) const {
+    __builtin_prefetch(sum(place), 1);
+    __builtin_prefetch(sum(place) + dim_ - 1, 1);
+    __builtin_prefetch(&counts_[place], 1);
+    for (std::size_t d = 0; d < dim_; d += 4) {
+      __builtin_prefetch(packed() + packed_index(place, d, dim_), 1);
+    }
+  }
   void read(std::uint32_t place, Row& row) const;
   void write(std::uint32_t place, const Row& row);
   void vacate(std::uint32_t place);
@@ -267,7 +280,7 @@ struct PrototypeMap::Store : PrototypeStore {
     }
   }
   void add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes, int threads);
-  void make_room(std::span<const std::int64_t> landmarks, std::size_t rows);
+  void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed);
   void make_room_for_positions();
   Cells learn_cells(std::size_t number, int threads) const;
   // Rows go by these cells: beside the map, which takes as much memory again, or within it, which

@@ -10,6 +10,7 @@
 
 #include "id_set.h"
 #include "map_sections.h"
+#include "parallel.h"
 #include "protomark/error.h"
 #include "prototype_store.h"
 #include "summary_builder.h"
@@ -19,6 +20,8 @@ namespace {
 
 // Descriptors that are encoded at a time, to bound the memory for their codes.
 constexpr std::size_t kEncodeChunk = 1 << 13;
+// Descriptors that a thread encodes at a time while another one adds.
+constexpr std::size_t kLeastShare = 64, kMostShare = 512;
 
 void check_pairs(std::size_t landmarks, std::size_t rows, const char* what) {
   if (landmarks != rows) {
@@ -100,15 +103,42 @@ void PrototypeMap::add(std::span<const std::int64_t> landmarks, Descriptors desc
                        int threads) {
   check_pairs(landmarks.size(), descriptors.rows, "descriptors");
   check_new_ids(landmarks);
-  std::vector<std::int8_t> buffer(std::min(descriptors.rows, kEncodeChunk) * dim_);
+  std::vector<std::int8_t> buffer(std::min(descriptors.rows, 2 * kEncodeChunk) * dim_);
+  const auto codes = [&](std::size_t begin) {
+    return MatrixView<std::int8_t>{buffer.data() + begin / kEncodeChunk % 2 * kEncodeChunk * dim_,
+                                   std::min(kEncodeChunk, descriptors.rows - begin), dim_};
+  };
+  const auto encode = [&](std::size_t begin, MatrixView<std::int8_t> to, int encode_threads) {
+    encoder_->encode({descriptors.row(begin), to.rows, descriptors.columns}, to, encode_threads);
+  };
+  const auto add_chunk = [&](std::size_t begin) {
+    const auto chunk = codes(begin);
+    store_->add_in_pieces(landmarks.subspan(begin, chunk.rows), {chunk.data, chunk.rows, dim_},
+                          threads);
+  };
   const std::unique_lock changing(store_->changing);
   // Even no observation at all is checked for its length.
-  for (std::size_t begin = 0; begin == 0 || begin < descriptors.rows; begin += kEncodeChunk) {
-    const std::size_t n = std::min(kEncodeChunk, descriptors.rows - begin);
-    encoder_->encode({descriptors.row(begin), n, descriptors.columns}, {buffer.data(), n, dim_},
-                     threads);
-    store_->add_in_pieces(landmarks.subspan(begin, n), {buffer.data(), n, dim_}, threads);
+  encode(0, codes(0), threads);
+  std::size_t begin = 0;
+  for (std::size_t next = kEncodeChunk; next < descriptors.rows; next += kEncodeChunk) {
+    const auto chunk = codes(next);
+    if (store_->cells().size() == 0) {
+      // One thread adds what is encoded and waits for memory, while the others go on encoding.
+      const std::size_t n = std::clamp<std::size_t>(
+          chunk.rows / (4 * static_cast<std::size_t>(threads)), kLeastShare, kMostShare);
+      run_tasks(threads, 1 + (chunk.rows + n - 1) / n, [&](std::size_t task) {
+        if (task == 0) return add_chunk(begin);
+        const std::size_t first = (task - 1) * n;
+        encode(next + first, {chunk.row(first), std::min(n, chunk.rows - first), dim_}, 1);
+      });
+    } else {
+      // All threads share the work on cells.
+      add_chunk(begin);
+      encode(next, chunk, threads);
+    }
+    begin = next;
   }
+  add_chunk(begin);
 }
 
 void PrototypeMap::add_codes(std::span<const std::int64_t> landmarks, Codes codes) {

@@ -220,6 +220,7 @@ void test_large_changes_show_in_pieces(const fs::path& folder) {
   std::iota(ids.begin(), ids.end(), 1);
   test::Random random(11);
   const auto codes = random.integers<std::int8_t>(kAll * kDim, -127, 127);
+  const auto descriptors = random.integers<std::uint8_t>(kAll * encoder->bytes(), 0, 255);
   const std::vector<Position> positions(kAll, Position{1, 2, 3});
   PrototypeMap map(encoder);
   const std::int64_t first = 0;
@@ -241,7 +242,11 @@ void test_large_changes_show_in_pieces(const fs::path& folder) {
       }
     });
     for (int round = 0; round < 20 || files < 3; ++round) {
-      map.add_codes(ids, {codes.data(), kAll, kDim});
+      if (round % 2 == 0) {
+        map.add_codes(ids, {codes.data(), kAll, kDim});
+      } else {
+        map.add(ids, {descriptors.data(), kAll, encoder->bytes()}, 2);
+      }
       map.set_positions(ids, positions);
       map.discard(ids);
     }
