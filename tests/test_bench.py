@@ -483,6 +483,7 @@ def test_figures_outlive_a_section_that_fails(
     kept = Results.load(tmp_path / "bench.json")
     assert [contest.section for contest in kept.contests] == ["add"] * 2
     assert kept.command == "again"
+    assert kept.interrupted
 
 
 def test_quick_run_from_end_to_end(tmp_path: Path) -> None:

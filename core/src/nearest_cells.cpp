@@ -10,8 +10,9 @@
 namespace protomark {
 namespace {
 
-// One block in so many tells how near the nearest centroids are.
-constexpr std::size_t kSampleStep = 16;
+// One block in so many, or fewer, tells how near the nearest centroids are: by the distance of at
+// most about so many of them.
+constexpr std::size_t kLeastStep = 16, kMostRank = 64;
 // Up to here a heap of the nearest is faster than selection.
 constexpr std::size_t kFewProbes = 16;
 
@@ -60,7 +61,8 @@ class Ranking {
 
   // Limits that are likely to leave some more than `probes` cells, by the nearest of a sample.
   void guess_limits(std::size_t queries, std::size_t probes) {
-    const std::size_t rank = probes * 3 / 2 / kSampleStep + 5;
+    const std::size_t step = std::max(kLeastStep, probes * 3 / 2 / kMostRank);
+    const std::size_t rank = probes * 3 / 2 / step + 5;
     sample_cells_.resize(queries * rank);
     sample_distances_.resize(queries * rank);
     std::vector<TopK> nearest;
@@ -68,7 +70,7 @@ class Ranking {
       nearest.emplace_back(&sample_cells_[q * rank], &sample_distances_[q * rank], rank, kNoLimit);
     }
     std::fill(limits_.begin(), limits_.end(), kNoLimit);
-    for (std::size_t block = 0; block < blocks_; block += kSampleStep) {
+    for (std::size_t block = 0; block < blocks_; block += step) {
       each_hit(0, queries, block, block + 1, [&](std::size_t q, const kernels::Hit& hit) {
         nearest[q].offer(hit.distance, hit.row);
       });

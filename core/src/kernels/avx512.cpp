@@ -339,10 +339,10 @@ PROTOMARK_TILE std::size_t scan_tile_once(const CodeTile& t, Hit* hits) {
   for (int q = 0; q < Queries; ++q) any |= near(acc[q], t.limits[q]);
   if (any == 0) [[likely]]
     return 0;
-  alignas(64) std::int32_t stored[Blocks][kCodeRows];
+  alignas(64) std::int32_t stored[Blocks * kCodeRows];
 #pragma GCC unroll 8
-  for (int b = 0; b < Blocks; ++b) _mm512_store_si512(stored[b], biases[b]);
-  return collect(t, stored[0], acc, hits);
+  for (int b = 0; b < Blocks; ++b) _mm512_store_si512(stored + b * kCodeRows, biases[b]);
+  return collect(t, stored, acc, hits);
 }
 
 // Calls take<Queries>(tile), so many queries at a time, for all n.

@@ -58,7 +58,7 @@ struct CodeQueries {
 // head_biases are neither written nor read.
 struct PackedCodes {
   const std::int8_t* codes;
-  const std::int32_t* biases;  // from code_biases of the same set, or nullptr for kFewQueries
+  const std::int32_t* biases;  // from code_biases of the same set; up to kFewQueries may lack them
   const std::int32_t* head_biases;
   std::size_t blocks;
   std::size_t dim;

@@ -116,6 +116,7 @@ def measure(workload: Workload, after: Callable[[Results], None] = lambda _: Non
             for name in settings.sections:
                 _RUN[name](workload, results, progress)
                 progress.end()
+                results.interrupted = name != settings.sections[-1]  # for whoever ends it now
                 after(results)
         except KeyboardInterrupt:
             results.interrupted = True

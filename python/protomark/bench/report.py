@@ -43,8 +43,9 @@ _SECTIONS = {
         "queries that are timed, for all alike; a map that is asked for a recall chooses on test "
         "queries of its own, and searches somewhat more (Growth). Slow settings are asked fewer "
         "queries, as stated. Bytes are those of the whole serialised index; building has its own "
-        "number of threads. What searches other rows than prototypes has no ratio. Peers that "
-        "were not raced, or do not find enough, are listed at the end.",
+        "number of threads, and what `--indexes` keeps was built before. What searches other rows "
+        "than prototypes has no ratio. Peers that were not raced, or do not find enough, are "
+        "listed at the end.",
     ),
     "real": (
         "Approximate search of real landmarks",
@@ -78,7 +79,7 @@ def markdown(results: Results, plots: Sequence[str] = ()) -> str:
         bullets(ceilings(results)),
     ]
     if results.interrupted:
-        parts.insert(1, "**The run was ended by Ctrl-C; what is missing was not measured.**")
+        parts.insert(1, "**The run ended early; what is missing was not measured.**")
     if results.resemblance:
         parts += [
             "### Grown data beside real data",

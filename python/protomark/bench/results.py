@@ -112,7 +112,7 @@ class Results:
         growth: points {landmarks, method, seconds (a query), bytes (a landmark), ...}.
         large: figures of the largest map, name -> value; empty where it was not made.
         skipped: what was left out, and why.
-        interrupted: whether Ctrl-C ended the run early.
+        interrupted: whether the run ended early.
         command: the command line that does the same again.
     """
 

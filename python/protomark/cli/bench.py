@@ -98,6 +98,7 @@ def bench(
     flags = [f"--only {only}"] if only else []
     flags += [f"--landmarks {landmarks}"] if landmarks else []
     flags += [f"--graphs {graphs}"] if graphs != "all" else []
+    flags += [f"--indexes {indexes.name}"] if indexes is not None else []
     flags += ["--full"] if full else ["--quick"] if quick else []
     flags += [f"--threads {threads}"] if threads != 1 else []
     repeat = " ".join(["protomark bench", *(path.name for path in tracks or []), *flags])

@@ -208,8 +208,7 @@ def _entrants(
         if graph in settings.graphs and everywhere:
             enter(name, partial(build, shelf=shelf), memory)
         else:
-            how = f"--graphs {graph} --landmarks {n}"
-            results.skipped.append(f"{name}, {ground.title}: {NOT_ASKED_FOR} (`{how}`)")
+            results.skipped.append(f"{name}, {ground.title}: {NOT_ASKED_FOR} (`--graphs {graph}`)")
 
     build = partial(ours.cells, workload, rows, codes, threads, build_threads)
     found.append(_Entrant(ours.APPROXIMATE, build, near, own=True))
