@@ -1,6 +1,7 @@
 // NEON with dot products (ARMv8.2 and later): phones since 2018, Apple silicon, Graviton 2.
 #include <arm_neon.h>
 
+#include "block_biases.h"
 #include "heads.h"
 #include "kernels.h"
 
@@ -258,19 +259,15 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   }
   Heads heads(queries, rows);
   std::size_t found = 0;
-  std::int32_t own[kCodeRows];
-  const std::int32_t* biases = own;
+  BlockBiases biases_of(rows, code_biases);
+  const std::int32_t* biases = nullptr;  // of the block
   const auto scan = [&]<int Queries>(std::size_t q, std::size_t row) {
     found += scan_tile<Queries>(codes + q * rows.dim, queries.limits + q, rows, biases, q, row,
                                 hits + found);
   };
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
-    if (rows.biases != nullptr) {
-      biases = rows.biases + row;
-    } else {
-      code_biases(rows.codes + row * rows.dim, 1, rows.dim, rows.dim, own, nullptr);
-    }
+    biases = biases_of(row);
     std::size_t q = 0;
     if (heads.now()) {
       std::uint8_t likely[kScanQueries];

@@ -1,4 +1,5 @@
 // Plain C++, for every machine; the definition that the others must match.
+#include "block_biases.h"
 #include "kernels.h"
 
 namespace protomark::kernels {
@@ -121,16 +122,11 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
   const std::size_t dim = rows.dim;
+  BlockBiases biases_of(rows, code_biases);
   std::size_t found = 0;
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
     const std::size_t row = *block * kCodeRows;
-    std::int32_t own[kCodeRows];
-    const std::int32_t* biases = own;
-    if (rows.biases != nullptr) {
-      biases = rows.biases + row;
-    } else {
-      code_biases(rows.codes + row * dim, 1, dim, dim, own, nullptr);
-    }
+    const std::int32_t* biases = biases_of(row);
     for (std::size_t q = 0; q < queries.n; ++q) {
       const std::uint8_t* query = queries.codes + q * dim;
       const std::int8_t* p = rows.codes + row * dim;
