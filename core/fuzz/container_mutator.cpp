@@ -6,8 +6,8 @@
 #include <random>
 #include <vector>
 
-#include "container.h"
-#include "crc32.h"
+#include "base/crc32.h"
+#include "file/container.h"
 #include "protomark/error.h"
 
 // Of libFuzzer.

@@ -1,6 +1,6 @@
 #include "aligned_copy.h"
-#include "container.h"
 #include "expect.h"
+#include "file/container.h"
 #include "protomark/error.h"
 
 using namespace protomark;

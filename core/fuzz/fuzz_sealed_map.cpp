@@ -1,6 +1,6 @@
 #include "aligned_copy.h"
 #include "answers.h"
-#include "container.h"
+#include "file/container.h"
 #include "protomark/error.h"
 #include "protomark/map_file.h"
 

@@ -4,9 +4,9 @@
 #include <filesystem>
 #include <limits>
 
-#include "container.h"
+#include "file/container.h"
+#include "file/sections.h"
 #include "journal_base.h"
-#include "map_sections.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"
 #include "random.h"

@@ -7,16 +7,16 @@
 #include <set>
 #include <string>
 
-#include "bit_numbers.h"
-#include "cell_blocks.h"
-#include "cell_search.h"
-#include "cells.h"
+#include "base/rounded_mean.h"
 #include "check.h"
-#include "container.h"
+#include "file/bit_numbers.h"
+#include "file/container.h"
 #include "protomark/error.h"
 #include "protomark/map_file.h"
 #include "random.h"
-#include "rounded_mean.h"
+#include "search/cell_blocks.h"
+#include "search/ivf.h"
+#include "search/ivf_search.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;

@@ -2,9 +2,9 @@
 #include <string>
 #include <vector>
 
+#include "base/crc32.h"
+#include "base/sha256.h"
 #include "check.h"
-#include "crc32.h"
-#include "sha256.h"
 
 namespace {
 std::span<const std::byte> bytes(const std::string& s) {

@@ -9,8 +9,8 @@
 #include <iterator>
 
 #include "check.h"
-#include "container.h"
 #include "faulty_disk.h"
+#include "file/container.h"
 #include "protomark/error.h"
 #include "protomark/prototypes.h"
 #include "random.h"

@@ -2,8 +2,8 @@
 // to be slow.
 #include <unordered_map>
 
+#include "base/id_index.h"
 #include "check.h"
-#include "id_index.h"
 #include "random.h"
 
 using protomark::IdIndex;

@@ -17,11 +17,11 @@
 #include <new>
 #include <optional>
 
+#include "base/crc32.h"
 #include "check.h"
-#include "container.h"
-#include "crc32.h"
-#include "journal.h"
-#include "open_map_content.h"
+#include "file/container.h"
+#include "file/journal.h"
+#include "map/map_content.h"
 #include "protomark/error.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"

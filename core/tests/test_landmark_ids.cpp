@@ -1,4 +1,4 @@
-#include "landmark_ids.h"
+#include "file/ids.h"
 
 #include <algorithm>
 #include <limits>
@@ -7,8 +7,8 @@
 #include <vector>
 
 #include "check.h"
-#include "container.h"
-#include "map_sections.h"
+#include "file/container.h"
+#include "file/sections.h"
 #include "protomark/error.h"
 #include "random.h"
 

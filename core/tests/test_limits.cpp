@@ -6,8 +6,8 @@
 #include <limits>
 
 #include "check.h"
-#include "container.h"
-#include "map_sections.h"
+#include "file/container.h"
+#include "file/sections.h"
 #include "protomark/error.h"
 #include "protomark/hamming.h"
 #include "protomark/map_file.h"

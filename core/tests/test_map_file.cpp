@@ -7,7 +7,7 @@
 #include <fstream>
 
 #include "check.h"
-#include "container.h"
+#include "file/container.h"
 #include "protomark/error.h"
 #include "random.h"
 

@@ -7,14 +7,14 @@
 #include <iterator>
 #include <memory>
 
+#include "base/utf8.h"
 #include "check.h"
-#include "container.h"
-#include "map_sections.h"
+#include "file/container.h"
+#include "file/sections.h"
 #include "protomark/error.h"
 #include "protomark/map_file.h"
 #include "protomark/prototypes.h"
 #include "random.h"
-#include "utf8.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;

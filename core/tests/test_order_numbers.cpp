@@ -1,5 +1,5 @@
 // The order of an index is checked where it is read: right answers, or an error.
-#include "order_numbers.h"
+#include "file/labels.h"
 
 #include <unistd.h>
 
@@ -11,10 +11,10 @@
 #include <numeric>
 #include <thread>
 
-#include "bit_numbers.h"
 #include "check.h"
-#include "container.h"
-#include "map_sections.h"
+#include "file/bit_numbers.h"
+#include "file/container.h"
+#include "file/sections.h"
 #include "protomark/error.h"
 #include "protomark/map_file.h"
 #include "random.h"

@@ -1,4 +1,4 @@
-#include "quantize4.h"
+#include "base/quantize4.h"
 
 #include <cstdlib>
 

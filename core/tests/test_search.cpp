@@ -7,9 +7,9 @@
 #include <limits>
 #include <map>
 
+#include "base/quantize4.h"
 #include "check.h"
 #include "protomark/hamming.h"
-#include "quantize4.h"
 #include "random.h"
 
 using namespace protomark;

@@ -1,4 +1,4 @@
-#include "ward.h"
+#include "map/prune.h"
 
 #include <utility>
 

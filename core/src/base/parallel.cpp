@@ -1,0 +1,120 @@
+#include "base/parallel.h"
+
+#include <unistd.h>
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <deque>
+#include <exception>
+#include <mutex>
+#include <system_error>
+#include <thread>
+
+namespace protomark {
+namespace {
+
+// Threads stay once they are started, so that a slip in a number must not start thousands.
+constexpr std::size_t kMaxThreads = 256;
+
+// Whether this thread runs a task.
+thread_local bool inside_task = false;
+
+struct Job {
+  const std::function<void(std::size_t)>& task;
+  std::size_t n;
+  std::size_t helpers_wanted;
+  std::atomic<std::size_t> next = 0;
+  // Guarded by the pool's mutex.
+  std::size_t helpers_at_work = 0;
+  std::exception_ptr error = nullptr;
+};
+
+class Pool {
+ public:
+  const pid_t process = ::getpid();
+
+  void run(Job& job) {
+    {
+      const std::scoped_lock lock(mutex_);
+      start_threads(job.helpers_wanted);
+      jobs_.push_back(&job);
+    }
+    wake_.notify_all();
+    work_on(job);
+    std::unique_lock lock(mutex_);
+    std::erase(jobs_, &job);
+    done_.wait(lock, [&] { return job.helpers_at_work == 0; });
+  }
+
+ private:
+  void start_threads(std::size_t n) {
+    try {
+      for (; threads_ < n; ++threads_) std::thread([this] { help(); }).detach();
+    } catch (const std::system_error&) {
+      return;  // the system gives no more; fewer do
+    }
+  }
+
+  [[noreturn]] void help() {
+    std::unique_lock lock(mutex_);
+    while (true) {
+      wake_.wait(lock, [&] { return !jobs_.empty(); });
+      Job& job = *jobs_.front();
+      ++job.helpers_at_work;
+      if (--job.helpers_wanted == 0) jobs_.pop_front();
+      lock.unlock();
+      work_on(job);
+      lock.lock();
+      if (--job.helpers_at_work == 0) done_.notify_all();
+    }
+  }
+
+  void work_on(Job& job) {
+    inside_task = true;
+    for (std::size_t i; (i = job.next.fetch_add(1)) < job.n;) {
+      try {
+        job.task(i);
+      } catch (...) {
+        job.next = job.n;
+        const std::scoped_lock lock(mutex_);
+        if (!job.error) job.error = std::current_exception();
+      }
+    }
+    inside_task = false;
+  }
+
+  std::mutex mutex_;
+  std::condition_variable wake_, done_;
+  std::deque<Job*> jobs_;  // that want helpers
+  std::size_t threads_ = 0;
+};
+
+// Never destroyed, and its threads are detached: at exit they sleep, in memory that stays. A child
+// of fork() makes its own, as the parent's has no threads there and may be locked.
+Pool& pool() {
+  static std::atomic<Pool*> shared = nullptr;
+  Pool* current = shared.load();
+  while (current == nullptr || current->process != ::getpid()) {
+    auto* fresh = new Pool;
+    if (shared.compare_exchange_strong(current, fresh)) return *fresh;
+    delete fresh;
+  }
+  return *current;
+}
+
+}  // namespace
+
+void run_tasks(int threads, std::size_t n, const std::function<void(std::size_t)>& task) {
+  if (threads < 1) throw std::invalid_argument("threads must be at least 1");
+  const std::size_t workers = std::min({static_cast<std::size_t>(threads), n, kMaxThreads});
+  if (workers <= 1 || inside_task) {
+    for (std::size_t i = 0; i < n; ++i) task(i);
+    return;
+  }
+  Job job{task, n, workers - 1};
+  pool().run(job);
+  if (job.error) std::rethrow_exception(job.error);
+}
+
+}  // namespace protomark

@@ -1,0 +1,264 @@
+#include "protomark/encoder.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <memory>
+#include <stdexcept>
+
+#include "base/parallel.h"
+#include "base/sha256.h"
+#include "base/utf8.h"
+#include "encoder/layers.h"
+#include "file/container.h"
+#include "kernels/kernels.h"
+#include "protomark/error.h"
+
+namespace protomark {
+namespace {
+
+constexpr std::size_t kMinBits = 64;
+constexpr std::size_t kMaxBits = 1024;
+constexpr std::size_t kMaxDim = 256;
+constexpr std::size_t kMaxWidth = 4096;
+constexpr std::size_t kMaxLayers = 16;
+
+// Descriptors that go through the network together at most; their activations stay in the L2 cache.
+constexpr std::size_t kBatch = 512;
+// Threads share descriptors in multiples of this.
+constexpr std::size_t kGrain = 64;
+
+[[noreturn]] void invalid(const std::string& what) {
+  throw std::invalid_argument("encoder: " + what);
+}
+
+// A sum must stay within 32 bits whatever the input is.
+void check_sums(const Layer& layer, bool first, const std::string& where) {
+  const std::int64_t most = first ? 1 : 255;
+  for (std::size_t o = 0; o < layer.outputs; ++o) {
+    std::int64_t low = layer.bias[o];
+    std::int64_t high = layer.bias[o];
+    for (std::size_t i = 0; i < layer.inputs; ++i) {
+      const std::int64_t product = most * layer.weights[o * layer.inputs + i];
+      (product < 0 ? low : high) += product;
+    }
+    if (low < std::numeric_limits<std::int32_t>::min() ||
+        high > std::numeric_limits<std::int32_t>::max()) {
+      invalid(where + ": sums of output " + std::to_string(o) + " could leave 32 bits");
+    }
+  }
+}
+
+void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t number) {
+  const std::string where = "layer " + std::to_string(number);
+  if (layer.inputs != inputs) {
+    invalid(where + " has " + std::to_string(layer.inputs) + " inputs, " + std::to_string(inputs) +
+            " are needed");
+  }
+  if (layer.outputs == 0 || layer.outputs > kMaxWidth) {
+    invalid(where + " has " + std::to_string(layer.outputs) + " outputs, 1 to " +
+            std::to_string(kMaxWidth) + " are allowed");
+  }
+  if (layer.weights.size() != layer.inputs * layer.outputs || layer.bias.size() != layer.outputs ||
+      layer.multipliers.size() != layer.outputs) {
+    invalid(where + ": weights, bias and multipliers do not match its size");
+  }
+  if (layer.shift < 1 || layer.shift > 62) invalid(where + ": shift must be 1 to 62");
+  for (const std::int32_t m : layer.multipliers) {
+    if (m <= 0) invalid(where + ": multipliers must be positive");
+  }
+  check_sums(layer, first, where);
+}
+
+// All that a model says of itself.
+std::vector<std::pair<std::string, std::string>> texts(const EncoderInfo& info) {
+  std::vector<std::pair<std::string, std::string>> result = {{"name", info.name},
+                                                             {"descriptor", info.descriptor},
+                                                             {"data", info.data},
+                                                             {"licence", info.licence}};
+  result.insert(result.end(), info.notes.begin(), info.notes.end());
+  return result;
+}
+
+}  // namespace
+
+struct Encoder::Packed {
+  BitLayer first;
+  std::vector<DenseLayer> later;
+  std::size_t widest;
+
+  explicit Packed(const std::vector<Layer>& layers)
+      : first(layers.front(), layers.size() == 1), widest(first.outputs()) {
+    for (std::size_t l = 1; l < layers.size(); ++l) {
+      later.emplace_back(layers[l], l + 1 == layers.size());
+      widest = std::max(widest, later.back().outputs());
+    }
+  }
+};
+
+Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims,
+                 float scale)
+    : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
+  if (info_.name.empty() || info_.descriptor.empty()) invalid("name and descriptor must be given");
+  for (const auto& [key, value] : texts(info_)) {
+    if (!is_utf8(key) || !is_utf8(value)) invalid("what it says of itself must be UTF-8");
+  }
+  if (layers_.empty() || layers_.size() > kMaxLayers) {
+    invalid("it has " + std::to_string(layers_.size()) + " layers, 1 to " +
+            std::to_string(kMaxLayers) + " are allowed");
+  }
+  const std::size_t bits = layers_.front().inputs;
+  if (bits < kMinBits || bits > kMaxBits || bits % 8 != 0) {
+    invalid("a descriptor has 64 to 1024 bits, a multiple of 8, not " + std::to_string(bits));
+  }
+  for (std::size_t l = 0; l < layers_.size(); ++l) {
+    check_layer(layers_[l], l == 0 ? bits : layers_[l - 1].outputs, l == 0, l);
+  }
+  if (dims_.empty() || dims_.front() == 0 || dims_.back() != layers_.back().outputs ||
+      std::adjacent_find(dims_.begin(), dims_.end(), std::greater_equal<>()) != dims_.end()) {
+    invalid("dims must ascend and end with the number of outputs");
+  }
+  if (dim() > kMaxDim) invalid("a code has at most 256 dimensions");
+  if (!(scale_ > 0) || !std::isfinite(scale_)) invalid("scale must be positive");
+  identity_ = sha256(network_bytes());
+  packed_ = std::make_shared<const Packed>(layers_);
+}
+
+std::size_t Encoder::multiply_adds() const {
+  std::size_t sum = 0;
+  for (const Layer& layer : layers_) sum += layer.inputs * layer.outputs;
+  return sum;
+}
+
+void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads) const {
+  if (descriptors.columns != bytes()) {
+    throw std::invalid_argument("descriptors have " + std::to_string(descriptors.columns) +
+                                " bytes, encoder '" + info_.name + "' takes " +
+                                std::to_string(bytes()));
+  }
+  if (codes.rows != descriptors.rows) {
+    throw std::invalid_argument("codes must have as many rows as descriptors");
+  }
+  if (std::find(dims_.begin(), dims_.end(), codes.columns) == dims_.end()) {
+    std::string allowed;
+    for (const std::size_t d : dims_) allowed += (allowed.empty() ? "" : ", ") + std::to_string(d);
+    throw std::invalid_argument("encoder '" + info_.name + "' gives " + allowed +
+                                " dimensions, not " + std::to_string(codes.columns));
+  }
+  const kernels::Kernels& kernel = kernels::active();
+  const Packed& network = *packed_;
+  const std::size_t depth = layers_.size(), width = network.widest;
+
+  parallel_for(threads, descriptors.rows, kGrain, [&](std::size_t first, std::size_t last) {
+    // Batches of the same size: a small rest would cost as much as a large one.
+    const std::size_t batches = (last - first + kBatch - 1) / kBatch;
+    const std::size_t most = std::min(kBatch, last - first);
+    auto x = std::make_unique_for_overwrite<std::uint8_t[]>(most * width);
+    auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? most * width : 0);
+    for (std::size_t b = 0; b < batches; ++b) {
+      const std::size_t begin = first + (last - first) * b / batches;
+      const std::size_t n = first + (last - first) * (b + 1) / batches - begin;
+      const auto wanted = [&](std::size_t l) {
+        return l + 1 < depth ? layers_[l].outputs : codes.columns;
+      };
+      network.first.run(kernel, descriptors.row(begin), n, wanted(0), {x.get(), width});
+      for (std::size_t l = 1; l < depth; ++l) {
+        network.later[l - 1].run(kernel, x.get(), width, n, wanted(l), {next.get(), width});
+        std::swap(x, next);
+      }
+      for (std::size_t i = 0; i < n; ++i) {
+        std::memcpy(codes.row(begin + i), x.get() + i * width, codes.columns);
+      }
+    }
+  });
+}
+
+// Everything that decides the codes; its SHA-256 is the encoder's identity.
+std::vector<std::byte> Encoder::network_bytes() const {
+  SectionWriter out;
+  out.value(scale_);
+  out.value(static_cast<std::uint32_t>(dims_.size()));
+  for (const std::size_t d : dims_) out.value(static_cast<std::uint32_t>(d));
+  out.value(static_cast<std::uint32_t>(layers_.size()));
+  for (const Layer& layer : layers_) {
+    out.value(static_cast<std::uint32_t>(layer.inputs));
+    out.value(static_cast<std::uint32_t>(layer.outputs));
+    out.value(static_cast<std::uint32_t>(layer.shift));
+    out.values(layer.bias.data(), layer.bias.size());
+    out.values(layer.multipliers.data(), layer.multipliers.size());
+    out.values(layer.table.data(), layer.table.size());
+    out.values(layer.weights.data(), layer.weights.size());
+  }
+  return out.take();
+}
+
+std::vector<std::byte> Encoder::serialize() const {
+  SectionWriter info;
+  for (const auto& [key, value] : texts(info_)) {
+    info.text(key);
+    info.text(value);
+  }
+  ContainerWriter file(FileKind::encoder);
+  file.add("info", info.take());
+  file.add("network", network_bytes());
+  return file.serialize();
+}
+
+void Encoder::save(const std::filesystem::path& path) const { write_file(path, serialize()); }
+
+Encoder Encoder::load(const std::filesystem::path& path) {
+  const MappedFile file(path);
+  return parse(file.bytes(), path.string());
+}
+
+Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name) {
+  const ContainerReader file(bytes, name);
+  file.expect(FileKind::encoder);
+
+  EncoderInfo info;
+  for (SectionReader in(file, "info"); !in.empty();) {
+    std::string key = in.text();
+    std::string value = in.text();
+    if (key == "name") {
+      info.name = std::move(value);
+    } else if (key == "descriptor") {
+      info.descriptor = std::move(value);
+    } else if (key == "data") {
+      info.data = std::move(value);
+    } else if (key == "licence") {
+      info.licence = std::move(value);
+    } else {
+      info.notes.emplace_back(std::move(key), std::move(value));
+    }
+  }
+
+  SectionReader in(file, "network");
+  const auto scale = in.value<float>();
+  const auto count = in.value<std::uint32_t>();
+  if (count > kMaxDim) file.fail("it has too many dims");
+  std::vector<std::size_t> dims;
+  for (const std::uint32_t d : in.values<std::uint32_t>(count)) dims.push_back(d);
+  const auto depth = in.value<std::uint32_t>();
+  if (depth > kMaxLayers) file.fail("it has too many layers");
+  std::vector<Layer> layers(depth);
+  for (Layer& layer : layers) {
+    layer.inputs = in.value<std::uint32_t>();
+    layer.outputs = in.value<std::uint32_t>();
+    if (layer.inputs > kMaxWidth || layer.outputs > kMaxWidth) file.fail("a layer is too wide");
+    const auto shift = in.value<std::uint32_t>();
+    layer.shift = static_cast<int>(std::min<std::uint32_t>(shift, 63));
+    layer.bias = in.values<std::int32_t>(layer.outputs);
+    layer.multipliers = in.values<std::int32_t>(layer.outputs);
+    in.copy(layer.table.data(), layer.table.size());
+    layer.weights = in.values<std::int8_t>(layer.inputs * layer.outputs);
+  }
+  in.finish();
+  try {
+    return Encoder(std::move(info), std::move(layers), std::move(dims), scale);
+  } catch (const std::invalid_argument& error) {
+    file.fail(error.what());
+  }
+}
+
+}  // namespace protomark

@@ -1,0 +1,171 @@
+#include "encoder/layers.h"
+
+#include <algorithm>
+#include <bit>
+#include <limits>
+#include <memory>
+
+namespace protomark {
+namespace {
+
+using kernels::kOutputs;
+
+// Fewer descriptors than this are not worth a table.
+constexpr std::size_t kFew = 20;
+// 256 weights of -128 to 127 stay within 16 bits.
+constexpr std::size_t kSafeWords = 256 / 64;
+// Inputs of a dense layer that go through it together.
+constexpr std::size_t kDenseBatch = 64;
+
+constexpr std::size_t round_up(std::size_t n, std::size_t to) { return (n + to - 1) / to * to; }
+
+template <typename T>
+std::vector<T> padded(const std::vector<T>& values) {
+  std::vector<T> result = values;
+  result.resize(round_up(values.size(), kOutputs));
+  return result;
+}
+
+bool fits_16_bits(const Layer& layer) {
+  for (std::size_t o = 0; o < layer.outputs; ++o) {
+    int low = 0, high = 0;
+    for (std::size_t i = 0; i < layer.inputs; ++i) {
+      const std::int8_t w = layer.weights[o * layer.inputs + i];
+      (w < 0 ? low : high) += w;
+    }
+    if (low < std::numeric_limits<std::int16_t>::min() ||
+        high > std::numeric_limits<std::int16_t>::max()) {
+      return false;
+    }
+  }
+  return true;
+}
+
+}  // namespace
+
+PackedActivation::PackedActivation(const Layer& layer, bool last)
+    : bias_(padded(layer.bias)),
+      multipliers_(padded(layer.multipliers)),
+      table_(layer.table),
+      shift_(layer.shift) {
+  if (!last) return;
+  for (int i = 0; i < 256; ++i) table_[i] = static_cast<std::uint8_t>(std::max(i - 128, -127));
+}
+
+BitLayer::BitLayer(const Layer& layer, bool last)
+    : bytes_(layer.inputs / 8),
+      words_((layer.inputs + 63) / 64),
+      span_(fits_16_bits(layer) ? words_ : kSafeWords),
+      weights_(words_ * 64 * round_up(layer.outputs, kOutputs)),
+      activation_(layer, last) {
+  for (std::size_t o = 0; o < layer.outputs; ++o) {
+    std::int8_t* block = &weights_[o / kOutputs * kOutputs * words_ * 64];
+    for (std::size_t i = 0; i < layer.inputs; ++i) {
+      block[i * kOutputs + o % kOutputs] = layer.weights[o * layer.inputs + i];
+    }
+  }
+}
+
+// Descriptors as bit_sums or bit_sum take them.
+class BitLayer::Input {
+ public:
+  Input(const BitLayer& layer, const std::uint8_t* descriptors, std::size_t n)
+      : layer_(layer), n_(n), words_(n * layer.words_) {
+    for (std::size_t i = 0; i < n; ++i, descriptors += layer.bytes_) {
+      for (std::size_t b = 0; b < layer.bytes_; ++b) {
+        words_[b / 8 * n + i] |= std::uint64_t{descriptors[b]} << (b % 8 * 8);
+      }
+    }
+    if (n < kFew) list_set_bits();
+  }
+
+  // Sums over the words of a span from `first` on, with the weights of a block.
+  void sums(const kernels::Kernels& kernel, const std::int8_t* weights, std::size_t first,
+            std::int16_t* sums) const {
+    weights += first * 64 * kOutputs;
+    if (set_.empty()) {
+      const std::size_t count = std::min(layer_.span_, layer_.words_ - first);
+      kernel.bit_sums(weights, &words_[first * n_], count, n_, sums);
+      return;
+    }
+    for (std::size_t i = 0; i < n_; ++i) {
+      const std::size_t at = i * layer_.words_ + first;
+      kernel.bit_sum(weights, &set_[at * 64], counts_[at], sums + i * kOutputs);
+    }
+  }
+
+ private:
+  // The set bits of each span, from its first bit on, at the place of its first word.
+  void list_set_bits() {
+    set_.resize(words_.size() * 64);
+    counts_.resize(words_.size());
+    for (std::size_t i = 0; i < n_; ++i) {
+      for (std::size_t w = 0; w < layer_.words_; ++w) {
+        const std::size_t first = w / layer_.span_ * layer_.span_;
+        std::size_t& count = counts_[i * layer_.words_ + first];
+        std::uint16_t* set = &set_[(i * layer_.words_ + first) * 64];
+        for (std::uint64_t word = words_[w * n_ + i]; word != 0; word &= word - 1) {
+          set[count++] = static_cast<std::uint16_t>(
+              (w - first) * 64 + static_cast<std::size_t>(std::countr_zero(word)));
+        }
+      }
+    }
+  }
+
+  const BitLayer& layer_;
+  std::size_t n_;
+  std::vector<std::uint64_t> words_;  // words x n
+  std::vector<std::uint16_t> set_;    // n x bits
+  std::vector<std::size_t> counts_;   // n x words
+};
+
+void BitLayer::run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
+                   std::size_t wanted, LayerOutput next) const {
+  const Input input(*this, descriptors, n);
+  const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
+  const auto sums = std::make_unique_for_overwrite<std::int16_t[]>(n * kOutputs);
+  std::vector<std::int32_t> wide(span_ < words_ ? n * kOutputs : 0);
+  for (std::size_t o = 0; o < wanted; o += kOutputs) {
+    const std::int8_t* weights = &weights_[o * words_ * 64];
+    if (wide.empty()) {
+      input.sums(kernel, weights, 0, sums.get());
+      activate.activate16(activation_.block(o), sums.get(), n, next.data + o, next.stride);
+      continue;
+    }
+    std::fill(wide.begin(), wide.end(), 0);
+    for (std::size_t first = 0; first < words_; first += span_) {
+      input.sums(kernel, weights, first, sums.get());
+      for (std::size_t i = 0; i < wide.size(); ++i) wide[i] += sums[i];
+    }
+    activate.activate32(activation_.block(o), wide.data(), n, next.data + o, next.stride);
+  }
+}
+
+DenseLayer::DenseLayer(const Layer& layer, bool last)
+    : inputs_(round_up(layer.inputs, kOutputs)),
+      weights_(inputs_ * round_up(layer.outputs, kOutputs)),
+      activation_(layer, last) {
+  for (std::size_t o = 0; o < layer.outputs; ++o) {
+    std::int8_t* group = &weights_[o / 16 * 16 * inputs_];
+    for (std::size_t i = 0; i < layer.inputs; ++i) {
+      group[i / 4 * 4 * 16 + o % 16 * 4 + i % 4] = layer.weights[o * layer.inputs + i];
+    }
+  }
+}
+
+void DenseLayer::run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride,
+                     std::size_t n, std::size_t wanted, LayerOutput next) const {
+  const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
+  std::vector<std::int32_t> sums(std::min(n, kDenseBatch) * kOutputs);
+  for (std::size_t i = 0; i < n; i += kDenseBatch) {
+    const std::size_t batch = std::min(kDenseBatch, n - i);
+    for (std::size_t o = 0; o < wanted; o += kOutputs) {
+      kernel.dense(&weights_[o * inputs_], inputs_, x + i * stride, stride, batch,
+                   round_up(std::min(wanted - o, kOutputs), 16), sums.data());
+      activate.activate32(activation_.block(o), sums.data(), batch, next.data + i * next.stride + o,
+                          next.stride);
+    }
+  }
+}
+
+}  // namespace protomark
