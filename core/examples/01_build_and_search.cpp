@@ -1,4 +1,4 @@
-// Build a map from observations, search it, save it, seal it.
+// Builds a map from observations, searches it, saves it and seals it.
 //
 //   01_build_and_search MODEL.pme FOLDER
 #include <cstdio>
@@ -7,9 +7,7 @@
 #include <random>
 #include <vector>
 
-#include "protomark/encoder.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 
 namespace pm = protomark;
 
@@ -21,8 +19,8 @@ int main(int argc, char** argv) try {
   const std::filesystem::path folder = argv[2];
   const auto encoder = std::make_shared<const pm::Encoder>(pm::Encoder::load(argv[1]));
 
-  // Descriptors come from a detector; here 1,000 landmarks are seen four times, each time with a
-  // tenth of the bits wrong.
+  // Descriptors come from a detector; here 1,000 landmarks are seen four times, with a tenth of the
+  // bits wrong each time.
   const std::size_t landmarks = 1000, views = 4, bytes = encoder->bytes();
   std::mt19937 random(0);
   std::vector<std::uint8_t> truth(landmarks * bytes);
@@ -46,27 +44,24 @@ int main(int argc, char** argv) try {
   pm::PrototypeMap map(encoder);
   map.add(ids, {descriptors.data(), ids.size(), bytes});
 
-  // A new frame: two neighbours a descriptor, kept where the first is clearly nearer.
+  // A new frame: the two nearest landmarks of each descriptor, kept if the first is clearly nearer.
   std::vector<std::uint8_t> frame;
   for (std::size_t landmark = 0; landmark < landmarks; ++landmark) observe(landmark, frame);
-  std::vector<std::int64_t> found(landmarks * 2);
-  std::vector<float> distances(landmarks * 2);
   pm::SearchOptions options;
   options.ratio = 0.9f;
-  map.search({frame.data(), landmarks, bytes}, options, {found.data(), landmarks, 2},
-             {distances.data(), landmarks, 2});
+  const auto [found, distances] = map.search({frame.data(), landmarks, bytes}, 2, options);
   std::size_t accepted = 0, right = 0;
   for (std::size_t i = 0; i < landmarks; ++i) {
-    accepted += found[2 * i] >= 0;
-    right += found[2 * i] == static_cast<std::int64_t>(i);
+    accepted += found.row(i)[0] >= 0;
+    right += found.row(i)[0] == static_cast<std::int64_t>(i);
   }
   std::printf("%zu landmarks, %zu matches accepted, %zu right\n", map.size(), accepted, right);
 
   map.set_metadata({{"frame", "ENU, metres"}, {"source", "example"}});
   map.save(folder / "scene.pmk");
-  map.seal(folder / "scene.sealed.pmk");
+  map.seal(folder / "scene.sealed.pmk", {.bytes_per_landmark = 33});
   const pm::SealedMap sealed(folder / "scene.sealed.pmk");
-  std::printf("sealed: %zu landmarks of %zu bytes\n", sealed.size(), sealed.dim() + 1);
+  std::printf("sealed: %zu landmarks of %.1f bytes\n", sealed.size(), sealed.bytes_per_landmark());
   return 0;
 } catch (const std::exception& error) {
   std::fprintf(stderr, "error: %s\n", error.what());

@@ -6,9 +6,11 @@
 #include <random>
 #include <vector>
 
+#include "base/checked_numbers.h"
 #include "base/crc32.h"
 #include "file/container.h"
-#include "protomark/error.h"
+#include "file/sections.h"
+#include "protomark/protomark.h"
 
 // Of libFuzzer.
 extern "C" std::size_t LLVMFuzzerMutate(std::uint8_t* data, std::size_t size, std::size_t max_size);
@@ -21,22 +23,20 @@ using Content = std::vector<std::byte>;
 
 struct File {
   FileKind kind;
-  std::uint32_t version;
   std::vector<std::pair<std::string, Content>> sections;
 
   // Throws FileError where these are not the bytes of a file with a good header.
   explicit File(Bytes bytes) {
     const ContainerReader reader(bytes, "input");
     kind = reader.kind();
-    std::memcpy(&version, bytes.data() + 8, sizeof(version));
     for (const auto& [name, size] : reader.sections()) {
-      const Bytes content = *reader.map_if_there(name);
+      const Bytes content = reader.map(name);
       sections.emplace_back(name, Content(content.begin(), content.end()));
     }
   }
 
   Content serialize() const {
-    ContainerWriter writer(kind, version);
+    ContainerWriter writer(kind);
     for (const auto& [name, content] : sections) writer.add(name, Bytes(content));
     return writer.serialize();
   }
@@ -64,12 +64,29 @@ Content mutate_table(Bytes file) {
   return bytes;
 }
 
+// Makes the checksums of the owners of rows right again.
+void repair_owners(File& file) {
+  const auto find = [&](const char* name) {
+    const auto found =
+        std::ranges::find(file.sections, name, [](const auto& s) { return s.first; });
+    return found == file.sections.end() ? nullptr : &found->second;
+  };
+  const Content* owners = find(section::kOwners);
+  Content* checksums = find(section::kOwnerChecksums);
+  if (owners == nullptr || checksums == nullptr) return;
+  std::vector<std::uint64_t> words(owners->size() / sizeof(std::uint64_t));
+  std::memcpy(words.data(), owners->data(), words.size() * sizeof(words[0]));
+  BlockChecksums right;
+  right.add(words);
+  const Bytes repaired = std::as_bytes(std::span(right.all()));
+  checksums->assign(repaired.begin(), repaired.end());
+}
+
 Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
   const auto one_in = [&](unsigned n) { return random() % n == 0; };
   File file(bytes);
   auto& sections = file.sections;
   if (one_in(16)) return mutate_table(bytes);
-  if (one_in(16)) file.version = 1 + random() % 4;
   if (one_in(32)) file.kind = static_cast<FileKind>(1 + random() % 6);
   if (sections.empty()) return file.serialize();
   auto& [name, content] = sections[random() % sections.size()];
@@ -88,6 +105,7 @@ Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
   } else {
     mutate(content, most);
   }
+  if (!one_in(8)) repair_owners(file);
   return file.serialize();
 }
 
@@ -95,8 +113,8 @@ Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
 std::vector<Content> split(Bytes bytes) {
   std::vector<Content> result;
   while (!bytes.empty()) {
-    std::uint64_t size = 0;
-    if (has_container_head(bytes)) std::memcpy(&size, &bytes[16], sizeof(size));
+    const auto head = ContainerHead::parse(bytes);
+    std::uint64_t size = head && head->has_right_checksum() ? head->header.file_size : 0;
     if (size == 0 || size > bytes.size()) size = bytes.size();
     const Bytes part = bytes.first(size);
     result.emplace_back(part.begin(), part.end());

@@ -3,8 +3,7 @@
 
 #include "aligned_copy.h"
 #include "expect.h"
-#include "protomark/encoder.h"
-#include "protomark/error.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 using namespace protomark;
@@ -49,11 +48,10 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     auto descriptors = random.integers<std::uint8_t>(n * bytes, 0, 255);
     std::fill_n(descriptors.begin(), bytes, std::uint8_t{255});
     for (const std::size_t dim : encoder.dims()) {
-      std::vector<std::int8_t> codes(n * dim);
-      encoder.encode({descriptors.data(), n, bytes}, {codes.data(), n, dim});
+      const auto codes = encoder.encode({descriptors.data(), n, bytes}, dim);
       for (std::size_t i = 0; i < n; ++i) {
         const auto wanted = reference(encoder, &descriptors[i * bytes]);
-        EXPECT(std::equal(&codes[i * dim], &codes[i * dim] + dim, wanted.begin()));
+        EXPECT(std::equal(codes.row(i), codes.row(i) + dim, wanted.begin()));
       }
     }
     const auto written = encoder.serialize();

@@ -9,8 +9,7 @@
 #include "aligned_copy.h"
 #include "answers.h"
 #include "journal_base.h"
-#include "protomark/error.h"
-#include "protomark/map_file.h"
+#include "protomark/protomark.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -70,14 +69,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     const auto base = std::as_bytes(std::span(content));
     try {
       const PrototypeMap map = PrototypeMap::parse(base, "input", input.bytes());
-      fuzz::search_map(map, [&](std::int64_t id) {
-        std::vector<std::vector<float>> looks;
-        for (Look& look : map.looks(id)) {
-          for (float& v : look.mean) v = std::round(v);  // halves away from zero
-          looks.push_back(std::move(look.mean));
-        }
-        return looks;
-      });
+      fuzz::search_map(map, [&](std::int64_t id) { return fuzz::rounded_appearances(map, id); });
       map.positions(map.ids());
       // Files take the longest by far.
       if (size / 64 % 8 == 0) go_on(map, base, input.bytes());

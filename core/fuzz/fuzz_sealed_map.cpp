@@ -1,8 +1,7 @@
 #include "aligned_copy.h"
 #include "answers.h"
 #include "file/container.h"
-#include "protomark/error.h"
-#include "protomark/map_file.h"
+#include "protomark/protomark.h"
 
 using namespace protomark;
 
@@ -13,17 +12,17 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     EXPECT(map.prototype_count() >= map.size());
     // With 8 bits nobody has checked that padding is zero, which counts.
     const bool exact = map.code_bits() == 4 || map.dim() % 4 == 0;
-    fuzz::search_map(map, [&](std::int64_t id) { return map.looks(id); }, exact);
+    fuzz::search_map(map, [&](std::int64_t id) { return map.appearances(id); }, exact);
     const auto ids = fuzz::first_ids(map.ids());
-    std::vector<float> means(ids.size() * map.dim());
-    map.prototypes(ids, {means.data(), ids.size(), map.dim()});
+    map.prototypes(ids);
     for (const std::uint32_t count : map.counts(ids)) EXPECT(count <= 255);
     for (const Position& p : map.positions(ids)) {
       EXPECT(std::isnan(p[0]) == std::isnan(p[1]) && std::isnan(p[0]) == std::isnan(p[2]));
       EXPECT(!std::isinf(p[0]) && !std::isinf(p[1]) && !std::isinf(p[2]));
     }
     const MapSummary summary = map.summary();
-    EXPECT(summary.placed <= map.size() && summary.observations <= 255 * map.size());
+    EXPECT(summary.landmarks_with_position <= map.size() &&
+           summary.observations <= 255 * map.size());
     const std::int64_t unknown = -1;
     try {
       map.counts(std::span(&unknown, 1));

@@ -5,7 +5,7 @@
 #include <memory>
 #include <vector>
 
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 namespace protomark::fuzz {
@@ -19,15 +19,15 @@ inline void observe(PrototypeMap& map, std::uint32_t seed, std::int64_t first) {
   map.add_codes(ids, {codes.data(), n, dim});
 }
 
-// Without looks, and with.
+// With one row per landmark, and with several.
 inline std::vector<PrototypeMap> journal_bases() {
   test::Random random(11);
   std::vector<Layer> layers = {test::random_layer(random, 64, 4)};
   const auto encoder = std::make_shared<const Encoder>(
       Encoder({"seed", "test", "", "", {}}, std::move(layers), {4}, 0.5f));
   std::vector<PrototypeMap> result;
-  for (const std::size_t look_bits : {0, 2}) {
-    observe(result.emplace_back(encoder, 0, look_bits), 1, 0);
+  for (const std::size_t appearance_bits : {0, 2}) {
+    observe(result.emplace_back(encoder, 0, appearance_bits), 1, 0);
   }
   return result;
 }

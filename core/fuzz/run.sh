@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs every fuzz target and says what it reached: run.sh BUILD_FOLDER SECONDS [TARGET ...]
+# Runs every fuzz target and tells what it reached: run.sh BUILD_FOLDER SECONDS [TARGET ...]
 #
 # Corpora stay in BUILD_FOLDER/corpus, so that a next run goes on from them. An input that fails is
 # kept in BUILD_FOLDER/found; it becomes a regression test.
@@ -8,7 +8,7 @@ build=$(cd "$1" && pwd)
 seconds=$2
 shift 2
 targets=("$@")
-if [ ${#targets[@]} -eq 0 ]; then targets=(container encoder journal open_map sealed_map); fi
+if [ ${#targets[@]} -eq 0 ]; then targets=(container encoder journal learning_map sealed_map); fi
 here=$(cd "$(dirname "$0")" && pwd)
 profiles=$build/profiles
 rm -rf "$profiles" "$build/seeds"
@@ -38,8 +38,8 @@ if command -v llvm-profdata > /dev/null && ls "$profiles"/*.profraw > /dev/null 
   llvm-profdata merge -sparse "$profiles"/*.profraw -o "$profiles/all.profdata"
   echo "lines of the readers that these inputs ran:"
   llvm-cov report "${objects[@]:1}" -instr-profile="$profiles/all.profdata" \
-    "$here"/../src/{container,encoder,journal,landmark_ids,landmark_sections,map_file}.cpp \
-    "$here"/../src/{map_sections,metadata,open_map_file}.cpp 2> /dev/null |
+    "$here"/../src/file/*.cpp "$here"/../src/encoder/encoder.cpp \
+    "$here"/../src/map/{learning_map_file,map_sections,positions,sealed_map}.cpp 2> /dev/null |
     awk '/\.cpp|TOTAL/ { print "  " $1, $10 }'
 fi
 exit $failed

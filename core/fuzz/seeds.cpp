@@ -7,9 +7,9 @@
 #include "file/container.h"
 #include "file/sections.h"
 #include "journal_base.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
+#include "sealing.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -47,18 +47,6 @@ void fill(PrototypeMap& map, std::size_t landmarks, std::int64_t step, bool posi
   }
 }
 
-// A sealed map with an index as it was before blocks of its order had checksums, so that mutations
-// of the order are not all refused for these.
-void write_without_checksums(const fs::path& from, const fs::path& to) {
-  const MappedFile mapped(from);
-  const ContainerReader file(mapped.bytes(), from.string());
-  ContainerWriter writer(file.kind(), 4);
-  for (const auto& [name, size] : file.sections()) {
-    if (name != section::kOrderChecksums) writer.add(name, file.read(name));
-  }
-  writer.write(to);
-}
-
 // Journals of one commit, of several, and with a map file in between.
 void write_journals(const fs::path& folder) {
   const fs::path path = folder.parent_path() / "journal.pmk";
@@ -73,7 +61,7 @@ void write_journals(const fs::path& folder) {
     fuzz::observe(map, 2, 3);
     map.commit();
     keep();
-    map.discard(std::vector{map.ids()[1]});
+    map.remove(std::vector{map.ids()[1]});
     map.set_positions(std::vector{map.ids()[0]}, std::vector{Position{1, 2, 3}});
     map.build_index(2);
     map.commit();
@@ -96,7 +84,7 @@ int main(int argc, char** argv) try {
     return 2;
   }
   const fs::path folder = argv[1];
-  for (const char* target : {"container", "encoder", "journal", "open_map", "sealed_map"}) {
+  for (const char* target : {"container", "encoder", "journal", "learning_map", "sealed_map"}) {
     fs::create_directories(folder / target);
   }
   const auto plain = small_encoder(4, 2), deep = small_encoder(9, 4), flat = small_encoder(1, 1);
@@ -106,32 +94,31 @@ int main(int argc, char** argv) try {
 
   int number = 0;
   for (const auto& encoder : {plain, deep, flat}) {
-    for (const std::size_t look_bits : {0, 1, 3}) {
-      if (look_bits > encoder->dim()) continue;
+    for (const std::size_t appearance_bits : {0, 1, 3}) {
+      if (appearance_bits > encoder->dim()) continue;
       for (const std::size_t landmarks : {0, 1, 5, 20}) {
-        PrototypeMap map(encoder, 0, look_bits);
+        PrototypeMap map(encoder, 0, appearance_bits);
         const std::string name = std::to_string(number++);
         if (landmarks > 0) fill(map, landmarks, number % 2 == 0 ? 1 : 7, number % 3 == 0);
         if (number % 2 == 0) {
           map.set_metadata({{"created", "2026-11-23T03:39:41Z"}, {"frame", "ENU, metres"}});
         }
-        map.save(folder / "open_map" / name);
+        map.save(folder / "learning_map" / name);
         map.seal(folder / "sealed_map" / name);
-        map.seal(folder / "sealed_map" / (name + ".4"), 4, std::nullopt, 16);
-        map.seal(folder / "sealed_map" / (name + ".1"), 8, 1.5);
+        map.seal(folder / "sealed_map" / (name + ".16"), {.position_bits = 16});
+        map.seal(folder / "sealed_map" / (name + ".4"), test::four_bits(map));
+        map.seal(folder / "sealed_map" / (name + ".merged"), test::four_bits(map, 1.5));
         if (landmarks == 0) continue;
-        map.build_index(std::min<std::size_t>(landmarks, 4));
-        map.save(folder / "open_map" / (name + ".cells"));
-        map.seal(folder / "sealed_map" / (name + ".cells"));
-        map.seal(folder / "sealed_map" / (name + ".4.cells"), 4);
-        write_without_checksums(folder / "sealed_map" / (name + ".cells"),
-                                folder / "sealed_map" / (name + ".old.cells"));
+        map.build_index({std::min<std::size_t>(landmarks, 4)});
+        map.save(folder / "learning_map" / (name + ".index"));
+        map.seal(folder / "sealed_map" / (name + ".index"));
+        map.seal(folder / "sealed_map" / (name + ".4.index"), test::four_bits(map));
       }
     }
   }
   write_journals(folder / "journal");
   fs::copy(folder / "encoder" / "plain", folder / "container" / "encoder");
-  fs::copy(folder / "open_map" / "2", folder / "container" / "open");
+  fs::copy(folder / "learning_map" / "2", folder / "container" / "learning");
   fs::copy(folder / "sealed_map" / "2", folder / "container" / "sealed");
   return 0;
 } catch (const std::exception& error) {

@@ -6,7 +6,7 @@
 #include <random>
 #include <vector>
 
-#include "protomark/encoder.h"
+#include "protomark/protomark.h"
 
 namespace protomark::test {
 

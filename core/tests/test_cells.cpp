@@ -9,11 +9,10 @@
 
 #include "base/rounded_mean.h"
 #include "check.h"
-#include "file/bit_numbers.h"
 #include "file/container.h"
-#include "protomark/error.h"
-#include "protomark/map_file.h"
+#include "protomark/protomark.h"
 #include "random.h"
+#include "sealing.h"
 #include "search/cell_blocks.h"
 #include "search/ivf.h"
 #include "search/ivf_search.h"
@@ -25,18 +24,9 @@ namespace {
 
 constexpr std::size_t kDim = 12;
 
-struct Found {
-  std::vector<std::int64_t> ids;
-  std::vector<float> distances;
-  bool operator==(const Found&) const = default;
-};
-
 template <typename Map>
-Found search(const Map& map, Codes queries, std::size_t k, SearchOptions options = {}) {
-  Found found{std::vector<std::int64_t>(queries.rows * k), std::vector<float>(queries.rows * k)};
-  map.search_codes(queries, options, {found.ids.data(), queries.rows, k},
-                   {found.distances.data(), queries.rows, k});
-  return found;
+Matches search(const Map& map, Codes queries, std::size_t k, SearchOptions options = {}) {
+  return map.search_codes(queries, k, options);
 }
 
 SearchOptions with_probes(std::size_t probes, int threads = 1) {
@@ -64,12 +54,12 @@ std::vector<std::int8_t> clumped(test::Random& random, std::size_t n, std::size_
   return result;
 }
 
-// What an open map answers in all ways that are exact.
+// What a learning map answers in all ways that are exact.
 template <typename Map>
-void check_exact(const Map& map, const Found& expected, Codes queries) {
+void check_exact(const Map& map, const Matches& expected, Codes queries) {
   CHECK(search(map, queries, 3) == expected);
   for (const int threads : {1, 3}) {
-    CHECK(search(map, queries, 3, with_probes(map.index_cells(), threads)) == expected);
+    CHECK(search(map, queries, 3, with_probes(map.nlist(), threads)) == expected);
   }
   CHECK(search(map, queries, 3, with_recall(1)) == expected);
 }
@@ -118,21 +108,6 @@ void blocks() {
       all += list.size();
     }
     CHECK(all == blocks.blocks());
-  }
-}
-
-void numbers() {
-  test::Random random(4);
-  for (const int bits : {1, 7, 8, 20, 24, 31, 32}) {
-    const auto values = random.integers<std::uint32_t>(1001, 0, (std::int64_t{1} << bits) - 1);
-    const std::vector<std::uint8_t> packed = pack_bit_numbers(values, bits);
-    CHECK(packed.size() == bit_numbers_size(values.size(), bits));
-    CHECK(packed.size() == (1001u * static_cast<unsigned>(bits) + 7) / 8 + 7);
-    bool equal = true;
-    for (std::size_t i = 0; i < values.size(); ++i) {
-      equal = equal && bit_number(packed.data(), bits, i) == values[i];
-    }
-    CHECK(equal);
   }
 }
 
@@ -186,10 +161,10 @@ std::vector<std::byte> content(const fs::path& path) {
 }
 
 // Whatever happens to a map with an index, it answers as one without.
-void histories(std::size_t look_bits) {
+void histories(std::size_t appearance_bits) {
   const auto encoder = test::random_encoder();
   test::Random random(6);
-  PrototypeMap with(encoder, kDim, look_bits), without(encoder, kDim, look_bits);
+  PrototypeMap with(encoder, kDim, appearance_bits), without(encoder, kDim, appearance_bits);
   const auto codes = clumped(random, 64);
   const Codes queries{codes.data(), 64, kDim};
   struct Observation {
@@ -210,8 +185,8 @@ void histories(std::size_t look_bits) {
     }
   };
   add(500, 300);
-  with.build_index(16);
-  CHECK(with.index_cells() == 16);
+  with.build_index({16});
+  CHECK(with.nlist() == 16);
   for (int round = 0; round < 12; ++round) {
     add(400, 300 + 100 * round);
     // Some observations are taken back, all of some landmarks among them.
@@ -225,28 +200,28 @@ void histories(std::size_t look_bits) {
       return true;
     });
     both([&](PrototypeMap& map) {
-      map.remove_codes(landmarks, {taken.data(), landmarks.size(), kDim});
+      map.subtract_codes(landmarks, {taken.data(), landmarks.size(), kDim});
     });
     const auto ids = with.ids();
     CHECK(ids == without.ids());
     const std::vector<std::int64_t> discarded = {ids[5], ids[77]};
-    both([&](PrototypeMap& map) { map.discard(discarded); });
+    both([&](PrototypeMap& map) { map.remove(discarded); });
     std::erase_if(
         added, [&](const Observation& o) { return o.id == discarded[0] || o.id == discarded[1]; });
     if (round % 3 == 1) {
       const std::vector<std::int64_t> into = {ids[1], ids[1]}, source = {ids[20], ids[30]};
-      both([&](PrototypeMap& map) { map.merge(into, source); });
+      both([&](PrototypeMap& map) { map.merge_landmarks(into, source); });
       for (Observation& o : added) {
         if (o.id == ids[20] || o.id == ids[30]) o.id = ids[1];
       }
     }
     if (round % 4 == 2) {
-      PrototypeMap other(encoder, kDim, look_bits);
+      PrototypeMap other(encoder, kDim, appearance_bits);
       const auto more = clumped(random, 100);
       const auto those = random.integers<std::int64_t>(100, 200, 2000);
       other.add_codes(those, {more.data(), 100, kDim});
-      if (round % 8 == 2) other.build_index(3);
-      both([&](PrototypeMap& map) { map.update(other); });
+      if (round % 8 == 2) other.build_index({3});
+      both([&](PrototypeMap& map) { map.merge_map(other); });
       for (std::size_t i = 0; i < 100; ++i) {
         added.push_back({those[i], {&more[i * kDim], &more[i * kDim] + kDim}});
       }
@@ -260,7 +235,7 @@ void histories(std::size_t look_bits) {
         fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
     with.save(path);
     const PrototypeMap again = PrototypeMap::load(path);
-    CHECK(again.index_cells() == 16);
+    CHECK(again.nlist() == 16);
     CHECK(search(again, queries, 3, with_probes(2)) == search(with, queries, 3, with_probes(2)));
     const auto bytes = content(path);
     again.save(path);
@@ -268,24 +243,24 @@ void histories(std::size_t look_bits) {
     fs::remove(path);
     if (round == 6) {
       with.drop_index();
-      CHECK(with.index_cells() == 0);
+      CHECK(with.nlist() == 0);
       CHECK(search(with, queries, 3) == search(without, queries, 3));
-      with.build_index(16, 2);
+      with.build_index({16}, 2);
     }
   }
   // To nothing and up again.
-  both([&](PrototypeMap& map) { map.discard(map.ids()); });
-  CHECK(search(with, queries, 2, with_probes(4)).ids == std::vector<std::int64_t>(128, -1));
+  both([&](PrototypeMap& map) { map.remove(map.ids()); });
+  CHECK(search(with, queries, 2, with_probes(4)).ids.data == std::vector<std::int64_t>(128, -1));
   add(300, 100);
   check_exact(with, search(without, queries, 3), queries);
 }
 
 // Rows that change places within the map end where they would beside it.
-void ways(std::size_t look_bits, bool placed) {
+void ways(std::size_t appearance_bits, bool placed) {
   const auto encoder = test::random_encoder();
   const fs::path path =
       fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
-  PrototypeMap beside(encoder, kDim, look_bits), within(encoder, kDim, look_bits);
+  PrototypeMap beside(encoder, kDim, appearance_bits), within(encoder, kDim, appearance_bits);
   test::Random random(12);
   const auto codes = clumped(random, 64);
   const Codes queries{codes.data(), 64, kDim};
@@ -302,14 +277,14 @@ void ways(std::size_t look_bits, bool placed) {
     if (placed) both([&](PrototypeMap& map) { map.set_positions(one, positions); });
   };
   const auto check_equal = [&] {
-    CHECK(within.index_cells() == beside.index_cells());
+    CHECK(within.nlist() == beside.nlist());
     CHECK(within.prototype_count() == beside.prototype_count());
     const auto ids = within.ids();
     CHECK(ids == beside.ids());
     CHECK(within.counts(ids) == beside.counts(ids));
     CHECK(search(within, queries, 3) == search(beside, queries, 3));
     for (const std::size_t probes : {1, 3}) {
-      if (within.index_cells() == 0) continue;
+      if (within.nlist() == 0) continue;
       CHECK(search(within, queries, 3, with_probes(probes)) ==
             search(beside, queries, 3, with_probes(probes)));
       CHECK(search(within, queries, 3, with_recall(0.9)) ==
@@ -327,13 +302,13 @@ void ways(std::size_t look_bits, bool placed) {
   add(900, 0);
   // More cells, fewer, as many, one, and none in between.
   for (const std::size_t cells : {7, 60, 60, 3, 1, 200}) {
-    beside.build_index(cells);
-    within.build_index(cells, 1, true);
+    beside.build_index({cells});
+    within.build_index({cells, true});
     check_equal();
     // Of cells in which rows are gone, and others have come.
     const auto ids = beside.ids();
     const std::vector<std::int64_t> gone(ids.begin() + 40, ids.begin() + 200);
-    both([&](PrototypeMap& map) { map.discard(gone); });
+    both([&](PrototypeMap& map) { map.remove(gone); });
     check_equal();
     add(300, static_cast<std::int64_t>(cells) * 10);
     check_equal();
@@ -343,56 +318,61 @@ void ways(std::size_t look_bits, bool placed) {
   both([](PrototypeMap& map) {
     auto ids = map.ids();
     ids.pop_back();
-    map.discard(ids);
+    map.remove(ids);
   });
-  beside.build_index(1);
-  within.build_index(1, 1, true);
+  beside.build_index({1});
+  within.build_index({1, true});
   check_equal();
   fs::remove(path);
 }
 
-void sealed(std::size_t look_bits, int bits, std::optional<double> prototypes,
+std::vector<std::vector<float>> sorted_rows(const Matrix<float>& matrix) {
+  std::vector<std::vector<float>> rows;
+  for (std::size_t i = 0; i < matrix.rows; ++i) {
+    rows.emplace_back(matrix.row(i), matrix.row(i) + matrix.columns);
+  }
+  std::ranges::sort(rows);
+  return rows;
+}
+
+void sealed(std::size_t appearance_bits, int bits, std::optional<double> prototypes = {},
             std::size_t n = 5000) {
   const auto encoder = test::random_encoder();
   test::Random random(8);
-  PrototypeMap with(encoder, kDim, look_bits), without(encoder, kDim, look_bits);
+  PrototypeMap with(encoder, kDim, appearance_bits), without(encoder, kDim, appearance_bits);
   const auto landmarks = random.integers<std::int64_t>(n, 0, static_cast<std::int64_t>(n / 10 * 3));
   const auto codes = clumped(random, n);
   for (PrototypeMap* map : {&with, &without}) map->add_codes(landmarks, {codes.data(), n, kDim});
-  with.build_index(30);
+  with.build_index({30});
   const fs::path path =
       fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
   const fs::path plain_path = path.string() + ".plain";
-  with.seal(path, bits, prototypes);
-  without.seal(plain_path, bits, prototypes);
+  const SealOptions options = bits == 4 ? test::four_bits(with, prototypes) : SealOptions();
+  with.seal(path, options);
+  without.seal(plain_path, options);
   const SealedMap map(path), plain(plain_path);
-  CHECK(map.index_cells() == 30);
+  CHECK(map.nlist() == 30);
   CHECK(map.prototype_count() == plain.prototype_count());
   const Codes queries{codes.data(), 80, kDim};
   check_exact(map, search(plain, queries, 3), queries);
   CHECK(map.ids() == plain.ids());
   CHECK(map.counts(map.ids()) == plain.counts(plain.ids()));
   const auto ids = map.ids();
-  std::vector<float> means(ids.size() * kDim), plain_means(means.size());
-  map.prototypes(ids, {means.data(), ids.size(), kDim});
-  plain.prototypes(ids, {plain_means.data(), ids.size(), kDim});
-  CHECK(means == plain_means);
+  CHECK(map.prototypes(ids) == plain.prototypes(ids));
   for (const std::int64_t id : {ids[0], ids[700], ids.back()}) {
-    auto looks = map.looks(id), plain_looks = plain.looks(id);
-    std::sort(looks.begin(), looks.end());
-    std::sort(plain_looks.begin(), plain_looks.end());
-    CHECK(looks == plain_looks);
+    CHECK(sorted_rows(map.appearances(id)) == sorted_rows(plain.appearances(id)));
   }
-  if (bits == 8 && !prototypes) {
-    CHECK(map.probes(0.9) == with.probes(0.9));
-    for (const SearchOptions& options : {with_recall(0.9), with_probes(3)}) {
-      CHECK(search(map, queries, 2, options) == search(with, queries, 2, options));
+  CHECK(map.code_bits() == bits);
+  if (bits == 8) {
+    CHECK(map.nprobe(0.9) == with.nprobe(0.9));
+    for (const SearchOptions& search_options : {with_recall(0.9), with_probes(3)}) {
+      CHECK(search(map, queries, 2, search_options) == search(with, queries, 2, search_options));
     }
   }
   CHECK(fs::file_size(path) > fs::file_size(plain_path));
-  CHECK(map.probes(0.5) <= map.probes(0.9));
-  CHECK(map.probes(1) == 30);
-  CHECK(check::throws<std::invalid_argument>([&] { plain.probes(0.9); }, "needs an index"));
+  CHECK(map.nprobe(0.5) <= map.nprobe(0.9));
+  CHECK(map.nprobe(1) == 30);
+  CHECK(check::throws<std::invalid_argument>([&] { plain.nprobe(0.9); }, "needs an index"));
   CHECK(check::throws<std::invalid_argument>([&] { search(plain, queries, 2, with_recall(0.9)); },
                                              "build_index before the map is sealed"));
   fs::remove(path);
@@ -408,15 +388,17 @@ void errors() {
   const auto codes = clumped(random, 3);
   const Codes queries{codes.data(), 3, kDim};
   map.add_codes(landmarks, queries);
-  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(4); }, "1 to 3 cells"));
-  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(0); }, "1 to 3 cells"));
-  CHECK(check::throws<std::invalid_argument>([&] { map.build_index(2, 0); }, "threads"));
-  CHECK(check::throws<std::invalid_argument>([&] { map.probes(0.9); }, "build_index"));
+  CHECK(
+      check::throws<std::invalid_argument>([&] { map.build_index({4}); }, "nlist must be 1 to 3"));
+  CHECK(
+      check::throws<std::invalid_argument>([&] { map.build_index({0}); }, "nlist must be 1 to 3"));
+  CHECK(check::throws<std::invalid_argument>([&] { map.build_index({2}, 0); }, "threads"));
+  CHECK(check::throws<std::invalid_argument>([&] { map.nprobe(0.9); }, "build_index"));
   for (const SearchOptions& options : {with_recall(0.9), with_probes(2)}) {
     CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, options); },
                                                "needs an index: call build_index first"));
   }
-  map.build_index(3);
+  map.build_index({3});
   for (const double recall : {0.0, -1.0, 1.1, std::nan("")}) {
     CHECK(check::throws<std::invalid_argument>(
         [&] { search(map, queries, 1, with_recall(recall)); }, "recall must be above 0"));
@@ -426,31 +408,30 @@ void errors() {
   SearchOptions two = with_probes(1);
   two.recall = 0.9;
   CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, two); }, "exclude"));
-  CHECK(search(map, queries, 1, with_probes(1000)).ids == landmarks);
+  CHECK(search(map, queries, 1, with_probes(1000)).ids.data == landmarks);
   map.build_index();
-  CHECK(map.index_cells() == 1);
+  CHECK(map.nlist() == 1);
 }
 
 }  // namespace
 
 int main() {
   blocks();
-  numbers();
   means();
   learning();
   histories(0);
   histories(5);
-  for (const std::size_t look_bits : {0, 5}) {
-    for (const bool placed : {false, true}) ways(look_bits, placed);
+  for (const std::size_t appearance_bits : {0, 5}) {
+    for (const bool placed : {false, true}) ways(appearance_bits, placed);
   }
-  sealed(0, 8, std::nullopt);
-  sealed(0, 4, std::nullopt);
-  sealed(5, 8, std::nullopt);
-  sealed(5, 8, 1.5);
+  for (const std::size_t appearance_bits : {0, 5}) {
+    for (const int bits : {8, 4}) sealed(appearance_bits, bits);
+  }
+  sealed(5, 4, 1.5);
   sealed(5, 4, 2.0);
   // More than are sealed at a time.
-  sealed(0, 8, std::nullopt, 250'000);
-  sealed(5, 8, std::nullopt, 100'000);
+  sealed(0, 8, {}, 250'000);
+  sealed(5, 8, {}, 100'000);
   errors();
   return check::result();
 }

@@ -9,8 +9,7 @@
 #include <thread>
 
 #include "check.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 using namespace protomark;
@@ -21,11 +20,7 @@ namespace {
 constexpr std::size_t kDim = 12, kNeighbours = 3, kQueries = 40;
 constexpr int kRounds = 30;
 
-struct Answer {
-  std::vector<std::int64_t> ids = std::vector<std::int64_t>(kQueries * kNeighbours);
-  std::vector<float> distances = std::vector<float>(kQueries * kNeighbours);
-  bool operator==(const Answer&) const = default;
-};
+using Answer = Matches;
 
 struct Observations {
   std::vector<std::int64_t> ids;
@@ -40,12 +35,9 @@ Observations observations(test::Random& random, std::size_t n, std::int64_t firs
 
 template <typename Map>
 Answer ask(const Map& map, Codes queries, int threads) {
-  Answer answer;
   SearchOptions options;
   options.threads = threads;
-  map.search_codes(queries, options, {answer.ids.data(), kQueries, kNeighbours},
-                   {answer.distances.data(), kQueries, kNeighbours});
-  return answer;
+  return map.search_codes(queries, kNeighbours, options);
 }
 
 // Changes that lead from the first state through others and back to it.
@@ -72,11 +64,11 @@ class Cycle {
       case 1:
         return map.add_codes(passing_.ids, passing_.view());
       case 2:
-        return map.merge(into_, source_);
+        return map.merge_landmarks(into_, source_);
       case 3:
-        return map.discard(into_);
+        return map.remove(into_);
       default:
-        return map.remove_codes(more_.ids, more_.view());
+        return map.subtract_codes(more_.ids, more_.view());
     }
   }
 
@@ -105,19 +97,19 @@ struct States {
   std::vector<std::size_t> sizes;
 };
 
-void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path& folder) {
+void test_searches_while_a_writer_changes(std::size_t appearance_bits, const fs::path& folder) {
   const auto encoder = test::random_encoder();
   const Cycle cycle(7);
   test::Random random(8);
   const auto codes = random.integers<std::int8_t>(kQueries * kDim, -127, 127);
   const Codes queries{codes.data(), kQueries, kDim};
 
-  const States states(cycle, queries, PrototypeMap(encoder, kDim, look_bits));
+  const States states(cycle, queries, PrototypeMap(encoder, kDim, appearance_bits));
 
   // A path of its own: where the last commits are not folded in, nothing else may be saved there.
-  const fs::path journaled = folder / ("journaled" + std::to_string(look_bits) + ".pmk");
+  const fs::path journaled = folder / ("journaled" + std::to_string(appearance_bits) + ".pmk");
   {
-    PrototypeMap first(encoder, kDim, look_bits);
+    PrototypeMap first(encoder, kDim, appearance_bits);
     cycle.start(first);
     first.save(journaled);
   }
@@ -133,14 +125,13 @@ void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path&
   const auto write_and_read = [&](const std::stop_token& stop) {
     const fs::path open = folder / "shared.pmk", sealed = folder / "shared.sealed.pmk";
     const std::int64_t id = shared.ids().front();
-    std::vector<float> mean(kDim);
     while (!stop.stop_requested()) {
       shared.save(open);
       wrong += states.has(ask(PrototypeMap::load(open), queries, 1)) ? 0 : 1;
       shared.seal(sealed);
       wrong += states.has(ask(SealedMap(sealed), queries, 1)) ? 0 : 1;
-      shared.prototypes(std::span(&id, 1), {mean.data(), 1, kDim});
-      shared.looks(id);
+      shared.prototypes(std::span(&id, 1));
+      shared.appearances(id);
       shared.positions(std::span(&id, 1));
       shared.counts(std::span(&id, 1));
       ++files;
@@ -170,13 +161,14 @@ void test_searches_while_a_writer_changes(std::size_t look_bits, const fs::path&
   CHECK(ask(shared, queries, 1) == states.answers.front());
   shared.commit();
   CHECK(ask(PrototypeMap::load(journaled), queries, 1) == states.answers.front());
-  std::printf("look_bits %zu: %d searches, %d files, %d commits, %d opened during %zu changes\n",
-              look_bits, searches.load(), files.load(), commits.load(), read.load(),
-              kRounds * Cycle::kSteps);
+  std::printf(
+      "appearance_bits %zu: %d searches, %d files, %d commits, %d opened during %zu changes\n",
+      appearance_bits, searches.load(), files.load(), commits.load(), read.load(),
+      kRounds * Cycle::kSteps);
 }
 
-// Two maps that take each other over at the same time.
-void test_updates_of_each_other() {
+// Two maps that are merged into each other at the same time.
+void test_merges_of_each_other() {
   const auto encoder = test::random_encoder();
   test::Random random(9);
   const Observations a = observations(random, 300, 0), b = observations(random, 300, 1000);
@@ -185,15 +177,15 @@ void test_updates_of_each_other() {
     left.add_codes(a.ids, a.view());
     right.add_codes(b.ids, b.view());
     {
-      const std::jthread one([&] { left.update(right); });
-      const std::jthread other([&] { right.update(left); });
+      const std::jthread one([&] { left.merge_map(right); });
+      const std::jthread other([&] { right.merge_map(left); });
     }
     CHECK(left.size() == right.size());
   }
 }
 
-// An update comes to an end while both maps are searched all the time.
-void test_updates_while_both_are_searched() {
+// A merge comes to an end while both maps are searched all the time.
+void test_merges_while_both_are_searched() {
   const auto encoder = test::random_encoder();
   test::Random random(10);
   const Observations a = observations(random, 3000, 0), b = observations(random, 3000, 1000);
@@ -207,11 +199,11 @@ void test_updates_while_both_are_searched() {
       while (!stop.stop_requested()) ask(*map, {codes.data(), kQueries, kDim}, 1);
     });
   }
-  for (int round = 0; round < 20; ++round) left.update(right);
+  for (int round = 0; round < 20; ++round) left.merge_map(right);
   CHECK(left.size() == 200 + right.size());
 }
 
-// A change of more than a piece (PrototypeMap::Store::kPiece) shows piece by piece to searches, and
+// A change of more than a piece (MapChange::kPiece) shows piece by piece to searches, and
 // whole to files.
 void test_large_changes_show_in_pieces(const fs::path& folder) {
   constexpr std::size_t kPiece = 2048, kAll = 9 * kPiece + 1000;
@@ -248,7 +240,7 @@ void test_large_changes_show_in_pieces(const fs::path& folder) {
         map.add(ids, {descriptors.data(), kAll, encoder->bytes()}, 2);
       }
       map.set_positions(ids, positions);
-      map.discard(ids);
+      map.remove(ids);
     }
   }
   CHECK(wrong == 0);
@@ -275,13 +267,10 @@ void test_searches_while_an_index_is_built() {
       readers.emplace_back([&](const std::stop_token& stop) {
         SearchOptions options;
         options.recall = 1;
-        Answer answer;
         while (!stop.stop_requested()) {
           try {
-            map.search_codes(queries, options, {answer.ids.data(), kQueries, kNeighbours},
-                             {answer.distances.data(), kQueries, kNeighbours});
-            wrong += answer == exact ? 0 : 1;
-            wrong += map.probes(0.9) <= 16 ? 0 : 1;
+            wrong += map.search_codes(queries, kNeighbours, options) == exact ? 0 : 1;
+            wrong += map.nprobe(0.9) <= 16 ? 0 : 1;
           } catch (const std::invalid_argument&) {
             continue;  // there is no index now
           }
@@ -290,9 +279,9 @@ void test_searches_while_an_index_is_built() {
       });
     }
     for (int round = 0; round < 20 || searches < 100; ++round) {
-      map.build_index(4 + round % 13, 1, round % 2 == 1);
+      map.build_index({static_cast<std::size_t>(4 + round % 13), round % 2 == 1});
       map.add_codes(some.ids, some.view());
-      map.remove_codes(some.ids, some.view());
+      map.subtract_codes(some.ids, some.view());
       if (round % 4 == 3) map.drop_index();
     }
   }
@@ -305,11 +294,11 @@ int main() {
   const fs::path folder =
       fs::temp_directory_path() / ("protomark_concurrency_" + std::to_string(::getpid()));
   fs::create_directory(folder);
-  for (const std::size_t look_bits : {0, 3}) {
-    test_searches_while_a_writer_changes(look_bits, folder);
+  for (const std::size_t appearance_bits : {0, 3}) {
+    test_searches_while_a_writer_changes(appearance_bits, folder);
   }
-  test_updates_of_each_other();
-  test_updates_while_both_are_searched();
+  test_merges_of_each_other();
+  test_merges_while_both_are_searched();
   test_large_changes_show_in_pieces(folder);
   test_searches_while_an_index_is_built();
   fs::remove_all(folder);

@@ -1,4 +1,5 @@
 // What a save does to the disk, in which order, and what is there when a step of it fails.
+#include <sys/resource.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -10,9 +11,8 @@
 
 #include "check.h"
 #include "faulty_disk.h"
-#include "file/container.h"
-#include "protomark/error.h"
-#include "protomark/prototypes.h"
+#include "file/sections.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 namespace fs = std::filesystem;
@@ -87,6 +87,47 @@ void pieces(const fs::path& path) {
   fs::remove(path);
 }
 
+// What a target may be: a link, which stays and leads to the new file; a long name; no device.
+void targets(const PrototypeMap& old_map, const PrototypeMap& new_map, const fs::path& folder) {
+  const fs::path real = folder / "real.pmk", link = folder / "link.pmk", far = folder / "far.pmk";
+  fs::create_symlink("real.pmk", link);
+  fs::create_symlink(link, far);
+  old_map.save(far);  // which leads to nothing yet
+  CHECK(fs::is_symlink(link) && fs::is_symlink(far) && PrototypeMap::load(real).size() == 50);
+  new_map.save(far);
+  CHECK(fs::is_symlink(link) && fs::is_symlink(far) && PrototypeMap::load(real).size() == 100);
+  for (const std::size_t length : {240, 250, 255}) {
+    const fs::path path = folder / std::string(length, 'x');
+    old_map.save(path);
+    new_map.save(path);
+    CHECK(PrototypeMap::load(path).size() == 100);
+  }
+  CHECK(check::throws<FileError>([&] { old_map.save(folder / std::string(256, 'x')); },
+                                 "File name too long"));
+  const fs::path pipe = folder / "pipe";
+  ::mkfifo(pipe.c_str(), 0600);
+  for (const fs::path& path : {pipe, folder, fs::path("/dev/null")}) {
+    const std::string why = path.string() + ": cannot be written: it is there and is no regular";
+    CHECK(check::throws<FileError>([&] { old_map.save(path); }, why));
+    CHECK(check::throws<FileError>([&] { old_map.seal(path); }, why));
+    CHECK(check::throws<FileError>([&] { old_map.encoder()->save(path); }, why));
+  }
+  CHECK(fs::is_fifo(pipe) && fs::is_character_file("/dev/null"));
+}
+
+// A limit on file sizes is an error like any other, though the system would end the program.
+void size_limit(const PrototypeMap& map, const fs::path& folder) {
+  const std::size_t before = files(folder);
+  rlimit limit;
+  ::getrlimit(RLIMIT_FSIZE, &limit);
+  const rlimit low{1000, limit.rlim_max};
+  ::setrlimit(RLIMIT_FSIZE, &low);
+  CHECK(check::throws<FileError>([&] { map.save(folder / "large.pmk"); }, "File too large"));
+  ::setrlimit(RLIMIT_FSIZE, &limit);
+  CHECK(files(folder) == before);
+  map.save(folder / "large.pmk");
+}
+
 }  // namespace
 
 int main() {
@@ -158,6 +199,8 @@ int main() {
   disk.calls.clear();
   old_map.seal(folder / "sealed.pmk");
   CHECK(disk.calls.size() == 3);
+  targets(old_map, new_map, folder);
+  size_limit(old_map, folder);
   fs::remove_all(folder);
   return check::result();
 }

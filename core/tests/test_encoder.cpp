@@ -1,4 +1,4 @@
-#include "protomark/encoder.h"
+#include "protomark/protomark.h"
 
 #include <algorithm>
 #include <cstdint>
@@ -8,7 +8,6 @@
 
 #include "check.h"
 #include "kernels/kernels.h"
-#include "protomark/error.h"
 #include "random.h"
 
 using namespace protomark;

@@ -1,4 +1,4 @@
-#include "protomark/hamming.h"
+#include "protomark/protomark.h"
 
 #include <algorithm>
 #include <bit>

@@ -6,7 +6,7 @@
 #include "check.h"
 #include "random.h"
 
-using protomark::IdIndex;
+using protomark::IdIndex, protomark::kNoLandmark, protomark::LandmarkIndex;
 
 namespace {
 
@@ -35,10 +35,10 @@ void chosen_ids() {
     if (x < std::uint64_t{1} << 63) ids.push_back(static_cast<std::int64_t>(x));
   }
   IdIndex index;
-  for (std::uint32_t row = 0; row < ids.size(); ++row) index.insert(ids, row);
-  std::size_t probes = 0;
-  for (const std::int64_t id : ids) probes += index.probes(ids, id);
-  CHECK(probes < 4 * ids.size());
+  for (std::uint32_t i = 0; i < ids.size(); ++i) index.insert(ids, LandmarkIndex{i});
+  std::size_t slots = 0;
+  for (const std::int64_t id : ids) slots += index.probe_length(ids, id);
+  CHECK(slots < 4 * ids.size());
 }
 
 }  // namespace
@@ -47,24 +47,25 @@ int main() {
   protomark::test::Random random(3);
   protomark::LargeVector<std::int64_t> ids;
   IdIndex index;
-  std::unordered_map<std::int64_t, std::uint32_t> expected;
+  std::unordered_map<std::int64_t, LandmarkIndex> expected;
   for (int step = 0; step < 200000; ++step) {
     const std::int64_t id = random.integer(0, 3000) << (step % 2 == 0 ? 0 : 40);
     const auto found = expected.find(id);
-    CHECK(index.find(ids, id) == (found == expected.end() ? IdIndex::kNone : found->second));
+    CHECK(index.find(ids, id) == (found == expected.end() ? kNoLandmark : found->second));
     if (found == expected.end()) {
       ids.push_back(id);
-      index.insert(ids, static_cast<std::uint32_t>(ids.size() - 1));
-      expected[id] = static_cast<std::uint32_t>(ids.size() - 1);
+      const LandmarkIndex last{static_cast<std::uint32_t>(ids.size() - 1)};
+      index.insert(ids, last);
+      expected[id] = last;
     } else if (random.integer(0, 2) > 0) {
-      // As the map erases: the last row takes the free place.
-      const std::uint32_t row = found->second;
+      // As the map erases: the last landmark takes the free index.
+      const LandmarkIndex landmark = found->second;
       index.erase(ids, id);
       expected.erase(found);
-      if (row != ids.size() - 1) {
-        index.move(ids, ids.back(), row);
-        expected[ids.back()] = row;
-        ids[row] = ids.back();
+      if (landmark.value != ids.size() - 1) {
+        index.move(ids, ids.back(), landmark);
+        expected[ids.back()] = landmark;
+        ids[landmark.value] = ids.back();
       }
       ids.pop_back();
     }

@@ -10,7 +10,7 @@
 
 #include "check.h"
 #include "counted_memory.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 using namespace protomark;
@@ -27,9 +27,9 @@ std::shared_ptr<const Encoder> encoder() {
       Encoder({"x", "test", "none", "none", {}}, std::move(layers), {kDim}, 1.0f));
 }
 
-PrototypeMap map_of(std::size_t n, std::size_t look_bits, bool placed) {
+PrototypeMap map_of(std::size_t n, std::size_t appearance_bits, bool placed) {
   test::Random random(6);
-  PrototypeMap map(encoder(), kDim, look_bits);
+  PrototypeMap map(encoder(), kDim, appearance_bits);
   std::vector<std::int64_t> ids(n);
   std::iota(ids.begin(), ids.end(), std::int64_t{0});
   // Backwards, so that ids and rows do not ascend together.
@@ -56,62 +56,63 @@ double bytes(const std::string& what, const Work& work) {
   return more / kLandmarks;
 }
 
-void test_memory(std::size_t look_bits, bool placed) {
+void test_memory(std::size_t appearance_bits, bool placed) {
   const std::size_t before = test::held;
-  PrototypeMap map = map_of(kLandmarks, look_bits, placed);
+  PrototypeMap map = map_of(kLandmarks, appearance_bits, placed);
   const double own = static_cast<double>(test::held - before) / kLandmarks;
-  const std::string what = "look bits " + std::to_string(look_bits) + (placed ? ", placed" : "");
+  const std::string what =
+      "look bits " + std::to_string(appearance_bits) + (placed ? ", placed" : "");
   std::printf("%-50s %4.1f bytes a landmark\n", what.c_str(), own);
   const double few = 5.5 + kBuffers / kLandmarks, sums = 2 * kDim;
   // Arrays that grew have room; positions were made at once, and with looks rows do without them.
-  const double grown = placed && look_bits == 0 ? sizeof(Position) : 0;
-  CHECK(bytes(what + ": in place", [&] { map.build_index(30, 1, true); }) < few + grown);
-  CHECK(bytes(what + ": in place again", [&] { map.build_index(20, 1, true); }) < few);
-  CHECK(bytes(what + ": beside", [&] { map.build_index(20); }) > 0.7 * own);
+  const double grown = placed && appearance_bits == 0 ? sizeof(Position) : 0;
+  CHECK(bytes(what + ": in place", [&] { map.build_index({30, true}); }) < few + grown);
+  CHECK(bytes(what + ": in place again", [&] { map.build_index({20, true}); }) < few);
+  CHECK(bytes(what + ": beside", [&] { map.build_index({20}); }) > 0.7 * own);
   // Now they have none for the half-filled blocks of more cells, and grow one after the other.
-  CHECK(bytes(what + ": in place, no room", [&] { map.build_index(60, 1, true); }) < few + sums);
+  CHECK(bytes(what + ": in place, no room", [&] { map.build_index({60, true}); }) < few + sums);
 }
 
 struct State {
-  std::vector<std::int64_t> ids, nearest;
+  std::vector<std::int64_t> ids;
   std::vector<std::uint32_t> counts;
-  std::vector<float> prototypes, distances;
+  Matrix<float> prototypes;
+  Matches matches;
   std::vector<Position> positions;
-  std::size_t cells, rows;
+  std::size_t nlist, rows;
   bool operator==(const State&) const = default;
 };
 
 State state_of(const PrototypeMap& map, Codes queries) {
-  State s{map.ids(), {}, {}, {}, {}, {}, map.index_cells(), map.prototype_count()};
-  s.counts = map.counts(s.ids);
-  s.positions = map.positions(s.ids);
+  const auto ids = map.ids();
+  SearchOptions options;
+  if (map.nlist() != 0) options.probes = 1;
+  State s{ids,
+          map.counts(ids),
+          map.prototypes(ids),
+          map.search_codes(queries, 3, options),
+          map.positions(ids),
+          map.nlist(),
+          map.prototype_count()};
   for (Position& p : s.positions) {
     if (std::isnan(p[0])) p = {};
   }
-  s.prototypes.resize(s.ids.size() * kDim);
-  map.prototypes(s.ids, {s.prototypes.data(), s.ids.size(), kDim});
-  s.nearest.resize(queries.rows * 3);
-  s.distances.resize(queries.rows * 3);
-  SearchOptions options;
-  if (s.cells != 0) options.probes = 1;
-  map.search_codes(queries, options, {s.nearest.data(), queries.rows, 3},
-                   {s.distances.data(), queries.rows, 3});
   return s;
 }
 
 // Whichever allocation fails, the map is what it was and does what it did.
-void test_failures(std::size_t look_bits, bool placed, bool in_place) {
-  PrototypeMap map = map_of(200, look_bits, placed);
+void test_failures(std::size_t appearance_bits, bool placed, bool in_place) {
+  PrototypeMap map = map_of(200, appearance_bits, placed);
   test::Random random(7);
   const auto codes = random.integers<std::int8_t>(20 * kDim, -127, 127);
   const Codes queries{codes.data(), 20, kDim};
   for (const std::size_t cells : {5, 9, 2}) {
     const State before = state_of(map, queries);
     // Learning takes most allocations; how many there are is seen on an equal map.
-    PrototypeMap same = map_of(200, look_bits, placed);
+    PrototypeMap same = map_of(200, appearance_bits, placed);
     const long all = 1L << 40;
     test::left = all;
-    same.build_index(cells, 1, in_place);
+    same.build_index({cells, in_place});
     const long needed = all - test::left;
     test::left = -1;
     int failed = 0;
@@ -121,7 +122,7 @@ void test_failures(std::size_t look_bits, bool placed, bool in_place) {
       if (allowed + 60 < needed) allowed += needed / static_cast<long>(kTries);
       test::left = allowed;
       try {
-        map.build_index(cells, 1, in_place);
+        map.build_index({cells, in_place});
         done = true;
       } catch (const std::bad_alloc&) {
         ++failed;
@@ -131,14 +132,14 @@ void test_failures(std::size_t look_bits, bool placed, bool in_place) {
     }
     CHECK(failed > 30);
     CHECK(kept);
-    CHECK(map.index_cells() == cells);
+    CHECK(map.nlist() == cells);
     const State after = state_of(map, queries);
     CHECK(after.ids == before.ids && after.counts == before.counts);
     CHECK(after.prototypes == before.prototypes);
     // It goes on learning, new landmarks included.
     const std::vector<std::int64_t> landmarks(before.ids.begin(), before.ids.begin() + 20);
     map.add_codes(landmarks, queries);
-    map.remove_codes(landmarks, queries);
+    map.subtract_codes(landmarks, queries);
     CHECK(state_of(map, queries) == after);
   }
 }
@@ -146,10 +147,10 @@ void test_failures(std::size_t look_bits, bool placed, bool in_place) {
 }  // namespace
 
 int main() {
-  for (const std::size_t look_bits : {0, 3}) {
+  for (const std::size_t appearance_bits : {0, 3}) {
     for (const bool placed : {false, true}) {
-      test_memory(look_bits, placed);
-      for (const bool in_place : {false, true}) test_failures(look_bits, placed, in_place);
+      test_memory(appearance_bits, placed);
+      for (const bool in_place : {false, true}) test_failures(appearance_bits, placed, in_place);
     }
   }
   return check::result();

@@ -14,9 +14,7 @@
 
 #include "check.h"
 #include "faulty_disk.h"
-#include "protomark/error.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 namespace fs = std::filesystem;
@@ -131,12 +129,12 @@ struct Session {
     map.emplace(PrototypeMap::load(path, true));
     add(*map, 2, 10, 10);
     map->commit();
-    map->discard(std::vector<std::int64_t>{map->ids().front()});
-    map->build_index(3);
+    map->remove(std::vector<std::int64_t>{map->ids().front()});
+    map->build_index({3});
     CHECK(map->commit() > 0);
     committed = bytes_of(*map);
     add(*map, 3, 100, 10);
-    map->merge(std::vector{map->ids()[1]}, std::vector{map->ids()[2]});
+    map->merge_landmarks(std::vector{map->ids()[1]}, std::vector{map->ids()[2]});
     changed = bytes_of(*map);
     CHECK(committed != changed);
   }

@@ -9,7 +9,7 @@
 #include "check.h"
 #include "file/container.h"
 #include "file/sections.h"
-#include "protomark/error.h"
+#include "protomark/protomark.h"
 #include "random.h"
 
 using namespace protomark;
@@ -20,11 +20,11 @@ constexpr std::int64_t kMostId = std::numeric_limits<std::int64_t>::max();
 using Ids = std::vector<std::int64_t>;
 
 std::vector<std::byte> file_of(const Ids& ids) {
-  ContainerWriter file(FileKind::sealed_map, 4);
-  const bool numbers = ids.empty() || ids_are_numbers(ids.size(), ids.back());
-  if (numbers) return file.serialize();
+  ContainerWriter file(FileKind::sealed_map);
+  const bool indices = ids.empty() || ids_are_indices(ids.size(), ids.back());
+  if (indices) return file.serialize();
   file.add_together({{section::kIdBlocks, IdBlockWriter::blocks_size(ids.size())},
-                     {section::kIdRests, ContainerWriter::kUnknownSize}},
+                     {section::kIdGaps, ContainerWriter::kUnknownSize}},
                     [&](std::span<const ContainerWriter::Sink> sinks) {
                       IdBlockWriter to(sinks[0], sinks[1]);
                       for (const std::int64_t id : ids) to.add(id);
@@ -40,6 +40,8 @@ std::size_t bytes_of(const Ids& ids) {
   return total;
 }
 
+LandmarkIndex index(std::size_t i) { return {static_cast<std::uint32_t>(i)}; }
+
 bool unknown(const LandmarkIds& ids, std::int64_t id) {
   return check::throws<UnknownLandmark>([&] { ids.find(id); });
 }
@@ -50,10 +52,10 @@ void test_round_trip(const Ids& ids) {
   file.verify();
   const LandmarkIds read(file, ids.size());
   CHECK(read.all() == ids);
-  CHECK(read.are_numbers() == (ids.empty() || ids.back() == std::int64_t(ids.size()) - 1));
+  CHECK(read.are_indices() == (ids.empty() || ids.back() == std::int64_t(ids.size()) - 1));
   bool same = true;
-  for (std::size_t i = 0; i < ids.size(); ++i) same = same && read[i] == ids[i];
-  for (std::size_t i = 0; i < ids.size(); ++i) same = same && read.find(ids[i]) == i;
+  for (std::size_t i = 0; i < ids.size(); ++i) same = same && read[index(i)] == ids[i];
+  for (std::size_t i = 0; i < ids.size(); ++i) same = same && read.find(ids[i]) == index(i);
   CHECK(same);
   const std::set<std::int64_t> known(ids.begin(), ids.end());
   for (const std::int64_t id : ids) {
@@ -82,7 +84,7 @@ void test_round_trips() {
     if (n > 0) widest.back() = kMostId;
     test_round_trip(widest);
   }
-  // Every width that a rest can have.
+  // Every width that a gap can have.
   for (int bits = 0; bits < 63; ++bits) {
     Ids ids = run(0, 200);
     for (std::size_t i = 100; i < ids.size(); ++i) ids[i] += (std::int64_t{1} << bits) - 1;
@@ -105,28 +107,28 @@ void test_sizes() {
 // A file with these blocks and words, of n landmarks.
 bool broken(std::size_t n, const std::vector<IdBlock>& blocks,
             const std::vector<std::uint64_t>& words, const std::string& message) {
-  ContainerWriter file(FileKind::sealed_map, 4);
+  ContainerWriter file(FileKind::sealed_map);
   file.add(section::kIdBlocks, std::as_bytes(std::span(blocks)));
-  file.add(section::kIdRests, std::as_bytes(std::span(words)));
+  file.add(section::kIdGaps, std::as_bytes(std::span(words)));
   const auto bytes = file.serialize();
   const ContainerReader read(bytes, "f");
   return check::throws<FileError>([&] { LandmarkIds(read, n).all(); }, "f: " + message);
 }
 
 void test_broken_files() {
-  const std::uint64_t one = 64;  // a place: the next word
+  const std::uint64_t one = 64;  // the next word
   CHECK(broken(129, {{5, 0}}, {}, "its section 'idblocks' has the wrong size"));
   CHECK(broken(128, {{5, 0}, {500, 0}}, {}, "its section 'idblocks' has the wrong size"));
   CHECK(broken(2, {{-1, 0}}, {}, "it has a negative landmark id"));
   CHECK(broken(2, {{5, one}}, {0}, "its blocks of ids do not follow each other"));
   CHECK(broken(2, {{5, ~std::uint64_t{0}}}, {}, "its blocks of ids do not follow each other"));
-  CHECK(broken(2, {{5, 63}}, {0}, "its section 'idrests' has the wrong size"));
-  CHECK(broken(2, {{5, 1}}, {0, 0}, "its section 'idrests' has the wrong size"));
-  CHECK(broken(2, {{5, 0}}, {0}, "its section 'idrests' has the wrong size"));
+  CHECK(broken(2, {{5, 63}}, {0}, "its section 'idgaps' has the wrong size"));
+  CHECK(broken(2, {{5, 1}}, {0, 0}, "its section 'idgaps' has the wrong size"));
+  CHECK(broken(2, {{5, 0}}, {0}, "its section 'idgaps' has the wrong size"));
   CHECK(broken(129, {{5, 0}, {132, 0}}, {}, "its landmark ids do not ascend"));
   CHECK(broken(129, {{5, 0}, {4, 0}}, {}, "its landmark ids do not ascend"));
   CHECK(broken(2, {{kMostId, 0}}, {}, "its landmark ids do not ascend"));
-  // Only rests say so.
+  // Only gaps say so.
   CHECK(broken(2, {{5, 2}}, {0b0011}, "its landmark ids do not ascend"));
   CHECK(broken(2, {{kMostId - 1, 1}}, {0b10}, "its landmark ids do not ascend"));
   CHECK(broken(2, {{kMostId - 1, 63}}, {~std::uint64_t{0}, ~std::uint64_t{0}},
@@ -134,24 +136,11 @@ void test_broken_files() {
   CHECK(broken(129, {{5, 1}, {133, 128}}, {0, std::uint64_t{1} << 63},
                "its landmark ids do not ascend"));
 
-  ContainerWriter file(FileKind::sealed_map, 4);
+  ContainerWriter file(FileKind::sealed_map);
   file.add(section::kIdBlocks, std::vector<std::byte>(16));
   const auto bytes = file.serialize();
   const ContainerReader read(bytes, "f");
-  CHECK(check::throws<FileError>([&] { LandmarkIds(read, 1); }, "it lacks the section 'idrests'"));
-}
-
-// As files of versions before 4 have them.
-void test_plain_ids() {
-  const Ids ids = {3, 5, 1000};
-  ContainerWriter file(FileKind::sealed_map, 1);
-  file.add(section::kIds, std::as_bytes(std::span(ids)));
-  const auto bytes = file.serialize();
-  const ContainerReader read(bytes, "f");
-  const LandmarkIds plain(read, 3);
-  CHECK(plain.all() == ids && plain[1] == 5 && plain.find(1000) == 2);
-  CHECK(unknown(plain, 4) && unknown(plain, 1001) && unknown(plain, -1));
-  CHECK(check::throws<FileError>([&] { LandmarkIds(read, 2); }, "has the wrong size"));
+  CHECK(check::throws<FileError>([&] { LandmarkIds(read, 1); }, "it lacks the section 'idgaps'"));
 }
 
 }  // namespace
@@ -160,6 +149,5 @@ int main() {
   test_round_trips();
   test_sizes();
   test_broken_files();
-  test_plain_ids();
   return check::result();
 }

@@ -4,15 +4,14 @@
 #include <cstring>
 #include <filesystem>
 #include <limits>
+#include <new>
 
 #include "check.h"
 #include "file/container.h"
 #include "file/sections.h"
-#include "protomark/error.h"
-#include "protomark/hamming.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
+#include "sealing.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -42,11 +41,7 @@ Codes view(const std::vector<std::int8_t>& codes) {
 
 template <typename Map>
 Ids search(const Map& map, const std::vector<std::int8_t>& codes, std::size_t k) {
-  const std::size_t n = codes.size() / kDim;
-  Ids ids(n * k);
-  std::vector<float> distances(n * k);
-  map.search_codes(view(codes), {}, {ids.data(), n, k}, {distances.data(), n, k});
-  return ids;
+  return map.search_codes(view(codes), k).ids.data;
 }
 
 struct Parts {
@@ -72,6 +67,11 @@ void test_encoder() {
     return test::random_layer(random, inputs, outputs);
   };
   bad([](Parts& p) { p.info.name.clear(); }, "name and descriptor");
+  for (const std::string key : {"name", "descriptor", "data", "licence"}) {
+    bad([&](Parts& p) { p.info.notes = {{key, "other"}}; }, "no note may have the key '" + key);
+  }
+  bad([](Parts& p) { p.info.data = "\xff"; }, "its data is not UTF-8");
+  bad([](Parts& p) { p.info.notes = {{"key", "\xff"}}; }, "its notes are not UTF-8");
   bad([](Parts& p) { p.layers.clear(); }, "it has 0 layers, 1 to 16");
   bad([&](Parts& p) { p.layers.assign(17, layer(64, 64)); }, "it has 17 layers");
   bad([&](Parts& p) { p.layers = {layer(56, 12)}; }, "64 to 1024 bits");
@@ -110,6 +110,8 @@ void test_encoder() {
   std::vector<std::int8_t> code(256);
   encoder.encode({descriptor.data(), 1, 128}, {code.data(), 1, 256});
   CHECK(code == std::vector<std::int8_t>(256, -1));  // -2^31 (2^31 - 1) / 2^62, rounded
+  CHECK(encoder.encode({descriptor.data(), 1, 128}).data == code);
+  CHECK(encoder.encode({}).rows == 0);  // as OpenCV gives no descriptors
 
   CHECK(refused([&] { encoder.encode({descriptor.data(), 2, 64}, {code.data(), 2, 128}); },
                 "descriptors have 64 bytes, encoder 'tiny' takes 128"));
@@ -122,9 +124,9 @@ void test_encoder() {
 }
 
 void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
-  CHECK(refused([] { PrototypeMap(nullptr); }, "needs an encoder"));
+  CHECK(refused([] { PrototypeMap(std::shared_ptr<const Encoder>()); }, "needs an encoder"));
   CHECK(refused([&] { PrototypeMap(encoder, 7); }, "no codes of 7 dimensions"));
-  CHECK(refused([&] { PrototypeMap(encoder, 6, 7); }, "look_bits must be 0 to 6, not 7"));
+  CHECK(refused([&] { PrototypeMap(encoder, 6, 7); }, "appearance_bits must be 0 to 6, not 7"));
 
   PrototypeMap map(encoder);
   const auto codes = codes_of(2);
@@ -147,17 +149,16 @@ void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
   CHECK(map.ids() == Ids{0, kMostId});
   CHECK(search(map, codes, 3) == Ids{0, kMostId, -1, kMostId, 0, -1});
   CHECK(check::throws<UnknownLandmark>([&] { map.counts(Ids{-1}); }, "landmark -1"));
-  std::vector<float> mean(kDim);
-  CHECK(refused([&] { map.prototypes(Ids{0}, {mean.data(), 1, kDim - 1}); }, "landmarks x dim"));
 
   CHECK(refused([&] { search(map, codes, 0); }, "k must be at least 1"));
-  Ids ids(2);
-  std::vector<float> distances(2);
-  const auto with = [&](const SearchOptions& options, std::size_t rows = 2) {
-    map.search_codes(view(codes), options, {ids.data(), rows, 1}, {distances.data(), 2, 1});
+  for (const std::size_t k : {SIZE_MAX, SIZE_MAX / 2 + 1, SIZE_MAX / 8}) {
+    CHECK(check::throws<std::bad_alloc>([&] { search(map, codes, k); }));
+  }
+  CHECK(check::throws<std::bad_alloc>([&] { search(map, {}, SIZE_MAX); }));
+  const auto with = [&](const SearchOptions& options) {
+    map.search_codes(view(codes), 1, options);
   };
   SearchOptions options;
-  CHECK(refused([&] { with(options, 1); }, "queries x k"));
   options.threads = 0;
   CHECK(refused([&] { with(options); }, "threads must be at least 1"));
   options = {};
@@ -170,11 +171,7 @@ void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
     options.ratio = ratio;
     CHECK(refused([&] { with(options); }, "ratio must be above 0"));
   }
-  CHECK(refused(
-      [&] {
-        map.search_codes({codes.data(), 2, 6}, {}, {ids.data(), 2, 1}, {distances.data(), 2, 1});
-      },
-      "queries have 6 dimensions"));
+  CHECK(refused([&] { map.search_codes({codes.data(), 2, 6}); }, "queries have 6 dimensions"));
 }
 
 // A landmark that a batch names twice is changed twice.
@@ -185,47 +182,47 @@ void test_duplicates(const std::shared_ptr<const Encoder>& encoder) {
   for (std::size_t i = 0; i < 4; ++i) {
     reference.add_codes(Ids{i == 3 ? 9 : 5}, {&codes[i * kDim], 1, kDim});
   }
-  std::vector<float> a(kDim), b(kDim);
-  map.prototypes(Ids{5}, {a.data(), 1, kDim});
-  reference.prototypes(Ids{5}, {b.data(), 1, kDim});
-  CHECK(a == b);
+  CHECK(map.prototypes(Ids{5}) == reference.prototypes(Ids{5}));
   CHECK(map.counts(Ids{5, 5, 9}) == std::vector<std::uint32_t>{3, 3, 1});
 
   const std::vector<Position> positions = {{1, 2, 3}, {4, 5, 6}};
   map.set_positions(Ids{5, 5}, positions);
   CHECK(map.positions(Ids{5})[0] == positions[1]);
 
-  CHECK(refused([&] { map.remove_codes(Ids{9, 9}, {codes.data(), 2, kDim}); },
-                "has 1 observations, 2 cannot be removed"));
-  CHECK(refused([&] { map.remove_codes(Ids{5}, {codes.data(), 0, kDim}); }, "1 landmark ids"));
-  CHECK(check::throws<UnknownLandmark>([&] { map.remove_codes(Ids{7}, {codes.data(), 1, kDim}); },
+  CHECK(refused([&] { map.subtract_codes(Ids{9, 9}, {codes.data(), 2, kDim}); },
+                "has 1 observations, 2 cannot be subtracted"));
+  CHECK(refused([&] { map.subtract_codes(Ids{5}, {codes.data(), 0, kDim}); }, "1 landmark ids"));
+  CHECK(check::throws<UnknownLandmark>([&] { map.subtract_codes(Ids{7}, {codes.data(), 1, kDim}); },
                                        "landmark 7"));
   const std::vector<std::int8_t> other(kDim, 127);
   map.add_codes(Ids{20, 20}, {codes.data(), 2, kDim});
   auto impossible = codes;
   for (std::size_t d = 0; d < kDim; ++d)
     impossible[d] = codes[d] + codes[kDim + d] > 0 ? -127 : 127;
-  CHECK(refused([&] { map.remove_codes(Ids{20}, {impossible.data(), 1, kDim}); }, "never added"));
+  CHECK(refused([&] { map.subtract_codes(Ids{20}, {impossible.data(), 1, kDim}); }, "never added"));
   CHECK(map.counts(Ids{5, 9, 20}) == std::vector<std::uint32_t>{3, 1, 2});
-  map.remove_codes(Ids{5, 5}, {codes.data(), 2, kDim});
+  map.subtract_codes(Ids{5, 5}, {codes.data(), 2, kDim});
   CHECK(map.counts(Ids{5}) == std::vector<std::uint32_t>{1});
 
   map.add_codes(Ids{30, 31, 32, 33}, view(codes));
-  CHECK(refused([&] { map.merge(Ids{30}, Ids{30}); }, "into itself"));
-  CHECK(refused([&] { map.merge(Ids{30, 32}, Ids{31, 31}); }, "31 was merged into another"));
-  CHECK(refused([&] { map.merge(Ids{30, 31}, Ids{31, 32}); }, "31 was merged into another"));
-  CHECK(refused([&] { map.merge(Ids{30}, Ids{}); }, "1 landmark ids for 0 sources"));
-  map.merge(Ids{30, 30}, Ids{31, 32});
+  CHECK(refused([&] { map.merge_landmarks(Ids{30}, Ids{30}); }, "into itself"));
+  CHECK(refused([&] { map.merge_landmarks(Ids{30, 32}, Ids{31, 31}); },
+                "31 was merged into another"));
+  CHECK(refused([&] { map.merge_landmarks(Ids{30, 31}, Ids{31, 32}); },
+                "31 was merged into another"));
+  CHECK(refused([&] { map.merge_landmarks(Ids{30}, Ids{}); }, "1 landmark ids for 0 sources"));
+  map.merge_landmarks(Ids{30, 30}, Ids{31, 32});
   CHECK(map.counts(Ids{30}) == std::vector<std::uint32_t>{3});
-  map.discard(Ids{33, 33, 30});
+  map.remove(Ids{33, 33, 30});
   CHECK(map.ids() == Ids{5, 9, 20});
 
-  PrototypeMap looks(encoder, 0, 2);
-  looks.add_codes(Ids{1}, {codes.data(), 1, kDim});
+  PrototypeMap several(encoder, 0, 2);
+  several.add_codes(Ids{1}, {codes.data(), 1, kDim});
   std::vector<std::int8_t> turned(codes.begin(), codes.begin() + kDim);
   for (auto& v : turned) v = static_cast<std::int8_t>(v > 0 ? -1 : 1);
-  CHECK(refused([&] { looks.remove_codes(Ids{1}, view(turned)); }, "never added"));
-  CHECK(refused([&] { looks.remove_codes(Ids{1, 1}, {codes.data(), 0, kDim}); }, "2 landmark ids"));
+  CHECK(refused([&] { several.subtract_codes(Ids{1}, view(turned)); }, "never added"));
+  CHECK(refused([&] { several.subtract_codes(Ids{1, 1}, {codes.data(), 0, kDim}); },
+                "2 landmark ids"));
 }
 
 void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::path& path) {
@@ -242,41 +239,41 @@ void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::pat
   map.save(path);
   CHECK(PrototypeMap::load(path).positions(Ids{1, 2}) == (std::vector{far, near}));
   for (const int bits : {32, 16}) {
-    CHECK(refused([&] { map.seal(path, 8, std::nullopt, bits); }, "too far apart"));
+    CHECK(refused([&] { map.seal(path, {.position_bits = bits}); }, "too far apart"));
   }
-  CHECK(refused([&] { map.seal(path, 8, std::nullopt, 24); }, "32 or 16 bits a coordinate"));
+  CHECK(refused([&] { map.seal(path, {.position_bits = 24}); }, "must be 32 or 16, not 24"));
   map.set_positions(Ids{2}, std::span(&none, 1));
   for (const int bits : {32, 16}) {
-    map.seal(path, 8, std::nullopt, bits);
+    map.seal(path, {.position_bits = bits});
     const SealedMap sealed(path);
     CHECK(sealed.position_bits() == bits);
     CHECK(sealed.positions(Ids{1})[0] == far);
     CHECK(std::isnan(sealed.positions(Ids{2})[0][1]));
-    CHECK(sealed.summary().placed == 1 && sealed.summary().high == far);
+    CHECK(sealed.summary().landmarks_with_position == 1 && sealed.summary().high == far);
   }
   CHECK((SealedMap(path).position_error() == Position{0, 0, 0}));
   map.set_positions(Ids{1}, std::span(&none, 1));
-  map.seal(path, 8, std::nullopt, 16);
+  map.seal(path, {.position_bits = 16});
   CHECK(SealedMap(path).position_bits() == 0 && !SealedMap(path).position_error());
 }
 
 // Whatever can be done with a map can be done with one of no landmarks, and with one of one.
 void test_small_maps(const std::shared_ptr<const Encoder>& encoder, const fs::path& folder) {
   const auto queries = codes_of(2, 7);
-  for (const std::size_t look_bits : {0, 3}) {
+  for (const std::size_t appearance_bits : {0, 3}) {
     for (const std::size_t n : {0, 1}) {
-      PrototypeMap map(encoder, 0, look_bits);
+      PrototypeMap map(encoder, 0, appearance_bits);
       const auto codes = codes_of(n);
       const Ids ids(n, kMostId);
       map.add_codes(ids, view(codes));
       map.add({}, {nullptr, 0, encoder->bytes()});
-      map.remove_codes({}, {nullptr, 0, kDim});
-      map.merge({}, {});
-      map.discard({});
+      map.subtract_codes({}, {nullptr, 0, kDim});
+      map.merge_landmarks({}, {});
+      map.remove({});
       map.set_positions({}, {});
-      PrototypeMap other(encoder, 0, look_bits);
-      other.update(map);
-      map.update(PrototypeMap(encoder, 0, look_bits));
+      PrototypeMap other(encoder, 0, appearance_bits);
+      other.merge_map(map);
+      map.merge_map(PrototypeMap(encoder, 0, appearance_bits));
       const Ids expected = n == 0 ? Ids{-1, -1, -1, -1} : Ids{kMostId, -1, kMostId, -1};
       map.save(folder / "open");
       verify_file(folder / "open");
@@ -286,29 +283,31 @@ void test_small_maps(const std::shared_ptr<const Encoder>& encoder, const fs::pa
       }
       const PrototypeMap read = PrototypeMap::load(folder / "open");
       CHECK(read.ids() == ids && search(read, queries, 2) == expected);
-      for (const int bits : {8, 4}) {
-        map.seal(folder / "sealed", bits, 1.0);
+      for (const SealOptions& options : {SealOptions(), test::four_bits(map)}) {
+        map.seal(folder / "sealed", options);
         verify_file(folder / "sealed");
         const SealedMap sealed(folder / "sealed");
         CHECK(sealed.ids() == ids && search(sealed, queries, 2) == expected);
         CHECK(sealed.counts(ids).size() == n && sealed.positions(ids).size() == n);
       }
       CHECK(search(map, {}, 2).empty());
-      CHECK(refused([&] { map.seal(folder / "sealed", 8, 0.99); }, "at least 1 prototype"));
-      CHECK(refused([&] { map.seal(folder / "sealed", 8, kNaN); }, "at least 1 prototype"));
-      map.remove_codes(ids, view(codes));
+      for (const double bytes : {8.99, kNaN}) {
+        CHECK(refused([&] { map.seal(folder / "sealed", {.bytes_per_landmark = bytes}); },
+                      "bytes_per_landmark must be at least 9"));
+      }
+      map.subtract_codes(ids, view(codes));
       CHECK(map.size() == 0);
     }
   }
 }
 
-void test_update(const std::shared_ptr<const Encoder>& encoder) {
+void test_merge_map(const std::shared_ptr<const Encoder>& encoder) {
   PrototypeMap map(encoder);
-  CHECK(refused([&] { map.update(map); }, "joined to itself"));
-  CHECK(refused([&] { map.update(PrototypeMap(encoder, 6)); }, "dimensions cannot be joined"));
-  CHECK(refused([&] { map.update(PrototypeMap(test::random_encoder(64, 12, 9))); },
+  CHECK(refused([&] { map.merge_map(map); }, "merged into itself"));
+  CHECK(refused([&] { map.merge_map(PrototypeMap(encoder, 6)); }, "dimensions cannot be merged"));
+  CHECK(refused([&] { map.merge_map(PrototypeMap(test::random_encoder(64, 12, 9))); },
                 "different encoders"));
-  CHECK(refused([&] { map.update(PrototypeMap(encoder, 12, 1)); }, "0 and 1 look bits"));
+  CHECK(refused([&] { map.merge_map(PrototypeMap(encoder, 12, 1)); }, "0 and 1 appearance bits"));
 }
 
 // Sections of a file as a stranger may write them.
@@ -345,7 +344,7 @@ class File {
   // Calls f with its bytes, at a multiple of 64 as a mapped file's are.
   template <typename F>
   void with_bytes(const F& f) const {
-    ContainerWriter writer(kind_, 2);
+    ContainerWriter writer(kind_);
     for (const auto& [name, bytes] : sections_) writer.add(name, Bytes(bytes));
     const auto bytes = writer.serialize();
     std::vector<std::byte> room(bytes.size() + 64);
@@ -361,7 +360,7 @@ class File {
       with_bytes([&](Bytes bytes) {
         if (kind_ == FileKind::encoder) {
           Encoder::parse(bytes, "file");
-        } else if (kind_ == FileKind::open_map) {
+        } else if (kind_ == FileKind::learning_map) {
           PrototypeMap::parse(bytes, "file");
         } else {
           SealedMap(bytes, "file");
@@ -379,7 +378,7 @@ class File {
 };
 
 void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& folder) {
-  const fs::path open = folder / "open", sealed = folder / "sealed", model = folder / "model";
+  const fs::path learning = folder / "open", sealed = folder / "sealed", model = folder / "model";
   PrototypeMap map(encoder, 0, 2);
   const auto codes = codes_of(30);
   Ids ids;
@@ -387,17 +386,18 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   map.add_codes(ids, view(codes));
   const Position p = {1, 2, 3};
   map.set_positions(Ids{0}, std::span(&p, 1));
-  map.save(open);
-  map.seal(sealed, 4);
+  map.save(learning);
+  map.seal(sealed, test::four_bits(map));
   encoder->save(model);
-  CHECK(File(open).error().empty() && File(sealed).error().empty() && File(model).error().empty());
+  CHECK(File(learning).error().empty() && File(sealed).error().empty() &&
+        File(model).error().empty());
 
   const auto says = [](const File& file, const std::string& part) {
     const bool found = !part.empty() && file.error().find(part) != std::string::npos;
     if (!found) std::printf("message was: %s\n", file.error().c_str());
     return found;
   };
-  for (const fs::path& path : {open, sealed}) {
+  for (const fs::path& path : {learning, sealed}) {
     CHECK(says(File(path).set("shape", 0, std::uint64_t{1} << 32), "more landmarks than a map"));
     CHECK(says(File(path).set("shape", 0, std::uint64_t{UINT32_MAX}), "section"));
     CHECK(says(File(path).set("shape", 0, UINT64_MAX), "more landmarks than a map"));
@@ -405,7 +405,7 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
     CHECK(says(File(path).set("shape", 16, kInfinity), "origin is not finite"));
     CHECK(says(File(path).resize("shape", 39), "'shape' is shorter"));
     CHECK(says(File(path).resize("shape", 41), "'shape' is longer"));
-    const char* ids_section = path == open ? "ids" : "idblocks";
+    const char* ids_section = path == learning ? "ids" : "idblocks";
     CHECK(says(File(path).set(ids_section, 0, std::int64_t{-1}), "negative landmark id"));
     CHECK(says(File(path).set(ids_section, 0, kMostId), "do not ascend"));
     CHECK(says(File(path).resize(ids_section, 15), "section 'id"));
@@ -413,19 +413,20 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
     CHECK(says(File(path).drop("counts"), "lacks the section 'counts'"));
     CHECK(says(File(path).resize("encoder", 10), "encoder: not a Protomark file"));
   }
-  CHECK(says(File(open).set("lookbits", 0, std::uint32_t{13}), "13 bits, not 1 to 12"));
-  CHECK(says(File(open).set("lookbits", 0, std::uint32_t{0}), "0 bits"));
-  CHECK(says(File(open).set("rows", 0, std::uint32_t{0}), "landmark without prototypes"));
-  CHECK(says(File(open).set("rows", 0, UINT32_MAX), "more prototypes than a map can hold"));
-  CHECK(says(File(open).set("looks", 0, std::uint16_t{4}), "do not ascend"));
-  CHECK(says(File(open).set("counts", 0, std::uint8_t{0}), "impossible prototype"));
-  CHECK(says(File(open).set("sums", 0, std::int16_t{32767}), "impossible prototype"));
-  CHECK(says(File(open).set("position", 0, kNaN), "no finite position"));
-  CHECK(says(File(open).set("position", 8, kInfinity), "no finite position"));
+  CHECK(says(File(learning).set("appbits", 0, std::uint32_t{13}), "13 bits, not 1 to 12"));
+  CHECK(says(File(learning).set("appbits", 0, std::uint32_t{0}), "0 bits"));
+  CHECK(says(File(learning).set("rows", 0, std::uint32_t{0}), "landmark without prototypes"));
+  CHECK(says(File(learning).set("rows", 0, UINT32_MAX), "more prototypes than a map can hold"));
+  CHECK(says(File(learning).set("appear", 0, std::uint16_t{4}), "do not ascend"));
+  CHECK(says(File(learning).set("counts", 0, std::uint8_t{0}), "impossible prototype"));
+  CHECK(says(File(learning).set("sums", 0, std::int16_t{32767}), "impossible prototype"));
+  CHECK(says(File(learning).set("position", 0, kNaN), "no finite position"));
+  CHECK(says(File(learning).set("position", 8, kInfinity), "no finite position"));
   CHECK(says(File(sealed).set("rows", 0, std::uint8_t{0}), "landmark without prototypes"));
-  CHECK(says(File(sealed).set("levels", 0, std::uint32_t{3}), "3 bits a number"));
-  CHECK(says(File(sealed).set("levels", 4, std::uint32_t{9}), "half-step"));
-  CHECK(says(File(sealed).set("levels", 4, std::uint32_t{0}), "half-step"));
+  for (const std::uint32_t scale : {0, 9}) {
+    CHECK(says(File(sealed).set("sq4scale", 0, scale), "scale of its prototypes is"));
+  }
+  CHECK(says(File(sealed).resize("sq4scale", 8), "'sq4scale' is longer"));
   CHECK(says(File(sealed).resize("protos", 64), "'protos' has the wrong size"));
   CHECK(says(File(sealed).resize("position", 13), "'position' has the wrong size"));
   CHECK(says(File(sealed).drop("protos"), "lacks the section 'protos'"));
@@ -446,7 +447,7 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
     });
   }
   // A section that nobody knows is skipped.
-  CHECK(File(open).resize("later", 100).error().empty());
+  CHECK(File(learning).resize("later", 100).error().empty());
   CHECK(File(sealed).resize("later", 100).error().empty());
 
   CHECK(check::throws<FileError>([&] { map_kind(model); }, "it holds an encoder"));
@@ -493,7 +494,7 @@ int main() {
   test_duplicates(encoder);
   test_positions(encoder, folder / "map");
   test_small_maps(encoder, folder);
-  test_update(encoder);
+  test_merge_map(encoder);
   test_claims(encoder, folder);
   test_hamming();
   fs::remove_all(folder);

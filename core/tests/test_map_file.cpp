@@ -1,15 +1,17 @@
-#include "protomark/map_file.h"
+#include "protomark/protomark.h"
 
 #include <unistd.h>
 
 #include <algorithm>
 #include <cmath>
 #include <fstream>
+#include <functional>
+#include <optional>
 
 #include "check.h"
 #include "file/container.h"
-#include "protomark/error.h"
 #include "random.h"
+#include "sealing.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -19,43 +21,72 @@ namespace {
 // A map of 4 bits answers as one of the numbers that it gives back, and those are the levels
 // nearest to the rounded means.
 void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path) {
-  map.seal(path, 4);
+  map.seal(path, test::four_bits(map));
   verify_file(path);
   const SealedMap mapped(path);
   CHECK(mapped.code_bits() == 4);
   CHECK(mapped.ids() == map.ids());
   const auto ids = map.ids();
-  const std::size_t n = ids.size(), dim = map.dim();
   CHECK(mapped.counts(ids) == map.counts(ids));
-  std::vector<float> means(n * dim), levels(n * dim);
-  map.prototypes(ids, {means.data(), n, dim});
-  mapped.prototypes(ids, {levels.data(), n, dim});
-  const float half_step = std::abs(*std::min_element(
-      levels.begin(), levels.end(), [](float a, float b) { return std::abs(a) < std::abs(b); }));
-  for (std::size_t i = 0; i < n * dim; ++i) {
-    const float rounded = std::round(means[i]);
+  const Matrix<float> means = map.prototypes(ids), levels = mapped.prototypes(ids);
+  const float scale = std::abs(*std::ranges::min_element(
+      levels.data, [](float a, float b) { return std::abs(a) < std::abs(b); }));
+  for (std::size_t i = 0; i < means.data.size(); ++i) {
+    const float rounded = std::round(means.data[i]);
     for (int u = 0; u < 16; ++u) {
-      const float level = half_step * static_cast<float>(2 * u - 15);
-      CHECK(std::abs(rounded - levels[i]) <= std::abs(rounded - level));
+      const float level = scale * static_cast<float>(2 * u - 15);
+      CHECK(std::abs(rounded - levels.data[i]) <= std::abs(rounded - level));
     }
   }
 
   PrototypeMap expanded(map.encoder());
-  std::vector<std::int8_t> codes(levels.begin(), levels.end());
-  expanded.add_codes(ids, {codes.data(), n, dim});
+  const std::vector<std::int8_t> codes(levels.data.begin(), levels.data.end());
+  expanded.add_codes(ids, {codes.data(), ids.size(), map.dim()});
   for (const std::size_t k : {1, 3}) {
     SearchOptions options;
     options.threads = 2;
     if (k == 1) options.ratio = 0.9f;
-    std::vector<std::int64_t> a(k * queries.rows), b(a.size());
-    std::vector<float> distance_a(a.size()), distance_b(a.size());
-    expanded.search_codes(queries, options, {a.data(), queries.rows, k},
-                          {distance_a.data(), queries.rows, k});
-    mapped.search_codes(queries, options, {b.data(), queries.rows, k},
-                        {distance_b.data(), queries.rows, k});
-    CHECK(a == b && distance_a == distance_b);
+    CHECK(expanded.search_codes(queries, k, options) == mapped.search_codes(queries, k, options));
   }
-  CHECK(check::throws<std::invalid_argument>([&] { map.seal(path, 5); }, "8 or 4 bits"));
+}
+
+// Lossless unless a number of bytes is named, then as many as fit.
+void test_bytes_per_landmark(const fs::path& path) {
+  const auto encoder = test::random_encoder();
+  test::Random random(16);
+  const auto codes = random.integers<std::int8_t>(4000 * 12, -127, 127);
+  const auto landmarks = random.integers<std::int64_t>(4000, 0, 299);
+  for (const std::size_t appearance_bits : {0, 4}) {
+    PrototypeMap map(encoder, 0, appearance_bits);
+    map.add_codes(landmarks, {codes.data(), 4000, 12});
+    const auto n = static_cast<double>(map.size()), m = static_cast<double>(map.prototype_count());
+    const auto sealed = [&](std::optional<double> bytes) {
+      map.seal(path, {.bytes_per_landmark = bytes});
+      return SealedMap(path);
+    };
+    const double counts = appearance_bits == 0 ? 1 : 2, all8 = 12 * m / n + counts;
+    for (const auto& bytes : {std::optional<double>(), {all8}, {1e9}}) {
+      const SealedMap lossless = sealed(bytes);
+      CHECK(lossless.code_bits() == 8 && lossless.prototype_count() == map.prototype_count());
+      CHECK(lossless.search_codes({codes.data(), 50, 12}) ==
+            map.search_codes({codes.data(), 50, 12}));
+    }
+    const double all4 = 8 * m / n + counts;
+    CHECK(sealed(all8 - 1 / n).code_bits() == 4);
+    CHECK(sealed(all4).prototype_count() == map.prototype_count());
+    for (const double bytes : {9.0, 9.5, 10.0, 10.5, 13.0, 18.0, 25.3}) {
+      const SealedMap one = sealed(bytes);
+      CHECK(one.bytes_per_landmark() <= bytes * (1 + 1e-12));
+      if (bytes >= all4) continue;
+      // One prototype more would not fit.
+      const auto rows = static_cast<double>(one.prototype_count());
+      CHECK((8 * (rows + 1) + 2 * n) / n > bytes);
+    }
+    for (const double bytes : {8.999, 0.0, -1.0, std::nan("")}) {
+      CHECK(check::throws<std::invalid_argument>([&] { sealed(bytes); },
+                                                 "bytes_per_landmark must be at least 9"));
+    }
+  }
 }
 
 }  // namespace
@@ -74,34 +105,29 @@ int main() {
   const Position here = {1.5, -2.5, 1e6};
   map.set_positions(std::span(ids).first(1), std::span(&here, 1));
 
-  const fs::path open = folder / "map.pmk", sealed = folder / "map.sealed.pmk";
-  map.save(open);
+  const fs::path learning = folder / "map.pmk", sealed = folder / "map.sealed.pmk";
+  map.save(learning);
   map.seal(sealed);
-  CHECK(map_kind(open) == MapKind::open);
+  CHECK(map_kind(learning) == MapKind::learning);
   CHECK(map_kind(sealed) == MapKind::sealed);
-  verify_file(open);
+  verify_file(learning);
   verify_file(sealed);
-  const PrototypeMap read = PrototypeMap::load(open);
+  const PrototypeMap read = PrototypeMap::load(learning);
   const SealedMap mapped(sealed);
   CHECK(read.ids() == map.ids());
   CHECK(mapped.ids() == map.ids());
   CHECK(mapped.code_bits() == 8);
   CHECK(mapped.positions(std::span(ids).first(1))[0] == here);
 
-  std::vector<std::int64_t> found(3 * n), found_read(3 * n), found_mapped(3 * n);
-  std::vector<float> distance(3 * n), distance_read(3 * n), distance_mapped(3 * n);
   const Codes queries{codes.data(), n, dim};
-  map.search_codes(queries, {}, {found.data(), n, 3}, {distance.data(), n, 3});
-  read.search_codes(queries, {}, {found_read.data(), n, 3}, {distance_read.data(), n, 3});
-  mapped.search_codes(queries, {}, {found_mapped.data(), n, 3}, {distance_mapped.data(), n, 3});
-  CHECK(found == found_read && distance == distance_read);
-  CHECK(found == found_mapped && distance == distance_mapped);
+  CHECK(read.search_codes(queries, 3) == map.search_codes(queries, 3));
+  CHECK(mapped.search_codes(queries, 3) == map.search_codes(queries, 3));
 
   test_four_bits(map, queries, folder / "map.4.pmk");
   CHECK(SealedMap(folder / "map.4.pmk").positions(std::span(ids).first(1))[0] == here);
 
   for (const std::string name : {"\xff\xfe", "\x1b[2J", "a\tb", "caf\xc3\xa9"}) {
-    ContainerWriter named(FileKind::open_map);
+    ContainerWriter named(FileKind::learning_map);
     named.add(name, Bytes());
     named.write(folder / "named.pmk");
     CHECK(check::throws<FileError>([&] { file_sections(folder / "named.pmk"); },
@@ -110,7 +136,14 @@ int main() {
 
   std::ofstream(folder / "text.pmk") << "no map";
   CHECK(check::throws<FileError>([&] { map_kind(folder / "text.pmk"); }, "not a Protomark file"));
-  CHECK(check::throws<FileError>([&] { SealedMap{open}; }, "it holds an open map"));
+  CHECK(check::throws<FileError>([&] { SealedMap{learning}; }, "it holds a learning map"));
+  CHECK(check::throws<FileError>([&] { PrototypeMap::load(sealed); }, "it holds a sealed map"));
+  encoder->save(folder / "model.pme");
+  for (const auto& f : {std::function([&] { map_kind(folder / "model.pme"); }),
+                        std::function([&] { map_encoder(folder / "model.pme"); })}) {
+    CHECK(check::throws<FileError>(f, "it holds an encoder, not a map"));
+  }
+  test_bytes_per_landmark(folder / "bytes.pmk");
   fs::resize_file(sealed, fs::file_size(sealed) - 1);
   CHECK(check::throws<FileError>([&] { SealedMap{sealed}; }, "cut off"));
   fs::remove_all(folder);

@@ -1,4 +1,4 @@
-#include "protomark/metadata.h"
+#include "protomark/protomark.h"
 
 #include <unistd.h>
 
@@ -11,9 +11,7 @@
 #include "check.h"
 #include "file/container.h"
 #include "file/sections.h"
-#include "protomark/error.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "map/map_sections.h"
 #include "random.h"
 
 using namespace protomark;
@@ -112,17 +110,17 @@ void test_update() {
   PrototypeMap here(encoder()), there(encoder());
   here.set_metadata({{"frame", "ENU"}, {"created", "2026-02-01T00:00:00Z"}, {"a", "here"}});
   there.set_metadata({{"frame", "ECEF"}, {"created", "2026-01-31T00:00:00Z"}, {"b", "there"}});
-  here.update(there);
+  here.merge_map(there);
   CHECK(here.metadata() ==
         Metadata{
             {"frame", "ENU"}, {"created", "2026-01-31T00:00:00Z"}, {"a", "here"}, {"b", "there"}});
   PrototypeMap later(encoder()), silent(encoder());
   later.set_metadata({{"created", "2027-01-01T00:00:00Z"}});
-  here.update(later);
+  here.merge_map(later);
   CHECK(here.metadata().at("created") == "2026-01-31T00:00:00Z");
-  silent.update(later);
+  silent.merge_map(later);
   CHECK(silent.metadata() == later.metadata());
-  later.update(PrototypeMap(encoder()));
+  later.merge_map(PrototypeMap(encoder()));
   CHECK(silent.metadata() == later.metadata());
 
   // Together too many: nothing is changed.
@@ -133,16 +131,16 @@ void test_update() {
   const std::int64_t id = 3;
   const std::vector<std::int8_t> code(12, 5);
   here.add_codes(std::span(&id, 1), {code.data(), 1, 12});
-  CHECK(check::throws<std::invalid_argument>([&] { full.update(here); }, "at most 256 names"));
+  CHECK(check::throws<std::invalid_argument>([&] { full.merge_map(here); }, "at most 256 names"));
   CHECK(full.size() == 0 && full.metadata() == many);
 }
 
 // A file of an empty map with these bytes as its section `metadata`.
 Metadata parsed(const std::vector<std::byte>& section) {
-  ContainerWriter file(FileKind::open_map);
+  ContainerWriter file(FileKind::learning_map);
   const auto tiny = encoder();
   file.add(section::kEncoder, tiny->serialize());
-  file.add(section::kShape, write_shape({0, 12, {}}));
+  add_value(file, section::kShape, MapShape{0, 12, {}});
   file.add(section::kMetadata, section);
   for (const char* name : {section::kIds, section::kCounts, section::kSums}) {
     file.add(name, std::vector<std::byte>());
@@ -166,7 +164,7 @@ void test_broken_files() {
   CHECK(parsed({}).empty());
   CHECK(broken(pairs({{"b", "1"}, {"a", "2"}}), "the names of its metadata do not ascend"));
   CHECK(broken(pairs({{"a", "1"}, {"a", "2"}}), "the names of its metadata do not ascend"));
-  CHECK(broken(pairs({{"a", "\xff"}}), "its section 'metadata' has a text that is no UTF-8"));
+  CHECK(broken(pairs({{"a", "\xff"}}), "its section 'metadata' has a text that is not UTF-8"));
   CHECK(broken(pairs({{"", "1"}}), "metadata: a name has 1 to 128 bytes"));
   CHECK(broken(pairs({{"created", "today"}}), "metadata: 'created' must be a time in UTC"));
   SectionWriter many;
@@ -192,7 +190,7 @@ void test_expectations() {
   expect_descriptor(*own, "test", "m.pmk");
   CHECK(check::throws<std::invalid_argument>([&] { expect_descriptor(*own, "orb", "m.pmk"); },
                                              "m.pmk: it is a map of test descriptors, not of orb"));
-  CHECK(check::throws<std::invalid_argument>([&] { encoder(1, "\xff"); }, "must be UTF-8"));
+  CHECK(check::throws<std::invalid_argument>([&] { encoder(1, "\xff"); }, "not UTF-8"));
 }
 
 }  // namespace

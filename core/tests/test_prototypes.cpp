@@ -1,4 +1,4 @@
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 
 #include <unistd.h>
 
@@ -7,7 +7,6 @@
 #include <thread>
 
 #include "check.h"
-#include "protomark/error.h"
 #include "random.h"
 
 using namespace protomark;
@@ -33,11 +32,10 @@ int main() {
       ++count;
       for (std::size_t d = 0; d < dim; ++d) sum[d] += all.row(i)[d];
     }
-    std::vector<float> mean(dim);
-    map.prototypes(std::span(&id, 1), {mean.data(), 1, dim});
+    const Matrix<float> mean = map.prototypes(std::span(&id, 1));
     CHECK(map.counts(std::span(&id, 1))[0] == count);
     for (std::size_t d = 0; d < dim; ++d) {
-      CHECK(mean[d] == static_cast<float>(sum[d]) / static_cast<float>(count));
+      CHECK(mean.row(0)[d] == static_cast<float>(sum[d]) / static_cast<float>(count));
     }
   }
 
@@ -50,20 +48,13 @@ int main() {
         for (std::size_t i = t; i < n; i += 4) {
           shared.add_codes(std::span(&ids[i], 1), {all.row(i), 1, dim});
           if (i % 100 == 0) {
-            std::int64_t found;
-            float distance;
-            shared.search_codes({all.row(i), 1, dim}, {}, {&found, 1, 1}, {&distance, 1, 1});
-            CHECK(found >= 0);
+            CHECK(shared.search_codes({all.row(i), 1, dim}, 1).ids.data[0] >= 0);
           }
         }
       });
     }
   }
-  const auto known = map.ids();
-  std::vector<float> a(known.size() * dim), b(a.size());
-  map.prototypes(known, {a.data(), known.size(), dim});
-  shared.prototypes(known, {b.data(), known.size(), dim});
-  CHECK(a == b);
+  CHECK(map.prototypes(map.ids()) == shared.prototypes(map.ids()));
 
   // Codes at their limit, more than a count holds: the mean stays where it is, and files are valid.
   for (const int value : {127, -127}) {
@@ -73,11 +64,10 @@ int main() {
       PrototypeMap full(encoder), twice(encoder);
       full.add_codes(same, {extreme.data(), times, dim});
       twice.add_codes(same, {extreme.data(), times, dim});
-      twice.update(full);
+      twice.merge_map(full);
       for (const PrototypeMap* one : {&full, &twice}) {
-        std::vector<float> mean(dim);
-        one->prototypes(std::span(&same[0], 1), {mean.data(), 1, dim});
-        CHECK(mean == std::vector<float>(dim, static_cast<float>(value)));
+        const Matrix<float> mean = one->prototypes(std::span(&same[0], 1));
+        CHECK(mean.data == std::vector<float>(dim, static_cast<float>(value)));
         const auto file = std::filesystem::temp_directory_path() /
                           ("protomark_extreme_" + std::to_string(::getpid()) + ".pmk");
         one->save(file);
@@ -87,9 +77,9 @@ int main() {
     }
   }
 
-  map.remove_codes(ids, all);
+  map.subtract_codes(ids, all);
   CHECK(map.size() == 0);
   const std::int64_t unknown = 5;
-  CHECK(check::throws<UnknownLandmark>([&] { map.discard(std::span(&unknown, 1)); }, "landmark 5"));
+  CHECK(check::throws<UnknownLandmark>([&] { map.remove(std::span(&unknown, 1)); }, "landmark 5"));
   return check::result();
 }

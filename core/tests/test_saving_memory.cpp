@@ -11,9 +11,9 @@
 
 #include "check.h"
 #include "counted_memory.h"
-#include "protomark/map_file.h"
-#include "protomark/prototypes.h"
+#include "protomark/protomark.h"
 #include "random.h"
+#include "sealing.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -25,12 +25,12 @@ const fs::path path =
 
 enum class Ids { ascending, mixed, sparse };
 
-PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t look_bits) {
+PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t appearance_bits) {
   test::Random random(5);
   std::vector<Layer> layers{test::random_layer(random, 64, dim)};
   PrototypeMap map(std::make_shared<const Encoder>(
                        Encoder({"x", "test", "none", "none", {}}, std::move(layers), {dim}, 1.0f)),
-                   dim, look_bits);
+                   dim, appearance_bits);
   std::vector<std::int64_t> ids(n);
   std::iota(ids.begin(), ids.end(), std::int64_t{0});
   if (kind == Ids::sparse) {
@@ -42,7 +42,7 @@ PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t look_b
                 ids[static_cast<std::size_t>(random.integer(0, static_cast<std::int64_t>(i) - 1))]);
     }
   }
-  for (int times = 0; times < (look_bits == 0 ? 1 : 2); ++times) {
+  for (int times = 0; times < (appearance_bits == 0 ? 1 : 2); ++times) {
     const auto codes = random.integers<std::int8_t>(n * dim, -127, 127);
     map.add_codes(ids, {codes.data(), n, dim});
   }
@@ -69,7 +69,7 @@ void check_save(const std::string& what, std::size_t own, const Save& save) {
 struct Case {
   std::size_t dim;
   Ids ids;
-  std::size_t look_bits;
+  std::size_t appearance_bits;
   bool indexed;
 };
 
@@ -88,19 +88,19 @@ int main(int argc, char** argv) {
   const std::size_t landmarks = argc > 1 ? std::strtoull(argv[1], nullptr, 10) : kLandmarks;
   for (const Case& c : kCases) {
     const std::size_t before = test::held;
-    PrototypeMap map = map_of(c.dim, landmarks, c.ids, c.look_bits);
-    if (c.indexed) map.build_index(16);
+    PrototypeMap map = map_of(c.dim, landmarks, c.ids, c.appearance_bits);
+    if (c.indexed) map.build_index({16});
     const std::size_t own = test::held - before;
     const std::string what = "dim " + std::to_string(c.dim) + ", ids " +
                              std::to_string(static_cast<int>(c.ids)) + ", look bits " +
-                             std::to_string(c.look_bits) + (c.indexed ? ", index" : "");
+                             std::to_string(c.appearance_bits) + (c.indexed ? ", index" : "");
     check_save(what + ": save", own, [&] { map.save(path); });
     // A regression: with the last landmark all arrays grew to twice their size.
     const std::size_t closed = test::held;
     const PrototypeMap opened = PrototypeMap::load(path);
     CHECK(test::held - closed < own + own / 4 + kBuffers);
     check_save(what + ": seal", own, [&] { map.seal(path); });
-    check_save(what + ": seal, 4 bits", own, [&] { map.seal(path, 4); });
+    check_save(what + ": seal, 4 bits", own, [&] { map.seal(path, test::four_bits(map)); });
   }
   fs::remove(path);
   return check::result();

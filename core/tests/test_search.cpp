@@ -1,5 +1,5 @@
 // Exact search and Hamming search against their definitions.
-#include "protomark/search.h"
+#include "protomark/protomark.h"
 
 #include <algorithm>
 #include <bit>
@@ -7,9 +7,8 @@
 #include <limits>
 #include <map>
 
-#include "base/quantize4.h"
+#include "base/sq4.h"
 #include "check.h"
-#include "protomark/hamming.h"
 #include "random.h"
 
 using namespace protomark;
@@ -167,8 +166,8 @@ void check_codes4(test::Random& random, std::size_t rows, std::size_t dim, std::
   const int half_step = static_cast<int>(random.integer(1, kMaxHalfStep));
   std::vector<std::uint8_t> packed(packed4_size(rows, dim), 0);
   for (std::size_t i = 0; i < rows * dim; ++i) {
-    const std::uint8_t u = quantize4(map.codes[i], half_step);
-    map.codes[i] = static_cast<std::int8_t>(level4(u, half_step));
+    const std::uint8_t u = sq4_quantize(map.codes[i], half_step);
+    map.codes[i] = static_cast<std::int8_t>(sq4_level(u, half_step));
     const std::size_t d = i % dim;
     packed[packed4_index(i / dim, d, dim)] |=
         static_cast<std::uint8_t>(packed4_high(d) ? u << 4 : u);

@@ -1,4 +1,4 @@
-// From packed bits to int8 codes, in integers: the same bytes on every machine.
+// The encoder: an integer network from packed bits to int8 codes, the same bytes on every machine.
 #pragma once
 
 #include <array>
@@ -11,7 +11,7 @@
 #include <utility>
 #include <vector>
 
-#include "protomark/matrix_view.h"
+#include "protomark/types.h"
 
 namespace protomark {
 
@@ -20,7 +20,8 @@ namespace protomark {
 //   t    = (sum * multipliers[o] + 2^(shift - 1)) >> shift      (64-bit product)
 //   next = table[clamp(t, -128, 127) + 128]                     (hidden layers)
 //   code = clamp(t, -127, 127)                                  (last layer)
-// The first layer's x are the descriptor's bits, 0 or 1, later ones the bytes of the table.
+// The first layer takes the bits of the descriptor, 0 or 1, as x; later layers take the bytes that
+// the table of the layer before gave.
 struct Layer {
   std::size_t inputs = 0;
   std::size_t outputs = 0;
@@ -31,45 +32,48 @@ struct Layer {
   std::array<std::uint8_t, 256> table{};
 };
 
-// What a model says of itself: any keys, of which these are always there.
+// What a model says of itself: four texts that are always there, and any others.
 struct EncoderInfo {
-  std::string name;        // "freak"
-  std::string descriptor;  // "freak"
+  std::string name;        // as in "freak"
+  std::string descriptor;  // the descriptor that it takes, as in "freak"
   std::string data;        // what it was trained on
   std::string licence;
   std::vector<std::pair<std::string, std::string>> notes;
 };
 
-class Encoder {
+class PROTOMARK_API Encoder {
  public:
-  // Takes a network. `dims` are the lengths at which a code may be cut, ascending, the last one
-  // the number of outputs; a code times `scale` is the real value. Throws std::invalid_argument
-  // where layers do not fit together or a sum could leave 32 bits.
+  // Takes a network. `dims` are the lengths at which a code may be cut, ascending, the last one the
+  // number of outputs; a code times `scale` is the real value. Throws std::invalid_argument if
+  // layers do not fit together, a sum could exceed 32 bits, or a note has one of the four keys that
+  // are always there.
   Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims, float scale);
 
   // Reads and checks a model file. Throws FileError.
   static Encoder load(const std::filesystem::path& path);
-  // Reads and checks the bytes of a model file; `name` is what errors call them.
+  // Reads and checks the bytes of a model file; errors call it `name`.
   static Encoder parse(std::span<const std::byte> bytes, const std::string& name);
   // Writes a model file, whole or not at all. Throws FileError.
   void save(const std::filesystem::path& path) const;
-  // The bytes of the model file.
+  // Returns the bytes of the model file.
   std::vector<std::byte> serialize() const;
 
   const EncoderInfo& info() const { return info_; }
   const std::vector<Layer>& layers() const { return layers_; }
-  std::size_t bits() const { return layers_.front().inputs; }
+  std::size_t bits() const { return layers_.front().inputs; }  // of a descriptor
   std::size_t bytes() const { return bits() / 8; }
   std::size_t dim() const { return dims_.back(); }
   const std::vector<std::size_t>& dims() const { return dims_; }
   float scale() const { return scale_; }
-  // SHA-256 of the network, in hexadecimal: equal where codes are equal.
+  // The SHA-256 of the network, in hexadecimal; encoders of equal identity give equal codes.
   const std::string& identity() const { return identity_; }
-  // Multiply-adds for one descriptor.
+  // Multiply-adds per descriptor.
   std::size_t multiply_adds() const;
 
-  // codes (n x dim) of descriptors (n x bytes), dim = codes.columns, one of dims().
-  // Throws std::invalid_argument where shapes do not fit.
+  // Encodes descriptors (n x bytes) to codes (n x dim), where dim is one of dims(); 0 means the
+  // full length. Throws std::invalid_argument if shapes do not fit.
+  Matrix<std::int8_t> encode(Descriptors descriptors, std::size_t dim = 0, int threads = 1) const;
+  // Encodes into memory of the caller, with dim = codes.columns.
   void encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads = 1) const;
 
  private:

@@ -5,7 +5,7 @@
 #include <optional>
 #include <span>
 
-#include "protomark/matrix_view.h"
+#include "protomark/types.h"
 
 namespace protomark {
 

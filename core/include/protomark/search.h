@@ -6,19 +6,19 @@
 #include <optional>
 #include <vector>
 
-#include "protomark/matrix_view.h"
+#include "protomark/types.h"
 
 namespace protomark {
 
-class OrderNumbers;
+class CheckedNumbers;
 
 // Which landmark each row is of, where that is not its number; at most one of the pointers is set.
 struct RowLandmarks {
   const std::uint32_t* of_row = nullptr;  // number of the landmark of each row
   // Number of rows of each landmark, at least 1; a landmark's rows follow each other.
   const std::uint8_t* rows_of = nullptr;
-  // As a sealed map with an index has them (core/src/file/labels.h).
-  const OrderNumbers* order = nullptr;
+  // As a sealed map with an index has them (core/src/base/checked_numbers.h).
+  const CheckedNumbers* order = nullptr;
   std::uint32_t end = UINT32_MAX;  // numbers from this on are of no landmark: rows are padding
 };
 

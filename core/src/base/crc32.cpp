@@ -10,7 +10,8 @@ namespace {
 constexpr std::size_t kSlices = 8;
 using Tables = std::array<std::array<std::uint32_t, 256>, kSlices>;
 
-// Table t advances a byte over t + 1 bytes ("slicing by 8", Kounavis and Berry 2008).
+// Table t holds the CRC of each byte when t zero bytes follow it ("slicing by 8", Kounavis and
+// Berry 2008).
 constexpr Tables make_tables() {
   Tables tables{};
   for (std::uint32_t i = 0; i < 256; ++i) {

@@ -7,8 +7,8 @@
 
 namespace protomark {
 
-// std::shared_mutex of glibc lets readers in for as long as any is there, so that a writer waits
-// for ever where a few threads search all the time.
+// glibc's std::shared_mutex admits new readers while others hold it, so that a writer waits for
+// ever if a few threads search all the time.
 class FairSharedMutex {
  public:
   void lock() {
@@ -21,7 +21,7 @@ class FairSharedMutex {
     mutex_.lock_shared();
     leave();
   }
-  // Fails where anybody waits.
+  // Fails if any thread is waiting.
   bool try_lock_shared() {
     std::uint32_t ticket = serving_.load();
     if (!next_.compare_exchange_strong(ticket, ticket + 1)) return false;
@@ -33,7 +33,7 @@ class FairSharedMutex {
   void unlock_shared() { mutex_.unlock_shared(); }
 
  private:
-  // One thread at a time waits at the mutex, the others for their turn.
+  // One thread at a time waits at the mutex, the others wait for their ticket.
   void enter() {
     const std::uint32_t ticket = next_.fetch_add(1);
     for (std::uint32_t now = serving_.load(); now != ticket; now = serving_.load()) {

@@ -1,17 +1,19 @@
-// Landmark id -> row, 4 bytes a slot: the slots hold rows, the ids stay in the map's own array.
+// A hash table from landmark ids to indices, of 4 bytes per slot: the ids stay in the caller's
+// array.
 #pragma once
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <random>
-#include <vector>
+#include <span>
 
 #include "base/large_vector.h"
+#include "base/rows.h"
 
 namespace protomark {
 
-// Of this process: ids come from files, and nobody can choose them so that all want one slot.
+// Each process draws its own, so that nobody can choose ids in a file that all hash to one slot.
 inline std::uint64_t hash_seed() {
   static const std::uint64_t seed = [] {
     std::random_device random;
@@ -20,78 +22,73 @@ inline std::uint64_t hash_seed() {
   return seed;
 }
 
-// Open addressing with linear probing, at most two thirds full, no tombstones. Which slot a row is
-// in differs from process to process; nothing that is given out may depend on it.
+// Open addressing with linear probing, at most two thirds full, no tombstones. Slots differ from
+// process to process; no result may depend on their order.
 class IdIndex {
  public:
-  static constexpr std::uint32_t kNone = UINT32_MAX;
+  using Ids = LargeVector<std::int64_t>;  // the array that indices point into
 
-  // The row of `id`, or kNone. `ids` is the array that rows point into.
-  std::uint32_t find(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
-    return slots_.empty() ? kNone : slots_[slot_of(ids, id)];
+  // The index of `id`, or kNoLandmark.
+  LandmarkIndex find(const Ids& ids, std::int64_t id) const {
+    return slots_.empty() ? kNoLandmark : slots_[slot_of(ids, id)];
   }
-  // Slots that `find` looks at.
-  std::size_t probes(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
+  // Slots that `find` reads.
+  std::size_t probe_length(const Ids& ids, std::int64_t id) const {
     return slots_.empty() ? 0 : ((slot_of(ids, id) - home(id)) & mask()) + 1;
   }
 
-  // Ask for the memory that `find` will read: first its slot, and when that has come, the ids that
-  // it may compare.
+  // Prefetch what `find` will read: first the slot and, once that has come, the ids to compare.
   void prefetch_slot(std::int64_t id) const {
     if (!slots_.empty()) __builtin_prefetch(&slots_[home(id)]);
   }
-  void prefetch_ids(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
+  void prefetch_ids(const Ids& ids, std::int64_t id) const {
     if (slots_.empty()) return;
-    for (std::size_t s = home(id); slots_[s] != kNone; s = next(s)) {
-      __builtin_prefetch(&ids[slots_[s]]);
+    for (std::size_t s = home(id); slots_[s] != kNoLandmark; s = next(s)) {
+      __builtin_prefetch(&ids[slots_[s].value]);
     }
   }
 
   bool has_room(std::size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }
-  // The same index with room for as many ids more.
-  IdIndex with_room(const LargeVector<std::int64_t>& ids, std::size_t more) const {
+  // A copy with room for `more` further ids.
+  IdIndex with_room(const Ids& ids, std::size_t more) const {
     IdIndex result;
     result.used_ = used_;
     std::size_t size = std::max<std::size_t>(16, slots_.size());
     while (3 * (used_ + more) > 2 * size) size *= 2;
-    result.slots_.assign(size, kNone);
-    for (const std::uint32_t row : slots_) {
-      if (row != kNone) result.place(ids, row);
+    result.slots_.assign(size, kNoLandmark);
+    for (const LandmarkIndex index : slots_) {
+      if (index != kNoLandmark) result.place(ids, index);
     }
     return result;
   }
 
-  // Takes a row whose id is not there yet.
-  void insert(const LargeVector<std::int64_t>& ids, std::uint32_t row) {
+  // Takes an index whose id is not there yet.
+  void insert(const Ids& ids, LandmarkIndex index) {
     if (!has_room(1)) *this = with_room(ids, 1);
-    place(ids, row);
+    place(ids, index);
     ++used_;
   }
-
-  // Changes the row of an id that is there.
-  void move(const LargeVector<std::int64_t>& ids, std::int64_t id, std::uint32_t to) {
-    slots_[slot_of(ids, id)] = to;
-  }
-
-  // All rows change; `to` has the new one of each.
-  void renumber(const std::vector<std::uint32_t>& to) {
-    for (std::uint32_t& row : slots_) {
-      if (row != kNone) row = to[row];
+  // Changes the index of an id that is there.
+  void move(const Ids& ids, std::int64_t id, LandmarkIndex to) { slots_[slot_of(ids, id)] = to; }
+  // Gives every index i the new value to[i].
+  void renumber(std::span<const Row> to) {
+    for (LandmarkIndex& index : slots_) {
+      if (index != kNoLandmark) index.value = to[index.value].value;
     }
   }
-
   // Removes an id that is there; `ids` must still hold it.
-  void erase(const LargeVector<std::int64_t>& ids, std::int64_t id) {
+  void erase(const Ids& ids, std::int64_t id) {
     std::size_t hole = slot_of(ids, id);
-    // Close the gap: whatever follows without a break and may stand in the hole moves back.
-    for (std::size_t s = next(hole); slots_[s] != kNone; s = next(s)) {
-      const std::size_t wanted = home(ids[slots_[s]]);
+    // Close the gap: each entry that follows without a break moves back if the hole is no further
+    // from its home than the slot that it is in.
+    for (std::size_t s = next(hole); slots_[s] != kNoLandmark; s = next(s)) {
+      const std::size_t wanted = home(ids[slots_[s].value]);
       if (((s - wanted) & mask()) >= ((s - hole) & mask())) {
         slots_[hole] = slots_[s];
         hole = s;
       }
     }
-    slots_[hole] = kNone;
+    slots_[hole] = kNoLandmark;
     --used_;
   }
 
@@ -107,22 +104,47 @@ class IdIndex {
     return static_cast<std::size_t>(x ^ (x >> 31)) & mask();
   }
 
-  // Of the id, or the free one where the search for it ends.
-  std::size_t slot_of(const LargeVector<std::int64_t>& ids, std::int64_t id) const {
+  // The slot of the id, or the free one at which the search for it ends.
+  std::size_t slot_of(const Ids& ids, std::int64_t id) const {
     std::size_t s = home(id);
-    while (slots_[s] != kNone && ids[slots_[s]] != id) s = next(s);
+    while (slots_[s] != kNoLandmark && ids[slots_[s].value] != id) s = next(s);
     return s;
   }
 
-  void place(const LargeVector<std::int64_t>& ids, std::uint32_t row) {
-    std::size_t s = home(ids[row]);
-    while (slots_[s] != kNone) s = next(s);
-    slots_[s] = row;
+  void place(const Ids& ids, LandmarkIndex index) {
+    std::size_t s = home(ids[index.value]);
+    while (slots_[s] != kNoLandmark) s = next(s);
+    slots_[s] = index;
   }
 
-  LargeVector<std::uint32_t> slots_;
+  LargeVector<LandmarkIndex> slots_;
   std::size_t used_ = 0;
   std::uint64_t seed_ = hash_seed();
+};
+
+// A set of landmark ids.
+class IdSet {
+ public:
+  bool empty() const { return ids_.empty(); }
+  bool contains(std::int64_t id) const { return index_.find(ids_, id) != kNoLandmark; }
+  // Each id once, in the order in which they came.
+  const LargeVector<std::int64_t>& ids() const { return ids_; }
+
+  // Leaves the set as it was if memory runs out.
+  void insert(std::int64_t id) {
+    if (contains(id)) return;
+    ids_.push_back(id);
+    try {
+      index_.insert(ids_, LandmarkIndex{static_cast<std::uint32_t>(ids_.size() - 1)});
+    } catch (...) {
+      ids_.pop_back();
+      throw;
+    }
+  }
+
+ private:
+  LargeVector<std::int64_t> ids_;
+  IdIndex index_;
 };
 
 }  // namespace protomark

@@ -1,5 +1,5 @@
-// Arrays that are read at random: large ones stand in large pages, so that most reads do not have
-// to look up a page as well, and all of them begin at a cache line.
+// A vector for random access: it begins at a cache line, and a large one stands in huge pages,
+// which spares most reads a page-table walk.
 #pragma once
 
 #include <cstddef>
@@ -25,8 +25,7 @@ struct LargePageAllocator {
     const std::size_t size = n * sizeof(T);
     void* memory = ::operator new(size, alignment(size));
 #ifdef __linux__
-    // Advice: where it is not taken, the pages are small. So are those of memory that was in use
-    // before, unless they are given back.
+    // Only advice. Memory that was in use before keeps its small pages unless they are dropped.
     if (size >= kLarge) {
       madvise(memory, size, MADV_HUGEPAGE);
       madvise(memory, size / kPage * kPage, MADV_DONTNEED);

@@ -14,10 +14,10 @@
 namespace protomark {
 namespace {
 
-// Threads stay once they are started, so that a slip in a number must not start thousands.
+// Threads stay once started, so a mistyped number must not start thousands.
 constexpr std::size_t kMaxThreads = 256;
 
-// Whether this thread runs a task.
+// Whether this thread is running a task.
 thread_local bool inside_task = false;
 
 struct Job {
@@ -52,7 +52,7 @@ class Pool {
     try {
       for (; threads_ < n; ++threads_) std::thread([this] { help(); }).detach();
     } catch (const std::system_error&) {
-      return;  // the system gives no more; fewer do
+      return;  // the system gives no more threads: work goes on with those there are
     }
   }
 
@@ -86,12 +86,13 @@ class Pool {
 
   std::mutex mutex_;
   std::condition_variable wake_, done_;
-  std::deque<Job*> jobs_;  // that want helpers
+  std::deque<Job*> jobs_;  // that still want helpers
   std::size_t threads_ = 0;
 };
 
-// Never destroyed, and its threads are detached: at exit they sleep, in memory that stays. A child
-// of fork() makes its own, as the parent's has no threads there and may be locked.
+// The pool is never destroyed and its threads are detached, so that at exit they sleep in memory
+// that stays valid. A child of fork() makes a pool of its own: its copy of the parent's has no
+// threads and may be locked.
 Pool& pool() {
   static std::atomic<Pool*> shared = nullptr;
   Pool* current = shared.load();

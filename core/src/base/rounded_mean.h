@@ -1,4 +1,4 @@
-// The rounding of every mean of codes.
+// Rounds means of codes to int8.
 #pragma once
 
 #include <cstddef>
@@ -14,8 +14,8 @@ std::int8_t rounded_mean(Integer sum, Integer n) {
   return static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
 }
 
-// The same for the sums of a row, n from 1 to 255 and magnitudes at most 127 n, without divisions:
-// with the half added, no quotient is as near to an integer as its error, 2^-23 of itself.
+// The same for `dim` sums of a row, without divisions; n is 1 to 255 and no sum beyond 127 n. With
+// the half added, no quotient is nearer to an integer than its own error, 2^-23 of itself.
 inline void rounded_means(const std::int16_t* sums, int n, std::size_t dim, std::int8_t* means) {
   const float reciprocal = 1.0f / static_cast<float>(2 * n);
   for (std::size_t d = 0; d < dim; ++d) {

@@ -1,4 +1,4 @@
-// SHA-256 (FIPS 180-4), the identity of an encoder.
+// SHA-256 (FIPS 180-4), which gives encoders and map files their identity.
 #pragma once
 
 #include <cstddef>
@@ -7,7 +7,7 @@
 
 namespace protomark {
 
-// 64 lower-case hexadecimal digits.
+// Returns 64 lower-case hexadecimal digits.
 std::string sha256(std::span<const std::byte> bytes);
 
 }  // namespace protomark

@@ -1,34 +1,33 @@
-// Numbers in the order of their keys, a piece at a time, so that the order takes few bytes.
+// Sorts the indices of a large set piece by piece, so that sorting takes little memory.
 #pragma once
 
 #include <algorithm>
 #include <cstddef>
-#include <cstdint>
 #include <span>
 #include <vector>
 
 namespace protomark {
 
-// `each(take)` calls take(number) for n numbers, again each time that it is called, and key(number)
-// is another one for each of them. Calls visit(std::span<const std::uint32_t>) with all of them by
-// ascending key. Takes 5 bits a number, and their keys are gone through some ten times.
-template <typename Each, typename Key, typename Visit>
+// `each(take)` calls take(index) for n indices (Row or LandmarkIndex) each time that it is called,
+// and key(index) differs between them. Calls visit(std::span<const Index>) for pieces that hold all
+// of them by ascending key. Takes 5 bits per index, and runs through all keys about ten times.
+template <typename Index, typename Each, typename Key, typename Visit>
 void visit_sorted(std::size_t n, const Each& each, const Key& key, const Visit& visit) {
-  using Value = decltype(key(std::uint32_t{}));
-  constexpr std::size_t kPieces = 8, kLeast = 1 << 13, kSample = 1 << 10;
-  const auto less = [&](std::uint32_t a, std::uint32_t b) { return key(a) < key(b); };
-  const std::size_t piece = std::max(kLeast, (n + kPieces - 1) / kPieces);
-  const std::size_t most = piece + piece / 4;
-  std::vector<std::uint32_t> numbers;
-  numbers.reserve(std::min(n, most));
+  using Value = decltype(key(Index{}));
+  constexpr std::size_t kPieces = 8, kMinPiece = 1 << 13, kSample = 1 << 10;
+  const auto less = [&](Index a, Index b) { return key(a) < key(b); };
+  const std::size_t piece = std::max(kMinPiece, (n + kPieces - 1) / kPieces);
+  const std::size_t limit = piece + piece / 4;
+  std::vector<Index> indices;
+  indices.reserve(std::min(n, limit));
 
-  std::vector<Value> bounds;  // keys with about a piece between them
+  std::vector<Value> bounds;  // keys about a piece apart, by a sample
   bool sorted = true;
-  if (n > most) {
+  if (n > limit) {
     Value before{};
     std::size_t i = 0;
-    each([&](std::uint32_t number) {
-      const Value value = key(number);
+    each([&](Index index) {
+      const Value value = key(index);
       sorted = sorted && (i == 0 || before < value);
       before = value;
       if (i++ % ((n + kSample - 1) / kSample) == 0) bounds.push_back(value);
@@ -38,42 +37,43 @@ void visit_sorted(std::size_t n, const Each& each, const Key& key, const Visit& 
     for (i = 0; (i + 1) * step < bounds.size(); ++i) bounds[i] = bounds[(i + 1) * step];
     bounds.resize(i);
   }
-  if (n > most && sorted) {
-    each([&](std::uint32_t number) {
-      numbers.push_back(number);
-      if (numbers.size() < piece) return;
-      visit(std::span<const std::uint32_t>(numbers));
-      numbers.clear();
+  if (n > limit && sorted) {
+    each([&](Index index) {
+      indices.push_back(index);
+      if (indices.size() < piece) return;
+      visit(std::span<const Index>(indices));
+      indices.clear();
     });
-    if (!numbers.empty()) visit(std::span<const std::uint32_t>(numbers));
+    if (!indices.empty()) visit(std::span<const Index>(indices));
     return;
   }
 
-  // A piece is what is above `last` and not above `end`, where there are these.
+  // A piece holds the keys above `last`, that of the piece before, up to `end`; the first has no
+  // `last`, and the final one no `end`.
   Value last{}, end{};
   bool bounded = false;
   auto bound = bounds.begin();
-  for (std::size_t seen = 0; seen < n; seen += numbers.size(), last = key(numbers.back())) {
+  for (std::size_t seen = 0; seen < n; seen += indices.size(), last = key(indices.back())) {
     const bool first = seen == 0;
     while (bound != bounds.end() && !first && !(last < *bound)) ++bound;
     bounded = bound != bounds.end();
     if (bounded) end = *bound;
-    numbers.clear();
-    each([&](std::uint32_t number) {
-      const Value value = key(number);
+    indices.clear();
+    each([&](Index index) {
+      const Value value = key(index);
       if ((bounded && end < value) || (!first && !(last < value))) return;
-      if (numbers.size() == most) {  // more than the sample made one expect
-        const auto middle = numbers.begin() + static_cast<std::ptrdiff_t>(piece - 1);
-        std::nth_element(numbers.begin(), middle, numbers.end(), less);
+      if (indices.size() == limit) {  // the sample promised fewer
+        const auto middle = indices.begin() + static_cast<std::ptrdiff_t>(piece - 1);
+        std::nth_element(indices.begin(), middle, indices.end(), less);
         bounded = true;
         end = key(*middle);
-        numbers.resize(piece);
+        indices.resize(piece);
         if (end < value) return;
       }
-      numbers.push_back(number);
+      indices.push_back(index);
     });
-    std::sort(numbers.begin(), numbers.end(), less);
-    visit(std::span<const std::uint32_t>(numbers));
+    std::sort(indices.begin(), indices.end(), less);
+    visit(std::span<const Index>(indices));
   }
 }
 

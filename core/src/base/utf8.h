@@ -1,3 +1,4 @@
+// Checks texts for UTF-8.
 #pragma once
 
 #include <cstddef>
@@ -16,8 +17,7 @@ inline bool is_utf8(std::string_view text) {
     const bool leads = lead < 0x80 || (lead >= 0xc2 && lead <= 0xf4);
     if (!leads) return false;
     const std::size_t size = lead < 0x80 ? 1 : lead < 0xe0 ? 2 : lead < 0xf0 ? 3 : 4;
-    // The second byte's range leaves out longer forms than needed, surrogates and what is beyond
-    // U+10FFFF.
+    // The range of the second byte excludes overlong forms, surrogates and what is beyond U+10FFFF.
     std::uint8_t low = lead == 0xe0 ? 0xa0 : lead == 0xf0 ? 0x90 : 0x80;
     std::uint8_t high = lead == 0xed ? 0x9f : lead == 0xf4 ? 0x8f : 0xbf;
     for (std::size_t j = 1; j < size; ++j) {

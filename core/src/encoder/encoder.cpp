@@ -6,14 +6,15 @@
 #include <limits>
 #include <memory>
 #include <stdexcept>
+#include <string_view>
 
 #include "base/parallel.h"
 #include "base/sha256.h"
 #include "base/utf8.h"
 #include "encoder/layers.h"
-#include "file/container.h"
+#include "file/journal.h"
+#include "file/sections.h"
 #include "kernels/kernels.h"
-#include "protomark/error.h"
 
 namespace protomark {
 namespace {
@@ -24,23 +25,32 @@ constexpr std::size_t kMaxDim = 256;
 constexpr std::size_t kMaxWidth = 4096;
 constexpr std::size_t kMaxLayers = 16;
 
-// Descriptors that go through the network together at most; their activations stay in the L2 cache.
+// Largest number of descriptors that go through the network together; their activations stay in the
+// L2 cache.
 constexpr std::size_t kBatch = 512;
-// Threads share descriptors in multiples of this.
+// Threads take multiples of so many descriptors.
 constexpr std::size_t kGrain = 64;
+// The texts that are always there.
+struct Field {
+  std::string_view key;
+  std::string EncoderInfo::* text;
+};
+constexpr Field kFields[] = {{"name", &EncoderInfo::name},
+                             {"descriptor", &EncoderInfo::descriptor},
+                             {"data", &EncoderInfo::data},
+                             {"licence", &EncoderInfo::licence}};
 
 [[noreturn]] void invalid(const std::string& what) {
   throw std::invalid_argument("encoder: " + what);
 }
 
-// A sum must stay within 32 bits whatever the input is.
+// Checks that no input takes a sum beyond 32 bits.
 void check_sums(const Layer& layer, bool first, const std::string& where) {
-  const std::int64_t most = first ? 1 : 255;
+  const std::int64_t largest = first ? 1 : 255;
   for (std::size_t o = 0; o < layer.outputs; ++o) {
-    std::int64_t low = layer.bias[o];
-    std::int64_t high = layer.bias[o];
+    std::int64_t low = layer.bias[o], high = layer.bias[o];
     for (std::size_t i = 0; i < layer.inputs; ++i) {
-      const std::int64_t product = most * layer.weights[o * layer.inputs + i];
+      const std::int64_t product = largest * layer.weights[o * layer.inputs + i];
       (product < 0 ? low : high) += product;
     }
     if (low < std::numeric_limits<std::int32_t>::min() ||
@@ -71,14 +81,23 @@ void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t
   check_sums(layer, first, where);
 }
 
-// All that a model says of itself.
-std::vector<std::pair<std::string, std::string>> texts(const EncoderInfo& info) {
-  std::vector<std::pair<std::string, std::string>> result = {{"name", info.name},
-                                                             {"descriptor", info.descriptor},
-                                                             {"data", info.data},
-                                                             {"licence", info.licence}};
-  result.insert(result.end(), info.notes.begin(), info.notes.end());
-  return result;
+// The field of a key, or the end of kFields for a note.
+const Field* field_of(std::string_view key) { return std::ranges::find(kFields, key, &Field::key); }
+
+ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network) {
+  SectionWriter texts;
+  for (const Field& field : kFields) {
+    texts.text(std::string(field.key));
+    texts.text(info.*field.text);
+  }
+  for (const auto& [key, text] : info.notes) {
+    texts.text(key);
+    texts.text(text);
+  }
+  ContainerWriter file(FileKind::encoder);
+  texts.add_to(file, section::kInfo);
+  file.add(section::kNetwork, std::move(network));
+  return file;
 }
 
 }  // namespace
@@ -101,8 +120,12 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::s
                  float scale)
     : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
   if (info_.name.empty() || info_.descriptor.empty()) invalid("name and descriptor must be given");
-  for (const auto& [key, value] : texts(info_)) {
-    if (!is_utf8(key) || !is_utf8(value)) invalid("what it says of itself must be UTF-8");
+  for (const Field& field : kFields) {
+    if (!is_utf8(info_.*field.text)) invalid("its " + std::string(field.key) + " is not UTF-8");
+  }
+  for (const auto& [key, text] : info_.notes) {
+    if (!is_utf8(key) || !is_utf8(text)) invalid("its notes are not UTF-8");
+    if (field_of(key) != std::end(kFields)) invalid("no note may have the key '" + key + "'");
   }
   if (layers_.empty() || layers_.size() > kMaxLayers) {
     invalid("it has " + std::to_string(layers_.size()) + " layers, 1 to " +
@@ -131,8 +154,17 @@ std::size_t Encoder::multiply_adds() const {
   return sum;
 }
 
+Matrix<std::int8_t> Encoder::encode(Descriptors descriptors, std::size_t dimensions,
+                                    int threads) const {
+  Matrix<std::int8_t> codes(descriptors.rows, dimensions == 0 ? dim() : dimensions);
+  encode(descriptors, codes.view(), threads);
+  return codes;
+}
+
 void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads) const {
-  if (descriptors.columns != bytes()) {
+  // What OpenCV gives for an image without keypoints has no columns either.
+  const bool none = descriptors.rows == 0 && descriptors.columns == 0;
+  if (descriptors.columns != bytes() && !none) {
     throw std::invalid_argument("descriptors have " + std::to_string(descriptors.columns) +
                                 " bytes, encoder '" + info_.name + "' takes " +
                                 std::to_string(bytes()));
@@ -140,7 +172,7 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
   if (codes.rows != descriptors.rows) {
     throw std::invalid_argument("codes must have as many rows as descriptors");
   }
-  if (std::find(dims_.begin(), dims_.end(), codes.columns) == dims_.end()) {
+  if (std::ranges::find(dims_, codes.columns) == dims_.end()) {
     std::string allowed;
     for (const std::size_t d : dims_) allowed += (allowed.empty() ? "" : ", ") + std::to_string(d);
     throw std::invalid_argument("encoder '" + info_.name + "' gives " + allowed +
@@ -151,11 +183,11 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
   const std::size_t depth = layers_.size(), width = network.widest;
 
   parallel_for(threads, descriptors.rows, kGrain, [&](std::size_t first, std::size_t last) {
-    // Batches of the same size: a small rest would cost as much as a large one.
+    // Batches of equal size, as a small last one would cost as much as a large one.
     const std::size_t batches = (last - first + kBatch - 1) / kBatch;
-    const std::size_t most = std::min(kBatch, last - first);
-    auto x = std::make_unique_for_overwrite<std::uint8_t[]>(most * width);
-    auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? most * width : 0);
+    const std::size_t limit = std::min(kBatch, last - first);
+    auto x = std::make_unique_for_overwrite<std::uint8_t[]>(limit * width);
+    auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? limit * width : 0);
     for (std::size_t b = 0; b < batches; ++b) {
       const std::size_t begin = first + (last - first) * b / batches;
       const std::size_t n = first + (last - first) * (b + 1) / batches - begin;
@@ -174,7 +206,7 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
   });
 }
 
-// Everything that decides the codes; its SHA-256 is the encoder's identity.
+// All that decides the codes; its SHA-256 is the encoder's identity.
 std::vector<std::byte> Encoder::network_bytes() const {
   SectionWriter out;
   out.value(scale_);
@@ -194,18 +226,12 @@ std::vector<std::byte> Encoder::network_bytes() const {
 }
 
 std::vector<std::byte> Encoder::serialize() const {
-  SectionWriter info;
-  for (const auto& [key, value] : texts(info_)) {
-    info.text(key);
-    info.text(value);
-  }
-  ContainerWriter file(FileKind::encoder);
-  file.add("info", info.take());
-  file.add("network", network_bytes());
-  return file.serialize();
+  return file_of(info_, network_bytes()).serialize();
 }
 
-void Encoder::save(const std::filesystem::path& path) const { write_file(path, serialize()); }
+void Encoder::save(const std::filesystem::path& path) const {
+  write_guarded(file_of(info_, network_bytes()), path);
+}
 
 Encoder Encoder::load(const std::filesystem::path& path) {
   const MappedFile file(path);
@@ -217,23 +243,17 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
   file.expect(FileKind::encoder);
 
   EncoderInfo info;
-  for (SectionReader in(file, "info"); !in.empty();) {
+  for (SectionReader in(file, section::kInfo); !in.empty();) {
     std::string key = in.text();
     std::string value = in.text();
-    if (key == "name") {
-      info.name = std::move(value);
-    } else if (key == "descriptor") {
-      info.descriptor = std::move(value);
-    } else if (key == "data") {
-      info.data = std::move(value);
-    } else if (key == "licence") {
-      info.licence = std::move(value);
+    if (const Field* field = field_of(key); field != std::end(kFields)) {
+      info.*field->text = std::move(value);
     } else {
       info.notes.emplace_back(std::move(key), std::move(value));
     }
   }
 
-  SectionReader in(file, "network");
+  SectionReader in(file, section::kNetwork);
   const auto scale = in.value<float>();
   const auto count = in.value<std::uint32_t>();
   if (count > kMaxDim) file.fail("it has too many dims");

@@ -10,9 +10,9 @@ namespace {
 
 using kernels::kOutputs;
 
-// Fewer descriptors than this are not worth a table.
-constexpr std::size_t kFew = 20;
-// 256 weights of -128 to 127 stay within 16 bits.
+// A table pays from this number of descriptors on.
+constexpr std::size_t kMinTabulated = 20;
+// Sums of 256 weights, -128 to 127, stay within 16 bits.
 constexpr std::size_t kSafeWords = 256 / 64;
 // Inputs of a dense layer that go through it together.
 constexpr std::size_t kDenseBatch = 64;
@@ -76,10 +76,10 @@ class BitLayer::Input {
         words_[b / 8 * n + i] |= std::uint64_t{descriptors[b]} << (b % 8 * 8);
       }
     }
-    if (n < kFew) list_set_bits();
+    if (n < kMinTabulated) list_set_bits();
   }
 
-  // Sums over the words of a span from `first` on, with the weights of a block.
+  // Sums up the words of a span from `first` on, with the weights of a block.
   void sums(const kernels::Kernels& kernel, const std::int8_t* weights, std::size_t first,
             std::int16_t* sums) const {
     weights += first * 64 * kOutputs;
@@ -95,7 +95,7 @@ class BitLayer::Input {
   }
 
  private:
-  // The set bits of each span, from its first bit on, at the place of its first word.
+  // Lists the set bits of each span, counted from its first bit, where its first word is.
   void list_set_bits() {
     set_.resize(words_.size() * 64);
     counts_.resize(words_.size());

@@ -1,5 +1,5 @@
-// The layers of an encoder as the kernels take them: weights in blocks of 64 outputs, padded with
-// zeros to whole blocks.
+// The layers of an encoder as the kernels take them: weights in blocks of 64 outputs, the last
+// block padded with zeros.
 #pragma once
 
 #include <array>
@@ -12,23 +12,23 @@
 
 namespace protomark {
 
-// Next bytes (n x `stride`), at least as many columns as the outputs padded to whole blocks.
+// The bytes that a layer gives, n x stride; a row has room for whole blocks of outputs.
 struct LayerOutput {
   std::uint8_t* data;
   std::size_t stride;
 };
 
-// From sums to bytes.
+// Turns sums into bytes.
 class PackedActivation {
  public:
-  // A last layer's codes are bytes of a table, too.
+  // The codes of a last layer come from a table, too.
   PackedActivation(const Layer& layer, bool last);
 
   std::size_t outputs() const { return bias_.size(); }
   kernels::Activation block(std::size_t first) const {
     return {&bias_[first], &multipliers_[first], table_.data(), shift_};
   }
-  // Vector kernels do not take small shifts, which no trained network has.
+  // Vector kernels do not take small shifts, which trained networks do not have.
   bool is_for_vectors() const { return shift_ >= 32; }
 
  private:
@@ -38,15 +38,15 @@ class PackedActivation {
   int shift_;
 };
 
-// A first layer, whose inputs are bits. For a block of outputs, the sums of all subsets of every 4
-// inputs are tabulated once for many descriptors: one load and one 16-bit add then stand for 4
-// inputs ("four Russians"). Few descriptors add the weights of the bits that are set.
+// A first layer, whose inputs are bits. For many descriptors, the sums of all subsets of every 4
+// inputs are tabulated once per block of outputs: one load and one 16-bit addition then stand for 4
+// inputs ("four Russians"). For a few, the weights of the bits that are set are added.
 class BitLayer {
  public:
   BitLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // The first `wanted` outputs of n descriptors, n x bytes.
+  // Computes the first `wanted` outputs of n descriptors (n x bytes).
   void run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
            std::size_t wanted, LayerOutput next) const;
 
@@ -66,7 +66,7 @@ class DenseLayer {
   DenseLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // The first `wanted` outputs of n inputs.
+  // Computes the first `wanted` outputs of n inputs.
   void run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride, std::size_t n,
            std::size_t wanted, LayerOutput next) const;
 

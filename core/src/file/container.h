@@ -1,17 +1,7 @@
-// The file that models and maps share: a header, a table of sections, the sections.
-//
-//   header   64 bytes: magic "PROTOMRK", u32 version, u32 kind, u64 file size, u32 number of
-//            sections, u32 CRC-32 of header and table (this field taken as 0), 32 bytes of zero
-//   table    32 bytes a section: name (8 bytes, padded with 0), u64 offset, u64 size,
-//            u32 CRC-32 of the section, u32 zero
-//   sections each at a multiple of 64 bytes, in the table's order, gaps filled with zeros
-//
-// Everything is little-endian. docs/format.md says what each kind holds.
+// The file that models, maps and journals share: a header, a table of sections, the sections. All
+// is little-endian; docs/format.md says what each kind of file holds.
 #pragma once
 
-#include <sys/types.h>
-
-#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <filesystem>
@@ -29,34 +19,72 @@ namespace protomark {
 
 enum class FileKind : std::uint32_t {
   encoder = 1,
-  open_map = 2,
+  learning_map = 2,
   sealed_map = 3,
-  // A journal is one of the first kind and any number of the others, one after the other.
+  // A journal is a container of the first kind, followed by any number of the others.
   journal = 4,
   commit = 5,
   fold = 6
 };
 
+// As in "a learning map".
 const char* describe(FileKind kind);
 
-// Sections to be written as one file. They are in memory and belong to somebody else, or come into
-// being piece by piece while the file is written.
+struct ContainerHeader {
+  char magic[8];  // "PROTOMRK"
+  std::uint32_t version;
+  std::uint32_t kind;
+  std::uint64_t file_size;
+  std::uint32_t sections;
+  std::uint32_t crc;  // CRC-32 of the header, with zero here, and the section table
+  std::uint8_t reserved[32];
+};
+static_assert(sizeof(ContainerHeader) == 64);
+
+struct SectionEntry {
+  char name[8];          // padded with zeros
+  std::uint64_t offset;  // a multiple of kSectionAlignment
+  std::uint64_t size;
+  std::uint32_t crc;
+  std::uint32_t reserved;
+};
+static_assert(sizeof(SectionEntry) == 32);
+
+inline constexpr std::size_t kSectionAlignment = 64;
+inline constexpr std::uint32_t kMaxSections = 64;
+inline constexpr std::size_t kMaxHead =
+    sizeof(ContainerHeader) + kMaxSections * sizeof(SectionEntry);
+
+// Whether bytes begin as every container does, or would if there were more of them.
+bool has_magic(Bytes bytes);
+
+// The header and section table that bytes begin with.
+struct ContainerHead {
+  // nullopt unless they are there as a whole; their checksum may be wrong.
+  static std::optional<ContainerHead> parse(Bytes bytes);
+
+  ContainerHeader header;
+  Bytes bytes;  // header and table
+
+  bool has_right_checksum() const;
+  // The SHA-256 of header and table, which have the size and checksum of everything in the file.
+  std::string identity() const;
+};
+
+// Sections to be written as one file. They are in memory, or come into being piece by piece while
+// the file is written.
 class ContainerWriter {
  public:
   using Sink = std::function<void(Bytes)>;
-  // Hands the bytes of a section to the sink, from the first to the last.
+  // Hands the bytes of a section to the sink in order.
   using Produce = std::function<void(const Sink&)>;
 
-  // `version` is the oldest format that has all that the file holds (docs/format.md), so that a
-  // reader which knows less refuses it, and older ones go on reading everything else.
-  explicit ContainerWriter(FileKind kind, std::uint32_t version = 1)
-      : kind_(kind), version_(version) {}
+  explicit ContainerWriter(FileKind kind) : kind_(kind) {}
 
   // `bytes` must stay alive until the file is written.
   void add(std::string name, Bytes bytes);
-  // Takes the bytes over.
   void add(std::string name, std::vector<std::byte> bytes);
-  // `produce` is called each time that the file is written, and must then give `size` bytes.
+  // `produce` is called each time that the file is written, and gives `size` bytes.
   void add(std::string name, std::size_t size, Produce produce);
 
   struct Part {
@@ -65,14 +93,17 @@ class ContainerWriter {
   };
   static constexpr std::size_t kUnknownSize = SIZE_MAX;
   using ProduceAll = std::function<void(std::span<const Sink>)>;
-  // Sections that come into being side by side: `produce` has a sink for each, and hands them their
-  // bytes in any turn. Only the last one's size may be unknown.
+  // Sections that come into being side by side: `produce` has a sink for each, and hands bytes to
+  // any of them in turn. Only the size of the last one may be unknown.
   void add_together(std::vector<Part> parts, ProduceAll produce);
 
   std::vector<std::byte> serialize() const;
-  // Writes the file as write_file does, without a copy of the sections. What a producer throws
-  // passes through, and the old file is still there. `before` is called with the new file's
-  // identity when that is synced and has not taken the place of the old one yet.
+  // Writes the file, whole or not at all, without copying sections: beside `path`, then synced,
+  // renamed and its folder synced. If that or a producer fails, the old file is still there; only
+  // if the folder cannot be synced is the new one there, and may be lost with the power. A process
+  // that is killed leaves `path`.<number> behind, which nobody reads. `before` is called with the
+  // identity of the new file once that is synced, before it takes the place of the old one. Throws
+  // FileError.
   void write(const std::filesystem::path& path,
              const std::function<void(const std::string&)>& before = {}) const;
 
@@ -81,59 +112,51 @@ class ContainerWriter {
     std::vector<Part> parts;
     ProduceAll produce;
   };
-  using Place = std::function<void(std::size_t offset, Bytes)>;
-  // Where the sections begin.
+  using Put = std::function<void(std::size_t offset, Bytes)>;
   std::size_t head_size() const;
-  // Puts the sections to their places and returns what stands before them, which has their
-  // checksums.
-  std::vector<std::byte> emit(const Place& place) const;
+  // Puts the sections to their offsets and returns the head, which has their checksums.
+  std::vector<std::byte> emit(const Put& put) const;
 
   FileKind kind_;
-  std::uint32_t version_;
   std::vector<Group> groups_;
 };
 
-// The identity of a file that begins with these bytes: the SHA-256 of its header and section table,
-// which have the checksum and size of everything in it. Empty where these are not there.
-std::string file_identity(Bytes head);
-
-// Whether bytes begin with a header and section table that match their checksum.
-bool has_container_head(Bytes head);
-
-// Writes bytes beside `path`, syncs, renames over it, syncs the folder. On any failure the old file
-// is still there and the new one is gone; only where the folder cannot be synced is it the new one
-// that is there, and may be lost with the power. A process that is killed leaves
-// `path`.<number> behind, which nobody reads. Throws FileError.
-void write_file(const std::filesystem::path& path, Bytes bytes);
-
-// A checked view of the bytes of a file. `name` is what errors call it.
+// A checked view of the bytes of a file. Errors call the file `name`. All functions throw
+// FileError.
 class ContainerReader {
  public:
-  // Checks header, table and bounds; a section's checksum is checked when it is read. Throws
-  // FileError.
+  // Checks header, table and bounds; a section's checksum is checked when the section is read.
   ContainerReader(Bytes file, std::string name);
 
   FileKind kind() const { return kind_; }
   const std::string& name() const { return name_; }
-  // Of header and table, and thereby of everything.
-  std::uint32_t checksum() const { return checksum_; }
-  std::string identity() const { return file_identity(file_); }
+  // The checksum and identity of the head, and thereby of everything.
+  std::uint32_t checksum() const { return head_.header.crc; }
+  std::string identity() const { return head_.identity(); }
   // In bytes, padding included.
   std::size_t size() const { return file_.size(); }
-  // Throws FileError where the file is of another kind.
+  // Throws if the file is of another kind.
   void expect(FileKind kind) const;
 
-  // A section, checked against its checksum. Throws FileError where it is missing or broken.
+  bool has(std::string_view section) const { return find(section) != nullptr; }
+  // A section that matches its checksum.
   Bytes read(std::string_view section) const;
-  std::optional<Bytes> read_if_there(std::string_view section) const;
-  // A section whose checksum nobody has checked; for what is mapped and too large to read.
-  std::optional<Bytes> map_if_there(std::string_view section) const;
+  // A section whose checksum was not looked at, for what is mapped and too large to read.
+  Bytes map(std::string_view section) const;
+  // The same as n values of a type.
+  template <typename T>
+  std::span<const T> map(std::string_view section, std::size_t n) const {
+    const Bytes bytes = map(section);
+    if (bytes.size() % sizeof(T) != 0 || bytes.size() / sizeof(T) != n) fail_size(section);
+    return {reinterpret_cast<const T*>(bytes.data()), n};  // aligned, as sections are
+  }
   // Names and sizes in bytes, in file order.
   std::vector<std::pair<std::string, std::size_t>> sections() const;
-  // Checks every section. Throws FileError.
+  // Checks every section.
   void verify() const;
-  // An error about this file.
+  // Throws an error about this file.
   [[noreturn]] void fail(const std::string& what) const;
+  [[noreturn]] void fail_size(std::string_view section) const;
 
  private:
   struct Section {
@@ -143,110 +166,14 @@ class ContainerReader {
     std::uint32_t crc;
   };
   const Section* find(std::string_view name) const;
+  const Section& get(std::string_view name) const;
   Bytes checked(const Section& section) const;
 
   Bytes file_;
   std::string name_;
-  FileKind kind_;
-  std::uint32_t checksum_ = 0;
+  FileKind kind_ = FileKind::encoder;
+  ContainerHead head_{};
   std::vector<Section> sections_;
-};
-
-// A file mapped read-only.
-class MappedFile {
- public:
-  // Throws FileError where the file cannot be read.
-  explicit MappedFile(const std::filesystem::path& path);
-  ~MappedFile();
-  MappedFile(const MappedFile&) = delete;
-  MappedFile& operator=(const MappedFile&) = delete;
-
-  Bytes bytes() const { return {static_cast<const std::byte*>(data_), size_}; }
-  // Whether this file still has that name.
-  bool is_at(const std::filesystem::path& path) const;
-
- private:
-  void* data_ = nullptr;
-  std::size_t size_ = 0;
-  dev_t device_ = 0;
-  ino_t inode_ = 0;
-};
-
-// Reads plain values from a section front to back; running past the end throws FileError.
-class SectionReader {
- public:
-  SectionReader(const ContainerReader& file, std::string_view section)
-      : file_(&file), section_(section), rest_(file.read(section)) {}
-
-  template <typename T>
-  T value() {
-    T v;
-    copy(&v, 1);
-    return v;
-  }
-  template <typename T>
-  std::vector<T> values(std::size_t n) {
-    if (n > rest_.size() / sizeof(T)) too_short();
-    std::vector<T> v(n);
-    copy(v.data(), n);
-    return v;
-  }
-  template <typename T>
-  void copy(T* to, std::size_t n) {
-    if (n > rest_.size() / sizeof(T)) too_short();
-    take(to, n * sizeof(T));
-  }
-  // A u32 length and that many bytes of UTF-8.
-  std::string text();
-  bool empty() const { return rest_.empty(); }
-  // Throws FileError where bytes are left.
-  void finish() const;
-
- private:
-  [[noreturn]] void too_short() const;
-  void take(void* to, std::size_t n);
-
-  const ContainerReader* file_;
-  std::string section_;
-  Bytes rest_;
-};
-
-// Hands n elements of `width` values each to a sink. `fill(i, to)` gives the values of element i.
-template <typename T, typename Fill>
-void put_values(const ContainerWriter::Sink& sink, std::size_t n, std::size_t width,
-                const Fill& fill) {
-  constexpr std::size_t kPiece = 1 << 16;  // bytes
-  const std::size_t element = width * sizeof(T);
-  const std::size_t some = std::min(n, std::max<std::size_t>(1, kPiece / element));
-  std::vector<T> values(some * width);
-  for (std::size_t first = 0; first < n; first += some) {
-    const std::size_t end = std::min(n, first + some);
-    for (std::size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
-    sink(std::as_bytes(std::span(values)).first((end - first) * element));
-  }
-}
-
-// Collects plain values for a section.
-class SectionWriter {
- public:
-  template <typename T>
-  void value(const T& v) {
-    values(&v, 1);
-  }
-  template <typename T>
-  void values(const T* v, std::size_t n) {
-    const auto* p = reinterpret_cast<const std::byte*>(v);
-    bytes_.insert(bytes_.end(), p, p + n * sizeof(T));
-  }
-  // As SectionReader reads it.
-  void text(const std::string& v) {
-    value(static_cast<std::uint32_t>(v.size()));
-    values(v.data(), v.size());
-  }
-  std::vector<std::byte> take() { return std::move(bytes_); }
-
- private:
-  std::vector<std::byte> bytes_;
 };
 
 }  // namespace protomark

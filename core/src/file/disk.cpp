@@ -1,40 +1,127 @@
 #include "file/disk.h"
 
 #include <fcntl.h>
+#include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
 #include <cerrno>
+#include <csignal>
 #include <cstring>
+#include <ctime>
 #include <random>
-#include <utility>
 
-#include "protomark/error.h"
+#include "protomark/types.h"
 
 namespace protomark {
+namespace {
+
+// Blocks SIGXFSZ in this thread, which would end the program at a limit on file sizes; the write
+// then fails with EFBIG.
+class NoSizeSignal {
+ public:
+  NoSizeSignal() {
+    ::sigemptyset(&signals_);
+    ::sigaddset(&signals_, SIGXFSZ);
+    ::pthread_sigmask(SIG_BLOCK, &signals_, &before_);
+  }
+  ~NoSizeSignal() { ::pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
+  NoSizeSignal(const NoSizeSignal&) = delete;
+  NoSizeSignal& operator=(const NoSizeSignal&) = delete;
+
+  // Takes the signal of a write that failed, so that it is not delivered later.
+  void discard() const {
+    const int error = errno;
+    const timespec now{};
+    if (error == EFBIG) ::sigtimedwait(&signals_, nullptr, &now);
+    errno = error;
+  }
+
+ private:
+  sigset_t signals_, before_;
+};
+
+// The path of a temporary file beside `target`, with a number of its own and no name that is too
+// long.
+std::filesystem::path beside(const std::filesystem::path& target) {
+  constexpr std::size_t kMaxName = 255;  // bytes
+  std::random_device random;
+  const std::string suffix = "." + std::to_string(random());
+  const std::string name = target.filename().string().substr(0, kMaxName - suffix.size());
+  return target.parent_path() / (name + suffix);
+}
+
+}  // namespace
 
 std::string system_error() { return std::strerror(errno); }
 
-bool write_all(int descriptor, Bytes bytes) {
+FileDescriptor FileDescriptor::open_to_read(const std::filesystem::path& path) {
+  return FileDescriptor(::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC));
+}
+
+FileDescriptor& FileDescriptor::operator=(FileDescriptor&& other) noexcept {
+  std::swap(descriptor_, other.descriptor_);
+  return *this;
+}
+
+FileDescriptor::~FileDescriptor() {
+  if (descriptor_ < 0) return;
+  const int error = errno;
+  ::close(descriptor_);
+  errno = error;
+}
+
+std::optional<std::span<std::byte>> FileDescriptor::read(std::size_t offset,
+                                                         std::span<std::byte> to) const {
+  std::size_t done = 0;
+  while (done < to.size()) {
+    const ssize_t n =
+        ::pread(descriptor_, to.data() + done, to.size() - done, static_cast<off_t>(offset + done));
+    if (n < 0 && errno == EINTR) continue;
+    if (n < 0) return std::nullopt;
+    if (n == 0) break;
+    done += static_cast<std::size_t>(n);
+  }
+  return to.first(done);
+}
+
+bool FileDescriptor::write(Bytes bytes) const {
+  const NoSizeSignal no_signal;
   while (!bytes.empty()) {
-    const ssize_t written = ::write(descriptor, bytes.data(), bytes.size());
+    const ssize_t written = ::write(descriptor_, bytes.data(), bytes.size());
     if (written < 0 && errno == EINTR) continue;
-    if (written < 0) return false;
+    if (written < 0) {
+      no_signal.discard();
+      return false;
+    }
     bytes = bytes.subspan(static_cast<std::size_t>(written));
   }
   return true;
 }
 
+bool FileDescriptor::is_at(const std::filesystem::path& path) const {
+  struct stat own, there;
+  return ::fstat(descriptor_, &own) == 0 && ::stat(path.c_str(), &there) == 0 &&
+         own.st_dev == there.st_dev && own.st_ino == there.st_ino;
+}
+
+std::filesystem::path link_target(std::filesystem::path path) {
+  constexpr int kMaxLinks = 40;
+  std::error_code error;
+  for (int i = 0; i < kMaxLinks && std::filesystem::is_symlink(path, error); ++i) {
+    const auto target = std::filesystem::read_symlink(path, error);
+    if (error) break;
+    path = path.parent_path() / target;
+  }
+  return path;
+}
+
 bool sync_folder(const std::filesystem::path& path) {
   auto folder = path.parent_path();
   if (folder.empty()) folder = ".";
-  const int descriptor = ::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-  if (descriptor < 0) return true;  // a folder may be writable and yet not readable
-  const bool synced = ::fsync(descriptor) == 0 || errno == EINVAL || errno == ENOTSUP;
-  const int error = errno;
-  ::close(descriptor);
-  errno = error;
-  return synced;
+  const FileDescriptor file(::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC));
+  if (!file) return true;  // a folder may be writable and yet not readable
+  return ::fsync(file.get()) == 0 || errno == EINVAL || errno == ENOTSUP;
 }
 
 std::optional<mode_t> permissions(const std::filesystem::path& path) {
@@ -43,52 +130,78 @@ std::optional<mode_t> permissions(const std::filesystem::path& path) {
   return status.st_mode & 0777;
 }
 
-TemporaryFile::TemporaryFile(const std::filesystem::path& target) : target_(target) {
+TemporaryFile::TemporaryFile(const std::filesystem::path& target)
+    : name_(target), target_(link_target(target)) {
+  std::error_code error;
+  const auto type = std::filesystem::status(target_, error).type();
+  using enum std::filesystem::file_type;
+  if (type != not_found && type != none && type != regular) {
+    throw FileError(name_.string() + ": cannot be written: it is there and is no regular file");
+  }
   // Not mkstemp, whose files only their owner may read: a map is as readable as any file.
-  const auto mode = permissions(target);
-  std::random_device random;
+  const auto mode = permissions(target_);
   do {
-    path_ = target.string() + "." + std::to_string(random());
-    descriptor_ =
-        ::open(path_.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode.value_or(0666));
-  } while (descriptor_ < 0 && errno == EEXIST);
-  if (descriptor_ < 0) {
+    path_ = beside(target_);
+    file_ = FileDescriptor(
+        ::open(path_.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode.value_or(0666)));
+  } while (!file_ && errno == EEXIST);
+  if (!file_) {
     path_.clear();
     fail();
   }
-  // What the umask took away; where that fails, fewer may read the file, never more.
-  if (mode) ::fchmod(descriptor_, *mode);
+  // Restores what the umask took away; if that fails, fewer may read the file, never more.
+  if (mode) ::fchmod(file_.get(), *mode);
 }
 
 TemporaryFile::~TemporaryFile() {
-  if (descriptor_ >= 0) ::close(descriptor_);
   if (!path_.empty()) ::unlink(path_.c_str());
 }
 
 void TemporaryFile::write(std::size_t offset, Bytes bytes) {
   if (bytes.empty()) return;
-  if (offset != offset_ && ::lseek(descriptor_, static_cast<off_t>(offset), SEEK_SET) < 0) fail();
-  if (!write_all(descriptor_, bytes)) fail();
+  if (offset != offset_ && ::lseek(file_.get(), static_cast<off_t>(offset), SEEK_SET) < 0) fail();
+  if (!file_.write(bytes)) fail();
   offset_ = offset + bytes.size();
 }
 
 void TemporaryFile::sync() {
-  if (::fsync(descriptor_) != 0) fail();
-  const int descriptor = std::exchange(descriptor_, -1);
-  if (::close(descriptor) != 0) fail();
+  if (::fsync(file_.get()) != 0 || ::close(file_.release()) != 0) fail();
 }
 
 void TemporaryFile::replace_target() {
   if (::rename(path_.c_str(), target_.c_str()) != 0) fail();
   path_.clear();
   if (!sync_folder(target_)) {
-    throw FileError(target_.string() +
+    throw FileError(name_.string() +
                     ": is written, but its folder cannot be synced: " + system_error());
   }
 }
 
 void TemporaryFile::fail() const {
-  throw FileError(target_.string() + ": cannot be written: " + system_error());
+  throw FileError(name_.string() + ": cannot be written: " + system_error());
+}
+
+MappedFile::MappedFile(const std::filesystem::path& path) {
+  const auto fail = [&](const std::string& why) { throw FileError(path.string() + why); };
+  const auto file = FileDescriptor::open_to_read(path);
+  struct stat status;
+  if (!file) fail(": cannot be read: " + system_error());
+  if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail(": not a file");
+  size_ = static_cast<std::size_t>(status.st_size);
+  device_ = status.st_dev;
+  inode_ = status.st_ino;
+  if (size_ == 0) return;
+  data_ = ::mmap(nullptr, size_, PROT_READ, MAP_SHARED, file.get(), 0);
+  if (data_ == MAP_FAILED) fail(": cannot be read: " + system_error());
+}
+
+MappedFile::~MappedFile() {
+  if (data_ != nullptr) ::munmap(data_, size_);
+}
+
+bool MappedFile::is_at(const std::filesystem::path& path) const {
+  struct stat status;
+  return ::stat(path.c_str(), &status) == 0 && status.st_dev == device_ && status.st_ino == inode_;
 }
 
 }  // namespace protomark

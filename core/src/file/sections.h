@@ -1,96 +1,159 @@
-// The sections that open and sealed maps share.
+// The sections of files, and how plain values and texts are read and written in them.
 #pragma once
 
+#include <algorithm>
+#include <cstddef>
 #include <cstdint>
-#include <memory>
 #include <span>
+#include <string>
+#include <string_view>
 #include <vector>
 
 #include "file/container.h"
-#include "protomark/metadata.h"
-#include "protomark/prototypes.h"
 
 namespace protomark {
 
+// Names of sections; docs/format.md says what each of them holds.
 namespace section {
-inline constexpr char kEncoder[] = "encoder";    // a whole model file
-inline constexpr char kShape[] = "shape";        // MapShape
-inline constexpr char kMetadata[] = "metadata";  // texts, name and value; absent for none
-inline constexpr char kIds[] = "ids";            // int64, ascending; sealed: before version 4
-// Sealed, both absent for 0 ... n - 1 (landmark_ids.h).
-inline constexpr char kIdBlocks[] = "idblocks";  // IdBlock, of 128 landmarks each
-inline constexpr char kIdRests[] = "idrests";    // uint64, bits of the rests
-inline constexpr char kCounts[] = "counts";      // uint8; open: of rows; sealed: of landmarks
-// Where landmarks have several prototypes, rows of each: open uint32, sealed uint8.
+// Encoders.
+inline constexpr char kInfo[] = "info";
+inline constexpr char kNetwork[] = "network";
+// Maps of both kinds.
+inline constexpr char kEncoder[] = "encoder";
+inline constexpr char kShape[] = "shape";
+inline constexpr char kMetadata[] = "metadata";
+inline constexpr char kCounts[] = "counts";
 inline constexpr char kRows[] = "rows";
-inline constexpr char kLookBits[] = "lookbits";  // open, where not 0: u32
-inline constexpr char kLooks[] = "looks";        // open: uint16, of each row
-inline constexpr char kSums[] = "sums";          // open: int16, rows x dim
-inline constexpr char kPrototypes[] = "protos";  // sealed: packed (protomark/search.h)
-inline constexpr char kLevels[] = "levels";      // sealed, 4 bits a number: u32 4, u32 half-step
-inline constexpr char kCells[] = "cells";        // int8, centroids, cells x dim
-inline constexpr char kCellRows[] = "cellrows";  // sealed, with cells: uint32, rows of each
-inline constexpr char kOrder[] = "order";        // ... landmark of each place (bit_numbers.h)
-inline constexpr char kOrderChecksums[] = "ordersum";  // ... uint32, of its blocks
-inline constexpr char kProbes[] = "probes";            // ... uint32, ProbeRanks
-// Open: 3 x float64; sealed: 3 x float32, with steps 3 x uint16.
 inline constexpr char kPositions[] = "position";
-inline constexpr char kSteps[] = "steps";  // sealed, positions of 16 bits: 3 x float64
-inline constexpr char kBase[] = "base";    // journal, fold: identity of a map file
-inline constexpr char kChain[] = "chain";  // commit, fold: what stands before it
-inline constexpr char kGone[] = "gone";    // commit: int64, ids of landmarks that went
+inline constexpr char kCentroids[] = "centroid";
+// Learning maps and commits.
+inline constexpr char kIds[] = "ids";
+inline constexpr char kAppearanceBits[] = "appbits";
+inline constexpr char kAppearances[] = "appear";
+inline constexpr char kSums[] = "sums";
+// Sealed maps.
+inline constexpr char kIdBlocks[] = "idblocks";
+inline constexpr char kIdGaps[] = "idgaps";
+inline constexpr char kPrototypes[] = "protos";
+inline constexpr char kScale[] = "sq4scale";
+inline constexpr char kSteps[] = "steps";
+inline constexpr char kListRows[] = "listrows";
+inline constexpr char kOwners[] = "owners";
+inline constexpr char kOwnerChecksums[] = "ownercrc";
+inline constexpr char kRecall[] = "recall";
+// Journals.
+inline constexpr char kBase[] = "base";
+inline constexpr char kChain[] = "chain";
+inline constexpr char kRemoved[] = "removed";
 }  // namespace section
 
-struct MapShape {
-  std::size_t landmarks = 0;
-  std::size_t dim = 0;
-  Position origin{};  // what a sealed map's positions are relative to
+// Reads plain values from a section, front to back. All functions throw FileError if the section
+// is too short.
+class SectionReader {
+ public:
+  SectionReader(const ContainerReader& file, std::string_view section)
+      : file_(&file), section_(section), rest_(file.read(section)) {}
+
+  template <typename T>
+  T value() {
+    T v;
+    copy(&v, 1);
+    return v;
+  }
+  template <typename T>
+  std::vector<T> values(std::size_t n) {
+    check(n, sizeof(T));
+    std::vector<T> v(n);
+    copy(v.data(), n);
+    return v;
+  }
+  template <typename T>
+  void copy(T* to, std::size_t n) {
+    check(n, sizeof(T));
+    take(to, n * sizeof(T));
+  }
+  // A u32 length and that many bytes of UTF-8.
+  std::string text();
+  bool empty() const { return rest_.empty(); }
+  // Throws FileError if bytes are left.
+  void finish() const;
+
+ private:
+  void check(std::size_t n, std::size_t size) const;
+  void take(void* to, std::size_t n);
+
+  const ContainerReader* file_;
+  std::string section_;
+  Bytes rest_;
 };
 
-std::vector<std::byte> write_shape(const MapShape& shape);
-MapShape read_shape(const ContainerReader& file, const Encoder& encoder);
-std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
-// Nothing where there is none.
-void add_metadata(ContainerWriter& file, const Metadata& metadata);
-Metadata read_metadata(const ContainerReader& file);
-// What a map says of itself when another has been joined to it: its own texts, those of the other
-// under other names, the earlier of both creations. Throws std::invalid_argument where these are
-// too many.
-Metadata joined(const Metadata& own, const Metadata& other);
-// What 4-bit prototypes stand for.
-std::vector<std::byte> write_levels(int half_step);
-int read_levels(const ContainerReader& file);
-// Signs that tell looks apart; 0 where the file says nothing of them.
-std::vector<std::byte> write_look_bits(std::size_t look_bits);
-std::size_t read_look_bits(const ContainerReader& file, std::size_t dim);
-// Centroids, (cells x dim); empty where there is no index.
-std::vector<std::int8_t> read_cells(const ContainerReader& file, std::size_t dim);
-// Throws FileError unless ids are ascending and not negative.
-void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
-// The steps of positions in 16 bits (PositionGrid).
-std::vector<std::byte> write_steps(const Position& step);
-Position read_steps(const ContainerReader& file, const Position& origin);
-
-// The sum of the numbers of rows of all landmarks. Throws FileError where a landmark has none, or
-// where these are more than a map can hold.
-template <typename T>
-std::size_t count_rows(const ContainerReader& file, std::span<const T> rows_of) {
-  std::uint64_t total = 0;
-  for (const T n : rows_of) {
-    if (n == 0) file.fail("it has a landmark without prototypes");
-    total += n;
-    if (total > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
-  }
-  return total;
-}
-
-// A section of exactly n values.
+// Reads a section of exactly n values.
 template <typename T>
 std::vector<T> read_section(const ContainerReader& file, const char* name, std::size_t n) {
   SectionReader in(file, name);
   std::vector<T> result = in.values<T>(n);
   in.finish();
   return result;
+}
+
+// Reads a section that is a single value.
+template <typename T>
+T read_value(const ContainerReader& file, const char* name) {
+  return read_section<T>(file, name, 1)[0];
+}
+
+// Collects plain values for a section.
+class SectionWriter {
+ public:
+  template <typename T>
+  void value(const T& v) {
+    values(&v, 1);
+  }
+  template <typename T>
+  void values(const T* v, std::size_t n) {
+    const Bytes bytes = std::as_bytes(std::span(v, n));
+    bytes_.insert(bytes_.end(), bytes.begin(), bytes.end());
+  }
+  // As SectionReader reads it.
+  void text(const std::string& v) {
+    value(static_cast<std::uint32_t>(v.size()));
+    values(v.data(), v.size());
+  }
+  void add_to(ContainerWriter& file, const char* name) { file.add(name, std::move(bytes_)); }
+  std::vector<std::byte> take() { return std::move(bytes_); }
+
+ private:
+  std::vector<std::byte> bytes_;
+};
+
+// Adds a section that is a single value.
+template <typename T>
+void add_value(ContainerWriter& file, const char* name, const T& value) {
+  SectionWriter out;
+  out.value(value);
+  out.add_to(file, name);
+}
+
+// Hands n elements of `width` values each to a sink; fill(i, to) writes the values of element i.
+template <typename T, typename Fill>
+void put_values(const ContainerWriter::Sink& sink, std::size_t n, std::size_t width,
+                const Fill& fill) {
+  constexpr std::size_t kPiece = 1 << 16;  // bytes
+  const std::size_t element = width * sizeof(T);
+  const std::size_t piece = std::min(n, std::max<std::size_t>(1, kPiece / element));
+  std::vector<T> values(piece * width);
+  for (std::size_t first = 0; first < n; first += piece) {
+    const std::size_t end = std::min(n, first + piece);
+    for (std::size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
+    sink(std::as_bytes(std::span(values)).first((end - first) * element));
+  }
+}
+
+// Hands a value of type T for each element of a span to a sink.
+template <typename T, typename Element, typename Value>
+void put_each(const ContainerWriter::Sink& sink, std::span<const Element> elements,
+              const Value& value) {
+  put_values<T>(sink, elements.size(), 1, [&](std::size_t i, T* to) { *to = value(elements[i]); });
 }
 
 }  // namespace protomark

@@ -17,7 +17,7 @@
 #endif
 
 #include "kernels.h"
-#include "protomark/instruction_set.h"
+#include "protomark/types.h"
 
 namespace protomark::kernels {
 namespace {

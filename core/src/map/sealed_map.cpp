@@ -1,88 +1,37 @@
-#include "protomark/map_file.h"
+#include "protomark/sealed_map.h"
 
 #include <algorithm>
-#include <bit>
-#include <cmath>
 #include <mutex>
-#include <optional>
 #include <stdexcept>
+#include <utility>
 
-#include "base/quantize4.h"
-#include "file/container.h"
+#include "base/checked_numbers.h"
+#include "base/sq4.h"
 #include "file/ids.h"
-#include "file/journal.h"
-#include "file/labels.h"
+#include "file/journal_content.h"
 #include "file/sections.h"
-#include "map/position_grid.h"
-#include "map/summary_builder.h"
-#include "protomark/error.h"
+#include "map/map_sections.h"
+#include "map/positions.h"
+#include "map/sealed_blocks.h"
 #include "search/ivf.h"
 #include "search/ivf_search.h"
 #include "search/recall.h"
 
 namespace protomark {
-
-void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::string& map) {
-  if (encoder.identity() == expected.identity()) return;
-  const auto named = [](const Encoder& e) {
-    return "'" + e.info().name + "' (identity " + e.identity().substr(0, 12) + ")";
-  };
-  throw std::invalid_argument(map + ": it was made with encoder " + named(encoder) + ", not with " +
-                              named(expected) +
-                              ": use the map's own encoder, or build the map with the other");
-}
-
-void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
-                       const std::string& map) {
-  if (encoder.info().descriptor == descriptor) return;
-  throw std::invalid_argument(map + ": it is a map of " + encoder.info().descriptor +
-                              " descriptors, not of " + descriptor);
-}
-
-MapKind map_kind(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  const ContainerReader file(mapped.bytes(), path.string());
-  if (file.kind() == FileKind::open_map) return MapKind::open;
-  file.expect(FileKind::sealed_map);
-  return MapKind::sealed;
-}
-
-std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  const ContainerReader file(mapped.bytes(), path.string());
-  if (file.kind() != FileKind::open_map) file.expect(FileKind::sealed_map);
-  return read_encoder(file);
-}
-
-std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  return ContainerReader(mapped.bytes(), path.string()).sections();
-}
-
-void verify_file(const std::filesystem::path& path) {
-  const JournaledFile both(path);
-  both.file().verify();
-  both.journal().commits(both.file().identity());
-}
-
-std::optional<FileJournal> file_journal(const std::filesystem::path& path) {
-  const JournaledFile both(path);
-  const JournalContent& journal = both.journal();
-  if (journal.size() == 0) return std::nullopt;
-  return FileJournal{journal.commits(both.file().identity()).size(), journal.size(),
-                     journal.torn()};
-}
-
 namespace {
 
 constexpr char kRemedy[] = "call build_index before the map is sealed";
+
+constexpr LandmarkIndex landmark_at(std::size_t i) {
+  return LandmarkIndex{static_cast<std::uint32_t>(i)};
+}
 
 }  // namespace
 
 struct SealedMap::Content {
   explicit Content(const std::filesystem::path& path)
       : Content(std::make_unique<MappedFile>(path), path.string()) {
-    // Commits that somebody put this map in the way of are not passed over in silence.
+    // A map file that takes the place of one with commits is refused.
     const JournaledFile both(path);
     both.journal().commits(both.file().identity());
   }
@@ -96,142 +45,133 @@ struct SealedMap::Content {
     shape = read_shape(file, *encoder);
     metadata = read_metadata(file);
     const std::size_t n = shape.landmarks;
-    rows = n;
-    if (const auto bytes = file.read_if_there(section::kRows)) read_rows();
-    RowLandmarks landmarks;
-    std::size_t places = rows;
-    if (file.map_if_there(section::kCells)) {
-      places = read_index();
-      landmarks.order = order.get();
-      landmarks.end = static_cast<std::uint32_t>(n);
+    prototype_count = n;
+    if (file.has(section::kRows)) read_row_counts();
+    RowLandmarks owner_of;
+    std::size_t row_end = prototype_count;
+    if (file.has(section::kCentroids)) {
+      row_end = read_index();
+      owner_of.order = owners.get();
+      owner_of.end = static_cast<std::uint32_t>(n);
     } else {
-      landmarks.rows_of = rows_of;
+      owner_of.rows_of = row_counts.empty() ? nullptr : row_counts.data();
     }
-    if (file.map_if_there(section::kLevels)) {
+    if (file.has(section::kScale)) {
       code_bits = 4;
-      const int half_step = read_levels(file);
-      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(places, shape.dim)),
-                     places, shape.dim, half_step};
-      if (!indexed()) check_padding();
+      const auto scale = read_value<std::uint32_t>(file, section::kScale);
+      if (scale < 1 || scale > kMaxScale) {
+        file.fail("the scale of its prototypes is " + std::to_string(scale) + ", not 1 to " +
+                  std::to_string(kMaxScale));
+      }
+      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(row_end, shape.dim)),
+                     row_end, shape.dim, static_cast<int>(scale)};
+      if (nlist() == 0) check_padding();
     } else {
-      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(places, shape.dim)), places,
-                    shape.dim};
+      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(row_end, shape.dim)),
+                    row_end, shape.dim};
     }
-    prototypes.landmarks = prototypes4.landmarks = landmarks;
-    counts = map<std::uint8_t>(section::kCounts, n);
+    prototypes.landmarks = prototypes4.landmarks = owner_of;
+    counts = file.map<std::uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
-    if (!file.map_if_there(section::kPositions)) return;
-    if (file.map_if_there(section::kSteps)) {
-      grid = PositionGrid(shape.origin, read_steps(file, shape.origin));
-      position_cells = map<PositionGrid::Cell>(section::kPositions, n);
-    } else {
-      positions = map<std::array<float, 3>>(section::kPositions, n);
-    }
+    if (!file.has(section::kPositions)) return;
+    codec.emplace(file, shape.origin);
+    positions = file.map<std::byte>(section::kPositions, n * codec->size());
   }
 
-  // Sections stand at multiples of 64 bytes, so the pointer is aligned.
   template <typename T>
-  const T* map(const char* name, std::size_t n) {
-    const auto bytes = file.map_if_there(name);
-    if (!bytes) file.fail("it lacks the section '" + std::string(name) + "'");
-    if (bytes->size() % sizeof(T) != 0 || bytes->size() / sizeof(T) != n) {
-      file.fail("its section '" + std::string(name) + "' has the wrong size");
-    }
-    return reinterpret_cast<const T*>(bytes->data());
+  const T* map(const char* name, std::size_t n) const {
+    return file.map<T>(name, n).data();
   }
 
-  // NaN where there is none, or where a broken file has no number.
-  Position position(std::size_t landmark) const {
-    constexpr Position kNone = {NAN, NAN, NAN};
-    if (position_cells != nullptr) return grid.position(position_cells[landmark]);
-    if (positions == nullptr) return kNone;
-    Position p = shape.origin;
-    for (std::size_t i = 0; i < 3; ++i) p[i] += positions[landmark][i];
-    return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]) ? p : kNone;
-  }
-
-  void read_rows() {
-    const std::size_t n = shape.landmarks;
-    rows_of = map<std::uint8_t>(section::kRows, n);
-    rows = count_rows(file, std::span(rows_of, n));
+  void read_row_counts() {
+    file.read(section::kRows);  // for its checksum
+    row_counts = file.map<std::uint8_t>(section::kRows, shape.landmarks);
+    prototype_count = sum_rows(file, row_counts);
     std::uint32_t row = 0;
-    for (std::size_t i = 0; i < n; ++i) {
-      if (i % kFirstRowsStep == 0) first_rows.push_back(row);
-      row += rows_of[i];
+    for (std::size_t i = 0; i < row_counts.size(); ++i) {
+      if (i % kFirstRowStep == 0) first_rows.push_back(row);
+      row += row_counts[i];
     }
   }
 
-  // Cells, and the places of their rows, of which there are as many as this returns.
+  // Reads the inverted lists, and returns how many rows they have, padding included.
   std::size_t read_index() {
-    centroids = read_cells(file, shape.dim);
-    const std::size_t cells = centroids.size() / shape.dim;
-    packed_centroids = pack_codes({centroids.data(), cells, shape.dim});
-    file.read(section::kCellRows);  // for its checksum
-    cell_rows = {map<std::uint32_t>(section::kCellRows, cells), cells};
+    centroids = read_centroids(file, shape.dim);
+    const std::size_t lists = centroids.size() / shape.dim;
+    packed_centroids = pack_codes({centroids.data(), lists, shape.dim});
+    file.read(section::kListRows);  // for its checksum
+    list_rows = file.map<std::uint32_t>(section::kListRows, lists);
     first_blocks.push_back(0);
-    std::uint64_t all = 0;
-    for (const std::uint32_t n : cell_rows) {
-      all += n;
-      if (all > rows) break;
+    std::uint64_t total = 0;
+    for (const std::uint32_t n : list_rows) {
+      total += n;
+      if (total > prototype_count) break;
       first_blocks.push_back(
           first_blocks.back() +
           static_cast<std::uint32_t>((std::uint64_t{n} + kPackedRows - 1) / kPackedRows));
     }
-    if (all != rows) file.fail("its cells do not have as many prototypes as the map");
-    const std::size_t places = std::size_t{first_blocks.back()} * kPackedRows;
-    // Numbers of landmarks and, for padding, the next one.
-    order = std::make_unique<const OrderNumbers>(
-        file, places, std::bit_width(std::max<std::size_t>(shape.landmarks, 1)));
-    const auto bytes = file.read(section::kProbes);
-    ranks.resize(bytes.size() / sizeof(std::uint32_t));
-    SectionReader(file, section::kProbes).copy(ranks.data(), ranks.size());
-    if (bytes.size() % sizeof(std::uint32_t) != 0 || ranks.size() > kTestQueries ||
-        !std::is_sorted(ranks.begin(), ranks.end()) ||
-        (!ranks.empty() && (ranks.front() < 1 || ranks.back() > cells))) {
-      file.fail("its section 'probes' is impossible");
+    if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
+    const std::size_t row_end = std::size_t{first_blocks.back()} * kPackedRows;
+    const int bits = OwnerWriter::bits_for(shape.landmarks);
+    const auto words = file.map<std::uint64_t>(section::kOwners, packed_words(row_end, bits));
+    file.read(section::kOwnerChecksums);  // for its own
+    owners = std::make_unique<const CheckedNumbers>(
+        words, bits,
+        file.map<std::uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
+        file.name() + ": its section '" + section::kOwners + "'");
+    const std::size_t size = file.map(section::kRecall).size() / sizeof(std::uint32_t);
+    recall_table = read_section<std::uint32_t>(file, section::kRecall, size);
+    if (size > kTestQueries || !std::ranges::is_sorted(recall_table) ||
+        (size > 0 && (recall_table.front() < 1 || recall_table.back() > lists))) {
+      file.fail("its recall table is impossible");
     }
-    return places;
+    return row_end;
   }
 
-  bool indexed() const { return !centroids.empty(); }
-  std::size_t index_cells() const { return cell_rows.size(); }
+  std::size_t nlist() const { return list_rows.size(); }
 
-  // The place of a row. With an index places are looked for once, in all of the order.
-  std::size_t place(std::size_t row) const {
-    if (!indexed()) return row;
-    std::call_once(places_found, [&] {
-      std::vector<std::uint32_t> found(rows), taken(shape.landmarks, 0);
-      const std::size_t all = std::size_t{first_blocks.back()} * kPackedRows;
+  Position position(LandmarkIndex landmark) const {
+    return codec ? codec->decode(&positions[landmark.value * codec->size()]) : kNoPosition;
+  }
+
+  // The prototypes of a landmark, the first one and the one behind the last, counted by id.
+  std::pair<std::size_t, std::size_t> prototypes_of(LandmarkIndex landmark) const {
+    const std::size_t i = landmark.value;
+    if (row_counts.empty()) return {i, i + 1};
+    std::size_t first = first_rows[i / kFirstRowStep];
+    for (std::size_t j = i / kFirstRowStep * kFirstRowStep; j < i; ++j) first += row_counts[j];
+    return {first, first + row_counts[i]};
+  }
+
+  // The row of a prototype that is counted by id. With an index rows are looked up once, by the
+  // owners of all.
+  Row row_of(std::size_t prototype) const {
+    if (nlist() == 0) return {static_cast<std::uint32_t>(prototype)};
+    std::call_once(rows_found, [&] {
+      std::vector<Row> found(prototype_count);
+      std::vector<std::uint32_t> taken(shape.landmarks, 0);
+      const std::size_t end = std::size_t{first_blocks.back()} * kPackedRows;
       std::size_t total = 0;
-      for (std::size_t p = 0; p < all; ++p) {
-        const std::uint32_t landmark = (*order)[p];
-        if (landmark >= shape.landmarks) continue;
-        const auto [first, end] = rows_at(landmark);
-        if (first + taken[landmark] == end) file.fail("its order names a landmark too often");
-        found[first + taken[landmark]++] = static_cast<std::uint32_t>(p);
+      for (std::size_t row = 0; row < end; ++row) {
+        const std::uint64_t owner = (*owners)[row];
+        if (owner >= shape.landmarks) continue;
+        const auto [first, last] = prototypes_of(landmark_at(owner));
+        const std::size_t at = first + taken[owner]++;
+        if (at == last) file.fail("it has more prototypes of a landmark than it says");
+        found[at].value = static_cast<std::uint32_t>(row);
         ++total;
       }
-      if (total != rows) file.fail("its order lacks landmarks");
-      places = std::move(found);
+      if (total != prototype_count) file.fail("it lacks prototypes of a landmark");
+      rows = std::move(found);
     });
-    return places[row];
+    return rows[prototype];
   }
 
-  // The rows of landmark i: the first one and the one behind the last.
-  std::pair<std::size_t, std::size_t> rows_at(std::size_t i) const {
-    if (rows_of == nullptr) return {i, i + 1};
-    std::size_t first = first_rows[i / kFirstRowsStep];
-    for (std::size_t j = i / kFirstRowsStep * kFirstRowsStep; j < i; ++j) first += rows_of[j];
-    return {first, first + rows_of[i]};
-  }
-
-  // That of the last block, where the padding of rows is; padding elsewhere is never looked at.
+  // Checks the padding of the last block; other padding is never looked at.
   void check_padding() const {
-    const std::size_t n = rows, dim = shape.dim;
-    const std::size_t padded_dim = (dim + 7) / 8 * 8;
-    const std::size_t first = n == 0 ? 0 : (n - 1) / kPackedRows * kPackedRows;
-    const std::size_t end = n == 0 ? 0 : first + kPackedRows;
-    for (std::size_t row = first; row < end; ++row) {
+    const std::size_t n = prototype_count, dim = shape.dim, padded_dim = (dim + 7) / 8 * 8;
+    const std::size_t end = (n + kPackedRows - 1) / kPackedRows * kPackedRows;
+    for (std::size_t row = n == 0 ? end : end - kPackedRows; row < end; ++row) {
       for (std::size_t d = row < n ? dim : 0; d < padded_dim; ++d) {
         if (value4(row, d) != 0) file.fail("the padding of its prototypes is not zero");
       }
@@ -243,118 +183,117 @@ struct SealedMap::Content {
     return static_cast<std::uint8_t>(packed4_high(d) ? byte >> 4 : byte & 15);
   }
 
-  int prototype(std::size_t row, std::size_t d) const {
-    if (code_bits == 4) return level4(value4(place(row), d), prototypes4.half_step);
-    return prototypes.data[packed_index(place(row), d, shape.dim)];
+  int value(Row row, std::size_t d) const {
+    if (code_bits == 4) return sq4_level(value4(row.value, d), prototypes4.half_step);
+    return prototypes.data[packed_index(row.value, d, shape.dim)];
   }
 
-  // Landmarks whose first rows are remembered: every one of these.
-  static constexpr std::size_t kFirstRowsStep = 64;
+  static constexpr std::size_t kFirstRowStep = 64;  // landmarks
 
   std::unique_ptr<MappedFile> mapped;  // nullptr: the bytes are the caller's
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
   Metadata metadata;
-  std::size_t rows = 0;                   // prototypes
-  const std::uint8_t* rows_of = nullptr;  // of each landmark; nullptr: each has one
-  std::vector<std::uint32_t> first_rows;
+  std::size_t prototype_count = 0;
+  std::span<const std::uint8_t> row_counts;  // empty if each landmark has one row
+  std::vector<std::uint32_t> first_rows;     // of every kFirstRowStep-th landmark
   int code_bits = 8;
-  PackedPrototypes prototypes;    // where it is 8
-  PackedPrototypes4 prototypes4;  // where it is 4
-  // The index, or nothing.
+  PackedPrototypes prototypes;    // if it is 8
+  PackedPrototypes4 prototypes4;  // if it is 4
+  // The index, if there is one.
   std::vector<std::int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
-  std::span<const std::uint32_t> cell_rows;
-  std::vector<std::uint32_t> first_blocks;    // of each cell, and the end
-  std::unique_ptr<const OrderNumbers> order;  // landmark of each place
-  ProbeRanks ranks;
-  mutable std::once_flag places_found;
-  mutable std::vector<std::uint32_t> places;  // of each row
+  std::span<const std::uint32_t> list_rows;
+  std::vector<std::uint32_t> first_blocks;       // of each list, and the end
+  std::unique_ptr<const CheckedNumbers> owners;  // of each row
+  ProbeRanks recall_table;
+  mutable std::once_flag rows_found;
+  mutable std::vector<Row> rows;  // of prototypes by id
 
-  const std::uint8_t* counts = nullptr;
+  std::span<const std::uint8_t> counts;
   LandmarkIds ids;
-  const std::array<float, 3>* positions = nullptr;
-  const PositionGrid::Cell* position_cells = nullptr;  // and with them
-  PositionGrid grid;
+  std::optional<PositionCodec> codec;
+  std::span<const std::byte> positions;
 };
 
 SealedMap::SealedMap(const std::filesystem::path& path)
     : content_(std::make_unique<const Content>(path)) {}
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
-  if (reinterpret_cast<std::uintptr_t>(bytes.data()) % 64 != 0) {
+  if (reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment != 0) {
     throw std::invalid_argument("the bytes of a map must stand at a multiple of 64");
   }
   content_ = std::make_unique<const Content>(bytes, name);
 }
-SealedMap::~SealedMap() = default;
 SealedMap::SealedMap(SealedMap&&) noexcept = default;
+SealedMap::~SealedMap() = default;
 
 const std::shared_ptr<const Encoder>& SealedMap::encoder() const { return content_->encoder; }
 const Metadata& SealedMap::metadata() const { return content_->metadata; }
 std::size_t SealedMap::dim() const { return content_->shape.dim; }
 std::size_t SealedMap::size() const { return content_->shape.landmarks; }
-std::size_t SealedMap::prototype_count() const { return content_->rows; }
+std::size_t SealedMap::prototype_count() const { return content_->prototype_count; }
 int SealedMap::code_bits() const { return content_->code_bits; }
+std::size_t SealedMap::nlist() const { return content_->nlist(); }
+std::vector<std::int64_t> SealedMap::ids() const { return content_->ids.all(); }
 
-std::size_t SealedMap::index_cells() const { return content_->index_cells(); }
-
-std::size_t SealedMap::probes(double recall) const {
-  check_recall(recall, index_cells(), kRemedy);
-  return probes_for(content_->ranks, recall, index_cells());
+double SealedMap::bytes_per_landmark() const {
+  if (size() == 0) return 0;
+  return static_cast<double>(sealed_bytes(size(), prototype_count(), dim(), code_bits())) /
+         static_cast<double>(size());
 }
 
-int SealedMap::position_bits() const {
-  return content_->position_cells != nullptr ? 16 : content_->positions != nullptr ? 32 : 0;
+std::size_t SealedMap::nprobe(double recall) const {
+  check_recall(recall, nlist(), kRemedy);
+  return probes_for(content_->recall_table, recall, nlist());
 }
+
+int SealedMap::position_bits() const { return content_->codec ? content_->codec->bits() : 0; }
 
 std::optional<Position> SealedMap::position_error() const {
-  if (content_->position_cells == nullptr) return std::nullopt;
-  const Position& step = content_->grid.step;
+  if (position_bits() != 16) return std::nullopt;
+  const Position& step = content_->codec->step();
   return Position{step[0] / 2, step[1] / 2, step[2] / 2};
 }
 
-std::vector<std::int64_t> SealedMap::ids() const { return content_->ids.all(); }
-
-std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmarks) const {
+std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> wanted) const {
   std::vector<std::uint32_t> result;
-  result.reserve(landmarks.size());
-  for (const std::int64_t id : landmarks) {
-    result.push_back(content_->counts[content_->ids.find(id)]);
+  result.reserve(wanted.size());
+  for (const std::int64_t id : wanted) {
+    result.push_back(content_->counts[content_->ids.find(id).value]);
   }
   return result;
 }
 
-void SealedMap::prototypes(std::span<const std::int64_t> landmarks, MatrixView<float> means) const {
-  if (means.rows != landmarks.size() || means.columns != dim()) {
-    throw std::invalid_argument("means must be landmarks x dim");
-  }
-  for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const auto [first, end] = content_->rows_at(content_->ids.find(landmarks[i]));
+Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> wanted) const {
+  Matrix<float> means(wanted.size(), dim());
+  for (std::size_t i = 0; i < wanted.size(); ++i) {
+    const auto [first, end] = content_->prototypes_of(content_->ids.find(wanted[i]));
     for (std::size_t d = 0; d < dim(); ++d) {
       int sum = 0;
-      for (std::size_t row = first; row < end; ++row) sum += content_->prototype(row, d);
+      for (std::size_t p = first; p < end; ++p) sum += content_->value(content_->row_of(p), d);
       means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(end - first);
     }
   }
+  return means;
 }
 
-std::vector<std::vector<float>> SealedMap::looks(std::int64_t landmark) const {
-  const auto [first, end] = content_->rows_at(content_->ids.find(landmark));
-  std::vector<std::vector<float>> result;
-  for (std::size_t row = first; row < end; ++row) {
-    std::vector<float>& look = result.emplace_back(dim());
+Matrix<float> SealedMap::appearances(std::int64_t id) const {
+  const auto [first, end] = content_->prototypes_of(content_->ids.find(id));
+  Matrix<float> result(end - first, dim());
+  for (std::size_t i = 0; i < result.rows; ++i) {
+    const Row row = content_->row_of(first + i);
     for (std::size_t d = 0; d < dim(); ++d) {
-      look[d] = static_cast<float>(content_->prototype(row, d));
+      result.row(i)[d] = static_cast<float>(content_->value(row, d));
     }
   }
   return result;
 }
 
-std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmarks) const {
+std::vector<Position> SealedMap::positions(std::span<const std::int64_t> wanted) const {
   std::vector<Position> result;
-  result.reserve(landmarks.size());
-  for (const std::int64_t id : landmarks) {
+  result.reserve(wanted.size());
+  for (const std::int64_t id : wanted) {
     result.push_back(content_->position(content_->ids.find(id)));
   }
   return result;
@@ -362,46 +301,43 @@ std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmar
 
 MapSummary SealedMap::summary() const {
   SummaryBuilder result;
-  for (std::size_t i = 0; i < size(); ++i) result.add(content_->counts[i], content_->position(i));
+  for (std::size_t i = 0; i < size(); ++i) {
+    result.add(content_->counts[i], content_->position(landmark_at(i)));
+  }
   return result.take();
 }
 
-void SealedMap::search(Descriptors queries, const SearchOptions& options,
-                       MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
-  std::vector<std::int8_t> codes(queries.rows * dim());
-  encoder()->encode(queries, {codes.data(), queries.rows, dim()}, options.threads);
-  search_codes({codes.data(), queries.rows, dim()}, options, ids, distances);
+Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOptions& options) const {
+  return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
 }
 
-void SealedMap::search_codes(Codes queries, const SearchOptions& options,
-                             MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
+Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
   const Content& c = *content_;
-  const auto probes = asked_probes(options, c.index_cells(), kRemedy);
+  Matches matches{{queries.rows, k}, {queries.rows, k}};
+  auto nprobe = asked_probes(options, nlist(), kRemedy);
+  if (options.recall) nprobe = this->nprobe(*options.recall);
   const auto run = [&](const auto& prototypes) {
-    if (!probes) {
-      protomark::search(prototypes, queries, options, ids, distances);
+    if (!nprobe || *nprobe >= nlist()) {
+      protomark::search(prototypes, queries, exact(options), matches.ids.view(),
+                        matches.distances.view());
       return;
     }
     const PackedPrototypes centroids{
-        reinterpret_cast<const std::int8_t*>(c.packed_centroids.data()), c.index_cells(), dim()};
-    const std::size_t searched = options.recall ? this->probes(*options.recall) : *probes;
-    if (searched >= c.index_cells()) {
-      protomark::search(prototypes, queries, exact(options), ids, distances);
-      return;
-    }
-    search_cells(prototypes, CellView(c.cell_rows, c.first_blocks), centroids, searched, queries,
-                 exact(options), ids, distances);
+        reinterpret_cast<const std::int8_t*>(c.packed_centroids.data()), nlist(), dim()};
+    search_cells(prototypes, CellView(c.list_rows, c.first_blocks), centroids, *nprobe, queries,
+                 exact(options), matches.ids.view(), matches.distances.view());
   };
   if (c.code_bits == 4) {
     run(c.prototypes4);
   } else {
     run(c.prototypes);
   }
-  // Ids ascend as numbers do, so that these decide between equals as ids would.
-  if (c.ids.are_numbers()) return;
-  for (std::int64_t& id : std::span(ids.data, ids.rows * ids.columns)) {
-    if (id >= 0) id = c.ids[static_cast<std::size_t>(id)];
+  // Search gives landmark indices. Ids ascend with them, so that ties went to the smaller id.
+  if (c.ids.are_indices()) return matches;
+  for (std::int64_t& id : matches.ids.data) {
+    if (id >= 0) id = c.ids[landmark_at(static_cast<std::size_t>(id))];
   }
+  return matches;
 }
 
 }  // namespace protomark

@@ -1,0 +1,82 @@
+// The sealed map: what a map needs to answer, mapped from its file without parsing.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <filesystem>
+#include <memory>
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "protomark/encoder.h"
+#include "protomark/search.h"
+#include "protomark/types.h"
+
+namespace protomark {
+
+// A landmark takes dim bytes per prototype (dimensions padded to a multiple of 4), or dim / 2 with
+// 4 bits per number (padded to a multiple of 8); a byte for its count; another one if landmarks
+// have several prototypes; 12 or 6 for its position, if the map has positions; and an eighth of a
+// byte and the bits of the gaps between ids, unless ids are 0 ... n - 1. Any number of threads may
+// use a sealed map.
+class PROTOMARK_API SealedMap {
+ public:
+  // Maps a file. Does not read the large sections, which verify_file checks. Throws FileError.
+  explicit SealedMap(const std::filesystem::path& path);
+  // Opens the bytes of a map file, which stand at a multiple of 64 and must outlive the map; errors
+  // call the file `name`.
+  SealedMap(std::span<const std::byte> bytes, const std::string& name);
+  SealedMap(SealedMap&&) noexcept;
+  ~SealedMap();
+
+  const std::shared_ptr<const Encoder>& encoder() const;
+  const Metadata& metadata() const;
+  std::size_t dim() const;
+  // Number of landmarks.
+  std::size_t size() const;
+  // One prototype per landmark, or several if the learning map told appearances apart.
+  std::size_t prototype_count() const;
+  // Bits per number of a prototype: 8 or 4.
+  int code_bits() const;
+  // Bytes that a landmark takes on average for its prototypes, their number and its count, as
+  // SealOptions counts them; 0 for an empty map.
+  double bytes_per_landmark() const;
+  // Bits per coordinate: 32, 16, or 0 if no landmark has a position.
+  int position_bits() const;
+  // With 16 bits: how far a coordinate may be from that of the learning map, along each axis. With
+  // 32 bits coordinates are rounded to floats, relative to the middle of the map.
+  std::optional<Position> position_error() const;
+  // Returns the ids of all landmarks in ascending order. Throws FileError if the file breaks that
+  // order, which nothing else checks.
+  std::vector<std::int64_t> ids() const;
+
+  // Number of inverted lists; 0 means no index.
+  std::size_t nlist() const;
+  // Returns how many lists a search with this recall, above 0 and at most 1, visits, as measured
+  // when the map was sealed. Throws std::invalid_argument for another recall, and without an index.
+  std::size_t nprobe(double recall) const;
+
+  // Return what the map knows of landmarks, and throw UnknownLandmark: positions; numbers of
+  // observations, at most 255; and rounded prototypes (n x dim), in code units, with 4 bits the
+  // levels nearest to these. If a landmark has several prototypes, their mean, each counting alike.
+  std::vector<Position> positions(std::span<const std::int64_t> ids) const;
+  std::vector<std::uint32_t> counts(std::span<const std::int64_t> ids) const;
+  Matrix<float> prototypes(std::span<const std::int64_t> ids) const;
+  // Returns the prototypes of one landmark (n x dim); with an index they come in no particular
+  // order.
+  Matrix<float> appearances(std::int64_t id) const;
+  // Reads all counts and positions once, and keeps nothing.
+  MapSummary summary() const;
+
+  // Finds the k nearest landmarks of each query (protomark/search.h).
+  Matches search(Descriptors queries, std::size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search_codes(Codes queries, std::size_t k = 2, const SearchOptions& options = {}) const;
+
+ private:
+  struct Content;
+  std::unique_ptr<const Content> content_;
+};
+
+}  // namespace protomark

@@ -1,0 +1,122 @@
+// What all of Protomark speaks in: matrices, descriptors, codes, positions, matches, metadata,
+// errors.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <map>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+#include <vector>
+
+// What a shared library exports; everything else stays hidden.
+#ifdef PROTOMARK_SHARED
+#define PROTOMARK_API __attribute__((visibility("default")))
+#else
+#define PROTOMARK_API
+#endif
+
+namespace protomark {
+
+// A row-major matrix that somebody else owns.
+template <typename T>
+struct MatrixView {
+  T* data = nullptr;
+  std::size_t rows = 0;
+  std::size_t columns = 0;
+
+  T* row(std::size_t i) const { return data + i * columns; }
+  operator MatrixView<const T>() const  // NOLINT: as T* converts to const T*
+    requires(!std::is_const_v<T>)
+  {
+    return {data, rows, columns};
+  }
+};
+
+// A row-major matrix that owns its elements.
+template <typename T>
+struct Matrix {
+  Matrix() = default;
+  // All zeros. Throws std::bad_alloc if memory does not suffice.
+  Matrix(std::size_t n, std::size_t m) : rows(n), columns(m) {
+    if (m > PTRDIFF_MAX || (m != 0 && n > PTRDIFF_MAX / sizeof(T) / m)) throw std::bad_alloc();
+    data.resize(n * m);
+  }
+
+  T* row(std::size_t i) { return data.data() + i * columns; }
+  const T* row(std::size_t i) const { return data.data() + i * columns; }
+  MatrixView<T> view() { return {data.data(), rows, columns}; }
+  MatrixView<const T> view() const { return {data.data(), rows, columns}; }
+  operator MatrixView<const T>() const { return view(); }  // NOLINT: a view costs nothing
+  bool operator==(const Matrix&) const = default;
+
+  std::size_t rows = 0;
+  std::size_t columns = 0;
+  std::vector<T> data;
+};
+
+// One descriptor per row, as OpenCV gives them: bit i of a descriptor is bit i % 8 (least
+// significant first) of byte i / 8.
+using Descriptors = MatrixView<const std::uint8_t>;
+// One code per row, each number -127 to 127.
+using Codes = MatrixView<const std::int8_t>;
+
+// World coordinates of a landmark; NaN in all three if it has none.
+using Position = std::array<double, 3>;
+
+// The k nearest neighbours of each query, nearest first.
+struct Matches {
+  Matrix<std::int64_t> ids;  // (queries x k); -1 where there is no neighbour
+  Matrix<float> distances;   // (queries x k)
+  bool operator==(const Matches&) const = default;
+};
+
+// Texts by name, all in UTF-8: what a map says of itself. Names are free but for two:
+//   "frame"    the coordinate frame of the positions and their unit, as in "ENU, metres" or
+//              "map (REP 105), metres"
+//   "created"  when the map was begun, in UTC: "2026-11-23T03:39:41Z" (ISO 8601)
+// The library writes none of them by itself, so that equal maps stay equal files.
+using Metadata = std::map<std::string, std::string>;
+
+inline constexpr std::size_t kMaxMetadata = 256;          // names
+inline constexpr std::size_t kMaxMetadataName = 128;      // bytes, at least 1
+inline constexpr std::size_t kMaxMetadataText = 1 << 16;  // bytes
+
+// Throws std::invalid_argument if something exceeds these limits or is not UTF-8, or if "created"
+// is no such time.
+PROTOMARK_API void check_metadata(const Metadata& metadata);
+
+// A map at a glance.
+struct MapSummary {
+  std::uint64_t observations = 0;  // a sealed map counts at most 255 per landmark
+  // How many landmarks have i observations, at index i; at the last index, that many or more.
+  std::array<std::uint64_t, 256> landmarks_by_count{};
+  std::size_t landmarks_with_position = 0;
+  // The bounding box of the positions; zeros if there are none.
+  Position low{};
+  Position high{};
+};
+
+// A file that cannot be read or written, or that is not what it should be. Wrong arguments are
+// std::invalid_argument.
+struct PROTOMARK_API FileError : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+// A landmark id that the map does not hold.
+struct PROTOMARK_API UnknownLandmark : std::out_of_range {
+  explicit UnknownLandmark(std::int64_t unknown)
+      : std::out_of_range("landmark " + std::to_string(unknown) + " is not in the map"),
+        id(unknown) {}
+  std::int64_t id;
+};
+
+// The instruction set that the kernels use, such as "avx512", "avx2", "neon" or "portable": the
+// best that this CPU runs, or the one that the environment variable PROTOMARK_ISA names. Throws
+// std::invalid_argument if that is unknown or does not run here. All give the same bytes.
+PROTOMARK_API const char* instruction_set();
+
+}  // namespace protomark

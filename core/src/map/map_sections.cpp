@@ -1,0 +1,140 @@
+#include "map/map_sections.h"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+
+#include "base/utf8.h"
+#include "file/sections.h"
+#include "search/ivf.h"
+
+namespace protomark {
+namespace {
+
+constexpr char kCreated[] = "created";
+
+[[noreturn]] void invalid(const std::string& what) {
+  throw std::invalid_argument("metadata: " + what);
+}
+
+// Times have exactly one form, so that the order of texts is that of times.
+bool is_utc_time(std::string_view text) {
+  constexpr std::string_view kForm = "0000-00-00T00:00:00Z";
+  const auto fits = [](char c, char form) {
+    return form == '0' ? c >= '0' && c <= '9' : c == form;
+  };
+  if (!std::ranges::equal(text, kForm, fits)) return false;
+  const auto number = [&](std::size_t at, std::size_t digits) {
+    int value = 0;
+    for (const char c : text.substr(at, digits)) value = 10 * value + (c - '0');
+    return value;
+  };
+  const std::chrono::year_month_day day{std::chrono::year(number(0, 4)),
+                                        std::chrono::month(static_cast<unsigned>(number(5, 2))),
+                                        std::chrono::day(static_cast<unsigned>(number(8, 2)))};
+  return day.ok() && number(11, 2) < 24 && number(14, 2) < 60 && number(17, 2) < 60;
+}
+
+}  // namespace
+
+void check_metadata(const Metadata& metadata) {
+  if (metadata.size() > kMaxMetadata) {
+    invalid("a map has at most " + std::to_string(kMaxMetadata) + " names, not " +
+            std::to_string(metadata.size()));
+  }
+  for (const auto& [name, text] : metadata) {
+    if (!is_utf8(name) || !is_utf8(text)) invalid("names and texts must be UTF-8");
+    if (name.empty() || name.size() > kMaxMetadataName) {
+      invalid("a name has 1 to " + std::to_string(kMaxMetadataName) + " bytes, not " +
+              std::to_string(name.size()));
+    }
+    if (text.size() > kMaxMetadataText) {
+      invalid("'" + name + "' has " + std::to_string(text.size()) + " bytes, at most " +
+              std::to_string(kMaxMetadataText) + " are allowed");
+    }
+    if (name == kCreated && !is_utc_time(text)) {
+      invalid("'created' must be a time in UTC such as 2026-11-23T03:39:41Z, not '" + text + "'");
+    }
+  }
+}
+
+Metadata merged(const Metadata& own, const Metadata& other) {
+  Metadata result = own;
+  result.insert(other.begin(), other.end());
+  if (const auto created = other.find(kCreated); created != other.end()) {
+    result[kCreated] = std::min(result[kCreated], created->second);
+  }
+  check_metadata(result);
+  return result;
+}
+
+void add_metadata(ContainerWriter& file, const Metadata& metadata) {
+  if (metadata.empty()) return;
+  SectionWriter out;
+  for (const auto& [name, text] : metadata) {
+    out.text(name);
+    out.text(text);
+  }
+  out.add_to(file, section::kMetadata);
+}
+
+Metadata read_metadata(const ContainerReader& file) {
+  Metadata result;
+  if (!file.has(section::kMetadata)) return result;
+  for (SectionReader in(file, section::kMetadata); !in.empty();) {
+    std::string name = in.text();
+    if (!result.empty() && name <= result.rbegin()->first) {
+      file.fail("the names of its metadata do not ascend");
+    }
+    result.emplace_hint(result.end(), std::move(name), in.text());
+    if (result.size() > kMaxMetadata) break;
+  }
+  try {
+    check_metadata(result);
+  } catch (const std::invalid_argument& error) {
+    file.fail(error.what());
+  }
+  return result;
+}
+
+MapShape read_shape(const ContainerReader& file, const Encoder& encoder) {
+  const auto shape = read_value<MapShape>(file, section::kShape);
+  if (shape.landmarks > UINT32_MAX) file.fail("it claims more landmarks than a map can hold");
+  if (std::ranges::find(encoder.dims(), shape.dim) == encoder.dims().end()) {
+    file.fail("its dimension does not fit its encoder");
+  }
+  if (!std::ranges::all_of(shape.origin, [](double x) { return std::isfinite(x); })) {
+    file.fail("its origin is not finite");
+  }
+  return shape;
+}
+
+std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {
+  return std::make_shared<const Encoder>(
+      Encoder::parse(file.read(section::kEncoder), file.name() + ": encoder"));
+}
+
+std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim) {
+  if (!file.has(section::kCentroids)) return {};
+  const std::size_t size = file.map(section::kCentroids).size(), lists = size / dim;
+  if (lists == 0 || lists > Cells::kMaxCells || size % dim != 0) {
+    file.fail_size(section::kCentroids);
+  }
+  auto centroids = read_section<std::int8_t>(file, section::kCentroids, size);
+  if (std::ranges::find(centroids, -128) != centroids.end()) {
+    file.fail("its centroids are impossible");
+  }
+  return centroids;
+}
+
+void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {
+  if (!ids.empty() && ids.front() < 0) file.fail("it has a negative landmark id");
+  for (std::size_t i = 1; i < ids.size(); ++i) {
+    if (ids[i] <= ids[i - 1]) file.fail("its landmark ids do not ascend");
+  }
+}
+
+}  // namespace protomark

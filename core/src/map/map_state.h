@@ -1,0 +1,145 @@
+// What users do not see of a learning map, and the guard of its changes.
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <filesystem>
+#include <iterator>
+#include <memory>
+#include <mutex>
+#include <shared_mutex>
+#include <span>
+#include <utility>
+#include <vector>
+
+#include "base/fair_shared_mutex.h"
+#include "file/journal.h"
+#include "map/prototype_store.h"
+#include "protomark/prototype_map.h"
+#include "search/recall.h"
+
+namespace protomark {
+
+// Locks, in the order in which a thread takes them. What is held and by whom:
+//   journal_mutex  by commit, compact, close, and a save onto the map's own file
+//   measuring      by the one thread that measures the recall table
+//   changing       alone by a change, from its first look at the map to its end; shared by what
+//                  reads the map for long: save, seal, split, summary, commit while it copies, the
+//                  source of a merge, measuring
+//   searching      alone by a change while it writes, a piece at a time; shared by searches and
+//                  short questions
+//   recall_mutex   to read or replace `recall_table`
+// So a search waits for nothing but a piece of a change.
+struct MapState {
+  MapState(std::shared_ptr<const Encoder> its_encoder, std::size_t dim, std::size_t appearance_bits)
+      : encoder(std::move(its_encoder)), store(dim, appearance_bits) {}
+
+  std::shared_ptr<const Encoder> encoder;
+  PrototypeStore store;
+  Metadata metadata;
+  std::mutex journal_mutex, measuring;
+  FairSharedMutex changing, searching;
+
+  std::unique_ptr<Journal> journal;  // nullptr without a journal
+  // The map file whose journal this is or was; empty if it never had one. Needs no lock, as it does
+  // not change once others have the map.
+  std::filesystem::path journaled;
+
+  // Returns the recall table as measured on the map now, or earlier if little has changed since or
+  // others measure or change the map; with these centroids at any rate. `lock` holds `searching`,
+  // and is released while the table is measured.
+  std::shared_ptr<const MeasuredRanks> recall(std::shared_lock<FairSharedMutex>& lock,
+                                              double recall, int threads);
+
+  // A map of some of the landmarks.
+  PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;
+
+  // Throws std::invalid_argument without a journal.
+  Journal& need_journal() const;
+  // Writes the map file anew and empties the journal.
+  void fold();
+
+ private:
+  bool is_stale(const MeasuredRanks& table) const;
+  void measure(int threads, bool wait);
+
+  std::mutex recall_mutex;
+  std::shared_ptr<const MeasuredRanks> recall_table;
+};
+
+// A change of a map: while it is there no other one begins, and whatever reads the map for long
+// waits. Searches go on between its pieces.
+class MapChange {
+ public:
+  // Observations or landmarks that are changed at a time.
+  static constexpr std::size_t kPiece = 1 << 11;
+
+  explicit MapChange(MapState& state) : MapChange(state, std::unique_lock(state.changing)) {}
+  MapChange(MapState& state, std::unique_lock<FairSharedMutex> changing)
+      : state_(&state), changing_(std::move(changing)) {}
+
+  // Lets a change write: as long as the lock is held no search reads the map.
+  std::unique_lock<FairSharedMutex> write() { return std::unique_lock(state_->searching); }
+
+  // The pieces of [0, n), for range-for: each turn of the loop may write, and ends with all rows in
+  // their lists.
+  class Pieces {
+   public:
+    struct Piece {
+      std::size_t begin, end;
+    };
+    class Iterator {
+     public:
+      explicit Iterator(Pieces& pieces) : pieces_(&pieces) {}
+      Piece operator*() const {
+        return {pieces_->first_, std::min(pieces_->n_, pieces_->first_ + kPiece)};
+      }
+      Iterator& operator++() {
+        pieces_->next();
+        return *this;
+      }
+      bool operator==(std::default_sentinel_t) const { return pieces_->first_ >= pieces_->n_; }
+
+     private:
+      Pieces* pieces_;
+    };
+
+    Pieces(MapState& state, std::size_t n) : state_(&state), n_(n) {}
+    Iterator begin() {
+      if (first_ < n_) lock_ = std::unique_lock(state_->searching);
+      return Iterator(*this);
+    }
+    std::default_sentinel_t end() const { return {}; }
+
+   private:
+    void next() {
+      state_->store.reassign(1);
+      lock_.unlock();
+      first_ += kPiece;
+      begin();
+    }
+
+    MapState* state_;
+    std::size_t n_, first_ = 0;
+    std::unique_lock<FairSharedMutex> lock_;
+  };
+  Pieces pieces(std::size_t n) { return {*state_, n}; }
+
+  void make_room_for_positions() { state_->store.make_room_for_positions(state_->searching); }
+  void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed) {
+    state_->store.make_room(landmarks, rows, changed, state_->searching);
+  }
+  void set_metadata(Metadata metadata);
+  // Adds observations in pieces.
+  void add(std::span<const std::int64_t> ids, Codes codes, int threads);
+  // Puts rows into the lists of other centroids; none drop the index. `in_place`: within the map,
+  // which takes 5 bytes per row and, if arrays have to grow, the largest of them once more, but
+  // makes searches wait. Otherwise in a copy of it.
+  void set_centroids(Cells centroids, int threads, bool in_place);
+
+ private:
+  MapState* state_;
+  std::unique_lock<FairSharedMutex> changing_;
+};
+
+}  // namespace protomark

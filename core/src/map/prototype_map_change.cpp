@@ -1,0 +1,277 @@
+// Changes of a learning map: observations, landmarks, positions, metadata.
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <stdexcept>
+#include <string>
+#include <unordered_map>
+
+#include "base/id_index.h"
+#include "base/parallel.h"
+#include "map/map_state.h"
+
+namespace protomark {
+namespace {
+
+// Descriptors that are encoded at a time, to bound the memory for their codes.
+constexpr std::size_t kEncodeChunk = 1 << 13;
+// Descriptors that a thread encodes at a time while another one adds.
+constexpr std::size_t kMinShare = 64, kMaxShare = 512;
+
+void check_pairs(std::size_t ids, std::size_t others, const char* what) {
+  if (ids == others) return;
+  throw std::invalid_argument(std::to_string(ids) + " landmark ids for " + std::to_string(others) +
+                              " " + what);
+}
+
+void check_codes(Codes codes, std::size_t dim) {
+  if (codes.columns != dim) {
+    throw std::invalid_argument("codes have " + std::to_string(codes.columns) +
+                                " dimensions, the map has " + std::to_string(dim));
+  }
+  const std::int8_t* end = codes.data + codes.rows * codes.columns;
+  if (std::find(codes.data, end, -128) != end) {
+    throw std::invalid_argument("codes must be -127 to 127, one is -128");
+  }
+}
+
+void check_new_ids(std::span<const std::int64_t> ids) {
+  for (const std::int64_t id : ids) {
+    if (id < 0) throw std::invalid_argument("landmark id " + std::to_string(id) + " is negative");
+  }
+}
+
+}  // namespace
+
+// Ids and codes are copied and checked once more: a caller that writes over them meanwhile must not
+// be able to break the map.
+void MapChange::add(std::span<const std::int64_t> ids, Codes codes, int threads) {
+  PrototypeStore& store = state_->store;
+  const std::size_t size = std::min(codes.rows, kPiece);
+  std::vector<Row> row_space(size);
+  std::vector<std::int64_t> id_space(size);
+  std::vector<std::int8_t> code_space(size * codes.columns);
+  for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
+    const std::size_t n = std::min(kPiece, codes.rows - begin);
+    std::copy_n(ids.begin() + static_cast<std::ptrdiff_t>(begin), n, id_space.begin());
+    std::copy_n(codes.row(begin), n * codes.columns, code_space.begin());
+    const auto piece_ids = std::span(id_space).first(n);
+    const Codes piece{code_space.data(), n, codes.columns};
+    check_new_ids(piece_ids);
+    check_codes(piece, store.dim());
+    const auto rows = std::span(row_space).first(n);
+    store.find_rows(piece_ids, piece, rows);
+    std::size_t new_landmarks = 0, new_rows = 0;
+    for (std::size_t i = 0; i < n; ++i) {
+      if (rows[i] != kNoRow) continue;
+      ++new_rows;
+      if (store.find(piece_ids[i]) == kNoLandmark) ++new_landmarks;
+    }
+    make_room(new_landmarks, new_rows, n);
+    const auto lock = write();
+    store.add(piece_ids, piece, rows);
+    store.reassign(threads);
+  }
+}
+
+void MapChange::set_metadata(Metadata metadata) {
+  const auto lock = write();
+  if (auto& uncommitted = state_->store.uncommitted()) {
+    uncommitted->metadata |= metadata != state_->metadata;
+  }
+  state_->metadata = std::move(metadata);
+}
+
+void PrototypeMap::add(std::span<const std::int64_t> ids, Descriptors descriptors, int threads) {
+  check_pairs(ids.size(), descriptors.rows, "descriptors");
+  check_new_ids(ids);
+  const std::size_t dim = this->dim();
+  // One chunk is encoded while the chunk before it is added.
+  std::vector<std::int8_t> buffer(std::min(descriptors.rows, 2 * kEncodeChunk) * dim);
+  const auto codes = [&](std::size_t begin) {
+    return MatrixView<std::int8_t>{buffer.data() + begin / kEncodeChunk % 2 * kEncodeChunk * dim,
+                                   std::min(kEncodeChunk, descriptors.rows - begin), dim};
+  };
+  const auto encode = [&](std::size_t begin, MatrixView<std::int8_t> to, int encode_threads) {
+    encoder()->encode({descriptors.row(begin), to.rows, descriptors.columns}, to, encode_threads);
+  };
+  MapChange change(*state_);
+  const auto add_chunk = [&](std::size_t begin) {
+    const auto chunk = codes(begin);
+    change.add(ids.subspan(begin, chunk.rows), chunk, threads);
+  };
+  // Also if there are no descriptors, to check their length.
+  encode(0, codes(0), threads);
+  std::size_t begin = 0;
+  for (std::size_t next = kEncodeChunk; next < descriptors.rows; next += kEncodeChunk) {
+    const auto chunk = codes(next);
+    if (state_->store.centroids().size() == 0) {
+      // One thread adds what is encoded, mostly waiting for memory, while the others encode.
+      const std::size_t share = std::clamp<std::size_t>(
+          chunk.rows / (4 * static_cast<std::size_t>(threads)), kMinShare, kMaxShare);
+      run_tasks(threads, 1 + (chunk.rows + share - 1) / share, [&](std::size_t task) {
+        if (task == 0) return add_chunk(begin);
+        const std::size_t first = (task - 1) * share, n = std::min(share, chunk.rows - first);
+        encode(next + first, {chunk.row(first), n, dim}, 1);
+      });
+    } else {
+      // All threads share the work on inverted lists.
+      add_chunk(begin);
+      encode(next, chunk, threads);
+    }
+    begin = next;
+  }
+  add_chunk(begin);
+}
+
+void PrototypeMap::add_codes(std::span<const std::int64_t> ids, Codes codes) {
+  check_pairs(ids.size(), codes.rows, "codes");
+  check_codes(codes, dim());
+  check_new_ids(ids);
+  MapChange(*state_).add(ids, codes, 1);
+}
+
+void PrototypeMap::subtract(std::span<const std::int64_t> ids, Descriptors descriptors,
+                            int threads) {
+  check_pairs(ids.size(), descriptors.rows, "descriptors");
+  subtract_codes(ids, encoder()->encode(descriptors, dim(), threads));
+}
+
+void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes) {
+  check_pairs(ids.size(), codes.rows, "codes");
+  check_codes(codes, dim());
+  const std::size_t dim = codes.columns;
+  MapChange change(*state_);
+  PrototypeStore& store = state_->store;
+
+  // What is to be subtracted from each row, summed up first so that all can be checked before
+  // anything changes.
+  struct Difference {
+    std::int64_t id;
+    std::uint16_t appearance;
+    int count = 0;
+    std::vector<int> sum;
+  };
+  std::unordered_map<std::uint32_t, std::size_t> of_row;
+  std::vector<Difference> differences;
+  const auto never_added = [](std::int64_t id) {
+    return std::invalid_argument("descriptors to be subtracted from landmark " +
+                                 std::to_string(id) + " were never added to it");
+  };
+  for (std::size_t i = 0; i < ids.size(); ++i) {
+    const std::int64_t id = ids[i];
+    const Row row = store.find_row(store.at(id), store.appearance_of(codes.row(i)));
+    if (row == kNoRow) throw never_added(id);
+    const auto [found, is_new] = of_row.emplace(row.value, differences.size());
+    if (is_new) differences.push_back({id, store.appearance(row), 0, std::vector<int>(dim)});
+    Difference& difference = differences[found->second];
+    for (std::size_t d = 0; d < dim; ++d) difference.sum[d] += codes.row(i)[d];
+    ++difference.count;
+  }
+  for (const auto& [value, index] : of_row) {
+    const Row row{value};
+    const Difference& difference = differences[index];
+    const int left = store.count(row) - difference.count;
+    if (left < 0) {
+      throw std::invalid_argument("landmark " + std::to_string(difference.id) + " has " +
+                                  std::to_string(store.count(row)) + " observations" +
+                                  (store.several() ? " of one appearance" : "") + ", " +
+                                  std::to_string(difference.count) + " cannot be subtracted");
+    }
+    for (std::size_t d = 0; d < dim; ++d) {
+      if (std::abs(store.sum(row)[d] - difference.sum[d]) > 127 * left) {
+        throw never_added(difference.id);
+      }
+    }
+  }
+  for (const auto [begin, end] : change.pieces(differences.size())) {
+    for (std::size_t i = begin; i < end; ++i) {
+      const Difference& difference = differences[i];
+      const Row row = store.find_row(store.at(difference.id), difference.appearance);
+      if (store.count(row) == difference.count) {
+        store.erase_row(row);
+        continue;
+      }
+      std::int16_t* sum = store.sum(row);
+      for (std::size_t d = 0; d < dim; ++d) {
+        sum[d] = static_cast<std::int16_t>(sum[d] - difference.sum[d]);
+      }
+      store.set_count(row, store.count(row) - difference.count);
+      store.refresh(row);
+    }
+  }
+}
+
+void PrototypeMap::remove(std::span<const std::int64_t> ids) {
+  MapChange change(*state_);
+  std::vector<std::int64_t> sorted(ids.begin(), ids.end());
+  std::ranges::sort(sorted);
+  sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
+  for (const std::int64_t id : sorted) state_->store.at(id);
+  for (const auto [begin, end] : change.pieces(sorted.size())) {
+    for (std::size_t i = begin; i < end; ++i) state_->store.erase(sorted[i]);
+  }
+}
+
+void PrototypeMap::merge_landmarks(std::span<const std::int64_t> into,
+                                   std::span<const std::int64_t> source) {
+  check_pairs(into.size(), source.size(), "sources");
+  MapChange change(*state_);
+  PrototypeStore& store = state_->store;
+  IdSet removed;
+  for (std::size_t i = 0; i < into.size(); ++i) {
+    for (const std::int64_t id : {into[i], source[i]}) {
+      store.at(id);
+      if (removed.contains(id)) {
+        throw std::invalid_argument("landmark " + std::to_string(id) +
+                                    " was merged into another earlier in the same call");
+      }
+    }
+    if (into[i] == source[i]) {
+      throw std::invalid_argument("landmark " + std::to_string(into[i]) +
+                                  " cannot be merged into itself");
+    }
+    removed.insert(source[i]);
+  }
+  for (const auto [begin, end] : change.pieces(into.size())) {
+    for (std::size_t i = begin; i < end; ++i) {
+      const LandmarkIndex from = store.at(source[i]);
+      for (const Row row : store.rows(from)) {
+        const Row target = store.find_or_create_row(into[i], store.appearance(row));
+        store.merge(target, store.sum(row), store.count(row));  // sums may have moved
+      }
+      const LandmarkIndex to = store.at(into[i]);
+      if (!has_position(store.position(to))) store.set_position(to, store.position(from));
+      store.erase(source[i]);
+    }
+  }
+}
+
+void PrototypeMap::set_metadata(Metadata metadata) {
+  check_metadata(metadata);
+  MapChange(*state_).set_metadata(std::move(metadata));
+}
+
+void PrototypeMap::set_positions(std::span<const std::int64_t> ids,
+                                 std::span<const Position> positions) {
+  check_pairs(ids.size(), positions.size(), "positions");
+  MapChange change(*state_);
+  PrototypeStore& store = state_->store;
+  for (std::size_t i = 0; i < ids.size(); ++i) {
+    store.at(ids[i]);
+    const Position& p = positions[i];
+    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
+    if (!finite && has_position(p)) {
+      throw std::invalid_argument("position of landmark " + std::to_string(ids[i]) +
+                                  " is not finite");
+    }
+  }
+  if (std::ranges::any_of(positions, has_position)) change.make_room_for_positions();
+  for (const auto [begin, end] : change.pieces(ids.size())) {
+    for (std::size_t i = begin; i < end; ++i) {
+      store.set_position(store.at(ids[i]), positions[i]);
+    }
+  }
+}
+
+}  // namespace protomark

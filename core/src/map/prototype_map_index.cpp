@@ -1,0 +1,165 @@
+// The index of a learning map, and search.
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+#include "map/map_state.h"
+#include "search/ivf_search.h"
+
+namespace protomark {
+namespace {
+
+constexpr char kRemedy[] = "call build_index first";
+// The recall table is measured again once this part of the rows has changed.
+constexpr std::size_t kStalePart = 10;
+
+// From prototypes by id, so that centroids do not depend on how the map came about.
+Cells learn_centroids(const PrototypeStore& store, std::size_t nlist, int threads) {
+  const std::size_t rows = store.prototype_count();
+  std::vector<std::size_t> sample(std::min(rows, Cells::sample_for(nlist)));
+  for (std::size_t i = 0; i < sample.size(); ++i) sample[i] = i * rows / sample.size();
+  const std::vector<std::int8_t> codes = store.rounded(store.sorted_rows_at(sample));
+  return Cells::learn({codes.data(), sample.size(), store.dim()}, nlist, threads);
+}
+
+}  // namespace
+
+void PrototypeMap::build_index(const IndexOptions& options, int threads) {
+  if (threads < 1) throw std::invalid_argument("threads must be at least 1");
+  MapChange change(*state_);
+  const PrototypeStore& store = state_->store;
+  const std::size_t rows = store.prototype_count();
+  if (rows == 0) throw std::invalid_argument("a map without landmarks has nothing to index");
+  const std::size_t nlist =
+      options.nlist.value_or(Cells::number_for(rows, store.dim(), store.row_bytes()));
+  const std::size_t limit = std::min(rows, Cells::kMaxCells);
+  if (nlist < 1 || nlist > limit) {
+    throw std::invalid_argument("nlist must be 1 to " + std::to_string(limit) +
+                                " for this map, not " + std::to_string(nlist));
+  }
+  change.set_centroids(learn_centroids(store, nlist, threads), threads, options.in_place);
+}
+
+void PrototypeMap::drop_index() { MapChange(*state_).set_centroids({}, 1, false); }
+
+void MapChange::set_centroids(Cells centroids, int threads, bool in_place) {
+  PrototypeStore& store = state_->store;
+  auto arrangement = store.arrange(std::move(centroids), threads);
+  if (in_place) {
+    store.make_room_for(arrangement, state_->searching);
+    const auto lock = write();
+    store.rearrange(arrangement);
+    return;
+  }
+  PrototypeStore other = store.arranged(arrangement);
+  const auto lock = write();
+  other.uncommitted() = std::move(store.uncommitted());
+  if (other.uncommitted()) other.uncommitted()->centroids = true;
+  std::swap(store, other);  // what was there before is freed after the lock is released
+}
+
+std::size_t PrototypeMap::nlist() const {
+  const std::shared_lock lock(state_->searching);
+  return state_->store.centroids().size();
+}
+
+std::size_t PrototypeMap::nprobe(double recall, int threads) const {
+  std::shared_lock lock(state_->searching);
+  const auto table = state_->recall(lock, recall, threads);
+  return probes_for(table->ranks, recall, state_->store.centroids().size());
+}
+
+Matches PrototypeMap::search(Descriptors queries, std::size_t k,
+                             const SearchOptions& options) const {
+  return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
+}
+
+Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
+                                   const SearchOptions& options) const {
+  Matches matches{{queries.rows, k}, {queries.rows, k}};
+  std::shared_lock lock(state_->searching);
+  const PrototypeStore& store = state_->store;
+  auto nprobe = asked_probes(options, store.centroids().size(), kRemedy);
+  if (options.recall) {
+    const auto table = state_->recall(lock, *options.recall, options.threads);
+    nprobe = probes_for(table->ranks, *options.recall, store.centroids().size());
+  }
+  if (!nprobe || *nprobe >= store.centroids().size()) {
+    protomark::search(store.view(), queries, exact(options), matches.ids.view(),
+                      matches.distances.view());
+  } else {
+    search_cells(store.view(), CellView(store.lists()), store.centroids().packed(), *nprobe,
+                 queries, exact(options), matches.ids.view(), matches.distances.view());
+  }
+  return matches;
+}
+
+std::shared_ptr<const MeasuredRanks> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
+                                                      double recall, int threads) {
+  for (bool tried = false;; tried = true) {
+    check_recall(recall, store.centroids().size(), kRemedy);
+    std::shared_ptr<const MeasuredRanks> known;
+    {
+      const std::scoped_lock reading(recall_mutex);
+      known = recall_table;
+    }
+    const bool of_these = known && known->cells_version == store.centroids_version();
+    if (of_these && (tried || !is_stale(*known))) return known;
+    lock.unlock();
+    measure(threads, !of_these);
+    lock.lock();
+  }
+}
+
+bool MapState::is_stale(const MeasuredRanks& table) const {
+  return table.cells_version != store.centroids_version() ||
+         (store.changes() - table.changes) * kStalePart >= store.prototype_count();
+}
+
+// Without `wait` only if nobody else measures or changes the map.
+void MapState::measure(int threads, bool wait) {
+  std::unique_lock one(measuring, std::defer_lock);
+  std::shared_lock still(changing, std::defer_lock);
+  if (wait) {
+    one.lock();
+    still.lock();
+  } else if (!one.try_lock() || !still.try_lock()) {
+    return;
+  }
+  if (store.centroids().size() == 0 || (recall_table && !is_stale(*recall_table))) return;
+  const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
+  std::vector<std::int64_t> own;
+  for (const Row row : rows) own.push_back(store.id(store.owner(row)));
+  const std::vector<std::int8_t> codes = store.rounded(rows);
+  const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids,
+                              MatrixView<float> distances) {
+    SearchOptions options;
+    options.threads = threads;
+    protomark::search(store.view(), queries, options, ids, distances);
+  };
+  std::vector<std::int8_t> prototype(store.dim());
+  const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
+    std::uint32_t list = 0;
+    std::int32_t least = INT32_MAX;
+    for (const Row row : store.rows(store.at(id))) {
+      store.rounded(row, prototype.data());
+      std::int32_t distance = 0;
+      for (std::size_t d = 0; d < prototype.size(); ++d) {
+        distance += (query[d] - prototype[d]) * (query[d] - prototype[d]);
+      }
+      if (distance >= least) continue;
+      least = distance;
+      list = store.lists().cell_of(row.value);
+    }
+    return list;
+  };
+  auto measured = std::make_shared<MeasuredRanks>();
+  measured->ranks = measure_ranks({codes.data(), rows.size(), store.dim()}, own,
+                                  store.centroids().centroids(), search_two, list_of);
+  measured->cells_version = store.centroids_version();
+  measured->changes = store.changes();
+  const std::scoped_lock writing(recall_mutex);
+  recall_table = std::move(measured);
+}
+
+}  // namespace protomark

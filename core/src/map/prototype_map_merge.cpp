@@ -1,0 +1,188 @@
+// Merges maps into one, and splits one into parts.
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <functional>
+#include <stdexcept>
+#include <string>
+#include <unordered_map>
+#include <utility>
+
+#include "map/map_sections.h"
+#include "map/map_state.h"
+
+namespace protomark {
+namespace {
+
+using Cell = std::array<std::int64_t, 3>;
+
+// Beyond this, neighbouring cells are one in double precision.
+constexpr double kMaxCell = 9007199254740992;  // 2^53
+
+Cell cell_of(const Position& position, double size) {
+  Cell cell;
+  for (std::size_t i = 0; i < cell.size(); ++i) {
+    // A quotient alone may be rounded up to the next cell; a remainder is exact.
+    const double remainder = std::fmod(position[i], size);
+    const double index = std::round((position[i] - remainder) / size) - (remainder < 0 ? 1 : 0);
+    if (!(std::abs(index) <= kMaxCell)) {
+      throw std::invalid_argument("cells of " + std::to_string(size) +
+                                  " are too small for the extent of this map");
+    }
+    cell[i] = static_cast<std::int64_t>(index);
+  }
+  return cell;
+}
+
+void check_alike(const PrototypeMap& map, const PrototypeMap& other) {
+  const auto describe = [](const PrototypeMap& m) {
+    return "'" + m.encoder()->info().name + "' with " + std::to_string(m.dim());
+  };
+  if (other.encoder()->identity() != map.encoder()->identity() || other.dim() != map.dim()) {
+    throw std::invalid_argument("maps of different encoders or dimensions cannot be merged: " +
+                                describe(map) + ", " + describe(other));
+  }
+  if (other.appearance_bits() != map.appearance_bits()) {
+    throw std::invalid_argument("maps of " + std::to_string(map.appearance_bits()) + " and " +
+                                std::to_string(other.appearance_bits()) +
+                                " appearance bits cannot be merged: build both with the same");
+  }
+}
+
+}  // namespace
+
+void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int64_t> into,
+                             std::span<const std::int64_t> source) {
+  if (&other == this) throw std::invalid_argument("a map cannot be merged into itself");
+  check_alike(*this, other);
+  if (into.size() != source.size()) {
+    throw std::invalid_argument(std::to_string(into.size()) + " landmark ids for " +
+                                std::to_string(source.size()) + " sources");
+  }
+  // Both wait for their turn, in one order for all pairs of maps, so that no two merges wait for
+  // each other.
+  std::unique_lock own(state_->changing, std::defer_lock);
+  std::shared_lock others(other.state_->changing, std::defer_lock);
+  if (std::less<>{}(state_.get(), other.state_.get())) {
+    own.lock();
+    others.lock();
+  } else {
+    others.lock();
+    own.lock();
+  }
+  MapChange change(*state_, std::move(own));
+  PrototypeStore& to = state_->store;
+  const PrototypeStore& from = other.state_->store;
+  std::unordered_map<std::uint32_t, std::int64_t> renamed;
+  renamed.reserve(source.size());
+  for (std::size_t i = 0; i < source.size(); ++i) {
+    if (into[i] < 0) {
+      throw std::invalid_argument("landmark id " + std::to_string(into[i]) + " is negative");
+    }
+    if (!renamed.emplace(from.at(source[i]).value, into[i]).second) {
+      throw std::invalid_argument("landmark " + std::to_string(source[i]) +
+                                  " of the other map is named twice");
+    }
+  }
+  Metadata metadata = merged(state_->metadata, other.state_->metadata);
+  if (!from.positions().empty()) change.make_room_for_positions();
+  // By id, so that the result does not depend on how the other map came about.
+  const std::vector<LandmarkIndex> landmarks = from.sorted_landmarks();
+  std::vector<std::int64_t> ids;
+  for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
+    ids.clear();
+    std::size_t rows = 0, new_landmarks = 0;
+    for (; end < landmarks.size() && rows < MapChange::kPiece; ++end) {
+      const auto found = renamed.find(landmarks[end].value);
+      ids.push_back(found == renamed.end() ? from.id(landmarks[end]) : found->second);
+      rows += from.row_count(landmarks[end]);
+      if (to.find(ids.back()) == kNoLandmark) ++new_landmarks;
+    }
+    change.make_room(new_landmarks, to.several() ? rows : new_landmarks, rows);
+    const auto lock = change.write();
+    for (std::size_t i = 0; i < ids.size(); ++i) {
+      const LandmarkIndex theirs = landmarks[first + i];
+      for (const Row row : from.rows(theirs)) {
+        to.merge(to.find_or_create_row(ids[i], from.appearance(row)), from.sum(row),
+                 from.count(row));
+      }
+      const LandmarkIndex ours = to.at(ids[i]);
+      if (!has_position(to.position(ours))) to.set_position(ours, from.position(theirs));
+    }
+    to.reassign(1);
+  }
+  change.set_metadata(std::move(metadata));
+}
+
+PrototypeMap MapState::part(std::span<const LandmarkIndex> landmarks) const {
+  auto result = std::make_unique<MapState>(encoder, store.dim(), store.appearance_bits());
+  PrototypeStore& to = result->store;
+  result->metadata = metadata;
+  std::size_t rows = 0;
+  for (const LandmarkIndex landmark : landmarks) rows += store.row_count(landmark);
+  to.reserve(landmarks.size(), rows);
+  for (const LandmarkIndex landmark : landmarks) {
+    LandmarkIndex own = kNoLandmark;
+    for (const Row row : store.sorted_rows(landmark)) {
+      const Row copy = own == kNoLandmark
+                           ? to.create_landmark(store.id(landmark), store.appearance(row))
+                           : to.create_row(own, store.appearance(row));
+      own = to.owner(copy);
+      to.merge(copy, store.sum(row), store.count(row));
+    }
+    to.set_position(own, store.position(landmark));
+  }
+  return PrototypeMap(std::move(result));
+}
+
+std::vector<PrototypeMap> PrototypeMap::split_by_id(
+    std::span<const std::int64_t> boundaries) const {
+  if (!std::ranges::is_sorted(boundaries)) {
+    throw std::invalid_argument("boundaries of parts must ascend");
+  }
+  const std::shared_lock lock(state_->changing);
+  const std::vector<LandmarkIndex> landmarks = state_->store.sorted_landmarks();
+  std::vector<PrototypeMap> parts;
+  parts.reserve(boundaries.size() + 1);
+  auto first = landmarks.begin();
+  for (std::size_t i = 0; i <= boundaries.size(); ++i) {
+    const auto end =
+        i == boundaries.size()
+            ? landmarks.end()
+            : std::ranges::lower_bound(first, landmarks.end(), boundaries[i], {},
+                                       [&](LandmarkIndex l) { return state_->store.id(l); });
+    parts.push_back(state_->part({first, end}));
+    first = end;
+  }
+  return parts;
+}
+
+std::vector<MapPart> PrototypeMap::split_by_space(double cell_size) const {
+  if (!(cell_size > 0) || std::isinf(cell_size)) {
+    throw std::invalid_argument("the edge of a cell must be above 0 and finite");
+  }
+  const std::shared_lock lock(state_->changing);
+  const PrototypeStore& store = state_->store;
+  std::vector<std::pair<std::optional<Cell>, LandmarkIndex>> all;
+  all.reserve(store.landmark_count());
+  for (const LandmarkIndex landmark : store.sorted_landmarks()) {
+    const Position position = store.position(landmark);
+    all.emplace_back(std::nullopt, landmark);
+    if (has_position(position)) all.back().first = cell_of(position, cell_size);
+  }
+  // By cell, and those without a position at last.
+  std::ranges::stable_sort(all, [](const auto& a, const auto& b) {
+    return a.first && (!b.first || *a.first < *b.first);
+  });
+  std::vector<MapPart> parts;
+  std::vector<LandmarkIndex> landmarks;
+  for (std::size_t i = 0; i < all.size(); ++i) {
+    landmarks.push_back(all[i].second);
+    if (i + 1 < all.size() && all[i + 1].first == all[i].first) continue;
+    parts.push_back({all[i].first, state_->part(landmarks)});
+    landmarks.clear();
+  }
+  return parts;
+}
+
+}  // namespace protomark

@@ -1,0 +1,201 @@
+#include "map/row_table.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace protomark {
+
+bool has_position(const Position& p) {
+  return !(std::isnan(p[0]) && std::isnan(p[1]) && std::isnan(p[2]));
+}
+
+LandmarkIndex RowTable::at(std::int64_t id) const {
+  const LandmarkIndex landmark = find(id);
+  if (landmark == kNoLandmark) throw UnknownLandmark(id);
+  return landmark;
+}
+
+Row RowTable::find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
+  Row row = first_row(landmark);
+  while (row != kNoRow && this->appearance(row) != appearance) row = next_row(row);
+  return row;
+}
+
+std::size_t RowTable::row_count(LandmarkIndex landmark) const {
+  std::size_t n = 0;
+  for ([[maybe_unused]] const Row row : rows(landmark)) ++n;
+  return n;
+}
+
+std::vector<Row> RowTable::sorted_rows(LandmarkIndex landmark) const {
+  return sorted_rows(std::span(&landmark, 1));
+}
+
+std::vector<Row> RowTable::sorted_rows(std::span<const LandmarkIndex> landmarks) const {
+  std::vector<Row> result;
+  result.reserve(landmarks.size());
+  for (const LandmarkIndex landmark : landmarks) {
+    const auto first = static_cast<std::ptrdiff_t>(result.size());
+    for (const Row row : rows(landmark)) result.push_back(row);
+    if (several_) {
+      std::sort(result.begin() + first, result.end(),
+                [&](Row a, Row b) { return appearance(a) < appearance(b); });
+    }
+  }
+  return result;
+}
+
+bool RowTable::any_position() const { return std::ranges::any_of(positions_, has_position); }
+
+std::size_t RowTable::row_bytes() const {
+  if (several_) return sizeof(appearances_[0]) + sizeof(owners_[0]) + sizeof(next_rows_[0]);
+  return sizeof(ids_[0]) + (any_position() ? sizeof(Position) : 0);
+}
+
+void RowTable::add_landmark(std::int64_t id, Row row, std::uint16_t appearance) {
+  if (!several_) {
+    ids_[row.value] = id;
+    index_.insert(ids_, LandmarkIndex{row.value});
+    return;
+  }
+  const LandmarkIndex landmark{static_cast<std::uint32_t>(ids_.size())};
+  for_each_array(1, 0, [](auto& v, std::size_t more) { make_room_in(v, more); });
+  ids_.push_back(id);
+  try {
+    index_.insert(ids_, landmark);
+  } catch (...) {
+    ids_.pop_back();
+    throw;
+  }
+  first_rows_.push_back(kNoRow);
+  if (!positions_.empty()) positions_.push_back(kNoPosition);
+  add_row(landmark, row, appearance);
+}
+
+void RowTable::add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance) {
+  write(row, {kNoPosition, -1, landmark, first_rows_[landmark.value], appearance});
+  first_rows_[landmark.value] = row;
+}
+
+// What leads to a row: the landmark's first row, or the next row of another one.
+Row& RowTable::link_to(Row row) {
+  Row* link = &first_rows_[owner(row).value];
+  for (; *link != row; ++steps_) link = &next_rows_[link->value];
+  return *link;
+}
+
+void RowTable::remove_row(Row row) {
+  if (!several_) return index_.erase(ids_, ids_[row.value]);
+  const LandmarkIndex landmark = owner(row);
+  link_to(row) = next_row(row);
+  if (first_row(landmark) == kNoRow) remove_landmark(landmark);
+}
+
+// The last landmark takes the index of one that has no rows left.
+void RowTable::remove_landmark(LandmarkIndex landmark) {
+  const LandmarkIndex last{static_cast<std::uint32_t>(ids_.size() - 1)};
+  index_.erase(ids_, id(landmark));
+  if (landmark != last) {
+    index_.move(ids_, id(last), landmark);
+    ids_[landmark.value] = id(last);
+    if (!positions_.empty()) positions_[landmark.value] = positions_[last.value];
+    first_rows_[landmark.value] = first_row(last);
+    for (const Row row : rows(landmark)) {
+      owners_[row.value] = landmark;
+      ++steps_;
+    }
+  }
+  ids_.pop_back();
+  if (!positions_.empty()) positions_.pop_back();
+  first_rows_.pop_back();
+}
+
+void RowTable::move_row(Row from, Row to) {
+  if (several_) {
+    link_to(from) = to;
+  } else {
+    index_.move(ids_, ids_[from.value], LandmarkIndex{to.value});
+  }
+  Entry entry;
+  read(from, entry);
+  write(to, entry);
+  vacate(from);
+}
+
+void RowTable::resize(std::size_t rows) {
+  if (several_) {
+    appearances_.resize(rows, 0);
+    owners_.resize(rows, kNoLandmark);
+    next_rows_.resize(rows, kNoRow);
+  } else {
+    ids_.resize(rows, -1);
+    if (!positions_.empty()) positions_.resize(rows, kNoPosition);
+  }
+}
+
+void RowTable::set_position(LandmarkIndex landmark, const Position& position) {
+  if (positions_.empty()) {
+    if (!has_position(position)) return;
+    positions_.assign(ids_.size(), kNoPosition);
+  }
+  // One NaN for all, so that equal maps give equal files.
+  positions_[landmark.value] = has_position(position) ? position : kNoPosition;
+}
+
+void RowTable::read(Row row, Entry& entry) const {
+  if (several_) {
+    entry.owner = owners_[row.value];
+    entry.next = next_rows_[row.value];
+    entry.appearance = appearances_[row.value];
+  } else {
+    entry.id = ids_[row.value];
+    if (!positions_.empty()) entry.position = positions_[row.value];
+  }
+}
+
+void RowTable::write(Row row, const Entry& entry) {
+  if (several_) {
+    owners_[row.value] = entry.owner;
+    next_rows_[row.value] = entry.next;
+    appearances_[row.value] = entry.appearance;
+  } else {
+    ids_[row.value] = entry.id;
+    if (!positions_.empty()) positions_[row.value] = entry.position;
+  }
+}
+
+void RowTable::prefetch(Row row) const {
+  if (several_) {
+    __builtin_prefetch(&owners_[row.value], 1);
+    __builtin_prefetch(&next_rows_[row.value], 1);
+    __builtin_prefetch(&appearances_[row.value], 1);
+  } else {
+    __builtin_prefetch(&ids_[row.value], 1);
+    if (!positions_.empty()) __builtin_prefetch(&positions_[row.value], 1);
+  }
+}
+
+void RowTable::renumber_rows(std::span<const Row> to) {
+  if (!several_) return index_.renumber(to);
+  for (auto* links : {&first_rows_, &next_rows_}) {
+    for (Row& row : *links) {
+      if (row != kNoRow) row = to[row.value];
+    }
+  }
+}
+
+RowTable RowTable::with_rows(std::size_t rows) const {
+  RowTable result(several_);
+  result.index_ = index_;
+  if (several_) {
+    result.ids_ = ids_;
+    result.positions_ = positions_;
+    result.first_rows_ = first_rows_;
+  } else if (!positions_.empty()) {
+    result.positions_.assign(rows, kNoPosition);
+  }
+  result.resize(rows);
+  return result;
+}
+
+}  // namespace protomark

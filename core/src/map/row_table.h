@@ -1,0 +1,169 @@
+// Which rows a landmark of a learning map has, and which landmark a row belongs to.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <iterator>
+#include <limits>
+#include <span>
+#include <vector>
+
+#include "base/id_index.h"
+#include "base/large_vector.h"
+#include "base/rows.h"
+#include "protomark/types.h"
+
+namespace protomark {
+
+inline constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+inline constexpr Position kNoPosition = {kNaN, kNaN, kNaN};
+bool has_position(const Position& position);
+
+// All that depends on how many rows a landmark has stands here. With one row per landmark, a
+// landmark has the index of its row, and only ids and positions are stored, by row. With one row
+// per appearance, landmarks have indices of their own, without gaps, and the rows of a landmark
+// form a chain.
+//
+// Neither landmarks nor rows are sorted. Rows that no landmark has are padding. Indices hold until
+// a landmark or row goes or moves; others then take its place.
+class RowTable {
+ public:
+  // `several`: a landmark may have several rows.
+  explicit RowTable(bool several) : several_(several) {}
+
+  // By landmark index; -1 if no landmark has that index.
+  const LargeVector<std::int64_t>& ids() const { return ids_; }
+  std::int64_t id(LandmarkIndex landmark) const { return ids_[landmark.value]; }
+  // The landmark with an id, or kNoLandmark; `at` throws UnknownLandmark instead.
+  LandmarkIndex find(std::int64_t id) const { return index_.find(ids_, id); }
+  LandmarkIndex at(std::int64_t id) const;
+
+  LandmarkIndex owner(Row row) const {
+    return several_ ? owners_[row.value] : LandmarkIndex{row.value};
+  }
+  bool is_row(Row row) const {
+    return several_ ? owners_[row.value] != kNoLandmark : ids_[row.value] >= 0;
+  }
+  std::uint16_t appearance(Row row) const { return several_ ? appearances_[row.value] : 0; }
+  Row first_row(LandmarkIndex landmark) const {
+    return several_ ? first_rows_[landmark.value] : Row{landmark.value};
+  }
+  Row next_row(Row row) const { return several_ ? next_rows_[row.value] : kNoRow; }
+  // The row of a landmark's appearance, or kNoRow.
+  Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const;
+
+  // The rows of a landmark, in no order, for range-for.
+  class Rows {
+   public:
+    Rows(const RowTable& table, Row first) : table_(&table), row_(first) {}
+    Rows begin() const { return *this; }
+    std::default_sentinel_t end() const { return {}; }
+    Row operator*() const { return row_; }
+    Rows& operator++() {
+      row_ = table_->next_row(row_);
+      return *this;
+    }
+    bool operator==(std::default_sentinel_t) const { return row_ == kNoRow; }
+
+   private:
+    const RowTable* table_;
+    Row row_;
+  };
+  Rows rows(LandmarkIndex landmark) const { return {*this, first_row(landmark)}; }
+  std::size_t row_count(LandmarkIndex landmark) const;
+  // The rows of one landmark, by ascending appearance; or of several, in their order.
+  std::vector<Row> sorted_rows(LandmarkIndex landmark) const;
+  std::vector<Row> sorted_rows(std::span<const LandmarkIndex> landmarks) const;
+
+  Position position(LandmarkIndex landmark) const {
+    return positions_.empty() ? kNoPosition : positions_[landmark.value];
+  }
+  // By landmark index; empty as long as no landmark ever had a position.
+  const std::vector<Position>& positions() const { return positions_; }
+  bool any_position() const;
+
+  // Rows that were stepped over to find those that lead to a row which goes or moves.
+  std::size_t steps() const { return steps_; }
+
+ protected:
+  // What moves with a row: `id` and `position`, or `owner`, `next` and `appearance`.
+  struct Entry {
+    Position position = kNoPosition;
+    std::int64_t id = -1;
+    LandmarkIndex owner = kNoLandmark;
+    Row next = kNoRow;
+    std::uint16_t appearance = 0;
+  };
+
+  // Makes a padding row the only one of a new landmark. If memory runs out nothing has changed, but
+  // that the row must be vacated.
+  void add_landmark(std::int64_t id, Row row, std::uint16_t appearance);
+  // Makes a padding row another one of a landmark.
+  void add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance);
+  // Takes a row away from its landmark, which goes with its last row. The row must be vacated then.
+  void remove_row(Row row);
+  // Moves a row to where padding is, and leaves padding.
+  void move_row(Row from, Row to);
+  // Makes a row padding.
+  void vacate(Row row) { write(row, {}); }
+  void resize(std::size_t rows);
+  void set_position(LandmarkIndex landmark, const Position& position);
+
+  // Reads or writes what stands at a row; what leads to it stays as it is.
+  void read(Row row, Entry& entry) const;
+  void write(Row row, const Entry& entry);
+  void prefetch(Row row) const;
+  // Makes all that leads to a row lead to to[row].
+  void renumber_rows(std::span<const Row> to);
+  // A table of as many rows as yet to be written, which leads to the rows of this one.
+  RowTable with_rows(std::size_t rows) const;
+
+  // Bytes per row, as in a file: positions count if any landmark has one.
+  std::size_t row_bytes() const;
+  // Calls visit(array, size) for each array with the size that so many landmarks and rows take.
+  template <typename Visit>
+  void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
+    if (!several_) landmarks = rows;
+    visit(ids_, landmarks);
+    if (!positions_.empty()) visit(positions_, landmarks);
+    if (!several_) return;
+    visit(first_rows_, landmarks);
+    visit(appearances_, rows);
+    visit(owners_, rows);
+    visit(next_rows_, rows);
+  }
+
+  bool several_;
+  // By landmark.
+  LargeVector<std::int64_t> ids_;
+  std::vector<Position> positions_;
+  std::vector<Row> first_rows_;  // only with several rows per landmark
+  // By row, only with several rows per landmark.
+  std::vector<std::uint16_t> appearances_;
+  std::vector<LandmarkIndex> owners_;
+  std::vector<Row> next_rows_;
+
+  IdIndex index_;
+
+ private:
+  Row& link_to(Row row);
+  void remove_landmark(LandmarkIndex landmark);
+
+  std::size_t steps_ = 0;
+};
+
+// Makes room for more elements as push_back does, so that adding them cannot fail half-way.
+template <typename Vector>
+std::size_t larger_capacity(const Vector& v, std::size_t more) {
+  return std::max(2 * v.capacity(), v.size() + more);
+}
+template <typename Vector>
+bool has_room(const Vector& v, std::size_t more) {
+  return v.capacity() - v.size() >= more;
+}
+template <typename Vector>
+void make_room_in(Vector& v, std::size_t more) {
+  if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
+}
+
+}  // namespace protomark

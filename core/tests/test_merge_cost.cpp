@@ -1,0 +1,105 @@
+#include "map/merge_cost.h"
+
+#include <utility>
+
+#include "check.h"
+#include "random.h"
+
+using namespace protomark;
+
+namespace {
+
+struct Cluster {
+  std::vector<std::int64_t> sum;
+  std::int64_t n;
+};
+
+double cost(const Cluster& a, const Cluster& b) {
+  std::int64_t total = 0;
+  for (std::size_t d = 0; d < a.sum.size(); ++d) {
+    const std::int64_t difference = b.n * a.sum[d] - a.n * b.sum[d];
+    total += difference * difference;
+  }
+  return static_cast<double>(total) / static_cast<double>(a.n * b.n * (a.n + b.n));
+}
+
+// Every pair at every step, in exact integers.
+std::vector<AppearanceMerge> plain_merges(const std::vector<std::int16_t>& sums,
+                                          const std::vector<std::uint8_t>& counts,
+                                          std::size_t dim) {
+  std::vector<Cluster> clusters;
+  for (std::size_t i = 0; i < counts.size(); ++i) {
+    clusters.push_back({{&sums[i * dim], &sums[i * dim] + dim}, counts[i]});
+  }
+  std::vector<AppearanceMerge> merges;
+  while (merges.size() + 1 < counts.size()) {
+    std::size_t best_i = 0, best_j = 0;
+    double best = -1;
+    for (std::size_t i = 0; i < clusters.size(); ++i) {
+      for (std::size_t j = i + 1; j < clusters.size(); ++j) {
+        if (clusters[i].n == 0 || clusters[j].n == 0) continue;
+        const double c = cost(clusters[i], clusters[j]);
+        if (best >= 0 && c >= best) continue;
+        best = c;
+        best_i = i;
+        best_j = j;
+      }
+    }
+    merges.push_back(
+        {best, static_cast<std::uint16_t>(best_i), static_cast<std::uint16_t>(best_j)});
+    for (std::size_t d = 0; d < dim; ++d) clusters[best_i].sum[d] += clusters[best_j].sum[d];
+    clusters[best_i].n += std::exchange(clusters[best_j].n, 0);
+  }
+  return merges;
+}
+
+}  // namespace
+
+int main() {
+  test::Random random(8);
+  for (int round = 0; round < 400; ++round) {
+    const auto rows = static_cast<std::size_t>(random.integer(1, round < 390 ? 12 : 60));
+    const auto dim = static_cast<std::size_t>(random.integer(1, 33));
+    // Small values make many costs equal.
+    const std::int64_t limit = round % 2 == 0 ? 1 : 127;
+    const auto counts = random.integers<std::uint8_t>(rows, 1, round % 3 == 0 ? 2 : 20);
+    std::vector<std::int16_t> sums;
+    for (std::size_t i = 0; i < rows * dim; ++i) {
+      sums.push_back(static_cast<std::int16_t>(counts[i / dim] * random.integer(-limit, limit)));
+    }
+    const auto merges = appearance_merges(sums, counts, dim),
+               expected = plain_merges(sums, counts, dim);
+    CHECK(merges.size() == rows - 1);
+    for (std::size_t i = 0; i < std::min(merges.size(), expected.size()); ++i) {
+      CHECK(merges[i].cost == expected[i].cost);
+      CHECK(merges[i].into == expected[i].into && merges[i].source == expected[i].source);
+    }
+  }
+
+  // The largest sums there are: 600 full rows whose values are at the ends of their range.
+  const std::size_t rows = 600, dim = 2;
+  const std::vector<std::uint8_t> counts(rows, 255);
+  std::vector<std::int16_t> sums;
+  for (std::size_t i = 0; i < rows * dim; ++i) {
+    sums.push_back(static_cast<std::int16_t>(i / dim % 2 == 0 ? 255 * 127 : -255 * 127));
+  }
+  const auto merges = appearance_merges(sums, counts, dim);
+  for (std::size_t i = 0; i + 1 < merges.size(); ++i) CHECK(merges[i].cost == 0);
+  // Half of the rows at each end: 2 dimensions, 254 apart, n m / (n + m) = 300 * 255 / 2.
+  CHECK(merges.back().cost == 2.0 * 254 * 254 * (300 * 255 / 2));
+  CHECK(appearance_merges({}, {}, 3).empty());
+
+  // As many rows as there can be, which took minutes before neighbours were joined first.
+  const std::size_t most = 65536;
+  std::vector<std::int16_t> many(most);
+  for (std::size_t i = 0; i < most; ++i) many[i] = static_cast<std::int16_t>(i % 251);
+  const auto all = appearance_merges(many, std::vector<std::uint8_t>(most, 1), 1);
+  CHECK(all.size() == most - 1);
+  CHECK(all[0].into == 0 && all[0].source == 1 && all[0].cost == 0);
+  std::vector<bool> removed(most, false);
+  for (const auto& join : all) {
+    CHECK(join.into < join.source && !removed[join.into] && !removed[join.source]);
+    removed[join.source] = true;
+  }
+  return check::result();
+}
