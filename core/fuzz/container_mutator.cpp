@@ -6,8 +6,8 @@
 #include <random>
 #include <vector>
 
-#include "base/checked_numbers.h"
-#include "base/crc32.h"
+#include "base/checksums.h"
+#include "base/packed_numbers.h"
 #include "file/container.h"
 #include "file/sections.h"
 #include "protomark/protomark.h"

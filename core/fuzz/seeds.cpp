@@ -63,7 +63,7 @@ void write_journals(const fs::path& folder) {
     keep();
     map.remove(std::vector{map.ids()[1]});
     map.set_positions(std::vector{map.ids()[0]}, std::vector{Position{1, 2, 3}});
-    map.build_index(2);
+    map.build_index({2});
     map.commit();
     keep();
     map.drop_index();

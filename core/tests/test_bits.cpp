@@ -1,8 +1,7 @@
 // Packed numbers, whatever their width.
-#include "base/bits.h"
+#include "base/packed_numbers.h"
 
-#include "base/checked_numbers.h"
-#include "base/crc32.h"
+#include "base/checksums.h"
 #include "check.h"
 #include "random.h"
 

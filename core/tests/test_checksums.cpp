@@ -2,8 +2,7 @@
 #include <string>
 #include <vector>
 
-#include "base/crc32.h"
-#include "base/sha256.h"
+#include "base/checksums.h"
 #include "check.h"
 
 namespace {

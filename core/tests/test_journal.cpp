@@ -13,7 +13,7 @@
 #include "file/container.h"
 #include "file/journal_content.h"
 #include "journal_files.h"
-#include "map/learning_map_file.h"
+#include "map/map_state.h"
 
 using namespace protomark;
 using namespace protomark::test;
@@ -308,8 +308,8 @@ void thousands_of_appearances() {
   const Content file_bytes = read(path), journal_bytes = read(journal);
   const ContainerReader file(std::as_bytes(std::span(file_bytes)), "map");
   const JournalContent commits(std::as_bytes(std::span(journal_bytes)), "map.journal");
-  PrototypeStore store(12, 12);
-  read_learning_map(file, commits, *map.encoder(), store);
+  const auto state = read_map(file, commits);
+  const PrototypeStore& store = state->store;
   CHECK(store.landmark_count() == 3 && store.prototype_count() == 3 * (1 << 12));
   CHECK(store.steps() <= store.prototype_count());
   map.close();

@@ -4,7 +4,7 @@
 #include <cstring>
 #include <new>
 
-#include "base/crc32.h"
+#include "base/checksums.h"
 #include "file/container.h"
 #include "file/sections.h"
 #include "journal_files.h"

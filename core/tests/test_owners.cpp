@@ -1,5 +1,5 @@
 // The owners of rows in an index are checked as they are read: right answers, or an error.
-#include "base/checked_numbers.h"
+#include "base/packed_numbers.h"
 
 #include <unistd.h>
 

@@ -17,7 +17,7 @@ struct RowLandmarks {
   const std::uint32_t* of_row = nullptr;  // number of the landmark of each row
   // Number of rows of each landmark, at least 1; a landmark's rows follow each other.
   const std::uint8_t* rows_of = nullptr;
-  // As a sealed map with an index has them (core/src/base/checked_numbers.h).
+  // As a sealed map with an index has them (core/src/base/packed_numbers.h).
   const CheckedNumbers* order = nullptr;
   std::uint32_t end = UINT32_MAX;  // numbers from this on are of no landmark: rows are padding
 };

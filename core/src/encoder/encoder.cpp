@@ -8,8 +8,8 @@
 #include <stdexcept>
 #include <string_view>
 
+#include "base/checksums.h"
 #include "base/parallel.h"
-#include "base/sha256.h"
 #include "base/utf8.h"
 #include "encoder/layers.h"
 #include "file/journal.h"

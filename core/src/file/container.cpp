@@ -6,8 +6,7 @@
 #include <cstring>
 #include <stdexcept>
 
-#include "base/crc32.h"
-#include "base/sha256.h"
+#include "base/checksums.h"
 #include "protomark/types.h"
 
 namespace protomark {

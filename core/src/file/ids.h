@@ -7,7 +7,7 @@
 #include <utility>
 #include <vector>
 
-#include "base/bits.h"
+#include "base/packed_numbers.h"
 #include "base/rows.h"
 #include "file/container.h"
 

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <filesystem>
+#include <functional>
 #include <iterator>
 #include <memory>
 #include <mutex>
@@ -66,6 +67,15 @@ struct MapState {
   std::mutex recall_mutex;
   std::shared_ptr<const MeasuredRanks> recall_table;
 };
+
+// Reads a map file and the commits to it. Throws FileError.
+std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal);
+
+// Measures which part of queries the inverted lists of a store serve, by lists visited. value(v)
+// tells what is searched in place of a rounded prototype's number v, and search_two finds the two
+// nearest landmarks of queries in that.
+ProbeRanks measure_recall(const PrototypeStore& store, const std::function<int(std::int8_t)>& value,
+                          const SearchTwo& search_two);
 
 // A change of a map: while it is there no other one begins, and whatever reads the map for long
 // waits. Searches go on between its pieces.

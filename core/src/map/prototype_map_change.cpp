@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <cstring>
 #include <stdexcept>
 #include <string>
 #include <unordered_map>
@@ -29,8 +30,8 @@ void check_codes(Codes codes, std::size_t dim) {
     throw std::invalid_argument("codes have " + std::to_string(codes.columns) +
                                 " dimensions, the map has " + std::to_string(dim));
   }
-  const std::int8_t* end = codes.data + codes.rows * codes.columns;
-  if (std::find(codes.data, end, -128) != end) {
+  const std::size_t n = codes.rows * codes.columns;
+  if (n > 0 && std::memchr(codes.data, -128, n) != nullptr) {
     throw std::invalid_argument("codes must be -127 to 127, one is -128");
   }
 }
@@ -43,23 +44,18 @@ void check_new_ids(std::span<const std::int64_t> ids) {
 
 }  // namespace
 
-// Ids and codes are copied and checked once more: a caller that writes over them meanwhile must not
-// be able to break the map.
 void MapChange::add(std::span<const std::int64_t> ids, Codes codes, int threads) {
   PrototypeStore& store = state_->store;
-  const std::size_t size = std::min(codes.rows, kPiece);
-  std::vector<Row> row_space(size);
-  std::vector<std::int64_t> id_space(size);
-  std::vector<std::int8_t> code_space(size * codes.columns);
+  std::vector<std::int64_t> piece_ids;
+  std::vector<Row> rows;
   for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
     const std::size_t n = std::min(kPiece, codes.rows - begin);
-    std::copy_n(ids.begin() + static_cast<std::ptrdiff_t>(begin), n, id_space.begin());
-    std::copy_n(codes.row(begin), n * codes.columns, code_space.begin());
-    const auto piece_ids = std::span(id_space).first(n);
-    const Codes piece{code_space.data(), n, codes.columns};
+    const auto some = ids.subspan(begin, n);
+    const Codes piece{codes.row(begin), n, codes.columns};
+    // Copied and checked once more, as a caller may write over them meanwhile.
+    piece_ids.assign(some.begin(), some.end());
     check_new_ids(piece_ids);
-    check_codes(piece, store.dim());
-    const auto rows = std::span(row_space).first(n);
+    rows.resize(n);
     store.find_rows(piece_ids, piece, rows);
     std::size_t new_landmarks = 0, new_rows = 0;
     for (std::size_t i = 0; i < n; ++i) {
@@ -76,8 +72,8 @@ void MapChange::add(std::span<const std::int64_t> ids, Codes codes, int threads)
 
 void MapChange::set_metadata(Metadata metadata) {
   const auto lock = write();
-  if (auto& uncommitted = state_->store.uncommitted()) {
-    uncommitted->metadata |= metadata != state_->metadata;
+  if (state_->store.uncommitted) {
+    state_->store.uncommitted->metadata |= metadata != state_->metadata;
   }
   state_->metadata = std::move(metadata);
 }

@@ -51,10 +51,11 @@ void MapChange::set_centroids(Cells centroids, int threads, bool in_place) {
     store.rearrange(arrangement);
     return;
   }
-  PrototypeStore other = store.arranged(arrangement);
+  PrototypeStore other = store;
+  FairSharedMutex nobody_searches;
+  other.make_room_for(arrangement, nobody_searches);
+  other.rearrange(arrangement);
   const auto lock = write();
-  other.uncommitted() = std::move(store.uncommitted());
-  if (other.uncommitted()) other.uncommitted()->centroids = true;
   std::swap(store, other);  // what was there before is freed after the lock is released
 }
 
@@ -94,6 +95,34 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
   return matches;
 }
 
+// Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.
+ProbeRanks measure_recall(const PrototypeStore& store, const std::function<int(std::int8_t)>& value,
+                          const SearchTwo& search_two) {
+  const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
+  std::vector<std::int64_t> own;
+  for (const Row row : rows) own.push_back(store.id(store.owner(row)));
+  const std::vector<std::int8_t> codes = store.rounded(rows);
+  std::vector<std::int8_t> prototype(store.dim());
+  const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
+    std::uint32_t list = 0;
+    std::int32_t least = INT32_MAX;
+    for (const Row row : store.sorted_rows(store.at(id))) {
+      store.rounded(row, prototype.data());
+      std::int32_t distance = 0;
+      for (std::size_t d = 0; d < prototype.size(); ++d) {
+        const int difference = query[d] - value(prototype[d]);
+        distance += difference * difference;
+      }
+      if (distance >= least) continue;
+      least = distance;
+      list = store.lists().cell_of(row.value);
+    }
+    return list;
+  };
+  return measure_ranks({codes.data(), rows.size(), store.dim()}, own, store.centroids().centroids(),
+                       search_two, list_of);
+}
+
 std::shared_ptr<const MeasuredRanks> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
                                                       double recall, int threads) {
   for (bool tried = false;; tried = true) {
@@ -127,35 +156,14 @@ void MapState::measure(int threads, bool wait) {
     return;
   }
   if (store.centroids().size() == 0 || (recall_table && !is_stale(*recall_table))) return;
-  const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
-  std::vector<std::int64_t> own;
-  for (const Row row : rows) own.push_back(store.id(store.owner(row)));
-  const std::vector<std::int8_t> codes = store.rounded(rows);
-  const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids,
-                              MatrixView<float> distances) {
-    SearchOptions options;
-    options.threads = threads;
-    protomark::search(store.view(), queries, options, ids, distances);
-  };
-  std::vector<std::int8_t> prototype(store.dim());
-  const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
-    std::uint32_t list = 0;
-    std::int32_t least = INT32_MAX;
-    for (const Row row : store.rows(store.at(id))) {
-      store.rounded(row, prototype.data());
-      std::int32_t distance = 0;
-      for (std::size_t d = 0; d < prototype.size(); ++d) {
-        distance += (query[d] - prototype[d]) * (query[d] - prototype[d]);
-      }
-      if (distance >= least) continue;
-      least = distance;
-      list = store.lists().cell_of(row.value);
-    }
-    return list;
-  };
   auto measured = std::make_shared<MeasuredRanks>();
-  measured->ranks = measure_ranks({codes.data(), rows.size(), store.dim()}, own,
-                                  store.centroids().centroids(), search_two, list_of);
+  measured->ranks = measure_recall(
+      store, [](std::int8_t code) { return int{code}; },
+      [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+        SearchOptions options;
+        options.threads = threads;
+        protomark::search(store.view(), queries, options, ids, distances);
+      });
   measured->cells_version = store.centroids_version();
   measured->changes = store.changes();
   const std::scoped_lock writing(recall_mutex);

@@ -1,7 +1,10 @@
 // Seals a learning map. Sections come into being while they are written, so that this takes little
 // memory beside the map.
 #include <algorithm>
-#include <functional>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <numeric>
 #include <optional>
 #include <span>
 #include <stdexcept>
@@ -9,118 +12,304 @@
 #include <utility>
 #include <vector>
 
+#include "base/packed_numbers.h"
+#include "base/sq4.h"
 #include "file/ids.h"
 #include "file/sections.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
 #include "map/positions.h"
-#include "map/sealed_recall.h"
+#include "map/sealed_store.h"
+#include "search/top_k.h"
 
 namespace protomark {
 namespace {
 
-using Sinks = std::span<const ContainerWriter::Sink>;
-using Landmarks = std::span<const LandmarkIndex>;
+using Sink = ContainerWriter::Sink;
+using Sinks = std::span<const Sink>;
 
-Histogram histogram_of(const SealedRows& rows) {
-  Histogram result{};
-  std::vector<std::int8_t> code(rows.dim());
-  rows.each_row([&](Row row) {
-    rows.code(row, code.data());
-    for (const std::int8_t value : code) ++result[static_cast<std::size_t>(value + 128)];
+// Packs blocks of kPackedRows rows as PackedPrototypes has them, or with a scale as
+// PackedPrototypes4.
+class BlockPacker {
+ public:
+  // A scale of 0 means 8 bits per number.
+  BlockPacker(const PrototypeStore& store, int scale) : store_(&store), scale_(scale) {
+    for (int v = -128; v < 128 && scale_ != 0; ++v) {
+      quantized_[static_cast<std::size_t>(v + 128)] = sq4_quantize(v, scale_);
+    }
+  }
+
+  int scale() const { return scale_; }
+  // Bytes per block.
+  std::size_t size() const {
+    return scale_ == 0 ? packed_size(kPackedRows, store_->dim())
+                       : packed4_size(kPackedRows, store_->dim());
+  }
+  // What remains of a number.
+  int value(std::int8_t code) const { return scale_ == 0 ? code : sq4_level(u(code), scale_); }
+
+  // `rows` are kPackedRows rows, kNoRow for padding.
+  void pack(const Row* rows, std::uint8_t* to) const {
+    const std::size_t dim = store_->dim();
+    std::array<std::int8_t, 256> code;
+    std::fill_n(to, size(), std::uint8_t{0});
+    for (std::size_t i = 0; i < kPackedRows; ++i) {
+      if (rows[i] == kNoRow) continue;
+      store_->rounded(rows[i], code.data());
+      for (std::size_t d = 0; d < dim && scale_ == 0; d += 4) {
+        std::memcpy(to + packed_index(i, d, dim), &code[d], std::min<std::size_t>(4, dim - d));
+      }
+      for (std::size_t d = 0; d < dim && scale_ != 0; ++d) {
+        std::uint8_t& byte = to[packed4_index(i, d, dim)];
+        byte |= static_cast<std::uint8_t>(packed4_high(d) ? u(code[d]) << 4 : u(code[d]));
+      }
+    }
+  }
+
+ private:
+  std::uint8_t u(std::int8_t code) const {
+    return quantized_[static_cast<std::size_t>(code + 128)];
+  }
+
+  const PrototypeStore* store_;
+  int scale_;
+  std::array<std::uint8_t, 256> quantized_{};
+};
+
+// Tells which landmark of a sealed map, by id, is which of the store, in little more than a byte
+// per landmark: the id tells which block of 256 a landmark is in.
+class SealedLandmarks {
+ public:
+  explicit SealedLandmarks(const PrototypeStore& store)
+      : store_(&store), in_block_(store.ids().size()) {}
+
+  // Takes all landmarks by ascending id.
+  void add(LandmarkIndex landmark) {
+    if (added_ % kBlock == 0) first_ids_.push_back(store_->id(landmark));
+    in_block_[landmark.value] = static_cast<std::uint8_t>(added_++ % kBlock);
+  }
+
+  std::size_t operator[](LandmarkIndex landmark) const {
+    const auto next = std::ranges::upper_bound(first_ids_, store_->id(landmark));
+    const auto block = static_cast<std::size_t>(next - first_ids_.begin()) - 1;
+    return block * kBlock + in_block_[landmark.value];
+  }
+
+ private:
+  static constexpr std::size_t kBlock = 256;
+
+  const PrototypeStore* store_;
+  std::vector<std::uint8_t> in_block_;  // where a landmark is in its block
+  std::vector<std::int64_t> first_ids_;
+  std::size_t added_ = 0;
+};
+
+// Writes rows list after list, each list from a new block on, and their owners if there is a sink
+// for these.
+class RowWriter {
+ public:
+  RowWriter(const BlockPacker& packer, const Sink& prototypes)
+      : packer_(packer), prototypes_(prototypes) {}
+  // `padding` is the owner of padding, and owners have so many bits.
+  RowWriter(const BlockPacker& packer, const Sink& prototypes, const Sink& owners, int bits,
+            std::size_t padding)
+      : packer_(packer),
+        prototypes_(prototypes),
+        owners_(&owners),
+        bits_(bits),
+        padding_(padding) {}
+
+  void add(Row row, std::size_t owner = 0) {
+    block_[filled_++] = row;
+    if (owners_ != nullptr) packed_owners_.add(owner, bits_);
+    if (filled_ == kPackedRows) end_block();
+  }
+  void end_list() {
+    while (filled_ != 0) add(kNoRow, padding_);
+  }
+  // Returns the checksums of owners.
+  std::vector<std::uint32_t> finish() {
+    packed_owners_.align();
+    flush();
+    return checksums_.all();
+  }
+
+ private:
+  static constexpr std::size_t kPiece = 1 << 16;  // bytes
+
+  void end_block() {
+    packed_.resize(packed_.size() + packer_.size());
+    packer_.pack(block_.data(), packed_.data() + packed_.size() - packer_.size());
+    filled_ = 0;
+    if (packed_.size() >= kPiece) flush();
+  }
+  void flush() {
+    prototypes_(std::as_bytes(std::span(packed_)));
+    packed_.clear();
+    if (owners_ == nullptr) return;
+    checksums_.add(packed_owners_.words());
+    (*owners_)(std::as_bytes(std::span(packed_owners_.words())));
+    packed_owners_.words().clear();
+  }
+
+  const BlockPacker& packer_;
+  const Sink& prototypes_;
+  const Sink* owners_ = nullptr;
+  int bits_ = 0;
+  std::size_t padding_ = 0;
+  std::array<Row, kPackedRows> block_{};
+  std::size_t filled_ = 0;
+  std::vector<std::uint8_t> packed_;
+  BitPacker packed_owners_;
+  BlockChecksums checksums_;
+};
+
+// Finds the two nearest landmarks of each query among prototypes as they are sealed, which are
+// packed piece by piece.
+void search_two(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
+                MatrixView<std::int64_t> ids) {
+  // As much memory as is little beside the map.
+  const std::size_t size =
+      std::max<std::size_t>(1 << 12, store.prototype_count() / 32 / kPackedRows * kPackedRows);
+  LargeVector<std::uint8_t> packed(size / kPackedRows * packer.size());
+  std::vector<Row> piece;
+  std::vector<std::int64_t> owners;
+  std::vector<std::uint32_t> own_index(size);  // several rows may have the same id
+  std::iota(own_index.begin(), own_index.end(), 0u);
+  Matrix<std::int64_t> found(queries.rows, 2);
+  Matrix<float> distances(queries.rows, 2);
+  std::vector<std::int32_t> best_distances(2 * queries.rows);
+  std::vector<TopK> best;
+  for (std::size_t q = 0; q < queries.rows; ++q) {
+    best.emplace_back(ids.row(q), &best_distances[2 * q], 2, INT32_MAX - 1);
+  }
+  const auto search_piece = [&] {
+    const std::size_t n = piece.size();
+    if (n == 0) return;
+    piece.resize((n + kPackedRows - 1) / kPackedRows * kPackedRows, kNoRow);
+    for (std::size_t begin = 0; begin < n; begin += kPackedRows) {
+      packer.pack(&piece[begin], &packed[begin / kPackedRows * packer.size()]);
+    }
+    RowLandmarks landmarks;
+    landmarks.of_row = own_index.data();
+    if (packer.scale() == 0) {
+      const auto* codes = reinterpret_cast<const std::int8_t*>(packed.data());
+      search(PackedPrototypes{codes, n, store.dim(), owners.data(), landmarks}, queries, {},
+             found.view(), distances.view());
+    } else {
+      search(PackedPrototypes4{packed.data(), n, store.dim(), packer.scale(), owners.data(),
+                               landmarks},
+             queries, {}, found.view(), distances.view());
+    }
+    for (std::size_t i = 0; i < found.data.size(); ++i) {
+      if (found.data[i] < 0) continue;
+      const float distance = distances.data[i];
+      best[i / 2].offer_distinct(static_cast<std::int32_t>(std::lround(distance * distance)),
+                                 found.data[i]);
+    }
+    piece.clear();
+    owners.clear();
+  };
+  store.each_row([&](Row row) {
+    piece.push_back(row);
+    owners.push_back(store.id(store.owner(row)));
+    if (piece.size() == size) search_piece();
   });
-  return result;
+  search_piece();
 }
 
 // The sections that have something per landmark or row. They come into being in one pass over
 // landmarks by id and, with an index, another one over its lists.
 class SealedContent {
  public:
-  SealedContent(const SealedRows& rows, const BlockPacker& packer,
+  // `store` has the prototypes, `map` everything else.
+  SealedContent(const PrototypeStore& store, const PrototypeStore& map, const BlockPacker& packer,
                 const std::optional<PositionCodec>& codec)
-      : rows_(rows),
-        store_(rows.store()),
+      : store_(store),
+        map_(map),
         packer_(packer),
         codec_(codec),
-        owners_(store_.landmark_count()) {
-    const auto& ids = store_.ids();
-    const std::int64_t largest = ids.empty() ? -1 : *std::ranges::max_element(ids);
-    ids_are_stored_ = !ids_are_indices(store_.landmark_count(), largest);
-    if (!indexed()) return;
-    tests_.emplace(rows);
-    if (ids_are_stored_) landmarks_.emplace(store_);
+        owner_bits_(owner_bits(map.landmark_count())) {
+    std::int64_t largest = -1;
+    for (const std::int64_t id : store.ids()) largest = std::max(largest, id);
+    ids_are_stored_ = !ids_are_indices(store.landmark_count(), largest);
   }
 
   // Adds the sections to a file that is written as long as this is there.
   void add_to(ContainerWriter& file) {
-    const std::size_t n = store_.landmark_count(), row_end = RowWriter::row_end(rows_);
+    const std::size_t n = store_.landmark_count(), nlist = store_.centroids().size();
     const ContainerWriter::Part prototypes{section::kPrototypes,
-                                           row_end / kPackedRows * packer_.size()};
+                                           store_.lists().blocks() * packer_.size()};
     std::vector<ContainerWriter::Part> parts{{section::kCounts, n}};
-    if (rows_.several()) parts.push_back({section::kRows, n});
+    if (has_row_counts()) parts.push_back({section::kRows, n});
     if (codec_) parts.push_back({section::kPositions, n * codec_->size()});
-    if (!indexed()) parts.push_back(prototypes);
+    if (nlist == 0) parts.push_back(prototypes);
     if (ids_are_stored_) {
       parts.push_back({section::kIdBlocks, IdBlockWriter::blocks_size(n)});
       parts.push_back({section::kIdGaps, ContainerWriter::kUnknownSize});
     }
     file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
-    if (!indexed()) return;
-    const std::size_t words = owners_.words(row_end);
+    if (nlist == 0) return;
+    const std::size_t words = packed_words(store_.row_end(), owner_bits_);
     file.add_together({prototypes, {section::kOwners, words * sizeof(std::uint64_t)}},
                       [this](Sinks sinks) { put_lists(sinks); });
     file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(std::uint32_t),
-             [this](const auto& sink) { sink(std::as_bytes(std::span(owners_.checksums()))); });
-    const std::size_t nlist = store_.centroids().size();
+             [this](const Sink& sink) { sink(std::as_bytes(std::span(owner_checksums_))); });
     file.add(section::kCentroids, std::as_bytes(std::span(store_.centroids().centroids())));
-    file.add(section::kListRows, nlist * sizeof(std::uint32_t), [this, nlist](const auto& sink) {
+    file.add(section::kListRows, nlist * sizeof(std::uint32_t), [this, nlist](const Sink& sink) {
       put_values<std::uint32_t>(sink, nlist, 1, [&](std::size_t list, std::uint32_t* to) {
-        *to = static_cast<std::uint32_t>(rows_.rows_in(static_cast<std::uint32_t>(list)));
+        *to = static_cast<std::uint32_t>(store_.lists().rows(static_cast<std::uint32_t>(list)));
       });
     });
-    file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const auto& sink) {
-      const ProbeRanks table = measure_sealed(rows_, packer_, *tests_);
+    file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
+      const ProbeRanks table = measure_recall(
+          store_, [this](std::int8_t code) { return packer_.value(code); },
+          [this](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float>) {
+            search_two(store_, packer_, queries, ids);
+          });
       sink(std::as_bytes(std::span(table)));
     });
   }
 
  private:
-  bool indexed() const { return store_.centroids().size() != 0; }
-
-  LandmarkIndex sealed(LandmarkIndex landmark) const {
-    return landmarks_ ? (*landmarks_)[landmark]
-                      : LandmarkIndex{static_cast<std::uint32_t>(store_.id(landmark))};
-  }
+  bool has_row_counts() const { return store_.prototype_count() != store_.landmark_count(); }
 
   void put_landmarks(Sinks sinks) {
     auto sink = sinks.begin();
-    const auto& counts = *sink++;
-    const auto* row_counts = rows_.several() ? &*sink++ : nullptr;
-    const auto* positions = codec_ ? &*sink++ : nullptr;
+    const Sink& counts = *sink++;
+    const Sink* row_counts = has_row_counts() ? &*sink++ : nullptr;
+    const Sink* positions = codec_ ? &*sink++ : nullptr;
     std::optional<RowWriter> prototypes;
-    if (!indexed()) prototypes.emplace(packer_, *sink++);
+    if (store_.centroids().size() == 0) prototypes.emplace(packer_, *sink++);
     std::optional<IdBlockWriter> ids;
     if (ids_are_stored_) ids.emplace(sink[0], sink[1]);
-    store_.visit_sorted_landmarks([&](Landmarks landmarks) {
+    if (!prototypes && ids_are_stored_) landmarks_.emplace(store_);
+    store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
+      const auto own = [&](LandmarkIndex l) {
+        return &store_ == &map_ ? l : map_.at(store_.id(l));
+      };
       put_each<std::uint8_t>(counts, landmarks, [&](LandmarkIndex l) {
-        return static_cast<std::uint8_t>(std::min(store_.observations(l), 255u));
+        return static_cast<std::uint8_t>(std::min(map_.observations(own(l)), 255u));
       });
       if (row_counts != nullptr) {
         put_each<std::uint8_t>(*row_counts, landmarks, [&](LandmarkIndex l) {
-          return static_cast<std::uint8_t>(rows_.row_count(l));
+          return static_cast<std::uint8_t>(store_.row_count(l));
         });
       }
       if (positions != nullptr) {
         put_values<std::byte>(*positions, landmarks.size(), codec_->size(), [&](auto i, auto* to) {
-          codec_->encode(store_.position(landmarks[i]), to);
+          codec_->encode(map_.position(own(landmarks[i])), to);
         });
       }
       for (const LandmarkIndex landmark : landmarks) {
         if (ids) ids->add(store_.id(landmark));
         if (landmarks_) landmarks_->add(landmark);
-        if (tests_) tests_->add(landmark);
         if (!prototypes) continue;
-        rows_.each_sorted_row(landmark, [&](Row row) { prototypes->add(row); });
+        if (!store_.several()) {
+          prototypes->add(store_.first_row(landmark));
+        } else {
+          for (const Row row : store_.sorted_rows(landmark)) prototypes->add(row);
+        }
       }
     });
     if (ids) ids->finish();
@@ -130,30 +319,28 @@ class SealedContent {
   }
 
   void put_lists(Sinks sinks) {
-    RowWriter prototypes(packer_, sinks[0]);
+    RowWriter writer(packer_, sinks[0], sinks[1], owner_bits_, store_.landmark_count());
     for (std::uint32_t list = 0; list < store_.centroids().size(); ++list) {
-      rows_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
+      store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
         for (const Row row : rows) {
-          prototypes.add(row);
-          owners_.add(sealed(rows_.owner(row)), sinks[1]);
+          const LandmarkIndex owner = store_.owner(row);
+          writer.add(
+              row, landmarks_ ? (*landmarks_)[owner] : static_cast<std::size_t>(store_.id(owner)));
         }
       });
-      prototypes.end_list();
-      owners_.end_list(sinks[1]);
+      writer.end_list();
     }
-    prototypes.finish();
-    owners_.finish(sinks[1]);
+    owner_checksums_ = writer.finish();
     landmarks_.reset();  // its memory is wanted for the test queries
   }
 
-  const SealedRows& rows_;
-  const PrototypeStore& store_;
+  const PrototypeStore &store_, &map_;
   const BlockPacker& packer_;
   const std::optional<PositionCodec>& codec_;
-  OwnerWriter owners_;
+  int owner_bits_;
   bool ids_are_stored_;
-  std::optional<TestQueries> tests_;          // with an index
   std::optional<SealedLandmarks> landmarks_;  // with an index, if ids are stored
+  std::vector<std::uint32_t> owner_checksums_;
 };
 
 }  // namespace
@@ -164,24 +351,34 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
                                 std::to_string(options.position_bits));
   }
   const std::shared_lock lock(state_->changing);
-  const PrototypeStore& store = state_->store;
-  const SealFormat format = seal_format(store, options.bytes_per_landmark);
-  const SealedRows rows(store, format.row_limit);
+  const PrototypeStore& map = state_->store;
+  const SealFormat format = seal_format(map, options.bytes_per_landmark);
+  const auto merged = merge_appearances(map, format.row_limit);
+  const PrototypeStore& store = merged ? *merged : map;
   PositionBox box;
-  for (const Position& position : store.positions()) box.add(position);
+  for (const Position& position : map.positions()) box.add(position);
   std::optional<PositionCodec> codec;
   if (box.positions != 0) codec.emplace(box, options.position_bits);
-  const int scale = format.bits == 4 ? sq4_best_scale(histogram_of(rows)) : 0;
-  const BlockPacker packer(rows, scale);
+  int scale = 0;
+  if (format.bits == 4) {
+    Histogram histogram{};
+    std::vector<std::int8_t> code(dim());
+    store.each_row([&](Row row) {
+      store.rounded(row, code.data());
+      for (const std::int8_t value : code) ++histogram[static_cast<std::size_t>(value + 128)];
+    });
+    scale = sq4_best_scale(histogram);
+  }
 
   ContainerWriter file(FileKind::sealed_map);
   file.add(section::kEncoder, encoder()->serialize());
   add_value(file, section::kShape,
-            MapShape{store.landmark_count(), dim(), codec ? codec->origin() : Position{}});
+            MapShape{map.landmark_count(), dim(), codec ? codec->origin() : Position{}});
   add_metadata(file, state_->metadata);
   if (scale != 0) add_value(file, section::kScale, static_cast<std::uint32_t>(scale));
   if (codec && codec->bits() == 16) add_value(file, section::kSteps, codec->step());
-  SealedContent content(rows, packer, codec);
+  const BlockPacker packer(store, scale);
+  SealedContent content(store, map, packer, codec);
   content.add_to(file);
   write_guarded(file, path);
 }

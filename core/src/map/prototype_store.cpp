@@ -11,16 +11,6 @@
 namespace protomark {
 namespace {
 
-// Replaces an array by one of more capacity; only the swap excludes searches.
-template <typename Vector>
-void enlarge(Vector& v, std::size_t capacity, FairSharedMutex& searching) {
-  Vector larger;
-  larger.reserve(capacity);
-  larger.assign(v.begin(), v.end());
-  const std::unique_lock lock(searching);
-  v.swap(larger);
-}
-
 constexpr Row row_at(std::size_t i) { return Row{static_cast<std::uint32_t>(i)}; }
 
 }  // namespace
@@ -38,7 +28,8 @@ std::uint16_t PrototypeStore::appearance_of(const std::int8_t* code) const {
 void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
   // And the block that take_row wants to be free.
   const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows + 1;
-  for_each_array(landmarks, blocks * kPackedRows, [](auto& v, std::size_t n) { v.reserve(n); });
+  for_each_array(landmarks, blocks * kPackedRows,
+                 [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
   lists_.reserve(blocks);
 }
 
@@ -47,7 +38,7 @@ void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::siz
   // New rows begin in the first list, and each that moves on may be the first of a block.
   const std::size_t moving = centroids_.size() == 0 ? 0 : std::min(changed, centroids_.size());
   const std::size_t blocks = 2 * ((rows + kPackedRows - 1) / kPackedRows) + moving;
-  for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more) {
+  for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more, const auto&) {
     if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), searching);
   });
   if (!index_.has_room(landmarks)) {
@@ -55,12 +46,6 @@ void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::siz
     const std::unique_lock lock(searching);
     std::swap(index_, larger);
   }
-}
-
-void PrototypeStore::make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
-  for_each_array(0, arrangement.row_end(), [&](auto& v, std::size_t n) {
-    if (v.capacity() < n) enlarge(v, n, searching);
-  });
 }
 
 void PrototypeStore::make_room_for_positions(FairSharedMutex& searching) {
@@ -100,7 +85,8 @@ Row PrototypeStore::take_row(std::uint32_t list) {
     throw std::length_error("a map holds under 2^32 prototypes");
   }
   lists_.make_room();
-  for_each_array(0, kPackedRows, [](auto& v, std::size_t more) { make_room_in(v, more); });
+  for_each_array(0, kPackedRows,
+                 [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
   const Row row{lists_.append(list)};
   if (row_end() != counts_.size()) resize(row_end());
   ++prototype_count_;
@@ -112,39 +98,30 @@ Row PrototypeStore::take_row(std::uint32_t list) {
 }
 
 void PrototypeStore::resize(std::size_t rows) {
-  sums_.resize(rows * dim_, 0);
-  counts_.resize(rows, 0);
-  packed_.resize(packed_size(rows, dim_) / sizeof(CodeVector));
-  RowTable::resize(rows);
+  for_each_array(ids_.size(), rows,
+                 [](auto& v, std::size_t n, const auto& padding) { v.resize(n, padding); });
 }
 
-void PrototypeStore::read(Row row, Record& record) const {
-  std::copy_n(sum(row), dim_, record.sum.data());
-  record.count = counts_[row.value];
-  for (std::size_t d = 0; d < dim_; d += 4) {
-    std::memcpy(&record.rounded[d], packed() + packed_index(row.value, d, dim_), 4);
-  }
-  RowTable::read(row, record.entry);
-}
-
-void PrototypeStore::write(Row row, const Record& record) {
-  std::copy_n(record.sum.data(), dim_, sum(row));
-  counts_[row.value] = record.count;
-  for (std::size_t d = 0; d < dim_; d += 4) {
-    std::memcpy(packed() + packed_index(row.value, d, dim_), &record.rounded[d], 4);
-  }
-  RowTable::write(row, record.entry);
-}
-
-// Moves a row to where padding is, and leaves padding.
-void PrototypeStore::relocate(Row from, Row to) {
-  std::copy_n(sum(from), dim_, sum(to));
-  counts_[to.value] = counts_[from.value];
+void PrototypeStore::copy_row(Row from, Row to) {
+  for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
+    std::copy_n(v.data() + from.value * width, width, v.data() + to.value * width);
+  });
   for (std::size_t d = 0; d < dim_; d += 4) {
     std::memcpy(packed() + packed_index(to.value, d, dim_),
                 packed() + packed_index(from.value, d, dim_), 4);
   }
-  move_row(from, to);
+}
+
+void PrototypeStore::vacate(Row row) {
+  for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto& padding) {
+    std::fill_n(v.data() + row.value * width, width, padding);
+  });
+}
+
+void PrototypeStore::relocate(Row from, Row to) {
+  relink(from, to);
+  copy_row(from, to);
+  vacate(from);
 }
 
 // The last row of its list takes the place of a row that is gone. If that empties a block, the last
@@ -166,7 +143,7 @@ void PrototypeStore::close_gap(Row row) {
 }
 
 void PrototypeStore::erase_row(Row row) {
-  if (uncommitted_) uncommitted_->insert(id(owner(row)));
+  if (uncommitted) uncommitted->insert(id(owner(row)));
   remove_row(row);
   close_gap(row);
 }
@@ -260,7 +237,7 @@ std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const std::size_t> n) 
 
 void PrototypeStore::set_position(LandmarkIndex landmark, const Position& position) {
   RowTable::set_position(landmark, position);
-  if (uncommitted_) uncommitted_->insert(id(landmark));
+  if (uncommitted) uncommitted->insert(id(landmark));
 }
 
 PackedPrototypes PrototypeStore::view() const {

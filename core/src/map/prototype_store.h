@@ -1,23 +1,48 @@
 // What a learning map holds in memory: landmarks, and a row for each prototype.
 #pragma once
 
-#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <functional>
 #include <memory>
+#include <new>
 #include <span>
-#include <utility>
 #include <vector>
 
 #include "base/fair_shared_mutex.h"
-#include "base/large_vector.h"
 #include "map/row_table.h"
-#include "map/uncommitted.h"
 #include "search/cell_blocks.h"
 #include "search/ivf.h"
 
 namespace protomark {
+
+// What changed in a map since its last commit.
+class Uncommitted {
+ public:
+  bool empty() const { return !centroids && !metadata && ids_.empty() && !incomplete_; }
+  // Landmarks that came, changed or went, each once, in no order.
+  const LargeVector<std::int64_t>& ids() const { return ids_.ids(); }
+  // Whether memory ran out, so that some ids are missing.
+  bool incomplete() const { return incomplete_; }
+
+  // Never throws, so that no change is made and not noted.
+  void insert(std::int64_t id) noexcept try { ids_.insert(id); } catch (const std::bad_alloc&) {
+    incomplete_ = true;
+  }
+  void insert(const Uncommitted& other) noexcept {
+    for (const std::int64_t id : other.ids()) insert(id);
+    centroids |= other.centroids;
+    metadata |= other.metadata;
+    incomplete_ |= other.incomplete_;
+  }
+
+  bool centroids = false;
+  bool metadata = false;
+
+ private:
+  IdSet ids_;
+  bool incomplete_ = false;
+};
 
 // Rows stand in blocks by inverted list: all in one without an index, otherwise each in the list of
 // its rounded prototype. Padding fills the last block of a list.
@@ -27,9 +52,9 @@ class PrototypeStore : private RowTable {
       : RowTable(appearance_bits != 0), dim_(dim), appearance_bits_(appearance_bits) {}
 
   using RowTable::any_position, RowTable::appearance, RowTable::at, RowTable::find,
-      RowTable::find_row, RowTable::first_row, RowTable::id, RowTable::ids, RowTable::is_row,
-      RowTable::next_row, RowTable::owner, RowTable::position, RowTable::positions,
-      RowTable::row_count, RowTable::rows, RowTable::sorted_rows, RowTable::steps;
+      RowTable::find_row, RowTable::first_row, RowTable::id, RowTable::ids, RowTable::next_row,
+      RowTable::owner, RowTable::position, RowTable::positions, RowTable::row_count, RowTable::rows,
+      RowTable::sorted_rows, RowTable::steps;
 
   std::size_t dim() const { return dim_; }
   std::size_t appearance_bits() const { return appearance_bits_; }
@@ -73,6 +98,19 @@ class PrototypeStore : private RowTable {
   void rounded(Row row, std::int8_t* to) const;
   std::vector<std::int8_t> rounded(std::span<const Row> rows) const;
 
+  // Calls take(landmark) for all landmarks, or take(row) for all rows, in no order.
+  template <typename Take>
+  void each_landmark(const Take& take) const {
+    for (LandmarkIndex l{0}; l.value < ids_.size(); ++l.value) {
+      if (id(l) >= 0) take(l);
+    }
+  }
+  template <typename Take>
+  void each_row(const Take& take) const {
+    for (Row row{0}; row.value < row_end(); ++row.value) {
+      if (is_row(row)) take(row);
+    }
+  }
   // Hand over all landmarks by ascending id, or the rows of a list by id and then appearance, piece
   // by piece (sorted_pieces.h).
   using VisitLandmarks = std::function<void(std::span<const LandmarkIndex>)>;
@@ -105,14 +143,11 @@ class PrototypeStore : private RowTable {
     Cells centroids;
     CellBlocks lists;
     std::vector<Row> to;  // of each row; kNoRow for padding
-    std::size_t row_end() const { return lists.blocks() * kPackedRows; }
   };
   // By these centroids; none drop the index.
   Arrangement arrange(Cells centroids, int threads) const;
-  // Returns the same map so arranged; takes the arrangement's centroids.
-  PrototypeStore arranged(Arrangement& arrangement) const;
   // Arranges this map within its memory, for which make_room_for must have been called; uses up the
-  // arrangement.
+  // arrangement, and takes its centroids.
   void rearrange(Arrangement& arrangement) noexcept;
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching);
 
@@ -122,7 +157,7 @@ class PrototypeStore : private RowTable {
   std::size_t changes() const { return changes_; }
   // What to commit; nullptr as long as nobody does. Only whoever commits may take it, while no
   // change is going on.
-  std::unique_ptr<Uncommitted>& uncommitted() const { return uncommitted_; }
+  std::shared_ptr<Uncommitted> uncommitted;
 
   PackedPrototypes view() const;
 
@@ -132,18 +167,9 @@ class PrototypeStore : private RowTable {
     std::int64_t id;
     std::uint16_t appearance;
   };
-  // All that moves with a row.
-  struct Record {
-    std::array<std::int16_t, 256> sum;
-    std::array<std::int8_t, 256> rounded;
-    std::uint8_t count;
-    Entry entry;
-  };
 
   const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
   std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
-  void read(Row row, Record& record) const;
-  void write(Row row, const Record& record);
   // Inlined, as GCC drops calls of a function that does nothing but this.
   [[gnu::always_inline]] void prefetch_prototype(Row row) const {
     __builtin_prefetch(sum(row), 1);
@@ -155,19 +181,27 @@ class PrototypeStore : private RowTable {
   }
   void add(Row row, const std::int8_t* code);
   Row take_row(std::uint32_t list);
-  void check_room() const;
   void resize(std::size_t rows);
+  // Copies all that stands at a row, but not what leads to it.
+  void copy_row(Row from, Row to);
+  void vacate(Row row);
+  // Moves a row to where padding is, and leaves padding.
   void relocate(Row from, Row to);
   void close_gap(Row row);
-  void permute(std::vector<Row>& to);
-  void adopt(Arrangement& arrangement);
-  // As RowTable::for_each_array, with the arrays of this class.
+  void permute(std::vector<Row>& to, Row spare);
+
+  // As RowTable::for_each_array, with the arrays of this class, without and with the packed one,
+  // which holds whole blocks of rows.
+  template <typename Visit>
+  void for_each_plain_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
+    RowTable::for_each_array(landmarks, rows, visit);
+    visit(sums_, rows * dim_, std::int16_t{0});
+    visit(counts_, rows, std::uint8_t{0});
+  }
   template <typename Visit>
   void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
-    RowTable::for_each_array(landmarks, rows, visit);
-    visit(sums_, rows * dim_);
-    visit(counts_, rows);
-    visit(packed_, packed_size(rows, dim_) / sizeof(CodeVector));
+    for_each_plain_array(landmarks, rows, visit);
+    visit(packed_, packed_size(rows, dim_) / sizeof(CodeVector), CodeVector{});
   }
 
   std::size_t dim_;
@@ -184,7 +218,6 @@ class PrototypeStore : private RowTable {
   std::size_t centroids_version_ = 0;
   std::vector<Key> to_reassign_;
   std::size_t changes_ = 0;
-  mutable std::unique_ptr<Uncommitted> uncommitted_;
 };
 
 }  // namespace protomark

@@ -68,7 +68,10 @@ void PrototypeStore::add(Row row, const std::int8_t* code) {
     n /= 2;
     for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], n);
   }
-  for (std::size_t d = 0; d < dim_; ++d) s[d] = static_cast<std::int16_t>(s[d] + code[d]);
+  // A caller may write over codes that were checked: even then no sum is impossible.
+  for (std::size_t d = 0; d < dim_; ++d) {
+    s[d] = static_cast<std::int16_t>(s[d] + std::max<int>(code[d], -127));
+  }
   ++n;
 }
 
@@ -97,7 +100,7 @@ void PrototypeStore::refresh(Row row) {
     std::memcpy(at, &after, 4);
     differences |= before ^ after;
   }
-  if (uncommitted_) uncommitted_->insert(id(owner(row)));
+  if (uncommitted) uncommitted->insert(id(owner(row)));
   if (differences != 0 && centroids_.size() != 0) {
     to_reassign_.push_back({id(owner(row)), appearance(row)});
   }

@@ -56,9 +56,7 @@ PrototypeStore::Arrangement PrototypeStore::arrange(Cells centroids, int threads
   std::vector<std::size_t> counts(nlist);
   std::vector<Row> rows;
   rows.reserve(std::min(prototype_count_, kAssignChunk));
-  for (Row row{0}; row.value < row_end(); ++row.value) {
-    if (is_row(row)) rows.push_back(row);
-    if (rows.size() < kAssignChunk && row.value + 1 < row_end()) continue;
+  const auto assign = [&] {
     std::vector<std::uint32_t> lists(rows.size(), 0);
     if (centroids.size() != 0) {
       const std::vector<std::int8_t> codes = rounded(rows);
@@ -69,92 +67,83 @@ PrototypeStore::Arrangement PrototypeStore::arrange(Cells centroids, int threads
       ++counts[lists[i]];
     }
     rows.clear();
-  }
+  };
+  each_row([&](Row row) {
+    rows.push_back(row);
+    if (rows.size() == kAssignChunk) assign();
+  });
+  assign();
   Arrangement result{std::move(centroids), CellBlocks(nlist), std::move(to)};
   std::size_t blocks = 0;
   for (const std::size_t n : counts) blocks += (n + kPackedRows - 1) / kPackedRows;
   result.lists.reserve(blocks);
-  std::vector<Row> next(nlist);  // of each list
+  std::vector<std::uint32_t> next(nlist);  // row of each list
   for (std::uint32_t list = 0; list < nlist; ++list) {
-    next[list].value = static_cast<std::uint32_t>(result.row_end());
+    next[list] = static_cast<std::uint32_t>(result.lists.blocks() * kPackedRows);
     for (std::size_t i = 0; i < counts[list]; ++i) result.lists.append(list);
   }
   for (Row& row : result.to) {
-    if (row != kNoRow) row.value = next[row.value].value++;
+    if (row != kNoRow) row.value = next[row.value]++;
   }
   return result;
 }
 
-PrototypeStore PrototypeStore::arranged(Arrangement& arrangement) const {
-  const std::size_t rows = arrangement.row_end();
-  PrototypeStore result(dim_, appearance_bits_);
-  static_cast<RowTable&>(result) = with_rows(rows);
-  result.prototype_count_ = prototype_count_;
-  result.changes_ = changes_;
-  result.centroids_version_ = centroids_version_;
-  result.resize(rows);
-  Record record;
-  for (Row row{0}; row.value < row_end(); ++row.value) {
-    const Row to = arrangement.to[row.value];
-    if (to == kNoRow) continue;
-    read(row, record);
-    result.write(to, record);
-  }
-  result.renumber_rows(arrangement.to);
-  result.adopt(arrangement);
-  return result;
+void PrototypeStore::make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
+  // And the block in which rows stand while they move.
+  const std::size_t blocks = std::max(lists_.blocks(), arrangement.lists.blocks()) + 1;
+  for_each_array(0, blocks * kPackedRows, [&](auto& v, std::size_t n, const auto&) {
+    if (v.capacity() < n) enlarge(v, n, searching);
+  });
 }
 
 void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
   const CellBlocks& lists = arrangement.lists;
-  renumber_rows(arrangement.to);
-  resize(std::max(row_end(), arrangement.row_end()));
-  permute(arrangement.to);
+  const std::size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
+  relink(arrangement.to);
+  resize(end + kPackedRows);
+  permute(arrangement.to, Row{static_cast<std::uint32_t>(end)});
   for (std::uint32_t list = 0; list < lists.cells(); ++list) {
     if (lists.rows(list) == 0) continue;
     for (Row row{lists.last(list) + 1}; row.value % kPackedRows != 0; ++row.value) vacate(row);
   }
-  resize(arrangement.row_end());
-  adopt(arrangement);
+  std::swap(centroids_, arrangement.centroids);
+  std::swap(lists_, arrangement.lists);
+  resize(row_end());
+  ++centroids_version_;
+  changes_ += prototype_count_;
+  if (uncommitted) uncommitted->centroids = true;
 }
 
 // Moves every row to where it goes, and uses up `to`. A row that stands there goes on in its turn,
-// until one comes to padding. In a large map nearly all of this waits for memory, so that is
-// prefetched.
-void PrototypeStore::permute(std::vector<Row>& to) {
+// until one comes to padding; meanwhile rows stand at `spare` and the next row. In a large map
+// nearly all of this waits for memory, so that is prefetched.
+void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
   constexpr int kAhead = 8;
   // Where the row that stands here goes; kNoRow if none stands here that has yet to move.
   const auto next = [&](Row row) { return row.value < to.size() ? to[row.value] : kNoRow; };
-  Record records[2];
+  Row moving = spare, met{spare.value + 1};
   for (Row first{0}; first.value < to.size(); ++first.value) {
     if (to[first.value] == kNoRow || to[first.value] == first) continue;
-    Record *moving = &records[0], *met = &records[1];
-    read(first, *moving);
+    copy_row(first, moving);
     Row row = std::exchange(to[first.value], kNoRow), ahead = row;
     const auto look_ahead = [&] {
       if (ahead == kNoRow) return;
       prefetch_prototype(ahead);
-      RowTable::prefetch(ahead);
+      RowTable::for_each_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
+        __builtin_prefetch(v.data() + ahead.value * width, 1);
+      });
       ahead = next(ahead);
     };
     for (int i = 0; i < kAhead; ++i) look_ahead();
     while (next(row) != kNoRow) {
       look_ahead();
-      read(row, *met);
-      write(row, *moving);
+      copy_row(row, met);
+      copy_row(moving, row);
       std::swap(moving, met);
       row = std::exchange(to[row.value], kNoRow);
     }
-    write(row, *moving);
+    copy_row(moving, row);
   }
-}
-
-void PrototypeStore::adopt(Arrangement& arrangement) {
-  std::swap(centroids_, arrangement.centroids);
-  std::swap(lists_, arrangement.lists);
-  ++centroids_version_;
-  changes_ += prototype_count_;
-  if (uncommitted_) uncommitted_->centroids = true;
 }
 
 }  // namespace protomark

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 namespace protomark {
 
@@ -59,7 +60,7 @@ void RowTable::add_landmark(std::int64_t id, Row row, std::uint16_t appearance) 
     return;
   }
   const LandmarkIndex landmark{static_cast<std::uint32_t>(ids_.size())};
-  for_each_array(1, 0, [](auto& v, std::size_t more) { make_room_in(v, more); });
+  for_each_array(1, 0, [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
   ids_.push_back(id);
   try {
     index_.insert(ids_, landmark);
@@ -73,8 +74,9 @@ void RowTable::add_landmark(std::int64_t id, Row row, std::uint16_t appearance) 
 }
 
 void RowTable::add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance) {
-  write(row, {kNoPosition, -1, landmark, first_rows_[landmark.value], appearance});
-  first_rows_[landmark.value] = row;
+  appearances_[row.value] = appearance;
+  owners_[row.value] = landmark;
+  next_rows_[row.value] = std::exchange(first_rows_[landmark.value], row);
 }
 
 // What leads to a row: the landmark's first row, or the next row of another one.
@@ -110,26 +112,20 @@ void RowTable::remove_landmark(LandmarkIndex landmark) {
   first_rows_.pop_back();
 }
 
-void RowTable::move_row(Row from, Row to) {
+void RowTable::relink(Row from, Row to) {
   if (several_) {
     link_to(from) = to;
   } else {
     index_.move(ids_, ids_[from.value], LandmarkIndex{to.value});
   }
-  Entry entry;
-  read(from, entry);
-  write(to, entry);
-  vacate(from);
 }
 
-void RowTable::resize(std::size_t rows) {
-  if (several_) {
-    appearances_.resize(rows, 0);
-    owners_.resize(rows, kNoLandmark);
-    next_rows_.resize(rows, kNoRow);
-  } else {
-    ids_.resize(rows, -1);
-    if (!positions_.empty()) positions_.resize(rows, kNoPosition);
+void RowTable::relink(std::span<const Row> to) {
+  if (!several_) return index_.renumber(to);
+  for (auto* links : {&first_rows_, &next_rows_}) {
+    for (Row& row : *links) {
+      if (row != kNoRow) row = to[row.value];
+    }
   }
 }
 
@@ -140,62 +136,6 @@ void RowTable::set_position(LandmarkIndex landmark, const Position& position) {
   }
   // One NaN for all, so that equal maps give equal files.
   positions_[landmark.value] = has_position(position) ? position : kNoPosition;
-}
-
-void RowTable::read(Row row, Entry& entry) const {
-  if (several_) {
-    entry.owner = owners_[row.value];
-    entry.next = next_rows_[row.value];
-    entry.appearance = appearances_[row.value];
-  } else {
-    entry.id = ids_[row.value];
-    if (!positions_.empty()) entry.position = positions_[row.value];
-  }
-}
-
-void RowTable::write(Row row, const Entry& entry) {
-  if (several_) {
-    owners_[row.value] = entry.owner;
-    next_rows_[row.value] = entry.next;
-    appearances_[row.value] = entry.appearance;
-  } else {
-    ids_[row.value] = entry.id;
-    if (!positions_.empty()) positions_[row.value] = entry.position;
-  }
-}
-
-void RowTable::prefetch(Row row) const {
-  if (several_) {
-    __builtin_prefetch(&owners_[row.value], 1);
-    __builtin_prefetch(&next_rows_[row.value], 1);
-    __builtin_prefetch(&appearances_[row.value], 1);
-  } else {
-    __builtin_prefetch(&ids_[row.value], 1);
-    if (!positions_.empty()) __builtin_prefetch(&positions_[row.value], 1);
-  }
-}
-
-void RowTable::renumber_rows(std::span<const Row> to) {
-  if (!several_) return index_.renumber(to);
-  for (auto* links : {&first_rows_, &next_rows_}) {
-    for (Row& row : *links) {
-      if (row != kNoRow) row = to[row.value];
-    }
-  }
-}
-
-RowTable RowTable::with_rows(std::size_t rows) const {
-  RowTable result(several_);
-  result.index_ = index_;
-  if (several_) {
-    result.ids_ = ids_;
-    result.positions_ = positions_;
-    result.first_rows_ = first_rows_;
-  } else if (!positions_.empty()) {
-    result.positions_.assign(rows, kNoPosition);
-  }
-  result.resize(rows);
-  return result;
 }
 
 }  // namespace protomark

@@ -1,13 +1,16 @@
 // Which rows a landmark of a learning map has, and which landmark a row belongs to.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <iterator>
 #include <limits>
+#include <mutex>
 #include <span>
 #include <vector>
 
+#include "base/fair_shared_mutex.h"
 #include "base/id_index.h"
 #include "base/large_vector.h"
 #include "base/rows.h"
@@ -86,59 +89,40 @@ class RowTable {
   std::size_t steps() const { return steps_; }
 
  protected:
-  // What moves with a row: `id` and `position`, or `owner`, `next` and `appearance`.
-  struct Entry {
-    Position position = kNoPosition;
-    std::int64_t id = -1;
-    LandmarkIndex owner = kNoLandmark;
-    Row next = kNoRow;
-    std::uint16_t appearance = 0;
-  };
-
-  // Makes a padding row the only one of a new landmark. If memory runs out nothing has changed, but
-  // that the row must be vacated.
+  // Makes a padding row the only one of a new landmark. If memory runs out nothing has changed but
+  // that row, which must be made padding again.
   void add_landmark(std::int64_t id, Row row, std::uint16_t appearance);
   // Makes a padding row another one of a landmark.
   void add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance);
-  // Takes a row away from its landmark, which goes with its last row. The row must be vacated then.
+  // Takes a row away from its landmark, which goes with its last row.
   void remove_row(Row row);
-  // Moves a row to where padding is, and leaves padding.
-  void move_row(Row from, Row to);
-  // Makes a row padding.
-  void vacate(Row row) { write(row, {}); }
-  void resize(std::size_t rows);
+  // Makes what leads to one row lead to another, or all that leads to rows lead to to[row].
+  void relink(Row from, Row to);
+  void relink(std::span<const Row> to);
   void set_position(LandmarkIndex landmark, const Position& position);
-
-  // Reads or writes what stands at a row; what leads to it stays as it is.
-  void read(Row row, Entry& entry) const;
-  void write(Row row, const Entry& entry);
-  void prefetch(Row row) const;
-  // Makes all that leads to a row lead to to[row].
-  void renumber_rows(std::span<const Row> to);
-  // A table of as many rows as yet to be written, which leads to the rows of this one.
-  RowTable with_rows(std::size_t rows) const;
 
   // Bytes per row, as in a file: positions count if any landmark has one.
   std::size_t row_bytes() const;
-  // Calls visit(array, size) for each array with the size that so many landmarks and rows take.
+  // Calls visit(array, size, padding) for each array, with the size that so many landmarks and rows
+  // take and what it holds for padding.
   template <typename Visit>
   void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
     if (!several_) landmarks = rows;
-    visit(ids_, landmarks);
-    if (!positions_.empty()) visit(positions_, landmarks);
+    visit(ids_, landmarks, std::int64_t{-1});
+    if (!positions_.empty()) visit(positions_, landmarks, kNoPosition);
     if (!several_) return;
-    visit(first_rows_, landmarks);
-    visit(appearances_, rows);
-    visit(owners_, rows);
-    visit(next_rows_, rows);
+    visit(first_rows_, landmarks, kNoRow);
+    visit(appearances_, rows, std::uint16_t{0});
+    visit(owners_, rows, kNoLandmark);
+    visit(next_rows_, rows, kNoRow);
   }
 
   bool several_;
-  // By landmark.
+  // By landmark; first rows only with several per landmark.
   LargeVector<std::int64_t> ids_;
   std::vector<Position> positions_;
-  std::vector<Row> first_rows_;  // only with several rows per landmark
-  // By row, only with several rows per landmark.
+  std::vector<Row> first_rows_;
+  // By row, only with several per landmark.
   std::vector<std::uint16_t> appearances_;
   std::vector<LandmarkIndex> owners_;
   std::vector<Row> next_rows_;
@@ -152,7 +136,7 @@ class RowTable {
   std::size_t steps_ = 0;
 };
 
-// Makes room for more elements as push_back does, so that adding them cannot fail half-way.
+// How arrays grow: as push_back does, but before a change, so that it cannot fail half-way.
 template <typename Vector>
 std::size_t larger_capacity(const Vector& v, std::size_t more) {
   return std::max(2 * v.capacity(), v.size() + more);
@@ -164,6 +148,15 @@ bool has_room(const Vector& v, std::size_t more) {
 template <typename Vector>
 void make_room_in(Vector& v, std::size_t more) {
   if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
+}
+// Replaces an array by one of more capacity; only the swap excludes searches.
+template <typename Vector>
+void enlarge(Vector& v, std::size_t capacity, FairSharedMutex& searching) {
+  Vector larger;
+  larger.reserve(capacity);
+  larger.assign(v.begin(), v.end());
+  const std::unique_lock lock(searching);
+  v.swap(larger);
 }
 
 }  // namespace protomark

@@ -5,14 +5,14 @@
 #include <stdexcept>
 #include <utility>
 
-#include "base/checked_numbers.h"
+#include "base/packed_numbers.h"
 #include "base/sq4.h"
 #include "file/ids.h"
 #include "file/journal_content.h"
 #include "file/sections.h"
 #include "map/map_sections.h"
 #include "map/positions.h"
-#include "map/sealed_blocks.h"
+#include "map/sealed_store.h"
 #include "search/ivf.h"
 #include "search/ivf_search.h"
 #include "search/recall.h"
@@ -112,7 +112,7 @@ struct SealedMap::Content {
     }
     if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
     const std::size_t row_end = std::size_t{first_blocks.back()} * kPackedRows;
-    const int bits = OwnerWriter::bits_for(shape.landmarks);
+    const int bits = owner_bits(shape.landmarks);
     const auto words = file.map<std::uint64_t>(section::kOwners, packed_words(row_end, bits));
     file.read(section::kOwnerChecksums);  // for its own
     owners = std::make_unique<const CheckedNumbers>(

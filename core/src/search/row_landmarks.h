@@ -4,7 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "base/checked_numbers.h"
+#include "base/packed_numbers.h"
 #include "protomark/search.h"
 #include "search/top_k.h"
 

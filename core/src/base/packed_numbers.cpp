@@ -1,9 +1,9 @@
-#include "base/checked_numbers.h"
+#include "base/packed_numbers.h"
 
 #include <algorithm>
 #include <utility>
 
-#include "base/crc32.h"
+#include "base/checksums.h"
 #include "protomark/types.h"
 
 namespace protomark {

@@ -1,9 +1,9 @@
-#include "map/sealed_rows.h"
+#include "map/sealed_store.h"
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <functional>
-#include <numeric>
 #include <queue>
 #include <span>
 #include <stdexcept>
@@ -76,28 +76,22 @@ class Merges {
   std::vector<std::size_t> made_;
 };
 
-// Calls take(landmark) for all landmarks.
-template <typename Take>
-void each_landmark(const PrototypeStore& store, const Take& take) {
-  for (LandmarkIndex l{0}; l.value < store.ids().size(); ++l.value) {
-    if (store.id(l) >= 0) take(l);
-  }
-}
-
 }  // namespace
 
 std::size_t sealed_bytes(std::size_t landmarks, std::size_t rows, std::size_t dim, int bits) {
   return rows * prototype_bytes(dim, bits) + landmarks * (rows > landmarks ? 2 : 1);
 }
 
+int owner_bits(std::size_t landmarks) {
+  return static_cast<int>(std::bit_width(std::max<std::size_t>(landmarks, 1)));
+}
+
 SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark) {
   const std::size_t n = store.landmark_count(), dim = store.dim();
   std::size_t rows = store.prototype_count();
-  if (store.several()) {
-    each_landmark(store, [&](LandmarkIndex l) {
-      rows -= store.row_count(l) - std::min(store.row_count(l), kMaxRows);
-    });
-  }
+  store.each_landmark([&](LandmarkIndex l) {
+    if (store.several()) rows -= store.row_count(l) - std::min(store.row_count(l), kMaxRows);
+  });
   if (!bytes_per_landmark) return {8, rows};
   const std::size_t smallest = sealed_bytes(1, 1, dim, 4);
   if (!(*bytes_per_landmark >= static_cast<double>(smallest))) {
@@ -118,88 +112,46 @@ SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_
   return {4, std::max(n, static_cast<std::size_t>(std::max(limit, 0.0)))};
 }
 
-SealedRows::SealedRows(const PrototypeStore& store, std::size_t limit) : store_(&store) {
-  if (!store.several()) return;
+std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std::size_t limit) {
+  if (!store.several()) return std::nullopt;
   bool fits = store.prototype_count() <= limit;
-  each_landmark(store, [&](LandmarkIndex l) { fits = fits && store.row_count(l) <= kMaxRows; });
-  if (!fits) merge(limit);
-}
-
-std::size_t SealedRows::row_count(LandmarkIndex landmark) const {
-  return merged_ ? sorted_rows(landmark).size() : store_->row_count(landmark);
-}
-
-std::vector<Row> SealedRows::sorted_rows(LandmarkIndex landmark) const {
-  if (!merged_) return store_->sorted_rows(landmark);
-  std::vector<Row> result;
-  for (Row row = merged_->first_rows[landmark.value];
-       row.value < size() && merged_->owners[row.value] == landmark; ++row.value) {
-    result.push_back(row);
-  }
-  return result;
-}
-
-LandmarkIndex SealedRows::owner(Row row) const {
-  return merged_ ? merged_->owners[row.value] : store_->owner(row);
-}
-
-std::size_t SealedRows::rows_in(std::uint32_t list) const {
-  if (!merged_) return store_->lists().rows(list);
-  return merged_->list_ends[list] - (list == 0 ? 0 : merged_->list_ends[list - 1]);
-}
-
-std::uint32_t SealedRows::list_of(Row row) const {
-  return merged_ ? merged_->lists[row.value] : store_->lists().cell_of(row.value);
-}
-
-void SealedRows::visit_sorted_rows(std::uint32_t list,
-                                   const PrototypeStore::VisitRows& visit) const {
-  if (!merged_) return store_->visit_sorted_rows(list, visit);
-  const std::size_t n = rows_in(list);
-  visit(std::span(merged_->by_list).subspan(merged_->list_ends[list] - n, n));
-}
-
-void SealedRows::code(Row row, std::int8_t* to) const {
-  if (!merged_) return store_->rounded(row, to);
-  std::copy_n(&merged_->codes[row.value * dim()], dim(), to);
-}
-
-void SealedRows::merge(std::size_t limit) {
-  const std::vector<LandmarkIndex> landmarks = store_->sorted_landmarks();
-  const Merges merges(*store_, landmarks, limit);
-  const std::size_t dim = this->dim();
-  Merged result;
-  result.first_rows.resize(landmarks.size());
+  store.each_landmark([&](LandmarkIndex l) { fits = fits && store.row_count(l) <= kMaxRows; });
+  if (fits) return std::nullopt;
+  const std::vector<LandmarkIndex> landmarks = store.sorted_landmarks();
+  const Merges merges(store, landmarks, limit);
+  const std::size_t dim = store.dim();
+  PrototypeStore result(dim, store.appearance_bits());
+  result.reserve(landmarks.size(), std::min(limit, store.prototype_count()));
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const LandmarkRows own(*store_, landmarks[i]);
+    const LandmarkRows own(store, landmarks[i]);
     std::vector<std::int64_t> sums(own.sums.begin(), own.sums.end());
     std::vector<std::int64_t> counts(own.counts.begin(), own.counts.end());
     for (const AppearanceMerge& m : merges.made(i)) {
       for (std::size_t d = 0; d < dim; ++d) sums[m.into * dim + d] += sums[m.source * dim + d];
       counts[m.into] += std::exchange(counts[m.source], 0);
     }
-    result.first_rows[landmarks[i].value].value = static_cast<std::uint32_t>(result.owners.size());
-    for (std::size_t row = 0; row < counts.size(); ++row) {
-      if (counts[row] == 0) continue;
+    LandmarkIndex landmark = kNoLandmark;
+    for (std::size_t from = 0; from < counts.size(); ++from) {
+      if (counts[from] == 0) continue;
+      const auto appearance = static_cast<std::uint16_t>(from);
+      const Row row = landmark == kNoLandmark
+                          ? result.create_landmark(store.id(landmarks[i]), appearance)
+                          : result.create_row(landmark, appearance);
+      landmark = result.owner(row);
       for (std::size_t d = 0; d < dim; ++d) {
-        result.codes.push_back(rounded_mean(sums[row * dim + d], counts[row]));
+        result.sum(row)[d] = rounded_mean(sums[from * dim + d], counts[from]);
       }
-      result.owners.push_back(landmarks[i]);
+      result.set_count(row, 1);
+      result.refresh(row);
     }
   }
-  const std::size_t rows = result.owners.size();
-  const Cells& centroids = store_->centroids();
-  result.lists = centroids.size() != 0 ? centroids.assign({result.codes.data(), rows, dim}, 1)
-                                       : std::vector<std::uint32_t>(rows, 0);
-  result.list_ends.resize(std::max<std::size_t>(centroids.size(), 1), 0);
-  for (const std::uint32_t list : result.lists) ++result.list_ends[list];
-  std::partial_sum(result.list_ends.begin(), result.list_ends.end(), result.list_ends.begin());
-  std::vector<std::uint32_t> next = result.list_ends;
-  result.by_list.resize(rows);
-  for (Row row{static_cast<std::uint32_t>(rows)}; row.value-- > 0;) {
-    result.by_list[--next[result.lists[row.value]]] = row;
+  if (store.centroids().size() != 0) {
+    FairSharedMutex nobody_searches;
+    auto arrangement = result.arrange(store.centroids(), 1);
+    result.make_room_for(arrangement, nobody_searches);
+    result.rearrange(arrangement);
   }
-  merged_ = std::move(result);
+  return result;
 }
 
 }  // namespace protomark
