@@ -19,12 +19,6 @@ std::size_t PrototypeStore::row_bytes() const {
   return dim_ * sizeof(sums_[0]) + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
 }
 
-std::uint16_t PrototypeStore::appearance_of(const std::int8_t* code) const {
-  unsigned signs = 0;
-  for (std::size_t j = 0; j < appearance_bits_; ++j) signs |= (code[j] > 0 ? 1u : 0u) << j;
-  return static_cast<std::uint16_t>(signs);
-}
-
 void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
   // And the block that take_row wants to be free.
   const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows + 1;

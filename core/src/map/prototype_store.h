@@ -68,7 +68,11 @@ class PrototypeStore : private RowTable {
   std::size_t row_bytes() const;
 
   // The appearance that a code is of: bit j is set if code[j] > 0, j < appearance_bits.
-  std::uint16_t appearance_of(const std::int8_t* code) const;
+  std::uint16_t appearance_of(const std::int8_t* code) const {
+    unsigned signs = 0;
+    for (std::size_t j = 0; j < appearance_bits_; ++j) signs |= (code[j] > 0 ? 1u : 0u) << j;
+    return static_cast<std::uint16_t>(signs);
+  }
 
   void reserve(std::size_t landmarks, std::size_t rows);
   // Makes room for so many more landmarks and rows in a change of `changed` rows, so that the

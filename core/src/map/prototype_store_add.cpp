@@ -70,7 +70,7 @@ void PrototypeStore::add(Row row, const std::int8_t* code) {
   }
   // A caller may write over codes that were checked: even then no sum is impossible.
   for (std::size_t d = 0; d < dim_; ++d) {
-    s[d] = static_cast<std::int16_t>(s[d] + std::max<int>(code[d], -127));
+    s[d] = static_cast<std::int16_t>(s[d] + std::max<std::int16_t>(code[d], -127));
   }
   ++n;
 }

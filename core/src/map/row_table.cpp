@@ -16,12 +16,6 @@ LandmarkIndex RowTable::at(std::int64_t id) const {
   return landmark;
 }
 
-Row RowTable::find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
-  Row row = first_row(landmark);
-  while (row != kNoRow && this->appearance(row) != appearance) row = next_row(row);
-  return row;
-}
-
 std::size_t RowTable::row_count(LandmarkIndex landmark) const {
   std::size_t n = 0;
   for ([[maybe_unused]] const Row row : rows(landmark)) ++n;

@@ -53,7 +53,11 @@ class RowTable {
   }
   Row next_row(Row row) const { return several_ ? next_rows_[row.value] : kNoRow; }
   // The row of a landmark's appearance, or kNoRow.
-  Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const;
+  Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
+    Row row = first_row(landmark);
+    while (several_ && row != kNoRow && appearances_[row.value] != appearance) row = next_row(row);
+    return row;
+  }
 
   // The rows of a landmark, in no order, for range-for.
   class Rows {

@@ -12,7 +12,7 @@
 
 #include "base/rounded_mean.h"
 #include "map/merge_cost.h"
-#include "protomark/search.h"
+#include "protomark/prototype_map.h"
 
 namespace protomark {
 namespace {
@@ -138,10 +138,13 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std
                           ? result.create_landmark(store.id(landmarks[i]), appearance)
                           : result.create_row(landmark, appearance);
       landmark = result.owner(row);
+      const bool fits_row = counts[from] <= PrototypeMap::kMaxCount;
       for (std::size_t d = 0; d < dim; ++d) {
-        result.sum(row)[d] = rounded_mean(sums[from * dim + d], counts[from]);
+        const std::int64_t sum = sums[from * dim + d];
+        result.sum(row)[d] = fits_row ? static_cast<std::int16_t>(sum)
+                                      : std::int16_t{rounded_mean(sum, counts[from])};
       }
-      result.set_count(row, 1);
+      result.set_count(row, fits_row ? static_cast<int>(counts[from]) : 1);
       result.refresh(row);
     }
   }
