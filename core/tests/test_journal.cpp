@@ -11,7 +11,7 @@
 #include <utility>
 
 #include "file/container.h"
-#include "file/journal_content.h"
+#include "file/journal.h"
 #include "journal_files.h"
 #include "map/map_state.h"
 

@@ -31,20 +31,9 @@ std::uint32_t head_checksum(ContainerHeader header, Bytes table) {
 }  // namespace
 
 const char* describe(FileKind kind) {
-  switch (kind) {
-    case FileKind::encoder:
-      return "an encoder";
-    case FileKind::learning_map:
-      return "a learning map";
-    case FileKind::sealed_map:
-      return "a sealed map";
-    case FileKind::journal:
-      return "a journal";
-    case FileKind::commit:
-    case FileKind::fold:
-      return "a record of a journal";
-  }
-  return "something unknown";
+  constexpr const char* kKinds[] = {"an encoder", "a learning map",        "a sealed map",
+                                    "a journal",  "a record of a journal", "a record of a journal"};
+  return kKinds[static_cast<std::uint32_t>(kind) - 1];
 }
 
 bool has_magic(Bytes bytes) {
@@ -102,7 +91,7 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
     const std::size_t first = table.size();
     for (const auto& [name, size] : group.parts) {
       SectionEntry entry{};
-      std::memcpy(entry.name, name.data(), std::min(sizeof(entry.name), name.size()));
+      std::memcpy(entry.padded_name, name.data(), std::min(sizeof(entry.padded_name), name.size()));
       entry.offset = offset;
       table.push_back(entry);
       if (size != kUnknownSize) offset = align(offset + size);
@@ -195,13 +184,12 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
       fail("its section table is broken");
     }
     end = entry.offset + entry.size;
-    const std::string section(entry.name, ::strnlen(entry.name, sizeof(entry.name)));
     // Names go into errors and lists, where they must not send commands to a terminal.
-    if (!std::ranges::all_of(section, [](char c) { return c >= ' ' && c <= '~'; })) {
+    if (!std::ranges::all_of(entry.name(), [](char c) { return c >= ' ' && c <= '~'; })) {
       fail("its section table is broken: a name is not printable ASCII");
     }
-    if (find(section) != nullptr) fail("it has two sections '" + section + "'");
-    sections_.push_back({section, entry.offset, entry.size, entry.crc});
+    if (has(entry.name())) fail("it has two sections '" + std::string(entry.name()) + "'");
+    sections_.push_back(entry);
   }
 }
 
@@ -209,21 +197,20 @@ void ContainerReader::expect(FileKind kind) const {
   if (kind_ != kind) fail(std::string("it holds ") + describe(kind_) + ", not " + describe(kind));
 }
 
-const ContainerReader::Section* ContainerReader::find(std::string_view name) const {
-  const auto found = std::find_if(sections_.begin(), sections_.end(),
-                                  [&](const Section& s) { return s.name == name; });
+const SectionEntry* ContainerReader::find(std::string_view name) const {
+  const auto found = std::ranges::find(sections_, name, &SectionEntry::name);
   return found == sections_.end() ? nullptr : &*found;
 }
 
-const ContainerReader::Section& ContainerReader::get(std::string_view name) const {
-  if (const Section* found = find(name)) return *found;
+const SectionEntry& ContainerReader::get(std::string_view name) const {
+  if (const SectionEntry* found = find(name)) return *found;
   fail("it lacks the section '" + std::string(name) + "'");
 }
 
-Bytes ContainerReader::checked(const Section& section) const {
+Bytes ContainerReader::checked(const SectionEntry& section) const {
   const Bytes bytes = file_.subspan(section.offset, section.size);
   if (crc32(bytes) != section.crc) {
-    fail("its section '" + section.name + "' does not match its checksum");
+    fail("its section '" + std::string(section.name()) + "' does not match its checksum");
   }
   return bytes;
 }
@@ -231,18 +218,18 @@ Bytes ContainerReader::checked(const Section& section) const {
 Bytes ContainerReader::read(std::string_view section) const { return checked(get(section)); }
 
 Bytes ContainerReader::map(std::string_view section) const {
-  const Section& found = get(section);
+  const SectionEntry& found = get(section);
   return file_.subspan(found.offset, found.size);
 }
 
 std::vector<std::pair<std::string, std::size_t>> ContainerReader::sections() const {
   std::vector<std::pair<std::string, std::size_t>> result;
-  for (const Section& section : sections_) result.emplace_back(section.name, section.size);
+  for (const SectionEntry& entry : sections_) result.emplace_back(entry.name(), entry.size);
   return result;
 }
 
 void ContainerReader::verify() const {
-  for (const Section& section : sections_) checked(section);
+  for (const SectionEntry& entry : sections_) checked(entry);
 }
 
 void ContainerReader::fail(const std::string& what) const { throw FileError(name_ + ": " + what); }

@@ -4,6 +4,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <filesystem>
 #include <functional>
 #include <optional>
@@ -42,11 +43,15 @@ struct ContainerHeader {
 static_assert(sizeof(ContainerHeader) == 64);
 
 struct SectionEntry {
-  char name[8];          // padded with zeros
+  char padded_name[8];   // ends where it is full, or with zeros
   std::uint64_t offset;  // a multiple of kSectionAlignment
   std::uint64_t size;
   std::uint32_t crc;
   std::uint32_t reserved;
+
+  std::string_view name() const {
+    return {padded_name, ::strnlen(padded_name, sizeof(padded_name))};
+  }
 };
 static_assert(sizeof(SectionEntry) == 32);
 
@@ -143,12 +148,14 @@ class ContainerReader {
   Bytes read(std::string_view section) const;
   // A section whose checksum was not looked at, for what is mapped and too large to read.
   Bytes map(std::string_view section) const;
-  // The same as n values of a type.
+  // The same as n values of a type, which the file's bytes must be aligned for.
+  template <typename T>
+  std::span<const T> read(std::string_view section, std::size_t n) const {
+    return as<T>(section, read(section), n);
+  }
   template <typename T>
   std::span<const T> map(std::string_view section, std::size_t n) const {
-    const Bytes bytes = map(section);
-    if (bytes.size() % sizeof(T) != 0 || bytes.size() / sizeof(T) != n) fail_size(section);
-    return {reinterpret_cast<const T*>(bytes.data()), n};  // aligned, as sections are
+    return as<T>(section, map(section), n);
   }
   // Names and sizes in bytes, in file order.
   std::vector<std::pair<std::string, std::size_t>> sections() const;
@@ -159,21 +166,20 @@ class ContainerReader {
   [[noreturn]] void fail_size(std::string_view section) const;
 
  private:
-  struct Section {
-    std::string name;
-    std::size_t offset;
-    std::size_t size;
-    std::uint32_t crc;
-  };
-  const Section* find(std::string_view name) const;
-  const Section& get(std::string_view name) const;
-  Bytes checked(const Section& section) const;
+  template <typename T>
+  std::span<const T> as(std::string_view section, Bytes bytes, std::size_t n) const {
+    if (bytes.size() % sizeof(T) != 0 || bytes.size() / sizeof(T) != n) fail_size(section);
+    return {reinterpret_cast<const T*>(bytes.data()), n};
+  }
+  const SectionEntry* find(std::string_view name) const;
+  const SectionEntry& get(std::string_view name) const;
+  Bytes checked(const SectionEntry& section) const;
 
   Bytes file_;
   std::string name_;
   FileKind kind_ = FileKind::encoder;
   ContainerHead head_{};
-  std::vector<Section> sections_;
+  std::vector<SectionEntry> sections_;
 };
 
 }  // namespace protomark

@@ -16,31 +16,6 @@
 namespace protomark {
 namespace {
 
-// Blocks SIGXFSZ in this thread, which would end the program at a limit on file sizes; the write
-// then fails with EFBIG.
-class NoSizeSignal {
- public:
-  NoSizeSignal() {
-    ::sigemptyset(&signals_);
-    ::sigaddset(&signals_, SIGXFSZ);
-    ::pthread_sigmask(SIG_BLOCK, &signals_, &before_);
-  }
-  ~NoSizeSignal() { ::pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
-  NoSizeSignal(const NoSizeSignal&) = delete;
-  NoSizeSignal& operator=(const NoSizeSignal&) = delete;
-
-  // Takes the signal of a write that failed, so that it is not delivered later.
-  void discard() const {
-    const int error = errno;
-    const timespec now{};
-    if (error == EFBIG) ::sigtimedwait(&signals_, nullptr, &now);
-    errno = error;
-  }
-
- private:
-  sigset_t signals_, before_;
-};
-
 // The path of a temporary file beside `target`, with a number of its own and no name that is too
 // long.
 std::filesystem::path beside(const std::filesystem::path& target) {
@@ -59,11 +34,6 @@ FileDescriptor FileDescriptor::open_to_read(const std::filesystem::path& path) {
   return FileDescriptor(::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC));
 }
 
-FileDescriptor& FileDescriptor::operator=(FileDescriptor&& other) noexcept {
-  std::swap(descriptor_, other.descriptor_);
-  return *this;
-}
-
 FileDescriptor::~FileDescriptor() {
   if (descriptor_ < 0) return;
   const int error = errno;
@@ -71,12 +41,11 @@ FileDescriptor::~FileDescriptor() {
   errno = error;
 }
 
-std::optional<std::span<std::byte>> FileDescriptor::read(std::size_t offset,
-                                                         std::span<std::byte> to) const {
+std::optional<std::span<std::byte>> FileDescriptor::read(std::span<std::byte> to) const {
   std::size_t done = 0;
   while (done < to.size()) {
     const ssize_t n =
-        ::pread(descriptor_, to.data() + done, to.size() - done, static_cast<off_t>(offset + done));
+        ::pread(descriptor_, to.data() + done, to.size() - done, static_cast<off_t>(done));
     if (n < 0 && errno == EINTR) continue;
     if (n < 0) return std::nullopt;
     if (n == 0) break;
@@ -86,17 +55,24 @@ std::optional<std::span<std::byte>> FileDescriptor::read(std::size_t offset,
 }
 
 bool FileDescriptor::write(Bytes bytes) const {
-  const NoSizeSignal no_signal;
+  // At a limit on file sizes the system would end the program; blocked, the write fails instead.
+  sigset_t size_signal, before;
+  ::sigemptyset(&size_signal);
+  ::sigaddset(&size_signal, SIGXFSZ);
+  ::pthread_sigmask(SIG_BLOCK, &size_signal, &before);
+  ssize_t written = 0;
   while (!bytes.empty()) {
-    const ssize_t written = ::write(descriptor_, bytes.data(), bytes.size());
+    written = ::write(descriptor_, bytes.data(), bytes.size());
     if (written < 0 && errno == EINTR) continue;
-    if (written < 0) {
-      no_signal.discard();
-      return false;
-    }
+    if (written < 0) break;
     bytes = bytes.subspan(static_cast<std::size_t>(written));
   }
-  return true;
+  const int error = errno;
+  const timespec now{};
+  if (written < 0 && error == EFBIG) ::sigtimedwait(&size_signal, nullptr, &now);
+  ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
+  errno = error;
+  return bytes.empty();
 }
 
 bool FileDescriptor::is_at(const std::filesystem::path& path) const {
@@ -187,16 +163,17 @@ MappedFile::MappedFile(const std::filesystem::path& path) {
   struct stat status;
   if (!file) fail(": cannot be read: " + system_error());
   if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail(": not a file");
-  size_ = static_cast<std::size_t>(status.st_size);
+  const auto size = static_cast<std::size_t>(status.st_size);
   device_ = status.st_dev;
   inode_ = status.st_ino;
-  if (size_ == 0) return;
-  data_ = ::mmap(nullptr, size_, PROT_READ, MAP_SHARED, file.get(), 0);
-  if (data_ == MAP_FAILED) fail(": cannot be read: " + system_error());
+  if (size == 0) return;
+  void* data = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.get(), 0);
+  if (data == MAP_FAILED) fail(": cannot be read: " + system_error());
+  bytes_ = {static_cast<const std::byte*>(data), size};
 }
 
 MappedFile::~MappedFile() {
-  if (data_ != nullptr) ::munmap(data_, size_);
+  if (!bytes_.empty()) ::munmap(const_cast<std::byte*>(bytes_.data()), bytes_.size());
 }
 
 bool MappedFile::is_at(const std::filesystem::path& path) const {

@@ -6,7 +6,6 @@
 
 #include <cstddef>
 #include <filesystem>
-#include <functional>
 #include <optional>
 #include <span>
 #include <string>
@@ -27,18 +26,21 @@ class FileDescriptor {
   // Opens a file to read it; does not wait for the writer of a named pipe.
   static FileDescriptor open_to_read(const std::filesystem::path& path);
   FileDescriptor(FileDescriptor&& other) noexcept : descriptor_(other.release()) {}
-  FileDescriptor& operator=(FileDescriptor&& other) noexcept;
+  FileDescriptor& operator=(FileDescriptor&& other) noexcept {
+    std::swap(descriptor_, other.descriptor_);
+    return *this;
+  }
   ~FileDescriptor();
 
   explicit operator bool() const { return descriptor_ >= 0; }
   int get() const { return descriptor_; }
   int release() { return std::exchange(descriptor_, -1); }
 
-  // Reads up to to.size() bytes from `offset` on; fewer at the end of the file. nullopt, with errno
+  // Reads from the beginning up to to.size() bytes, or to the end of the file. nullopt, with errno
   // set, if that fails.
-  std::optional<std::span<std::byte>> read(std::size_t offset, std::span<std::byte> to) const;
-  // Writes all of the bytes at the current offset. False, with errno set, if that fails; a limit on
-  // file sizes makes it fail, too, and raises no signal.
+  std::optional<std::span<std::byte>> read(std::span<std::byte> to) const;
+  // Writes all of the bytes at the current offset. False, with errno set, if that fails; so does a
+  // limit on file sizes, which raises no signal.
   bool write(Bytes bytes) const;
   // Whether the file still has that name.
   bool is_at(const std::filesystem::path& path) const;
@@ -51,8 +53,7 @@ class FileDescriptor {
 std::filesystem::path link_target(std::filesystem::path path);
 
 // Syncs the folder of `path`: without this a power cut may bring the old name back. False, with
-// errno set, if that fails; true if the file system cannot sync folders or the folder cannot be
-// read.
+// errno set, if that fails; true if the file system cannot do it or the folder cannot be read.
 bool sync_folder(const std::filesystem::path& path);
 
 // The permission bits of a file; nullopt if there is none.
@@ -93,13 +94,12 @@ class MappedFile {
   MappedFile(const MappedFile&) = delete;
   MappedFile& operator=(const MappedFile&) = delete;
 
-  Bytes bytes() const { return {static_cast<const std::byte*>(data_), size_}; }
+  Bytes bytes() const { return bytes_; }
   // Whether the file still has that name.
   bool is_at(const std::filesystem::path& path) const;
 
  private:
-  void* data_ = nullptr;
-  std::size_t size_ = 0;
+  Bytes bytes_;
   dev_t device_ = 0;
   ino_t inode_ = 0;
 };

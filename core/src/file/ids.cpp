@@ -53,8 +53,7 @@ void IdBlockWriter::flush() {
 
 LandmarkIds::LandmarkIds(const ContainerReader& file, std::size_t n) : file_(&file), n_(n) {
   if (!file.has(section::kIdBlocks)) return;
-  file.read(section::kIdBlocks);  // for its checksum
-  blocks_ = file.map<IdBlock>(section::kIdBlocks, (n + kIdBlock - 1) / kIdBlock);
+  blocks_ = file.read<IdBlock>(section::kIdBlocks, (n + kIdBlock - 1) / kIdBlock);
   const std::size_t bytes = file.map(section::kIdGaps).size();
   words_ = file.map<std::uint64_t>(section::kIdGaps, bytes / sizeof(std::uint64_t));
   check_blocks();

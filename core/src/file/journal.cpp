@@ -7,7 +7,6 @@
 
 #include <cerrno>
 #include <fstream>
-#include <optional>
 #include <sstream>
 
 #include "file/sections.h"
@@ -48,6 +47,32 @@ void add_base(ContainerWriter& file, const std::string& identity) {
 
 std::uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
 
+// Locks the journal of a map file that is to be written over, if there is one.
+FileDescriptor guard(const std::filesystem::path& map) {
+  const auto path = journal_path(map);
+  FileDescriptor file;
+  for (int tries = 0; tries < kTries; ++tries) {
+    file = FileDescriptor::open_to_read(path);
+    if (!file && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return file;
+    if (!file) throw FileError(path.string() + ": cannot be read: " + system_error());
+    if (::flock(file.get(), LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
+      throw FileError(map.string() + ": cannot be written: its journal is held by " + holder(file) +
+                      "; close it there, or save to another path");
+    }
+    const auto bytes = read_journal(file, path);
+    const std::size_t commits =
+        JournalContent(bytes, path.string()).commits(identity_of(map)).size();
+    if (commits > 0) {
+      throw FileError(map.string() + ": cannot be written: its journal holds " +
+                      std::to_string(commits) +
+                      " commits, which would be lost; open it with journal and compact it, or "
+                      "save to another path");
+    }
+    if (file.is_at(path)) break;
+  }
+  return file;
+}
+
 }  // namespace
 
 Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
@@ -77,7 +102,7 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   base_ = identity;
   end_ = content.end();
   last_ = content.last();
-  tail_ = content.torn() != 0;
+  tail_ = content.end() != content.size();
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
   // Whoever made the journal, or compacted, may have been killed before this: the new map file's
   // name must be durable before what it replaces is forgotten.
@@ -180,33 +205,10 @@ void Journal::abandon() noexcept {
 
 void Journal::fail(const std::string& what) const { throw FileError(path_.string() + ": " + what); }
 
-JournalGuard::JournalGuard(const std::filesystem::path& map) {
-  const auto path = journal_path(map);
-  for (int tries = 0; tries < kTries; ++tries) {
-    file_ = FileDescriptor::open_to_read(path);
-    if (!file_ && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return;
-    if (!file_) throw FileError(path.string() + ": cannot be read: " + system_error());
-    if (::flock(file_.get(), LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
-      throw FileError(map.string() + ": cannot be written: its journal is held by " +
-                      holder(file_) + "; close it there, or save to another path");
-    }
-    const auto bytes = read_journal(file_, path);
-    const std::size_t commits =
-        JournalContent(bytes, path.string()).commits(identity_of(map)).size();
-    if (commits > 0) {
-      throw FileError(map.string() + ": cannot be written: its journal holds " +
-                      std::to_string(commits) +
-                      " commits, which would be lost; open it with journal and compact it, or "
-                      "save to another path");
-    }
-    if (file_.is_at(path)) return;
-  }
-}
-
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path) {
-  const JournalGuard guard(path);
-  std::optional<JournalGuard> last;
-  file.write(path, [&](const std::string&) { last.emplace(path); });
+  const FileDescriptor before = guard(path);
+  FileDescriptor last;
+  file.write(path, [&](const std::string&) { last = guard(path); });
 }
 
 }  // namespace protomark

@@ -9,6 +9,7 @@
 #include <string_view>
 #include <vector>
 
+#include "base/utf8.h"
 #include "file/container.h"
 
 namespace protomark {
@@ -70,17 +71,28 @@ class SectionReader {
   template <typename T>
   void copy(T* to, std::size_t n) {
     check(n, sizeof(T));
-    take(to, n * sizeof(T));
+    if (n > 0) std::memcpy(to, rest_.data(), n * sizeof(T));
+    rest_ = rest_.subspan(n * sizeof(T));
   }
   // A u32 length and that many bytes of UTF-8.
-  std::string text();
+  std::string text() {
+    const std::vector<char> bytes = values<char>(value<std::uint32_t>());
+    std::string result(bytes.begin(), bytes.end());
+    if (!is_utf8(result))
+      file_->fail("its section '" + section_ + "' has a text that is not UTF-8");
+    return result;
+  }
   bool empty() const { return rest_.empty(); }
   // Throws FileError if bytes are left.
-  void finish() const;
+  void finish() const {
+    if (!rest_.empty()) file_->fail("its section '" + section_ + "' is longer than it should be");
+  }
 
  private:
-  void check(std::size_t n, std::size_t size) const;
-  void take(void* to, std::size_t n);
+  void check(std::size_t n, std::size_t size) const {
+    if (n <= rest_.size() / size) return;
+    file_->fail("its section '" + section_ + "' is shorter than it should be");
+  }
 
   const ContainerReader* file_;
   std::string section_;

@@ -2,7 +2,7 @@
 
 #include <stdexcept>
 
-#include "file/journal_content.h"
+#include "file/journal.h"
 #include "map/map_sections.h"
 
 namespace protomark {
@@ -61,7 +61,7 @@ std::optional<FileJournal> file_journal(const std::filesystem::path& path) {
   const JournalContent& journal = both.journal();
   if (journal.size() == 0) return std::nullopt;
   return FileJournal{journal.commits(both.file().identity()).size(), journal.size(),
-                     journal.torn()};
+                     journal.size() - journal.end()};
 }
 
 }  // namespace protomark

@@ -108,16 +108,10 @@ class SealedLandmarks {
 // for these.
 class RowWriter {
  public:
-  RowWriter(const BlockPacker& packer, const Sink& prototypes)
-      : packer_(packer), prototypes_(prototypes) {}
   // `padding` is the owner of padding, and owners have so many bits.
-  RowWriter(const BlockPacker& packer, const Sink& prototypes, const Sink& owners, int bits,
-            std::size_t padding)
-      : packer_(packer),
-        prototypes_(prototypes),
-        owners_(&owners),
-        bits_(bits),
-        padding_(padding) {}
+  RowWriter(const BlockPacker& packer, const Sink& prototypes, const Sink* owners = nullptr,
+            int bits = 0, std::size_t padding = 0)
+      : packer_(packer), prototypes_(prototypes), owners_(owners), bits_(bits), padding_(padding) {}
 
   void add(Row row, std::size_t owner = 0) {
     block_[filled_++] = row;
@@ -154,9 +148,9 @@ class RowWriter {
 
   const BlockPacker& packer_;
   const Sink& prototypes_;
-  const Sink* owners_ = nullptr;
-  int bits_ = 0;
-  std::size_t padding_ = 0;
+  const Sink* owners_;
+  int bits_;
+  std::size_t padding_;
   std::array<Row, kPackedRows> block_{};
   std::size_t filled_ = 0;
   std::vector<std::uint8_t> packed_;
@@ -164,18 +158,19 @@ class RowWriter {
   BlockChecksums checksums_;
 };
 
-// Finds the two nearest landmarks of each query among prototypes as they are sealed, which are
-// packed piece by piece.
-void search_two(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
-                MatrixView<std::int64_t> ids) {
+// Finds the two nearest landmarks of each query among the levels of 4-bit prototypes, piece by
+// piece.
+void search_levels(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
+                   MatrixView<std::int64_t> ids) {
   // As much memory as is little beside the map.
-  const std::size_t size =
-      std::max<std::size_t>(1 << 12, store.prototype_count() / 32 / kPackedRows * kPackedRows);
-  LargeVector<std::uint8_t> packed(size / kPackedRows * packer.size());
-  std::vector<Row> piece;
-  std::vector<std::int64_t> owners;
+  const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
+  const std::size_t dim = store.dim();
+  LargeVector<CodeVector> packed(packed_size(size, dim) / sizeof(CodeVector));
+  auto* levels = reinterpret_cast<std::int8_t*>(packed.data());
   std::vector<std::uint32_t> own_index(size);  // several rows may have the same id
   std::iota(own_index.begin(), own_index.end(), 0u);
+  std::vector<std::int64_t> owners;
+  std::vector<std::int8_t> code(dim);
   Matrix<std::int64_t> found(queries.rows, 2);
   Matrix<float> distances(queries.rows, 2);
   std::vector<std::int32_t> best_distances(2 * queries.rows);
@@ -184,36 +179,24 @@ void search_two(const PrototypeStore& store, const BlockPacker& packer, Codes qu
     best.emplace_back(ids.row(q), &best_distances[2 * q], 2, INT32_MAX - 1);
   }
   const auto search_piece = [&] {
-    const std::size_t n = piece.size();
-    if (n == 0) return;
-    piece.resize((n + kPackedRows - 1) / kPackedRows * kPackedRows, kNoRow);
-    for (std::size_t begin = 0; begin < n; begin += kPackedRows) {
-      packer.pack(&piece[begin], &packed[begin / kPackedRows * packer.size()]);
-    }
-    RowLandmarks landmarks;
-    landmarks.of_row = own_index.data();
-    if (packer.scale() == 0) {
-      const auto* codes = reinterpret_cast<const std::int8_t*>(packed.data());
-      search(PackedPrototypes{codes, n, store.dim(), owners.data(), landmarks}, queries, {},
-             found.view(), distances.view());
-    } else {
-      search(PackedPrototypes4{packed.data(), n, store.dim(), packer.scale(), owners.data(),
-                               landmarks},
-             queries, {}, found.view(), distances.view());
-    }
+    PackedPrototypes piece{levels, owners.size(), dim, owners.data()};
+    piece.landmarks.of_row = own_index.data();
+    search(piece, queries, {}, found.view(), distances.view());
     for (std::size_t i = 0; i < found.data.size(); ++i) {
       if (found.data[i] < 0) continue;
       const float distance = distances.data[i];
       best[i / 2].offer_distinct(static_cast<std::int32_t>(std::lround(distance * distance)),
                                  found.data[i]);
     }
-    piece.clear();
     owners.clear();
   };
   store.each_row([&](Row row) {
-    piece.push_back(row);
+    store.rounded(row, code.data());
+    for (std::size_t d = 0; d < dim; ++d) {
+      levels[packed_index(owners.size(), d, dim)] = static_cast<std::int8_t>(packer.value(code[d]));
+    }
     owners.push_back(store.id(store.owner(row)));
-    if (piece.size() == size) search_piece();
+    if (owners.size() == size) search_piece();
   });
   search_piece();
 }
@@ -264,8 +247,9 @@ class SealedContent {
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const ProbeRanks table = measure_recall(
           store_, [this](std::int8_t code) { return packer_.value(code); },
-          [this](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float>) {
-            search_two(store_, packer_, queries, ids);
+          [this](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+            if (packer_.scale() == 0) return search(store_.view(), queries, {}, ids, distances);
+            search_levels(store_, packer_, queries, ids);
           });
       sink(std::as_bytes(std::span(table)));
     });
@@ -319,7 +303,7 @@ class SealedContent {
   }
 
   void put_lists(Sinks sinks) {
-    RowWriter writer(packer_, sinks[0], sinks[1], owner_bits_, store_.landmark_count());
+    RowWriter writer(packer_, sinks[0], &sinks[1], owner_bits_, store_.landmark_count());
     for (std::uint32_t list = 0; list < store_.centroids().size(); ++list) {
       store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
         for (const Row row : rows) {

@@ -8,7 +8,7 @@
 #include "base/packed_numbers.h"
 #include "base/sq4.h"
 #include "file/ids.h"
-#include "file/journal_content.h"
+#include "file/journal.h"
 #include "file/sections.h"
 #include "map/map_sections.h"
 #include "map/positions.h"
@@ -29,17 +29,9 @@ constexpr LandmarkIndex landmark_at(std::size_t i) {
 }  // namespace
 
 struct SealedMap::Content {
-  explicit Content(const std::filesystem::path& path)
-      : Content(std::make_unique<MappedFile>(path), path.string()) {
-    // A map file that takes the place of one with commits is refused.
-    const JournaledFile both(path);
-    both.journal().commits(both.file().identity());
-  }
-  Content(std::unique_ptr<MappedFile> from, const std::string& name)
-      : Content(from->bytes(), name) {
-    mapped = std::move(from);
-  }
-  Content(Bytes bytes, const std::string& name) : file(bytes, name) {
+  // Bytes of the caller, or of a file that is mapped.
+  Content(Bytes bytes, const std::string& name, std::unique_ptr<MappedFile> from = nullptr)
+      : mapped(std::move(from)), file(bytes, name) {
     file.expect(FileKind::sealed_map);
     encoder = read_encoder(file);
     shape = read_shape(file, *encoder);
@@ -63,13 +55,16 @@ struct SealedMap::Content {
         file.fail("the scale of its prototypes is " + std::to_string(scale) + ", not 1 to " +
                   std::to_string(kMaxScale));
       }
-      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(row_end, shape.dim)),
-                     row_end, shape.dim, static_cast<int>(scale)};
+      prototypes4.data =
+          file.map<std::uint8_t>(section::kPrototypes, packed4_size(row_end, shape.dim)).data();
+      prototypes4.half_step = static_cast<int>(scale);
       if (nlist() == 0) check_padding();
     } else {
-      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(row_end, shape.dim)),
-                    row_end, shape.dim};
+      prototypes.data =
+          file.map<std::int8_t>(section::kPrototypes, packed_size(row_end, shape.dim)).data();
     }
+    prototypes.rows = prototypes4.rows = row_end;
+    prototypes.dim = prototypes4.dim = shape.dim;
     prototypes.landmarks = prototypes4.landmarks = owner_of;
     counts = file.map<std::uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
@@ -78,14 +73,8 @@ struct SealedMap::Content {
     positions = file.map<std::byte>(section::kPositions, n * codec->size());
   }
 
-  template <typename T>
-  const T* map(const char* name, std::size_t n) const {
-    return file.map<T>(name, n).data();
-  }
-
   void read_row_counts() {
-    file.read(section::kRows);  // for its checksum
-    row_counts = file.map<std::uint8_t>(section::kRows, shape.landmarks);
+    row_counts = file.read<std::uint8_t>(section::kRows, shape.landmarks);
     prototype_count = sum_rows(file, row_counts);
     std::uint32_t row = 0;
     for (std::size_t i = 0; i < row_counts.size(); ++i) {
@@ -99,25 +88,22 @@ struct SealedMap::Content {
     centroids = read_centroids(file, shape.dim);
     const std::size_t lists = centroids.size() / shape.dim;
     packed_centroids = pack_codes({centroids.data(), lists, shape.dim});
-    file.read(section::kListRows);  // for its checksum
-    list_rows = file.map<std::uint32_t>(section::kListRows, lists);
+    list_rows = file.read<std::uint32_t>(section::kListRows, lists);
     first_blocks.push_back(0);
     std::uint64_t total = 0;
-    for (const std::uint32_t n : list_rows) {
+    for (const std::uint64_t n : list_rows) {
       total += n;
       if (total > prototype_count) break;
-      first_blocks.push_back(
-          first_blocks.back() +
-          static_cast<std::uint32_t>((std::uint64_t{n} + kPackedRows - 1) / kPackedRows));
+      const std::uint64_t blocks = (n + kPackedRows - 1) / kPackedRows;
+      first_blocks.push_back(first_blocks.back() + static_cast<std::uint32_t>(blocks));
     }
     if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
     const std::size_t row_end = std::size_t{first_blocks.back()} * kPackedRows;
     const int bits = owner_bits(shape.landmarks);
     const auto words = file.map<std::uint64_t>(section::kOwners, packed_words(row_end, bits));
-    file.read(section::kOwnerChecksums);  // for its own
     owners = std::make_unique<const CheckedNumbers>(
         words, bits,
-        file.map<std::uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
+        file.read<std::uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
         file.name() + ": its section '" + section::kOwners + "'");
     const std::size_t size = file.map(section::kRecall).size() / sizeof(std::uint32_t);
     recall_table = read_section<std::uint32_t>(file, section::kRecall, size);
@@ -217,8 +203,14 @@ struct SealedMap::Content {
   std::span<const std::byte> positions;
 };
 
-SealedMap::SealedMap(const std::filesystem::path& path)
-    : content_(std::make_unique<const Content>(path)) {}
+SealedMap::SealedMap(const std::filesystem::path& path) {
+  auto mapped = std::make_unique<MappedFile>(path);
+  const Bytes bytes = mapped->bytes();
+  content_ = std::make_unique<const Content>(bytes, path.string(), std::move(mapped));
+  // A map file that takes the place of one with commits is refused.
+  const JournaledFile both(path);
+  both.journal().commits(both.file().identity());
+}
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
   if (reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment != 0) {
     throw std::invalid_argument("the bytes of a map must stand at a multiple of 64");
@@ -257,11 +249,10 @@ std::optional<Position> SealedMap::position_error() const {
 }
 
 std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> wanted) const {
-  std::vector<std::uint32_t> result;
-  result.reserve(wanted.size());
-  for (const std::int64_t id : wanted) {
-    result.push_back(content_->counts[content_->ids.find(id).value]);
-  }
+  std::vector<std::uint32_t> result(wanted.size());
+  std::ranges::transform(wanted, result.begin(), [&](std::int64_t id) {
+    return content_->counts[content_->ids.find(id).value];
+  });
   return result;
 }
 
@@ -291,11 +282,10 @@ Matrix<float> SealedMap::appearances(std::int64_t id) const {
 }
 
 std::vector<Position> SealedMap::positions(std::span<const std::int64_t> wanted) const {
-  std::vector<Position> result;
-  result.reserve(wanted.size());
-  for (const std::int64_t id : wanted) {
-    result.push_back(content_->position(content_->ids.find(id)));
-  }
+  std::vector<Position> result(wanted.size());
+  std::ranges::transform(wanted, result.begin(), [&](std::int64_t id) {
+    return content_->position(content_->ids.find(id));
+  });
   return result;
 }
 

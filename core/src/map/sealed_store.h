@@ -24,8 +24,8 @@ std::size_t sealed_bytes(std::size_t landmarks, std::size_t rows, std::size_t di
 int owner_bits(std::size_t landmarks);
 
 // Merges appearances until there are at most `limit` rows, and 255 of any landmark. Returns a store
-// of the prototypes, in lists of the same centroids, or nullopt if nothing has to be merged. Of more
-// than 255 observations it has the rounded prototype, with a count of one.
+// of the prototypes, in lists of the same centroids, or nullopt if nothing has to be merged. Of
+// more than 255 observations it has the rounded prototype, with a count of one.
 std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std::size_t limit);
 
 }  // namespace protomark

@@ -1,4 +1,5 @@
-#include "file/journal_content.h"
+// Reads journals, whole or torn.
+#include "file/journal.h"
 
 #include <sys/stat.h>
 
@@ -113,7 +114,7 @@ std::vector<std::byte> read_journal(const FileDescriptor& file, const std::files
   if (!S_ISREG(status.st_mode)) throw FileError(path.string() + ": not a file");
   const auto size = static_cast<std::size_t>(status.st_size);
   const auto read = [&](std::span<std::byte> to) {
-    const auto bytes = file.read(0, to);
+    const auto bytes = file.read(to);
     if (!bytes) fail(system_error());
     return *bytes;
   };
@@ -134,7 +135,7 @@ std::vector<std::byte> read_journal(const FileDescriptor& file, const std::files
 std::string identity_of(const std::filesystem::path& path) {
   const auto file = FileDescriptor::open_to_read(path);
   std::array<std::byte, kMaxHead> space;
-  const auto bytes = file ? file.read(0, space) : std::nullopt;
+  const auto bytes = file ? file.read(space) : std::nullopt;
   const auto head = bytes ? ContainerHead::parse(*bytes) : std::nullopt;
   return head ? head->identity() : "";
 }
