@@ -1,0 +1,24 @@
+// Row and LandmarkIndex: two kinds of 32-bit index that the compiler keeps apart.
+#pragma once
+
+#include <compare>
+#include <cstdint>
+
+namespace protomark {
+
+// Where a prototype stands among the packed prototypes of a map.
+struct Row {
+  std::uint32_t value = 0;
+  friend constexpr auto operator<=>(Row, Row) = default;
+};
+
+// A landmark's index in a map; its id is the user's.
+struct LandmarkIndex {
+  std::uint32_t value = 0;
+  friend constexpr auto operator<=>(LandmarkIndex, LandmarkIndex) = default;
+};
+
+inline constexpr Row kNoRow{UINT32_MAX};
+inline constexpr LandmarkIndex kNoLandmark{UINT32_MAX};
+
+}  // namespace protomark
