@@ -16,7 +16,7 @@
 #endif
 #endif
 
-#include "kernels.h"
+#include "kernels/kernels.h"
 #include "protomark/instruction_set.h"
 
 namespace protomark::kernels {

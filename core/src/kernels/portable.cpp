@@ -1,81 +1,182 @@
-// Plain C++, for every machine; the definition that the others must match.
-#include "block_biases.h"
-#include "kernels.h"
+// For every machine: 128-bit vectors as GCC and Clang translate them to what the target has.
+#include "kernels/generic_encoder.h"
+#include "kernels/generic_search.h"
 
 namespace protomark::kernels {
 namespace {
 
-// Outputs that are summed together: with a table of 16 KB for 64 inputs, in the L1 cache.
-constexpr std::size_t kHalf = kOutputs / 2;
+using Bytes [[gnu::vector_size(16)]] = std::int8_t;
+using Shorts16 [[gnu::vector_size(32)]] = std::int16_t;
+using Shorts [[gnu::vector_size(16)]] = std::int16_t;
+using Ints [[gnu::vector_size(16)]] = std::int32_t;
+using Longs [[gnu::vector_size(16)]] = std::uint64_t;
 
-// The sums of all subsets of 4 inputs, for each 4 of 64 inputs.
-void fill_table(const std::int8_t* weights, std::int16_t (*table)[kHalf]) {
-  for (std::size_t group = 0; group < 16; ++group, weights += 4 * kOutputs, table += 16) {
-    for (std::size_t o = 0; o < kHalf; ++o) table[0][o] = 0;
-    for (std::size_t j = 0; j < 4; ++j) {
-      const std::size_t bit = std::size_t{1} << j;
-      for (std::size_t subset = 0; subset < bit; ++subset) {
-        for (std::size_t o = 0; o < kHalf; ++o) {
-          table[bit + subset][o] =
-              static_cast<std::int16_t>(table[subset][o] + weights[j * kOutputs + o]);
-        }
-      }
+template <typename Vector>
+Vector load_vector(const void* p) {
+  Vector v;
+  __builtin_memcpy(&v, p, sizeof v);
+  return v;
+}
+
+// 64 bytes. All functions of these are loops over the four vectors.
+template <typename Vector>
+struct Four {
+  Vector v[4];
+};
+template <typename Vector>
+Four<Vector> load_four(const void* p) {
+  Four<Vector> result;
+  for (int i = 0; i < 4; ++i)
+    result.v[i] = load_vector<Vector>(static_cast<const char*>(p) + 16 * i);
+  return result;
+}
+template <typename Vector>
+Four<Vector> plus(const Four<Vector>& a, const Four<Vector>& b) {
+  Four<Vector> result;
+  for (int i = 0; i < 4; ++i) result.v[i] = a.v[i] + b.v[i];
+  return result;
+}
+
+struct Portable {
+  using Sums16 = Four<Shorts>;
+  static constexpr std::size_t kSums16 = 32;
+  static Sums16 zero16() { return {}; }
+  static Sums16 load16(const std::int16_t* sums) { return load_four<Shorts>(sums); }
+  static Sums16 widen(const std::int8_t* weights) {
+    Sums16 result;
+    for (int i = 0; i < 4; i += 2) {
+      // Two vectors at a time, which is two instructions.
+      const auto both = __builtin_convertvector(load_vector<Bytes>(weights + 8 * i), Shorts16);
+      __builtin_memcpy(&result.v[i], &both, sizeof both);
+    }
+    return result;
+  }
+  static Sums16 add16(const Sums16& a, const Sums16& b) { return plus(a, b); }
+  static void store16(std::int16_t* sums, const Sums16& a) { __builtin_memcpy(sums, &a, sizeof a); }
+
+  using Sums = Four<Ints>;
+  static Sums zero() { return {}; }
+  static Sums load(const std::int32_t* sums) { return load_four<Ints>(sums); }
+  static void store(std::int32_t* sums, const Sums& a) { __builtin_memcpy(sums, &a, sizeof a); }
+  static Sums add(const Sums& a, const Sums& b) { return plus(a, b); }
+  static Sums half(const Sums& a) {
+    Sums result;
+    for (int i = 0; i < 4; ++i) result.v[i] = a.v[i] >> 1;
+    return result;
+  }
+
+  // 4 dimensions of a row, a 32-bit lane, as 16-bit numbers (0, 2) and (1, 3). The product of two
+  // bytes fits 16 bits as well.
+  struct Codes {
+    Shorts even[4], odd[4];
+  };
+  static Codes load_codes(const std::int8_t* codes) {
+    Codes result;
+    for (int i = 0; i < 4; ++i) {
+      const auto both = load_vector<Shorts>(codes + 16 * i);
+      result.even[i] = both << 8 >> 8;
+      result.odd[i] = both >> 8;
+    }
+    return result;
+  }
+  struct Query {
+    Shorts even, odd;
+  };
+  static void dot(Sums& sums, const Query& q, const Codes& codes) {
+    for (int i = 0; i < 4; ++i) {
+      sums.v[i] += pairs(codes.even[i] * q.even) + pairs(codes.odd[i] * q.odd);
     }
   }
-}
+  struct Step {
+    std::uint8_t codes[4];
+  };
+  static const Step* steps(const std::uint8_t* codes, std::size_t, Step*) {
+    return reinterpret_cast<const Step*>(codes);
+  }
+  static Query broadcast(const Step& step) {
+    const auto four = __builtin_bit_cast(std::int32_t, step);
+    const Ints all = {four, four, four, four};
+    return {(Shorts)(all & 0xff00ff), (Shorts)(all >> 8 & 0xff00ff)};
+  }
 
-void bit_sums(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
-              std::size_t n, std::int16_t* sums) {
-  std::int16_t table[256][kHalf];
-  for (std::size_t i = 0; i < n * kOutputs; ++i) sums[i] = 0;
-  for (std::size_t w = 0; w < count; ++w, words += n, weights += 64 * kOutputs) {
-    for (std::size_t half = 0; half < kOutputs; half += kHalf) {
-      fill_table(weights + half, table);
-      for (std::size_t i = 0; i < n; ++i) {
-        std::int16_t* sum = sums + i * kOutputs + half;
-        std::int16_t acc[kHalf] = {};
-        for (std::size_t group = 0; group < 16; ++group) {
-          const std::int16_t* row = table[16 * group + (words[i] >> (4 * group) & 15)];
-          for (std::size_t o = 0; o < kHalf; ++o)
-            acc[o] = static_cast<std::int16_t>(acc[o] + row[o]);
-        }
-        for (std::size_t o = 0; o < kHalf; ++o) sum[o] = static_cast<std::int16_t>(sum[o] + acc[o]);
+  static constexpr int kDenseBatch = 1;
+  static constexpr std::size_t kLanes = 1;
+  static constexpr int kDenseGroups = 1;
+  using Inputs = const std::uint8_t*;
+  static Inputs inputs(const std::uint8_t* x) { return x; }
+  template <int>
+  static void dot_lane(Sums& sums, Inputs x, const Codes& weights) {
+    dot(sums, broadcast(*steps(x, 1, nullptr)), weights);
+  }
+  static Sums dense_start(const std::int8_t*, std::size_t) { return {}; }
+
+  static constexpr std::size_t kBlocks = 1;
+  // The biases are -|p|^2 - 256 sum(p), as queries come as q + 128.
+  class Norms {
+   public:
+    void add(const Codes& p) {
+      for (int i = 0; i < 4; ++i) {
+        biases_.v[i] -= pairs(p.even[i] * p.even[i]) + pairs(p.odd[i] * p.odd[i]) +
+                        ((pairs(p.even[i]) + pairs(p.odd[i])) << 8);
       }
     }
-  }
-}
+    Sums biases() const { return biases_; }
 
-void bit_sum(const std::int8_t* weights, const std::uint16_t* set, std::size_t count,
-             std::int16_t* sums) {
-  std::int16_t acc[kOutputs] = {};
-  for (std::size_t i = 0; i < count; ++i) {
-    const std::int8_t* row = weights + set[i] * kOutputs;
-    for (std::size_t o = 0; o < kOutputs; ++o) acc[o] = static_cast<std::int16_t>(acc[o] + row[o]);
+   private:
+    Sums biases_ = {};
+  };
+  using Flags = Ints;
+  static Flags at_least(const Sums& sums, std::int32_t threshold) {
+    return (sums.v[0] >= threshold) | (sums.v[1] >= threshold) | (sums.v[2] >= threshold) |
+           (sums.v[3] >= threshold);
   }
-  for (std::size_t o = 0; o < kOutputs; ++o) sums[o] = acc[o];
-}
-
-void dense(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
-           std::size_t stride, std::size_t n, std::size_t outputs, std::int32_t* sums) {
-  for (std::size_t i = 0; i < n; ++i, x += stride, sums += kOutputs) {
-    const std::int8_t* w = weights;
-    for (std::size_t group = 0; group < outputs; group += 16) {
-      std::int32_t acc[16] = {};
-      for (std::size_t j = 0; j < inputs; j += 4, w += 4 * 16) {
-        for (std::size_t o = 0; o < 16; ++o) {
-          acc[o] += w[4 * o] * x[j] + w[4 * o + 1] * x[j + 1] + w[4 * o + 2] * x[j + 2] +
-                    w[4 * o + 3] * x[j + 3];
-        }
-      }
-      for (std::size_t o = 0; o < 16; ++o) sums[group + o] = acc[o];
+  static Flags either(Flags a, Flags b) { return a | b; }
+  static bool any(Flags flags) { return (((Longs)flags)[0] | ((Longs)flags)[1]) != 0; }
+  static unsigned near_rows(const Sums& sums, std::int32_t threshold) {
+    unsigned bits = 0;
+    for (unsigned r = 0; r < kCodeRows; ++r) {
+      bits |= (sums.v[r / 4][r % 4] >= threshold ? 1u : 0u) << r;
     }
+    return bits;
   }
-}
+
+  static constexpr int kWordQueries = 1;
+  static constexpr std::size_t kByteWords = 0;
+  using Words = Four<Longs>;
+  using Counts = Four<Longs>;
+  static Words load_words(const std::uint64_t* words) { return load_four<Longs>(words); }
+  static void add_bits(Counts& counts, std::uint64_t query, const Words& row) {
+    for (int i = 0; i < 4; ++i) counts.v[i] += popcounts(row.v[i] ^ query);
+  }
+  static unsigned near_words(const Counts& counts, std::int32_t limit) {
+    unsigned bits = 0;
+    for (unsigned r = 0; r < kWordRows; ++r) {
+      bits |= (static_cast<std::int32_t>(counts.v[r / 2][r % 2]) <= limit ? 1u : 0u) << r;
+    }
+    return bits;
+  }
+  static void store_counts(std::int64_t* to, const Counts& counts) {
+    __builtin_memcpy(to, &counts, sizeof counts);
+  }
+
+ private:
+  // The sums of the two 16-bit numbers of each lane.
+  static Ints pairs(Shorts numbers) { return ((Ints)numbers << 16 >> 16) + ((Ints)numbers >> 16); }
+  static Longs popcounts(Longs x) {
+    x -= (x >> 1) & 0x5555555555555555u;
+    x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);
+    x = (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0fu;
+    x += x >> 8;
+    x += x >> 16;
+    x += x >> 32;
+    return x & 0xff;
+  }
+};
 
 // Rounds half up. s * multiplier is below 2^62, so adding 2^61 at most cannot overflow.
 template <typename Sum>
-void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
-              std::size_t stride) {
+void activate_any_shift(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
+                        std::size_t stride) {
   const std::int64_t half = std::int64_t{1} << (a.shift - 1);
   for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
     for (std::size_t o = 0; o < kOutputs; ++o) {
@@ -86,117 +187,33 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
   }
 }
 
-// Queries come as q + 128: |p|^2 - 2 p . q = |p|^2 + 256 sum(p) - 2 p . (q + 128).
-void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t,
-                 std::int32_t* biases, std::int32_t*) {
-  for (std::size_t b = 0; b < blocks; ++b, packed += kCodeRows * dim) {
-    for (std::size_t r = 0; r < kCodeRows; ++r) {
-      std::int32_t sum = 0;
-      for (std::size_t d = 0; d < dim; d += 4) {
-        for (std::size_t j = 0; j < 4; ++j) {
-          const std::int32_t p = packed[d * kCodeRows + 4 * r + j];
-          sum += p * p + 256 * p;
-        }
-      }
-      biases[b * kCodeRows + r] = sum;
-    }
-  }
-}
-
-void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int half_step,
+void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
                   std::int8_t* codes) {
   std::int8_t levels[16];
-  for (int u = 0; u < 16; ++u) levels[u] = static_cast<std::int8_t>(half_step * (2 * u - 15));
+  for (int u = 0; u < 16; ++u) levels[u] = static_cast<std::int8_t>(scale * (2 * u - 15));
   for (std::size_t b = 0; b < blocks; ++b) {
     for (std::size_t d = 0; d < dim; d += 4, codes += 4 * kCodeRows) {
       const int shift = d % 8 == 0 ? 0 : 4;
       for (std::size_t i = 0; i < 4 * kCodeRows; ++i) {
         codes[i] = d + i % 4 < dim ? levels[packed[i] >> shift & 15] : std::int8_t{0};
       }
-      // Both halves of the bytes were read, or there is no second half.
+      // Go on where both halves of the bytes were read, or there is no second half.
       if (shift == 4 || d + 4 >= dim) packed += 4 * kCodeRows;
     }
   }
 }
 
-std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
-                      Hit* hits) {
-  const std::size_t dim = rows.dim;
-  BlockBiases biases_of(rows, code_biases);
-  std::size_t found = 0;
-  for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
-    const std::size_t row = *block * kCodeRows;
-    const std::int32_t* biases = biases_of(row);
-    for (std::size_t q = 0; q < queries.n; ++q) {
-      const std::uint8_t* query = queries.codes + q * dim;
-      const std::int8_t* p = rows.codes + row * dim;
-      std::int32_t dot[kCodeRows] = {};
-      for (std::size_t d = 0; d < dim; d += 4, p += 4 * kCodeRows) {
-        for (std::size_t r = 0; r < kCodeRows; ++r) {
-          dot[r] += p[4 * r] * query[d] + p[4 * r + 1] * query[d + 1] +
-                    p[4 * r + 2] * query[d + 2] + p[4 * r + 3] * query[d + 3];
-        }
-      }
-      for (std::size_t r = 0; r < kCodeRows; ++r) {
-        const std::int32_t distance = biases[r] - 2 * dot[r];
-        if (distance <= queries.limits[q]) {
-          hits[found++] = {static_cast<std::uint32_t>(q), static_cast<std::uint32_t>(row + r),
-                           distance};
-        }
-      }
-    }
-  }
-  return found;
-}
-
-// Compilers turn this form into vector code where std::popcount without -mpopcnt is a library call.
-std::uint64_t popcount(std::uint64_t x) {
-  x -= (x >> 1) & 0x5555555555555555u;
-  x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);
-  x = (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0fu;
-  x += x >> 8;
-  x += x >> 16;
-  x += x >> 32;
-  return x & 0xff;
-}
-
-std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, std::size_t* block,
-                         Hit* hits) {
-  const std::size_t words = rows.words;
-  std::size_t found = 0;
-  for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
-    const std::size_t row = *block * kWordRows;
-    for (std::size_t q = 0; q < queries.n; ++q) {
-      std::uint64_t count[kWordRows] = {};
-      for (std::size_t w = 0; w < words; ++w) {
-        for (std::size_t r = 0; r < kWordRows; ++r) {
-          count[r] += popcount(queries.words[q * words + w] ^
-                               rows.words_of_rows[row * words + w * kWordRows + r]);
-        }
-      }
-      for (std::size_t r = 0; r < kWordRows; ++r) {
-        const auto distance = static_cast<std::int32_t>(count[r]);
-        if (distance <= queries.limits[q]) {
-          hits[found++] = {static_cast<std::uint32_t>(q), static_cast<std::uint32_t>(row + r),
-                           distance};
-        }
-      }
-    }
-  }
-  return found;
-}
-
 }  // namespace
 
 const Kernels portable = {.name = "portable",
-                          .bit_sums = bit_sums,
-                          .bit_sum = bit_sum,
-                          .dense = dense,
-                          .activate16 = activate<std::int16_t>,
-                          .activate32 = activate<std::int32_t>,
-                          .code_biases = code_biases,
+                          .bit_sums = bit_sums<Portable>,
+                          .bit_sum = bit_sum<Portable>,
+                          .dense = dense<Portable>,
+                          .activate16 = activate_any_shift<std::int16_t>,
+                          .activate32 = activate_any_shift<std::int32_t>,
+                          .code_biases = code_biases<Portable>,
                           .code_unpack4 = code_unpack4,
-                          .code_scan = code_scan,
-                          .hamming_scan = hamming_scan};
+                          .code_scan = code_scan<Portable>,
+                          .hamming_scan = hamming_scan<Portable>};
 
 }  // namespace protomark::kernels
