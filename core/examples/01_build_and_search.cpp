@@ -50,9 +50,9 @@ int main(int argc, char** argv) try {
   std::vector<std::uint8_t> frame;
   for (std::size_t landmark = 0; landmark < landmarks; ++landmark) observe(landmark, frame);
   std::vector<std::int64_t> found(landmarks * 2);
-  std::vector<float> distances(landmarks * 2);
+  std::vector<std::int32_t> distances(landmarks * 2);
   pm::SearchOptions options;
-  options.ratio = 0.9f;
+  options.ratio = 0.9;
   map.search({frame.data(), landmarks, bytes}, options, {found.data(), landmarks, 2},
              {distances.data(), landmarks, 2});
   std::size_t accepted = 0, right = 0;

@@ -77,9 +77,9 @@ void test_threads(std::size_t look_bits, std::size_t dim, std::size_t cells) {
   CHECK(bytes_of(encoded) == expected);
 }
 
-std::vector<float> distances(const PrototypeMap& map, Codes queries) {
+std::vector<std::int32_t> distances(const PrototypeMap& map, Codes queries) {
   std::vector<std::int64_t> ids(queries.rows);
-  std::vector<float> result(queries.rows);
+  std::vector<std::int32_t> result(queries.rows);
   map.search_codes(queries, {}, {ids.data(), queries.rows, 1}, {result.data(), queries.rows, 1});
   return result;
 }

@@ -23,7 +23,7 @@ constexpr int kRounds = 30;
 
 struct Answer {
   std::vector<std::int64_t> ids = std::vector<std::int64_t>(kQueries * kNeighbours);
-  std::vector<float> distances = std::vector<float>(kQueries * kNeighbours);
+  std::vector<std::int32_t> distances = std::vector<std::int32_t>(kQueries * kNeighbours);
   bool operator==(const Answer&) const = default;
 };
 

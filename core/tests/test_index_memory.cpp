@@ -75,7 +75,8 @@ void test_memory(std::size_t look_bits, bool placed) {
 struct State {
   std::vector<std::int64_t> ids, nearest;
   std::vector<std::uint32_t> counts;
-  std::vector<float> prototypes, distances;
+  std::vector<float> prototypes;
+  std::vector<std::int32_t> distances;
   std::vector<Position> positions;
   std::size_t cells, rows;
   bool operator==(const State&) const = default;
@@ -93,7 +94,7 @@ State state_of(const PrototypeMap& map, Codes queries) {
   s.nearest.resize(queries.rows * 3);
   s.distances.resize(queries.rows * 3);
   SearchOptions options;
-  if (s.cells != 0) options.probes = 1;
+  if (s.cells != 0) options.nprobe = 1;
   map.search_codes(queries, options, {s.nearest.data(), queries.rows, 3},
                    {s.distances.data(), queries.rows, 3});
   return s;

@@ -44,7 +44,7 @@ template <typename Map>
 Ids search(const Map& map, const std::vector<std::int8_t>& codes, std::size_t k) {
   const std::size_t n = codes.size() / kDim;
   Ids ids(n * k);
-  std::vector<float> distances(n * k);
+  std::vector<std::int32_t> distances(n * k);
   map.search_codes(view(codes), {}, {ids.data(), n, k}, {distances.data(), n, k});
   return ids;
 }
@@ -152,7 +152,7 @@ void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
 
   CHECK(refused([&] { search(map, codes, 0); }, "k must be at least 1"));
   Ids ids(2);
-  std::vector<float> distances(2);
+  std::vector<std::int32_t> distances(2);
   const auto with = [&](const SearchOptions& options, std::size_t rows = 2) {
     map.search_codes(view(codes), options, {ids.data(), rows, 1}, {distances.data(), 2, 1});
   };
@@ -161,12 +161,12 @@ void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
   options.threads = 0;
   CHECK(refused([&] { with(options); }, "threads must be at least 1"));
   options = {};
-  for (const float d : {-1.0f, NAN}) {
+  for (const std::int32_t d : {-1, INT32_MIN}) {
     options.max_distance = d;
     CHECK(refused([&] { with(options); }, "max_distance"));
   }
   options = {};
-  for (const float ratio : {0.0f, 1.01f, NAN}) {
+  for (const double ratio : {0.0, 1.01, std::nan("")}) {
     options.ratio = ratio;
     CHECK(refused([&] { with(options); }, "ratio must be above 0"));
   }
@@ -478,7 +478,7 @@ void test_hamming() {
   hamming_search(queries, database, repeated, {}, found, far);
   CHECK(ids == Ids{5, 7, 5, 7});
   hamming_search(queries, {rows.data(), 0, 8}, {}, found, far);
-  CHECK(ids == Ids{-1, -1, -1, -1} && distances[0] == 65);
+  CHECK(ids == Ids{-1, -1, -1, -1} && distances[0] == INT32_MAX);
 }
 
 }  // namespace

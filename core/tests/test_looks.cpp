@@ -45,7 +45,7 @@ template <typename Map>
 void check_search(const Map& map, const std::map<std::int64_t, Rows>& rows, Codes queries) {
   const std::size_t k = 3;
   std::vector<std::int64_t> ids(queries.rows * k);
-  std::vector<float> distances(ids.size());
+  std::vector<std::int32_t> distances(ids.size());
   SearchOptions options;
   options.threads = 2;
   map.search_codes(queries, options, {ids.data(), queries.rows, k},

@@ -46,9 +46,9 @@ void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path
   for (const std::size_t k : {1, 3}) {
     SearchOptions options;
     options.threads = 2;
-    if (k == 1) options.ratio = 0.9f;
+    if (k == 1) options.ratio = 0.9;
     std::vector<std::int64_t> a(k * queries.rows), b(a.size());
-    std::vector<float> distance_a(a.size()), distance_b(a.size());
+    std::vector<std::int32_t> distance_a(a.size()), distance_b(a.size());
     expanded.search_codes(queries, options, {a.data(), queries.rows, k},
                           {distance_a.data(), queries.rows, k});
     mapped.search_codes(queries, options, {b.data(), queries.rows, k},
@@ -89,7 +89,7 @@ int main() {
   CHECK(mapped.positions(std::span(ids).first(1))[0] == here);
 
   std::vector<std::int64_t> found(3 * n), found_read(3 * n), found_mapped(3 * n);
-  std::vector<float> distance(3 * n), distance_read(3 * n), distance_mapped(3 * n);
+  std::vector<std::int32_t> distance(3 * n), distance_read(3 * n), distance_mapped(3 * n);
   const Codes queries{codes.data(), n, dim};
   map.search_codes(queries, {}, {found.data(), n, 3}, {distance.data(), n, 3});
   read.search_codes(queries, {}, {found_read.data(), n, 3}, {distance_read.data(), n, 3});

@@ -54,7 +54,7 @@ std::vector<std::byte> changed(const std::vector<std::byte>& bytes, const Change
 
 struct Answers {
   std::vector<std::int64_t> ids = std::vector<std::int64_t>(2 * kQueries);
-  std::vector<float> distances = std::vector<float>(2 * kQueries);
+  std::vector<std::int32_t> distances = std::vector<std::int32_t>(2 * kQueries);
   bool operator==(const Answers&) const = default;
 };
 
@@ -62,7 +62,7 @@ template <typename Map>
 Answers search(const Map& map, Codes queries, std::optional<std::size_t> probes, int threads = 1) {
   Answers result;
   SearchOptions options;
-  options.probes = probes;
+  options.nprobe = probes;
   options.threads = threads;
   map.search_codes(queries, options, {result.ids.data(), kQueries, 2},
                    {result.distances.data(), kQueries, 2});

@@ -51,7 +51,7 @@ int main() {
           shared.add_codes(std::span(&ids[i], 1), {all.row(i), 1, dim});
           if (i % 100 == 0) {
             std::int64_t found;
-            float distance;
+            std::int32_t distance;
             shared.search_codes({all.row(i), 1, dim}, {}, {&found, 1, 1}, {&distance, 1, 1});
             CHECK(found >= 0);
           }

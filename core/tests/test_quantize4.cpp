@@ -18,7 +18,7 @@ Occurrences once(std::initializer_list<int> values) {
 }  // namespace
 
 int main() {
-  for (int half_step = 1; half_step <= kMaxHalfStep; ++half_step) {
+  for (int half_step = 1; half_step <= kMaxScale; ++half_step) {
     for (int value = -128; value < 128; ++value) {
       const std::uint8_t u = quantize4(value, half_step);
       CHECK(u < 16);

@@ -100,9 +100,9 @@ class SealedMap {
   MapSummary summary() const;
 
   void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
-              MatrixView<float> distances) const;
+              MatrixView<std::int32_t> distances) const;
   void search_codes(Codes queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
-                    MatrixView<float> distances) const;
+                    MatrixView<std::int32_t> distances) const;
 
  private:
   struct Content;

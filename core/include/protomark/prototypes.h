@@ -154,9 +154,9 @@ class PrototypeMap {
 
   // See protomark/search.h.
   void search(Descriptors queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
-              MatrixView<float> distances) const;
+              MatrixView<std::int32_t> distances) const;
   void search_codes(Codes queries, const SearchOptions& options, MatrixView<std::int64_t> ids,
-                    MatrixView<float> distances) const;
+                    MatrixView<std::int32_t> distances) const;
 
   // Writes the map, landmarks by ascending id, so that equal maps (of equal cells) give equal
   // files. Whole or not at all. Onto the file that it was loaded from with a journal: compacts.

@@ -5,8 +5,6 @@
 #include <cstdlib>
 #include <limits>
 
-#include "protomark/search.h"
-
 namespace protomark {
 
 std::uint8_t quantize4(int value, int half_step) {
@@ -18,7 +16,7 @@ std::uint8_t quantize4(int value, int half_step) {
 int best_half_step(const Occurrences& occurrences) {
   int best = 1;
   auto least = std::numeric_limits<std::uint64_t>::max();
-  for (int half_step = 1; half_step <= kMaxHalfStep; ++half_step) {
+  for (int half_step = 1; half_step <= kMaxScale; ++half_step) {
     std::uint64_t error = 0;
     for (std::size_t i = 0; i < occurrences.size(); ++i) {
       const int value = static_cast<int>(i) - 128;

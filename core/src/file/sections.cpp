@@ -4,8 +4,9 @@
 #include <cmath>
 #include <string>
 
+#include "base/quantize4.h"
 #include "map/position_grid.h"
-#include "search/ivf.h"
+#include "search/coarse_quantizer.h"
 
 namespace protomark {
 
@@ -52,9 +53,9 @@ int read_levels(const ContainerReader& file) {
     file.fail("its prototypes have " + std::to_string(bits) +
               " bits a number, this Protomark reads 8 and 4");
   }
-  if (half_step < 1 || half_step > kMaxHalfStep) {
+  if (half_step < 1 || half_step > kMaxScale) {
     file.fail("the half-step of its prototypes is " + std::to_string(half_step) + ", not 1 to " +
-              std::to_string(kMaxHalfStep));
+              std::to_string(kMaxScale));
   }
   return static_cast<int>(half_step);
 }
@@ -87,7 +88,7 @@ std::vector<std::int8_t> read_cells(const ContainerReader& file, std::size_t dim
   const auto bytes = file.map_if_there(section::kCells);
   if (!bytes) return {};
   const std::size_t cells = bytes->size() / dim;
-  if (cells == 0 || cells > Cells::kMaxCells || bytes->size() != cells * dim) {
+  if (cells == 0 || cells > CoarseQuantizer::kMaxLists || bytes->size() != cells * dim) {
     file.fail("its section 'cells' has the wrong size");
   }
   auto centroids = read_section<std::int8_t>(file, section::kCells, cells * dim);

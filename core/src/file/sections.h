@@ -32,7 +32,7 @@ inline constexpr char kCells[] = "cells";        // int8, centroids, cells x dim
 inline constexpr char kCellRows[] = "cellrows";  // sealed, with cells: uint32, rows of each
 inline constexpr char kOrder[] = "order";        // ... landmark of each place (bit_numbers.h)
 inline constexpr char kOrderChecksums[] = "ordersum";  // ... uint32, of its blocks
-inline constexpr char kProbes[] = "probes";            // ... uint32, ProbeRanks
+inline constexpr char kProbes[] = "probes";            // ... uint32, RecallTable
 // Open: 3 x float64; sealed: 3 x float32, with steps 3 x uint16.
 inline constexpr char kPositions[] = "position";
 inline constexpr char kSteps[] = "steps";  // sealed, positions of 16 bits: 3 x float64

@@ -40,7 +40,7 @@ void PrototypeStore::find_rows(std::span<const std::int64_t> landmarks, Codes co
 void PrototypeStore::add(std::span<const std::int64_t> landmarks, Codes codes,
                          std::span<const std::uint32_t> rows) {
   const std::size_t n = rows.size();
-  if (cells_.size() != 0) unsettled_.reserve(unsettled_.size() + n);
+  if (cells_.nlist() != 0) unsettled_.reserve(unsettled_.size() + n);
   for (std::size_t i = 0; i < n + kAhead; ++i) {
     if (i < n && rows[i] != kNone) prefetch_prototype(rows[i]);
     if (i < kAhead) continue;
@@ -99,7 +99,7 @@ void PrototypeStore::refresh(std::uint32_t row) {
     differences |= before ^ after;
   }
   if (uncommitted_) uncommitted_->insert(ids_[landmark_of(row)]);
-  if (differences != 0 && cells_.size() != 0) {
+  if (differences != 0 && cells_.nlist() != 0) {
     unsettled_.push_back({ids_[landmark_of(row)], look(row)});
   }
 }

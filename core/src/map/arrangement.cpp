@@ -12,27 +12,27 @@ constexpr std::size_t kChunk = 1 << 14;
 
 }  // namespace
 
-PrototypeStore::Arrangement PrototypeStore::arrange(Cells cells, int threads) const {
-  std::vector<std::uint32_t> cell_of(places(), CellOrder::kNone), rows;
+PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer cells, int threads) const {
+  std::vector<std::uint32_t> cell_of(places(), ListOrder::kNone), rows;
   rows.reserve(std::min(rows_, kChunk));
   for (std::uint32_t place = 0; place < places(); ++place) {
     if (is_row(place)) rows.push_back(place);
     if (rows.size() < kChunk && place + 1 < places()) continue;
     std::vector<std::uint32_t> own(rows.size(), 0);
-    if (cells.size() != 0) {
+    if (cells.nlist() != 0) {
       const std::vector<std::int8_t> codes = rounded(rows);
       own = cells.assign({codes.data(), rows.size(), dim_}, threads);
     }
     for (std::size_t i = 0; i < rows.size(); ++i) cell_of[rows[i]] = own[i];
     rows.clear();
   }
-  const std::size_t number_of_cells = std::max<std::size_t>(cells.size(), 1);
-  CellOrder order(std::move(cell_of), number_of_cells);
+  const std::size_t number_of_cells = std::max<std::size_t>(cells.nlist(), 1);
+  ListOrder order(std::move(cell_of), number_of_cells);
 
-  Arrangement result{std::move(cells), CellBlocks(number_of_cells), std::move(order.places)};
+  Arrangement result{std::move(cells), ListBlocks(number_of_cells), std::move(order.new_rows)};
   result.blocks.reserve(order.first_blocks.back());
   for (std::uint32_t c = 0; c < number_of_cells; ++c) {
-    for (std::size_t i = 0; i < order.rows[c]; ++i) result.blocks.append(c);
+    for (std::size_t i = 0; i < order.sizes[c]; ++i) result.blocks.append(c);
   }
   return result;
 }
@@ -64,7 +64,7 @@ PrototypeStore PrototypeStore::arranged(Arrangement& arrangement) const {
 }
 
 void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
-  const CellBlocks& blocks = arrangement.blocks;
+  const ListBlocks& blocks = arrangement.blocks;
   renumber_rows(arrangement.to);
   resize_rows(std::max(places(), arrangement.places()));
   permute(arrangement.to);
@@ -72,9 +72,9 @@ void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
   padding.position = kNowhere;
   padding.id = -1;
   padding.owner = padding.next = kNone;
-  for (std::uint32_t c = 0; c < blocks.cells(); ++c) {
+  for (std::uint32_t c = 0; c < blocks.nlist(); ++c) {
     if (blocks.rows(c) == 0) continue;
-    for (std::uint32_t place = blocks.last(c) + 1; place % kPackedRows != 0; ++place) {
+    for (std::uint32_t place = blocks.last(c).value + 1; place % kPackedRows != 0; ++place) {
       write(place, padding);
     }
   }

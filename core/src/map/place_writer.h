@@ -15,7 +15,7 @@
 #include "file/container.h"
 #include "map/landmark_numbers.h"
 #include "map/seal_rows.h"
-#include "protomark/search.h"
+#include "search/packed.h"
 
 namespace protomark {
 
@@ -88,7 +88,7 @@ class PlaceWriter {
   // As many as the rows take.
   static std::size_t places(const SealedRows& rows) {
     std::size_t blocks = 0;
-    for (std::uint32_t c = 0; c < rows.store().blocks().cells(); ++c) {
+    for (std::uint32_t c = 0; c < rows.store().blocks().nlist(); ++c) {
       blocks += (rows.rows_in(c) + kPackedRows - 1) / kPackedRows;
     }
     return blocks * kPackedRows;

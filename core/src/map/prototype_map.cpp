@@ -122,7 +122,7 @@ void PrototypeMap::add(std::span<const std::int64_t> landmarks, Descriptors desc
   std::size_t begin = 0;
   for (std::size_t next = kEncodeChunk; next < descriptors.rows; next += kEncodeChunk) {
     const auto chunk = codes(next);
-    if (store_->cells().size() == 0) {
+    if (store_->cells().nlist() == 0) {
       // One thread adds what is encoded and waits for memory, while the others go on encoding.
       const std::size_t n = std::clamp<std::size_t>(
           chunk.rows / (4 * static_cast<std::size_t>(threads)), kLeastShare, kMostShare);
@@ -361,7 +361,7 @@ std::vector<Look> PrototypeMap::looks(std::int64_t landmark) const {
 }
 
 void PrototypeMap::search(Descriptors queries, const SearchOptions& options,
-                          MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
+                          MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) const {
   std::vector<std::int8_t> codes(queries.rows * dim_);
   encoder_->encode(queries, {codes.data(), queries.rows, dim_}, options.threads);
   search_codes({codes.data(), queries.rows, dim_}, options, ids, distances);

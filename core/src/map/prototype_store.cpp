@@ -149,7 +149,7 @@ void PrototypeStore::make_room_for_row() {
 void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                                const Alone& alone) {
   // New rows begin in the first cell, and each that moves may be the first of a block.
-  const std::size_t moving = cells_.size() == 0 ? 0 : std::min(changed, cells_.size());
+  const std::size_t moving = cells_.nlist() == 0 ? 0 : std::min(changed, cells_.nlist());
   const std::size_t blocks = 2 * ((rows + kPackedRows - 1) / kPackedRows) + moving;
   for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more) {
     if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), alone);
@@ -184,7 +184,7 @@ void PrototypeStore::resize_rows(std::size_t places) {
 std::uint32_t PrototypeStore::take_place(std::uint32_t cell) {
   if (places() + kPackedRows > kNone) throw std::length_error("a map holds under 2^32 prototypes");
   make_room_for_row();
-  const std::uint32_t row = blocks_.append(cell);
+  const std::uint32_t row = blocks_.append(cell).value;
   if (places() != counts_.size()) resize_rows(places());
   ++rows_;
   std::fill_n(sum(row), dim_, std::int16_t{0});
@@ -272,12 +272,12 @@ void PrototypeStore::relocate(std::uint32_t from, std::uint32_t to) {
 // last block takes its place.
 void PrototypeStore::close_gap(std::uint32_t row) {
   vacate(row);
-  const std::uint32_t cell = blocks_.cell_of(row);
-  if (const std::uint32_t last = blocks_.last(cell); last != row) relocate(last, row);
+  const std::uint32_t cell = blocks_.list_of({row});
+  if (const std::uint32_t last = blocks_.last(cell).value; last != row) relocate(last, row);
   const std::uint32_t gone = blocks_.pop(cell);
   --rows_;
   ++changes_;
-  if (gone == CellBlocks::kNone) return;
+  if (gone == ListBlocks::kNone) return;
   const auto moved = static_cast<std::uint32_t>(blocks_.blocks());
   for (std::uint32_t i = 0; gone != moved && i < kPackedRows; ++i) {
     const std::uint32_t from = moved * kPackedRows + i;
@@ -367,7 +367,8 @@ void PrototypeStore::visit_sorted_landmarks(const Visit& visit) const {
 
 void PrototypeStore::visit_sorted_rows(std::uint32_t cell, const Visit& visit) const {
   visit_sorted(
-      blocks_.rows(cell), [&](const auto& take) { blocks_.each_row(cell, take); },
+      blocks_.rows(cell),
+      [&](const auto& take) { blocks_.each_row(cell, [&](auto row) { take(row.value); }); },
       [&](std::uint32_t row) { return std::pair(ids_[landmark_of(row)], look(row)); }, visit);
 }
 
@@ -455,12 +456,12 @@ void PrototypeStore::settle(int threads) {
     const std::vector<std::int8_t> codes = rounded(rows);
     std::vector<std::uint32_t> cells = cells_.assign({codes.data(), rows.size(), dim_}, threads);
     for (std::size_t i = 0; i < rows.size(); ++i) {
-      if (blocks_.cell_of(rows[i]) == cells[i]) cells[i] = kNone;
+      if (blocks_.list_of({rows[i]}) == cells[i]) cells[i] = kNone;
     }
     for (std::size_t i = 0; i < keys.size(); ++i) {
       if (cells[i] == kNone) continue;
       const std::uint32_t row = find_key(keys[i]);
-      if (blocks_.cell_of(row) == cells[i]) continue;  // it was there twice
+      if (blocks_.list_of({row}) == cells[i]) continue;  // it was there twice
       relocate(row, take_place(cells[i]));
       close_gap(row);
     }
@@ -503,7 +504,7 @@ void PrototypeMap::Store::alone(const std::function<void()>& swap) {
 }
 
 // What was there before goes when the lock has.
-void PrototypeMap::Store::put_into_cells(Cells cells, int threads, bool in_place) {
+void PrototypeMap::Store::put_into_cells(CoarseQuantizer cells, int threads, bool in_place) {
   Arrangement to = arrange(std::move(cells), threads);
   if (in_place) {
     make_places(to.places(), [&](const auto& swap) { alone(swap); });
@@ -518,8 +519,12 @@ void PrototypeMap::Store::put_into_cells(Cells cells, int threads, bool in_place
 }
 
 PackedPrototypes PrototypeStore::view() const {
-  PackedPrototypes result{packed(), places(), dim_, ids_.data()};
-  if (look_bits_ != 0) result.landmarks.of_row = owners_.data();
+  static_assert(sizeof(LandmarkIndex) == sizeof(std::uint32_t));
+  PackedPrototypes result{packed(), places(), dim_};
+  result.landmarks.ids = ids_.data();
+  if (look_bits_ != 0) {
+    result.landmarks.of_row = reinterpret_cast<const LandmarkIndex*>(owners_.data());
+  }
   return result;
 }
 

@@ -21,8 +21,8 @@
 #include "file/journal.h"
 #include "map/changes.h"
 #include "protomark/prototypes.h"
-#include "search/cell_blocks.h"
-#include "search/ivf.h"
+#include "search/coarse_quantizer.h"
+#include "search/list_blocks.h"
 #include "search/recall.h"
 
 namespace protomark {
@@ -36,7 +36,7 @@ bool is_nowhere(const Position& position);
 // Neither landmarks nor rows are sorted. Without looks a row is a landmark and has its number; with
 // them, the rows of a landmark are a chain.
 //
-// Rows stand in blocks by cell (CellBlocks): one without an index, else that of their rounded
+// Rows stand in blocks by cell (ListBlocks): one without an index, else that of their rounded
 // prototype. Row numbers that no row has are padding. Numbers of landmarks and rows hold until one
 // goes or `settle` is called: others take the places of those that go.
 class PrototypeStore {
@@ -140,20 +140,20 @@ class PrototypeStore {
   void refresh(std::uint32_t row);
 
   // Coarse cells; none: there is no index.
-  const Cells& cells() const { return cells_; }
-  const CellBlocks& blocks() const { return blocks_; }
+  const CoarseQuantizer& cells() const { return cells_; }
+  const ListBlocks& blocks() const { return blocks_; }
   // A number that every set of cells has for itself.
   std::size_t cells_version() const { return cells_version_; }
   // Where rows will stand by other cells.
   struct Arrangement {
-    Cells cells;
-    CellBlocks blocks;
+    CoarseQuantizer cells;
+    ListBlocks blocks;
     std::vector<std::uint32_t> to;  // of each place; kNone where no row stands
 
     std::size_t places() const { return blocks.blocks() * kPackedRows; }
   };
   // By these cells; none: drops the index.
-  Arrangement arrange(Cells cells, int threads) const;
+  Arrangement arrange(CoarseQuantizer cells, int threads) const;
   // The same map so arranged; takes the arrangement's cells.
   PrototypeStore arranged(Arrangement& arrangement) const;
   // This map itself; needs `make_places` for it before, and uses up the arrangement.
@@ -248,8 +248,8 @@ class PrototypeStore {
   std::vector<std::uint32_t> owners_;  // landmark of a row; empty without looks
   std::vector<std::uint32_t> next_;    // row of the same landmark; empty without looks
 
-  CellBlocks blocks_;
-  Cells cells_;
+  ListBlocks blocks_;
+  CoarseQuantizer cells_;
   std::size_t cells_version_ = 0;
   std::vector<Key> unsettled_;
   std::size_t changes_ = 0;
@@ -282,17 +282,17 @@ struct PrototypeMap::Store : PrototypeStore {
   void add_in_pieces(std::span<const std::int64_t> landmarks, Codes codes, int threads);
   void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed);
   void make_room_for_positions();
-  Cells learn_cells(std::size_t number, int threads) const;
+  CoarseQuantizer learn_cells(std::size_t number, int threads) const;
   // Rows go by these cells: beside the map, which takes as much memory again, or within it, which
   // takes 5 bytes a place and, where arrays have to grow, the largest of them once more, but lets
   // searches wait.
-  void put_into_cells(Cells cells, int threads, bool in_place);
+  void put_into_cells(CoarseQuantizer cells, int threads, bool in_place);
 
   // As measured on the map, now or when it was much the same; where others measure or change the
   // map, with these cells at least. `lock` is one of `mutex`, and is let go while ranks are
   // measured.
-  std::shared_ptr<const MeasuredRanks> ranks(std::shared_lock<FairSharedMutex>& lock, double recall,
-                                             int threads) const;
+  std::shared_ptr<const MeasuredRecall> ranks(std::shared_lock<FairSharedMutex>& lock,
+                                              double recall, int threads) const;
 
   void set_metadata(Metadata texts) {
     if (tracks_changes()) uncommitted().metadata |= texts != metadata;
@@ -309,12 +309,12 @@ struct PrototypeMap::Store : PrototypeStore {
 
  private:
   void alone(const std::function<void()>& swap);
-  bool is_stale(const MeasuredRanks& ranks) const;
+  bool is_stale(const MeasuredRecall& ranks) const;
   void measure(int threads, bool wait) const;
 
   mutable std::mutex measuring_;    // before `changing`
   mutable std::mutex ranks_mutex_;  // last
-  mutable std::shared_ptr<const MeasuredRanks> ranks_;
+  mutable std::shared_ptr<const MeasuredRecall> ranks_;
 };
 
 }  // namespace protomark

@@ -29,7 +29,7 @@
 #include "map/prototype_store.h"
 #include "map/seal_rows.h"
 #include "map/sealed_ranks.h"
-#include "search/ivf.h"
+#include "search/coarse_quantizer.h"
 
 namespace protomark {
 namespace {
@@ -98,16 +98,16 @@ class SealedContent {
                       [this](auto sinks) { put_cells(sinks); });
     file.add(section::kOrderChecksums, order_checksums_size(order_size),
              [this](const auto& sink) { sink(std::as_bytes(std::span(order_checksums_.all()))); });
-    const Cells& cells = store().cells();
+    const CoarseQuantizer& cells = store().cells();
     file.add(section::kCells, std::as_bytes(std::span(cells.centroids())));
-    file.add(section::kCellRows, cells.size() * sizeof(std::uint32_t), [this](const auto& sink) {
+    file.add(section::kCellRows, cells.nlist() * sizeof(std::uint32_t), [this](const auto& sink) {
       put_values<std::uint32_t>(
-          sink, store().cells().size(), 1, [&](std::size_t c, std::uint32_t* to) {
+          sink, store().cells().nlist(), 1, [&](std::size_t c, std::uint32_t* to) {
             *to = static_cast<std::uint32_t>(rows_->rows_in(static_cast<std::uint32_t>(c)));
           });
     });
     file.add(section::kProbes, ContainerWriter::kUnknownSize, [this](const auto& sink) {
-      const ProbeRanks measured = sealed_ranks(*rows_, *packer_, *tests_);
+      const RecallTable measured = sealed_ranks(*rows_, *packer_, *tests_);
       sink(std::as_bytes(std::span(measured)));
     });
   }
@@ -117,7 +117,7 @@ class SealedContent {
   using Put = std::function<void(const ContainerWriter::Sink&, std::span<const std::uint32_t>)>;
 
   const PrototypeStore& store() const { return rows_->store(); }
-  bool indexed() const { return store().cells().size() != 0; }
+  bool indexed() const { return store().cells().nlist() != 0; }
 
   void put_landmarks(Sinks sinks) {
     std::optional<PlaceWriter> places;
@@ -146,7 +146,7 @@ class SealedContent {
       sinks[1](bytes);
     };
     PlaceWriter places(*rows_, *packer_, sinks[0], order, numbers_, number_bits_);
-    for (std::uint32_t c = 0; c < store().cells().size(); ++c) {
+    for (std::uint32_t c = 0; c < store().cells().nlist(); ++c) {
       rows_->visit_sorted_rows(c, [&](std::span<const std::uint32_t> piece) {
         for (const std::uint32_t row : piece) places.add(row);
       });
@@ -206,7 +206,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, int bits,
       n == 0 || ids_are_numbers(n, *std::max_element(store.ids().begin(), store.ids().end()));
 
   ContainerWriter file(FileKind::sealed_map, !numbered || gridded          ? 4
-                                             : store.cells().size() != 0   ? 3
+                                             : store.cells().nlist() != 0  ? 3
                                              : bits == 4 || rows.several() ? 2
                                                                            : 1);
   file.add(section::kEncoder, encoder_->serialize());

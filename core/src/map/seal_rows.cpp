@@ -107,7 +107,7 @@ std::size_t SealedRows::rows_in(std::uint32_t cell) const {
 }
 
 std::uint32_t SealedRows::cell_of(std::uint32_t row) const {
-  return joined_ ? joined_->cells[row] : store_->blocks().cell_of(row);
+  return joined_ ? joined_->cells[row] : store_->blocks().list_of({row});
 }
 
 void SealedRows::visit_sorted_rows(std::uint32_t cell, const PrototypeStore::Visit& visit) const {
@@ -151,11 +151,11 @@ void SealedRows::join(double most) {
     }
   }
   const std::size_t rows = result.landmarks.size();
-  const Cells& cells = store_->cells();
-  result.cells = cells.size() != 0 ? cells.assign({result.codes.data(), rows, dim}, 1)
-                                   : std::vector<std::uint32_t>(rows, 0);
+  const CoarseQuantizer& cells = store_->cells();
+  result.cells = cells.nlist() != 0 ? cells.assign({result.codes.data(), rows, dim}, 1)
+                                    : std::vector<std::uint32_t>(rows, 0);
   result.by_cell.resize(rows);
-  result.cell_ends.resize(std::max<std::size_t>(cells.size(), 1), 0);
+  result.cell_ends.resize(std::max<std::size_t>(cells.nlist(), 1), 0);
   for (const std::uint32_t cell : result.cells) ++result.cell_ends[cell];
   std::partial_sum(result.cell_ends.begin(), result.cell_ends.end(), result.cell_ends.begin());
   std::vector<std::uint32_t> next = result.cell_ends;

@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "map/prototype_store.h"
-#include "search/ivf.h"
+#include "search/coarse_quantizer.h"
 
 namespace protomark {
 

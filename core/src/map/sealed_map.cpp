@@ -16,8 +16,9 @@
 #include "map/position_grid.h"
 #include "map/summary_builder.h"
 #include "protomark/error.h"
-#include "search/ivf.h"
-#include "search/ivf_search.h"
+#include "search/coarse_quantizer.h"
+#include "search/inverted_lists.h"
+#include "search/prototype_scan.h"
 #include "search/recall.h"
 
 namespace protomark {
@@ -98,26 +99,24 @@ struct SealedMap::Content {
     const std::size_t n = shape.landmarks;
     rows = n;
     if (const auto bytes = file.read_if_there(section::kRows)) read_rows();
-    RowLandmarks landmarks;
     std::size_t places = rows;
-    if (file.map_if_there(section::kCells)) {
-      places = read_index();
-      landmarks.order = order.get();
-      landmarks.end = static_cast<std::uint32_t>(n);
-    } else {
-      landmarks.rows_of = rows_of;
-    }
+    if (file.map_if_there(section::kCells)) places = read_index();
+    prototypes.rows = places;
+    prototypes.dim = shape.dim;
     if (file.map_if_there(section::kLevels)) {
       code_bits = 4;
-      const int half_step = read_levels(file);
-      prototypes4 = {map<std::uint8_t>(section::kPrototypes, packed4_size(places, shape.dim)),
-                     places, shape.dim, half_step};
+      prototypes.scale = read_levels(file);
+      prototypes.data = map<std::uint8_t>(section::kPrototypes, packed4_size(places, shape.dim));
       if (!indexed()) check_padding();
     } else {
-      prototypes = {map<std::int8_t>(section::kPrototypes, packed_size(places, shape.dim)), places,
-                    shape.dim};
+      prototypes.data = map<std::int8_t>(section::kPrototypes, packed_size(places, shape.dim));
     }
-    prototypes.landmarks = prototypes4.landmarks = landmarks;
+    if (indexed()) {
+      prototypes.landmarks.look_up = [this](Row row) { return LandmarkIndex{(*order)[row.value]}; };
+      prototypes.landmarks.end = {static_cast<std::uint32_t>(n)};
+    } else {
+      prototypes.landmarks.row_counts = rows_of;
+    }
     counts = map<std::uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
     if (!file.map_if_there(section::kPositions)) return;
@@ -239,13 +238,14 @@ struct SealedMap::Content {
   }
 
   std::uint8_t value4(std::size_t row, std::size_t d) const {
-    const std::uint8_t byte = prototypes4.data[packed4_index(row, d, shape.dim)];
+    const auto* bytes = static_cast<const std::uint8_t*>(prototypes.data);
+    const std::uint8_t byte = bytes[packed4_index(row, d, shape.dim)];
     return static_cast<std::uint8_t>(packed4_high(d) ? byte >> 4 : byte & 15);
   }
 
   int prototype(std::size_t row, std::size_t d) const {
-    if (code_bits == 4) return level4(value4(place(row), d), prototypes4.half_step);
-    return prototypes.data[packed_index(place(row), d, shape.dim)];
+    if (code_bits == 4) return level4(value4(place(row), d), prototypes.scale);
+    return static_cast<const std::int8_t*>(prototypes.data)[packed_index(place(row), d, shape.dim)];
   }
 
   // Landmarks whose first rows are remembered: every one of these.
@@ -260,15 +260,14 @@ struct SealedMap::Content {
   const std::uint8_t* rows_of = nullptr;  // of each landmark; nullptr: each has one
   std::vector<std::uint32_t> first_rows;
   int code_bits = 8;
-  PackedPrototypes prototypes;    // where it is 8
-  PackedPrototypes4 prototypes4;  // where it is 4
+  PackedPrototypes prototypes;
   // The index, or nothing.
   std::vector<std::int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
   std::span<const std::uint32_t> cell_rows;
   std::vector<std::uint32_t> first_blocks;    // of each cell, and the end
   std::unique_ptr<const OrderNumbers> order;  // landmark of each place
-  ProbeRanks ranks;
+  RecallTable ranks;
   mutable std::once_flag places_found;
   mutable std::vector<std::uint32_t> places;  // of each row
 
@@ -301,7 +300,7 @@ std::size_t SealedMap::index_cells() const { return content_->index_cells(); }
 
 std::size_t SealedMap::probes(double recall) const {
   check_recall(recall, index_cells(), kRemedy);
-  return probes_for(content_->ranks, recall, index_cells());
+  return nprobe_for(content_->ranks, recall, index_cells());
 }
 
 int SealedMap::position_bits() const {
@@ -367,35 +366,24 @@ MapSummary SealedMap::summary() const {
 }
 
 void SealedMap::search(Descriptors queries, const SearchOptions& options,
-                       MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
+                       MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) const {
   std::vector<std::int8_t> codes(queries.rows * dim());
   encoder()->encode(queries, {codes.data(), queries.rows, dim()}, options.threads);
   search_codes({codes.data(), queries.rows, dim()}, options, ids, distances);
 }
 
 void SealedMap::search_codes(Codes queries, const SearchOptions& options,
-                             MatrixView<std::int64_t> ids, MatrixView<float> distances) const {
+                             MatrixView<std::int64_t> ids,
+                             MatrixView<std::int32_t> distances) const {
   const Content& c = *content_;
-  const auto probes = asked_probes(options, c.index_cells(), kRemedy);
-  const auto run = [&](const auto& prototypes) {
-    if (!probes) {
-      protomark::search(prototypes, queries, options, ids, distances);
-      return;
-    }
-    const PackedPrototypes centroids{
-        reinterpret_cast<const std::int8_t*>(c.packed_centroids.data()), c.index_cells(), dim()};
-    const std::size_t searched = options.recall ? this->probes(*options.recall) : *probes;
-    if (searched >= c.index_cells()) {
-      protomark::search(prototypes, queries, exact(options), ids, distances);
-      return;
-    }
-    search_cells(prototypes, CellView(c.cell_rows, c.first_blocks), centroids, searched, queries,
-                 exact(options), ids, distances);
-  };
-  if (c.code_bits == 4) {
-    run(c.prototypes4);
+  auto nprobe = requested_nprobe(options, c.index_cells(), kRemedy);
+  if (options.recall) nprobe = probes(*options.recall);
+  if (nprobe) {
+    search_lists(c.prototypes, InvertedLists(c.cell_rows, c.first_blocks),
+                 {c.packed_centroids.data(), c.index_cells(), dim()}, *nprobe, queries, options,
+                 ids, distances);
   } else {
-    run(c.prototypes);
+    search_exact(c.prototypes, queries, options, ids, distances);
   }
   // Ids ascend as numbers do, so that these decide between equals as ids would.
   if (c.ids.are_numbers()) return;

@@ -2,21 +2,17 @@
 
 #include <algorithm>
 #include <array>
-#include <cmath>
-#include <optional>
 
 #include "base/large_vector.h"
 #include "map/prototype_store.h"
-#include "search/top_k.h"
+#include "search/prototype_scan.h"
 
 namespace protomark {
 namespace {
 
-// Offers the two nearest landmarks of each query, found in so many rows at a time, to `offer(query,
-// id of the landmark, distance)`; none further away than farthest() says before each time.
-template <typename Offer, typename Farthest>
+// Offers the two nearest landmarks of each query, found in so many rows at a time, to `nearest`.
 void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes queries,
-                      const Offer& offer, const Farthest& farthest) {
+                      Neighbours& nearest) {
   // As much memory as is little beside the map.
   const std::size_t some =
       std::max<std::size_t>(1 << 12, rows.size() / 32 / kPackedRows * kPackedRows);
@@ -24,9 +20,9 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
   LargeVector<std::uint8_t> packed(some / kPackedRows * packer.size());
   std::vector<std::uint32_t> piece;
   std::vector<std::int64_t> ids(2 * queries.rows), landmarks;
-  std::vector<float> distances(ids.size());
-  std::vector<std::uint32_t> itself(some);  // several rows may have the same id
-  std::iota(itself.begin(), itself.end(), 0u);
+  std::vector<std::int32_t> distances(ids.size());
+  std::vector<LandmarkIndex> itself(some);  // several rows may have the same id
+  for (std::uint32_t i = 0; i < some; ++i) itself[i] = {i};
   piece.reserve(some);
   landmarks.reserve(some);
   const auto search_piece = [&] {
@@ -36,24 +32,18 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
     for (std::size_t begin = 0; begin < n; begin += kPackedRows) {
       packer.pack(&piece[begin], &packed[begin / kPackedRows * packer.size()]);
     }
-    RowLandmarks numbers;
-    numbers.of_row = itself.data();
-    const MatrixView<std::int64_t> nearest{ids.data(), queries.rows, 2};
-    const MatrixView<float> far{distances.data(), queries.rows, 2};
+    PackedPrototypes prototypes{packed.data(), n, rows.dim(), packer.half_step()};
+    prototypes.landmarks.of_row = itself.data();
+    prototypes.landmarks.ids = landmarks.data();
     SearchOptions options;
-    options.max_distance = farthest();
-    const auto find = [&](const auto& prototypes) {
-      search(prototypes, queries, options, nearest, far);
-    };
-    if (packer.half_step() == 0) {
-      const auto* codes = reinterpret_cast<const std::int8_t*>(packed.data());
-      find(PackedPrototypes{codes, n, rows.dim(), landmarks.data(), numbers});
-    } else {
-      find(PackedPrototypes4{packed.data(), n, rows.dim(), packer.half_step(), landmarks.data(),
-                             numbers});
+    options.max_distance = 0;
+    for (std::size_t q = 0; q < queries.rows; ++q) {
+      options.max_distance = std::max(*options.max_distance, nearest.limit(q));
     }
+    search_exact(prototypes, queries, options, {ids.data(), queries.rows, 2},
+                 {distances.data(), queries.rows, 2});
     for (std::size_t i = 0; i < ids.size(); ++i) {
-      if (ids[i] >= 0) offer(i / 2, ids[i], distances[i]);
+      if (ids[i] >= 0) nearest[i / 2].offer_distinct(distances[i], ids[i]);
     }
     piece.clear();
     landmarks.clear();
@@ -68,16 +58,19 @@ void search_in_pieces(const SealedRows& rows, const BlockPacker& packer, Codes q
 
 }  // namespace
 
-ProbeRanks sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
-                        const TestQueries& tests) {
+RecallTable sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
+                         const TestQueries& tests) {
   const std::size_t dim = rows.dim();
-  struct Nearest {
-    std::int32_t distance = INT32_MAX;
-    std::uint32_t row = 0;
+  const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids,
+                              MatrixView<std::int32_t> distances) {
+    Neighbours nearest(2, std::vector<std::int32_t>(queries.rows, INT32_MAX));
+    search_in_pieces(rows, packer, queries, nearest);
+    write_answer(nearest, {}, {}, {}, ids, distances);
   };
-  const auto nearest_row = [&](std::int64_t id, const std::int8_t* query) {
+  const auto cell_of = [&](std::int64_t id, const std::int8_t* query) {
     std::array<std::int8_t, 256> code;
-    Nearest result;
+    std::int32_t least = INT32_MAX;
+    std::uint32_t nearest = 0;
     rows.each_sorted_row(rows.store().at(id), [&](std::uint32_t row) {
       rows.code(row, code.data());
       std::int32_t distance = 0;
@@ -85,34 +78,13 @@ ProbeRanks sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
         const int difference = query[d] - packer.value(code[d]);
         distance += difference * difference;
       }
-      if (distance < result.distance) result = {distance, row};
+      if (distance >= least) return;
+      least = distance;
+      nearest = row;
     });
-    return result;
+    return rows.cell_of(nearest);
   };
-  const auto search_two = [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float>) {
-    std::vector<std::int32_t> distances(2 * queries.rows);
-    std::vector<TopK> best;
-    for (std::size_t q = 0; q < queries.rows; ++q) {
-      best.emplace_back(ids.row(q), &distances[2 * q], 2, INT32_MAX - 1);
-    }
-    // Floats do not tell all distances apart, but those that are far too large.
-    const auto offer = [&](std::size_t q, std::int64_t id, double distance) {
-      if (distance * distance > 1.00001 * best[q].limit()) return;
-      best[q].offer_distinct(nearest_row(id, queries.row(q)).distance, id);
-    };
-    const auto farthest = [&]() -> std::optional<float> {
-      std::int32_t most = 0;
-      for (const TopK& one : best) most = std::max(most, one.limit());
-      if (most >= INT32_MAX - 1) return std::nullopt;
-      return std::sqrt(static_cast<float>(most)) * 1.00001f;
-    };
-    search_in_pieces(rows, packer, queries, offer, farthest);
-  };
-  const auto cell_of = [&](std::int64_t id, const std::int8_t* query) {
-    return rows.cell_of(nearest_row(id, query).row);
-  };
-  return measure_ranks(tests.codes(), tests.own(), rows.store().cells().centroids(), search_two,
-                       cell_of);
+  return measure_recall(tests.codes(), tests.own(), rows.store().cells(), search_two, cell_of);
 }
 
 }  // namespace protomark

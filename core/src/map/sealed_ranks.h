@@ -13,7 +13,7 @@
 
 namespace protomark {
 
-// The test queries of measure_ranks: rows of test_rows, as landmarks come by id.
+// The test queries of measure_recall: rows of test_rows, as landmarks come by id.
 class TestQueries {
  public:
   explicit TestQueries(const SealedRows& rows)
@@ -49,7 +49,7 @@ class TestQueries {
   std::size_t row_ = 0, next_ = 0;
 };
 
-ProbeRanks sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
-                        const TestQueries& tests);
+RecallTable sealed_ranks(const SealedRows& rows, const BlockPacker& packer,
+                         const TestQueries& tests);
 
 }  // namespace protomark
