@@ -220,9 +220,8 @@ def expected_answers(
 ) -> list[tuple[int, int]]:
     """The definition: a landmark is as far away as its nearest prototype."""
     every = sorted((int(((p - query) ** 2).sum(1).min()), i) for i, p in landmarks.items())
-    if ratio is not None and len(every) > 1:
-        if not float(every[0][0]) < ratio * ratio * float(every[1][0]):
-            every = []
+    clear = len(every) < 2 or ratio is None or every[0][0] < ratio * ratio * every[1][0]
+    every = every if clear else []
     limit = NO_DISTANCE if max_distance is None else max_distance
     best = [(i, squared) for squared, i in every[:k] if squared <= limit]
     return best + [(-1, NO_DISTANCE)] * (k - len(best))

@@ -77,7 +77,7 @@ class CodeScan {
                std::size_t rows, const LimitOf& limit_of, const Take& take) {
     const kernels::PackedCodes chunk = prepare(packed, rows, n);
     each_hit(
-        n, rows, chunk.blocks, hits_,
+        n, rows, chunk.blocks,
         [&](std::size_t first, std::size_t group, const std::int32_t* limits, std::size_t* block,
             kernels::Hit* hits) {
           return kernels::active().code_scan(
@@ -96,7 +96,6 @@ class CodeScan {
   std::vector<std::int32_t> rest_norms_;  // see kernels::CodeQueries
   std::size_t steps_in_full_ = 0;
   std::vector<std::int32_t> biases_, prefix_biases_;
-  std::vector<kernels::Hit> hits_;
 };
 
 }  // namespace protomark

@@ -9,7 +9,6 @@
 #include <mutex>
 #include <optional>
 #include <span>
-#include <vector>
 
 #include "base/parallel.h"
 #include "kernels/kernels.h"
@@ -75,15 +74,15 @@ void run_search(int threads, const Division& division, std::size_t work, Neighbo
 // hits)` scans for some queries from block on; take(query, distance, row) gets those that are
 // within limit_of(query), which may become smaller by it.
 template <typename Kernel, typename LimitOf, typename Take>
-void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, std::vector<kernels::Hit>& hits,
-              const Kernel& kernel, const LimitOf& limit_of, const Take& take) {
-  hits.resize(kernels::kHitRoom);
+void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel& kernel,
+              const LimitOf& limit_of, const Take& take) {
+  kernels::Hit hits[kernels::kHitRoom];
   std::int32_t limits[kernels::kScanQueries];
   for (std::size_t first = 0; first < n; first += kernels::kScanQueries) {
     const std::size_t group = std::min(kernels::kScanQueries, n - first);
     for (std::size_t block = 0; block < blocks;) {
       for (std::size_t i = 0; i < group; ++i) limits[i] = limit_of(first + i);
-      const std::size_t found = kernel(first, group, limits, &block, hits.data());
+      const std::size_t found = kernel(first, group, limits, &block, hits);
       for (std::size_t i = 0; i < found; ++i) {
         const kernels::Hit& hit = hits[i];
         // Hits before it may have left no room for it.

@@ -62,14 +62,13 @@ void scan(Descriptors queries, Descriptors database, Range rows, Neighbours& nea
   }
   const std::size_t blocks = std::max<std::size_t>(kChunkBytes / (8 * words * kWordRows), 1);
   std::vector<std::uint64_t> packed(blocks * kWordRows * words);
-  std::vector<kernels::Hit> hits;
   for (std::size_t begin = rows.begin; begin < rows.end; begin += blocks * kWordRows) {
     const Range chunk{begin, std::min(rows.end, begin + blocks * kWordRows)};
     pack(database, chunk, words, packed.data());
     const kernels::PackedWords packed_rows{packed.data(),
                                            (chunk.size() + kWordRows - 1) / kWordRows, words};
     each_hit(
-        queries.rows, chunk.size(), packed_rows.blocks, hits,
+        queries.rows, chunk.size(), packed_rows.blocks,
         [&](std::size_t first, std::size_t n, const std::int32_t* limits, std::size_t* block,
             kernels::Hit* found) {
           return kernels::active().hamming_scan({&query_words[first * words], limits, n},

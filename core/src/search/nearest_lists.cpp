@@ -15,20 +15,27 @@ constexpr std::size_t kFewProbes = 16;
 // Queries that are compared with the centroids together.
 constexpr std::size_t kBatch = 256;
 
+// What a query has found: distances above, indices of centroids below, so that the order of these
+// numbers decides ties.
+using Found = std::vector<std::int64_t>;
+
 // The centroids against a batch of queries. For one thread.
 class Selection {
  public:
-  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch)
+  // `found` has room for each query of the batch.
+  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch,
+            std::vector<Found>& found)
       : centroids_(centroids),
         scan_(queries, batch),
         limits_(batch.size(), CodeScan::kNoLimit),
-        found_(batch.size()) {}
+        found_(found) {
+    for (Found& of_query : found_) of_query.clear();
+  }
 
   // Writes (queries x nprobe) indices.
   void nearest(std::size_t nprobe, std::uint32_t* to) {
     guess_limits(nprobe);
     const auto limit_of = [&](std::size_t q) { return limits_[q]; };
-    // Distances above, indices below, so that the order of these numbers decides ties.
     const auto take = [&](std::size_t q, std::int32_t distance, std::size_t list) {
       found_[q].push_back(std::int64_t{distance} * (std::int64_t{1} << 32) +
                           static_cast<std::int64_t>(list));
@@ -37,7 +44,7 @@ class Selection {
     for (std::size_t row = 0; row < centroids_.rows; row += chunk) {
       compare(row, std::min(chunk, centroids_.rows - row), limit_of, take);
     }
-    for (std::uint32_t q = 0; q < found_.size(); ++q) {
+    for (std::uint32_t q = 0; q < limits_.size(); ++q) {
       if (found_[q].size() < nprobe) {
         found_[q].clear();
         limits_[q] = CodeScan::kNoLimit;
@@ -48,8 +55,6 @@ class Selection {
   }
 
  private:
-  using Found = std::vector<std::int64_t>;
-
   // Sets limits that are likely to leave some more than `nprobe` centroids.
   void guess_limits(std::size_t nprobe) {
     const std::size_t step = std::max(kLeastStep, nprobe * 3 / 2 / kMostRank);
@@ -91,7 +96,7 @@ class Selection {
   const PackedPrototypes& centroids_;
   CodeScan scan_;
   std::vector<std::int32_t> limits_;
-  std::vector<Found> found_;  // by each query
+  std::vector<Found>& found_;
 };
 
 }  // namespace
@@ -101,8 +106,9 @@ std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
                                          int threads) {
   std::vector<std::uint32_t> result(queries.queries() * nprobe);
   parallel_for(threads, queries.queries(), 16, [&](std::size_t first, std::size_t last) {
+    std::vector<Found> found(std::min(kBatch, last - first));
     for (std::size_t q = first; q < last; q += kBatch) {
-      Selection(centroids, queries, {q, std::min(last, q + kBatch)})
+      Selection(centroids, queries, {q, std::min(last, q + kBatch)}, found)
           .nearest(nprobe, &result[q * nprobe]);
     }
   });
