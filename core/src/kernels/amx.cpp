@@ -107,11 +107,11 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
         best = _mm512_max_epi32(best, _mm512_load_si512(halves[i][q]));
       }
       const __m512i least = _mm512_set1_epi32(threshold(queries.limits[q]));
-      if (_mm512_cmpge_epi32_mask(best, least) == 0) continue;
+      if (_mm512_cmpgt_epi32_mask(best, least) == 0) continue;
       for (std::size_t i = 0; i < blocks; ++i) {
         const std::size_t row = (*block + i) * kCodeRows;
         found +=
-            append_hits(_mm512_cmpge_epi32_mask(_mm512_load_si512(halves[i][q]), least),
+            append_hits(_mm512_cmpgt_epi32_mask(_mm512_load_si512(halves[i][q]), least),
                         halves[i][q], rows.biases + row, queries.limits[q], q, row, hits + found);
       }
     }

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "kernels/kernels.h"
+#include "kernels/vectors.h"
 
 // Under ThreadSanitizer (-O1 -fPIC) g++ 12 mixes up the sums of tiles that are inlined.
 #ifdef __SANITIZE_THREAD__
@@ -20,8 +21,8 @@ constexpr int kTileQueries = 4;
 
 // A negated distance is 2 p . q + bias. Sums start from half the bias and end as half the negated
 // distance, both rounded down; the bit that was lost is in the bias. A row may be a hit where its
-// half is at least this.
-std::int32_t threshold(std::int32_t limit) { return -((limit >> 1) + (limit & 1)); }
+// half is above this.
+std::int32_t threshold(std::int32_t limit) { return -((limit >> 1) + (limit & 1)) - 1; }
 
 // Appends the hits among those of a block's 16 rows whose bits are set in `near`.
 std::size_t append_hits(unsigned near, const std::int32_t* halves, const std::int32_t* biases,
@@ -72,7 +73,6 @@ class Prefix {
 
 // Queries, and rows from one on that they are compared with.
 //   S::Step              4 dimensions of a query, as S reads them best
-//   S::steps(codes, n, room)  n of these: in `room`, or where they are
 template <typename S>
 struct CodeTile {
   const typename S::Step* queries;
@@ -89,15 +89,15 @@ struct CodeTile {
 
 // Half the negated distances of the queries from `query` on over the first `dims` dimensions.
 // Inlined, so that they stay in registers.
-//   S::Sums               16 numbers of 32 bits: zero(), load(), store(), add(), half() (>> 1)
+//   S::Sums               16 numbers of 32 bits
 //   S::Codes              4 dimensions of 16 rows: load_codes()
-//   S::dot(sums, step, codes)  adds the products of 4 dimensions, sums in place
+//   S::dot(sums, query(step), codes)  adds the products of 4 dimensions
 template <typename S, int Queries, int Blocks>
 PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std::int32_t* biases,
                              std::size_t dims, typename S::Sums (&acc)[Queries][Blocks]) {
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
-    const typename S::Sums half = S::half(S::load(biases + b * kCodeRows));
+    const auto half = load_pack<typename S::Sums>(biases + b * kCodeRows) >> 1;
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) acc[q][b] = half;
   }
@@ -110,7 +110,7 @@ PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std:
     for (int b = 0; b < Blocks; ++b) codes[b] = S::load_codes(p + b * kCodeRows * t.dim);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) {
-      const auto four = S::broadcast(step[q * steps + s]);
+      const auto four = S::query(step[q * steps + s]);
 #pragma GCC unroll 8
       for (int b = 0; b < Blocks; ++b) S::dot(acc[q][b], four, codes[b]);
     }
@@ -131,24 +131,24 @@ PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query
   for (int b = 0; b < Blocks; ++b) {
     typename S::Norms norms;
 #pragma GCC unroll 8
-    for (int q = 0; q < Queries; ++q) acc[q][b] = S::zero();
+    for (int q = 0; q < Queries; ++q) acc[q][b] = {};
     for (std::size_t s = 0; s < steps; ++s, p += 4 * kCodeRows) {
       const typename S::Codes codes = S::load_codes(p);
       norms.add(codes);
 #pragma GCC unroll 8
       for (int q = 0; q < Queries; ++q) {
-        S::dot(acc[q][b], S::broadcast(step[q * steps + s]), codes);
+        S::dot(acc[q][b], S::query(step[q * steps + s]), codes);
       }
     }
     biases[b] = norms.biases();
-    const typename S::Sums half = S::half(biases[b]);
+    const typename S::Sums half = biases[b] >> 1;
 #pragma GCC unroll 8
-    for (int q = 0; q < Queries; ++q) acc[q][b] = S::add(acc[q][b], half);
+    for (int q = 0; q < Queries; ++q) acc[q][b] = acc[q][b] + half;
   }
 }
 
 // Where the rows of some blocks may be hits.
-//   S::Flags              of at_least(sums, threshold), joined by either(), asked by any()
+//   S::Flags              of above(sums, threshold), joined by |, asked by any()
 //   S::max(a, b)          where S compares several blocks at a time
 template <typename S, int Blocks>
 PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
@@ -158,11 +158,11 @@ PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
 #pragma GCC unroll 8
     for (int b = 1; b < Blocks; ++b) best = S::max(best, acc[b]);
   }
-  return S::at_least(best, threshold);
+  return S::above(best, threshold);
 }
 
 // Appends the hits of a tile.
-//   S::near_rows(sums, threshold)  a bit for each row that is at_least
+//   S::near_rows(sums, threshold)  a bit for each row above it
 template <typename S, int Queries, int Blocks, bool HasBiases>
 PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hit* hits) {
   typename S::Sums acc[Queries][Blocks];
@@ -175,7 +175,7 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hi
   const std::int32_t* thresholds = t.thresholds + query;
   typename S::Flags any = near<S>(acc[0], thresholds[0]);
 #pragma GCC unroll 8
-  for (int q = 1; q < Queries; ++q) any = S::either(any, near<S>(acc[q], thresholds[q]));
+  for (int q = 1; q < Queries; ++q) any = any | near<S>(acc[q], thresholds[q]);
   if (!S::any(any)) [[likely]]
     return 0;
 
@@ -183,20 +183,20 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hi
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
 #pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) S::store(halves[q][b], acc[q][b]);
+    for (int b = 0; b < Blocks; ++b) store_pack(halves[q][b], acc[q][b]);
   }
   const std::int32_t* biases = t.biases;
   alignas(64) std::int32_t stored[HasBiases ? 1 : Blocks * kCodeRows];
   if constexpr (!HasBiases) {
 #pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) S::store(stored + b * kCodeRows, own_biases[b]);
+    for (int b = 0; b < Blocks; ++b) store_pack(stored + b * kCodeRows, own_biases[b]);
     biases = stored;
   }
   std::size_t found = 0;
   for (std::size_t q = 0; q < Queries; ++q) {
     for (std::size_t b = 0; b < Blocks; ++b) {
-      found += append_hits(S::near_rows(S::load(halves[q][b]), thresholds[q]), halves[q][b],
-                           biases + b * kCodeRows, t.limits[query + q], query + q,
+      found += append_hits(S::near_rows(load_pack<typename S::Sums>(halves[q][b]), thresholds[q]),
+                           halves[q][b], biases + b * kCodeRows, t.limits[query + q], query + q,
                            t.first_row + b * kCodeRows, hits + found);
     }
   }
@@ -248,15 +248,21 @@ std::size_t near_by_prefix(const CodeTile<S>& t, std::size_t n, std::uint8_t* qu
   return size;
 }
 
+//   S::convert(codes, n, steps)  where S::Step is not 4 bytes of the codes
 template <typename S>
 std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                       Hit* hits) {
-  typename S::Step room[kScanQueries * 64];
+  [[maybe_unused]] typename S::Step room[kScanQueries * 64];
   std::int32_t thresholds[kScanQueries];
   for (std::size_t q = 0; q < queries.n; ++q) thresholds[q] = threshold(queries.limits[q]);
   Prefix prefix(queries, rows);
   CodeTile<S> tile{};
-  tile.queries = S::steps(queries.codes, queries.n * rows.dim / 4, room);
+  if constexpr (requires { S::convert(queries.codes, 0, room); }) {
+    S::convert(queries.codes, queries.n * rows.dim / 4, room);
+    tile.queries = room;
+  } else {
+    tile.queries = reinterpret_cast<const typename S::Step*>(queries.codes);
+  }
   tile.limits = queries.limits;
   tile.thresholds = thresholds;
   tile.prefix_thresholds = prefix.thresholds();
@@ -297,32 +303,30 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
     typename S::Norms norms;
     std::size_t d = 0;
     for (; d < prefix; d += 4, packed += 4 * kCodeRows) norms.add(S::load_codes(packed));
-    if (prefix < dim) S::store(prefix_biases + b * kCodeRows, norms.biases());
+    if (prefix < dim) store_pack(prefix_biases + b * kCodeRows, norms.biases());
     for (; d < dim; d += 4, packed += 4 * kCodeRows) norms.add(S::load_codes(packed));
-    S::store(biases + b * kCodeRows, norms.biases());
+    store_pack(biases + b * kCodeRows, norms.biases());
   }
 }
 
 // `Queries` queries share each load of the rows.
-//   S::Words              a 64-bit word of each of 8 rows: load_words()
-//   S::Counts             8 numbers of 64 bits: add_bits(counts, query, words), store_counts()
-//   S::Bytes              where S counts in bytes first, for S::kByteWords words: add_bits() adds
-//   to
+//   S::Words              8 numbers of 64 bits, one of each row: add_bits(counts, query, words);
+//                         near_words(counts, limit) has a bit for each row within the limit
+//   S::Bytes              where S counts S::kByteWords words in bytes first: add_bits() adds to
 //                         these, add_bytes(counts, bytes) adds them up
-//   S::near_words(counts, limit)  a bit for each row within the limit
 template <typename S, int Queries>
 std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limits,
                          const std::uint64_t* packed, std::size_t words, std::size_t first_query,
                          std::size_t first_row, Hit* hits) {
   const auto count = [&](std::size_t w, std::size_t end, auto& sums) {
     for (; w < end; ++w, packed += kWordRows) {
-      const typename S::Words row = S::load_words(packed);
+      const auto row = load_pack<typename S::Words>(packed);
 #pragma GCC unroll 8
       for (int q = 0; q < Queries; ++q) S::add_bits(sums[q], queries[q * words + w], row);
     }
   };
-  typename S::Counts counts[Queries] = {};
-  if constexpr (S::kByteWords == 0) {
+  typename S::Words counts[Queries] = {};
+  if constexpr (!requires { typename S::Bytes; }) {
     count(0, words, counts);
   } else {
     for (std::size_t w = 0; w < words; w += S::kByteWords) {
@@ -345,7 +349,7 @@ std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limit
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
     alignas(64) std::int64_t distances[kWordRows];
-    S::store_counts(distances, counts[q]);
+    store_pack(distances, counts[q]);
     for (; near[q] != 0; near[q] &= near[q] - 1) {
       const auto r = static_cast<std::size_t>(__builtin_ctz(near[q]));
       hits[found++] = {static_cast<std::uint32_t>(first_query + static_cast<std::size_t>(q)),
