@@ -18,8 +18,7 @@
 #include "search/coarse_quantizer.h"
 #include "search/inverted_lists.h"
 #include "search/list_blocks.h"
-#include "search/nearest_lists.h"
-#include "search/prototype_scan.h"
+#include "search/scan.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;

@@ -9,7 +9,7 @@
 #include "check.h"
 #include "protomark/hamming.h"
 #include "random.h"
-#include "search/prototype_scan.h"
+#include "search/scan.h"
 
 using namespace protomark;
 

@@ -105,9 +105,9 @@ struct Avx2 : ByPairs<Avx2, 32> {
 
   static constexpr int kWordQueries = 2;
   using Words = Pack<Vector<std::uint64_t, 32>, 2>;
-  using Bytes = Pack<Vector<std::uint8_t, 32>, 2>;
+  using BitCounts = Pack<Vector<std::uint8_t, 32>, 2>;
   static constexpr std::size_t kByteWords = 31;  // a byte counts 31 * 8 bits
-  static void add_bits(Bytes& bytes, std::uint64_t query, const Words& row) {
+  static void add_bits(BitCounts& bytes, std::uint64_t query, const Words& row) {
     const __m256i table = _mm256_setr_epi8(0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4,  //
                                            0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4);
     const __m256i nibble = _mm256_set1_epi8(15);
@@ -119,7 +119,7 @@ struct Avx2 : ByPairs<Avx2, 32> {
                                                               _mm256_shuffle_epi8(table, high));
     }
   }
-  static void add_bytes(Words& counts, const Bytes& bytes) {
+  static void add_counts(Words& counts, const BitCounts& bytes) {
     for (int i = 0; i < 2; ++i) {
       const __m256i sums = _mm256_sad_epu8((__m256i)bytes.v[i], _mm256_setzero_si256());
       counts.v[i] += (Vector<std::uint64_t, 32>)sums;
@@ -144,6 +144,7 @@ const Kernels avx2 = {.name = "avx2",
                       .activate16 = activate<Avx2, std::int16_t>,
                       .activate32 = activate<Avx2, std::int32_t>,
                       .code_biases = code_biases<Avx2>,
+                      .code_unpack4 = code_unpack4<Avx2>,
                       .code_scan = code_scan<Avx2>,
                       .hamming_scan = hamming_scan<Avx2>};
 

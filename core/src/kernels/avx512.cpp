@@ -109,30 +109,6 @@ struct Avx512 {
   }
 };
 
-void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
-                  std::int8_t* codes) {
-  // The shuffle looks bytes up in each 16 of a register: the same 16 levels four times.
-  std::int8_t table[64];
-  for (int i = 0; i < 64; ++i) table[i] = static_cast<std::int8_t>(scale * (2 * (i % 16) - 15));
-  const auto levels = load<__m512i>(table);
-  const __m512i low = _mm512_set1_epi8(15);
-  // Which of the last 4 dimensions there are.
-  const std::size_t last = dim % 4 == 0 ? 4 : dim % 4;
-  const __mmask64 tail = 0x1111111111111111u * ((1u << last) - 1);
-  for (std::size_t b = 0; b < blocks; ++b) {
-    for (std::size_t d = 0; d < dim; d += 8, packed += 64) {
-      const auto bytes = load<__m512i>(packed);
-      const auto unpack = [&](std::size_t end, __m512i numbers) {
-        const __mmask64 there = end < dim ? ~__mmask64{0} : tail;
-        _mm512_storeu_si512(codes, _mm512_maskz_shuffle_epi8(there, levels, numbers));
-        codes += 64;
-      };
-      unpack(d + 4, _mm512_and_si512(bytes, low));
-      if (d + 4 < dim) unpack(d + 8, _mm512_and_si512(_mm512_srli_epi16(bytes, 4), low));
-    }
-  }
-}
-
 }  // namespace
 
 const Kernels avx512 = {.name = "avx512",
@@ -142,7 +118,7 @@ const Kernels avx512 = {.name = "avx512",
                         .activate16 = activate<Avx512, std::int16_t>,
                         .activate32 = activate<Avx512, std::int32_t>,
                         .code_biases = code_biases<Avx512>,
-                        .code_unpack4 = code_unpack4,
+                        .code_unpack4 = code_unpack4<Avx512>,
                         .code_scan = code_scan<Avx512>,
                         .hamming_scan = hamming_scan<Avx512>};
 

@@ -309,11 +309,39 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
   }
 }
 
+template <typename S>
+void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
+                  std::int8_t* codes) {
+  constexpr std::size_t kBytes = sizeof(typename S::Sums::Vector);
+  using Bytes = Vector<std::uint8_t, kBytes>;
+  using Shorts = Vector<std::uint16_t, kBytes>;
+  const auto twice = static_cast<std::uint16_t>(2 * scale);
+  const auto offset = static_cast<std::uint8_t>(15 * scale);
+  // Two bytes at a time, whose products stay within them.
+  const auto level = [&](Bytes u) { return (Bytes)((Shorts)u * twice) - offset; };
+  // Which of the last 4 dimensions there are.
+  const std::uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
+  const std::size_t steps = (dim + 3) / 4;
+  for (std::size_t b = 0; b < blocks; ++b) {
+    for (std::size_t s = 0; s < steps; ++s, codes += 4 * kCodeRows) {
+      for (std::size_t i = 0; i < 4 * kCodeRows; i += kBytes) {
+        const auto bytes = load<Bytes>(packed + i);
+        store(codes + i, level(s % 2 == 0 ? bytes & 15 : bytes >> 4));
+      }
+      // Go on where both halves of the bytes were read, or there is no second half.
+      if (s % 2 == 1 || s + 1 == steps) packed += 4 * kCodeRows;
+    }
+    for (std::size_t i = 4 * kCodeRows; last != ~0u && i > 0; i -= 4) {
+      store(codes - i, load<std::uint32_t>(codes - i) & last);
+    }
+  }
+}
+
 // `Queries` queries share each load of the rows.
 //   S::Words              8 numbers of 64 bits, one of each row: add_bits(counts, query, words);
 //                         near_words(counts, limit) has a bit for each row within the limit
-//   S::Bytes              where S counts S::kByteWords words in bytes first: add_bits() adds to
-//                         these, add_bytes(counts, bytes) adds them up
+//   S::BitCounts          where S counts S::kByteWords words in bytes first: add_bits() adds to
+//                         these, add_counts(counts, bytes) adds them up
 template <typename S, int Queries>
 std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limits,
                          const std::uint64_t* packed, std::size_t words, std::size_t first_query,
@@ -326,14 +354,14 @@ std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limit
     }
   };
   typename S::Words counts[Queries] = {};
-  if constexpr (!requires { typename S::Bytes; }) {
+  if constexpr (!requires { typename S::BitCounts; }) {
     count(0, words, counts);
   } else {
     for (std::size_t w = 0; w < words; w += S::kByteWords) {
-      typename S::Bytes bytes[Queries] = {};
+      typename S::BitCounts bytes[Queries] = {};
       count(w, words - w < S::kByteWords ? words : w + S::kByteWords, bytes);
 #pragma GCC unroll 8
-      for (int q = 0; q < Queries; ++q) S::add_bytes(counts[q], bytes[q]);
+      for (int q = 0; q < Queries; ++q) S::add_counts(counts[q], bytes[q]);
     }
   }
   unsigned near[Queries], any = 0;

@@ -1,10 +1,9 @@
-// The inner loops: a table of functions for each instruction set, which all give the same bytes. A
-// set leaves out (nullptr) what the next simpler set does as well; plain C++ has every function.
+// The inner loops: a table of functions for each instruction set. All sets give the same bytes.
 //
 // This header has plain types only, and no function with a body. A kernel file is compiled with
 // flags of its own, and the linker could pick a function that was instantiated there for a CPU that
-// lacks its instructions. For the same reason all that kernel files share (generic_*.h) is in
-// anonymous namespaces.
+// lacks its instructions. For the same reason all that kernel files share (generic_*.h, vectors.h)
+// is in anonymous namespaces.
 #pragma once
 
 #include <cstddef>
@@ -134,17 +133,17 @@ struct Kernels {
                               std::size_t* block, Hit* hits) = nullptr;
 };
 
-// The best set that this CPU runs, complete, or the one that the environment variable PROTOMARK_ISA
+// The best set that this CPU runs, or the one that the environment variable PROTOMARK_ISA
 // names. Throws std::invalid_argument where that is unknown or does not run here.
 const Kernels& active();
 
-// The set of that name, complete, or nullptr where it is not built in or does not run on this CPU.
+// The set of that name, or nullptr if it is not built in or does not run on this CPU.
 const Kernels* find(const char* name);
 
 // The names of the sets that run on this CPU, best first, up to nullptr.
 const char* const* names();
 
-// The sets as their files define them, incomplete; use the functions above.
+// The sets as their files define them; use the functions above. amx has only code_scan of its own.
 extern const Kernels portable;
 #if defined(__x86_64__)
 extern const Kernels avx2;

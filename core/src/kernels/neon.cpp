@@ -126,15 +126,15 @@ struct Neon {
 
   static constexpr int kWordQueries = 2;
   using Words = Pack<uint64x2_t, 4>;
-  using Bytes = Pack<uint8x16_t, 4>;
+  using BitCounts = Pack<uint8x16_t, 4>;
   static constexpr std::size_t kByteWords = 31;  // a byte counts 31 * 8 bits
-  static void add_bits(Bytes& bytes, std::uint64_t query, const Words& row) {
+  static void add_bits(BitCounts& bytes, std::uint64_t query, const Words& row) {
     for (int i = 0; i < 4; ++i) {
       const uint64x2_t differ = veorq_u64(vdupq_n_u64(query), row.v[i]);
       bytes.v[i] = vaddq_u8(bytes.v[i], vcntq_u8(vreinterpretq_u8_u64(differ)));
     }
   }
-  static void add_bytes(Words& counts, const Bytes& bytes) {
+  static void add_counts(Words& counts, const BitCounts& bytes) {
     for (int i = 0; i < 4; ++i) {
       counts.v[i] = vpadalq_u32(counts.v[i], vpaddlq_u16(vpaddlq_u8(bytes.v[i])));
     }
@@ -158,6 +158,7 @@ const Kernels neon = {.name = "neon",
                       .activate16 = activate<Neon, std::int16_t>,
                       .activate32 = activate<Neon, std::int32_t>,
                       .code_biases = code_biases<Neon>,
+                      .code_unpack4 = code_unpack4<Neon>,
                       .code_scan = code_scan<Neon>,
                       .hamming_scan = hamming_scan<Neon>};
 

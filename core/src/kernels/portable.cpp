@@ -83,22 +83,6 @@ void activate_any_shift(const Activation& a, const Sum* sums, std::size_t n, std
   }
 }
 
-void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
-                  std::int8_t* codes) {
-  std::int8_t levels[16];
-  for (int u = 0; u < 16; ++u) levels[u] = static_cast<std::int8_t>(scale * (2 * u - 15));
-  for (std::size_t b = 0; b < blocks; ++b) {
-    for (std::size_t d = 0; d < dim; d += 4, codes += 4 * kCodeRows) {
-      const int shift = d % 8 == 0 ? 0 : 4;
-      for (std::size_t i = 0; i < 4 * kCodeRows; ++i) {
-        codes[i] = d + i % 4 < dim ? levels[packed[i] >> shift & 15] : std::int8_t{0};
-      }
-      // Go on where both halves of the bytes were read, or there is no second half.
-      if (shift == 4 || d + 4 >= dim) packed += 4 * kCodeRows;
-    }
-  }
-}
-
 }  // namespace
 
 const Kernels portable = {.name = "portable",
@@ -108,7 +92,7 @@ const Kernels portable = {.name = "portable",
                           .activate16 = activate_any_shift<std::int16_t>,
                           .activate32 = activate_any_shift<std::int32_t>,
                           .code_biases = code_biases<Portable>,
-                          .code_unpack4 = code_unpack4,
+                          .code_unpack4 = code_unpack4<Portable>,
                           .code_scan = code_scan<Portable>,
                           .hamming_scan = hamming_scan<Portable>};
 

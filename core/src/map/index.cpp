@@ -8,7 +8,7 @@
 
 #include "map/prototype_store.h"
 #include "search/inverted_lists.h"
-#include "search/prototype_scan.h"
+#include "search/scan.h"
 
 namespace protomark {
 namespace {

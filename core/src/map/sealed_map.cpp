@@ -18,8 +18,8 @@
 #include "protomark/error.h"
 #include "search/coarse_quantizer.h"
 #include "search/inverted_lists.h"
-#include "search/prototype_scan.h"
 #include "search/recall.h"
+#include "search/scan.h"
 
 namespace protomark {
 

@@ -5,7 +5,7 @@
 
 #include "base/large_vector.h"
 #include "map/prototype_store.h"
-#include "search/prototype_scan.h"
+#include "search/scan.h"
 
 namespace protomark {
 namespace {

@@ -8,8 +8,8 @@
 
 #include "base/rounded_mean.h"
 #include "search/inverted_lists.h"
-#include "search/prototype_scan.h"
 #include "search/recall.h"
+#include "search/scan.h"
 
 namespace protomark {
 namespace {

@@ -2,9 +2,6 @@
 
 #include <algorithm>
 
-#include "search/nearest_lists.h"
-#include "search/prototype_scan.h"
-
 namespace protomark {
 namespace {
 

@@ -6,9 +6,8 @@
 #include <span>
 #include <vector>
 
-#include "protomark/search.h"
 #include "search/list_blocks.h"
-#include "search/packed.h"
+#include "search/scan.h"
 
 namespace protomark {
 
@@ -32,6 +31,12 @@ class InvertedLists {
   std::span<const std::uint32_t> rows_;
   std::span<const std::uint32_t> first_blocks_;
 };
+
+// Returns (queries x nprobe) indices of the centroids that are nearest to each query, ties to the
+// smaller, the nearest first, the others in no order. `nprobe` is 1 to the number of centroids.
+std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
+                                         const PreparedCodes& queries, std::size_t nprobe,
+                                         int threads);
 
 // As search_exact, but in the `nprobe` lists (at least 1) nearest to each query, ties to the
 // smaller list; exactly if these are all. Prototype i of `centroids` is the centroid of list i.

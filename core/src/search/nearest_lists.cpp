@@ -1,8 +1,10 @@
-#include "search/nearest_lists.h"
+// Selects the lists that queries look into. TopK is for a few neighbours, here they may be
+// hundreds.
 
 #include <algorithm>
 
 #include "base/parallel.h"
+#include "search/inverted_lists.h"
 
 namespace protomark {
 namespace {

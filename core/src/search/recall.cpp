@@ -5,7 +5,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "search/code_scan.h"
+#include "search/scan.h"
 
 namespace protomark {
 namespace {
