@@ -57,7 +57,7 @@ void run_search(int threads, const Division& division, std::size_t work, Neighbo
                 const Scan& scan) {
   std::mutex mutex;
   const std::size_t tasks = division.query_ranges * division.work_ranges;
-  run_tasks(threads, tasks, [&](std::size_t i) {
+  run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](std::size_t i) {
     if (tasks == 1) return scan(Range{0, nearest.queries()}, Range{0, work}, nearest);
     const Range queries =
         Division::range(nearest.queries(), division.query_ranges, i / division.work_ranges);

@@ -15,23 +15,19 @@ namespace {
 
 using kernels::kWordRows;
 
-// Packs some rows as the kernels want them (kernels.h), missing rows as zeros.
+// Packs some rows as the kernels want them (kernels.h), the last word of each with zeros behind it.
 void pack(Descriptors database, Range rows, std::size_t words, std::uint64_t* packed) {
   const std::size_t rest = database.columns % 8;
-  for (std::size_t row = rows.begin; row < rows.end; row += kWordRows) {
-    const std::size_t n = std::min(kWordRows, rows.end - row);
-    if (n < kWordRows) std::fill_n(packed, kWordRows * words, 0);
-    for (std::size_t r = 0; r < n; ++r) {
-      const std::uint8_t* bytes = database.row(row + r);
-      for (std::size_t w = 0; w < database.columns / 8; ++w) {
-        std::memcpy(&packed[w * kWordRows + r], bytes + 8 * w, 8);
-      }
-      if (rest == 0) continue;
-      std::uint64_t last = 0;
-      std::memcpy(&last, bytes + database.columns - rest, rest);
-      packed[(words - 1) * kWordRows + r] = last;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    const std::uint8_t* bytes = database.row(rows.begin + i);
+    std::uint64_t* to = packed + i / kWordRows * kWordRows * words + i % kWordRows;
+    for (std::size_t w = 0; w < database.columns / 8; ++w, to += kWordRows) {
+      std::memcpy(to, bytes + 8 * w, 8);
     }
-    packed += kWordRows * words;
+    if (rest != 0) {
+      *to = 0;
+      std::memcpy(to, bytes + database.columns - rest, rest);
+    }
   }
 }
 

@@ -49,8 +49,10 @@ class Selection {
     for (std::uint32_t q = 0; q < limits_.size(); ++q) {
       if (found_[q].size() < nprobe) {
         found_[q].clear();
-        limits_[q] = CodeScan::kNoLimit;
-        scan_.compare({&q, 1}, codes(0), centroids_.rows, limit_of, take);
+        scan_.select({&q, 1});
+        compare(
+            0, centroids_.rows, [](std::size_t) { return CodeScan::kNoLimit; },
+            [&](std::size_t, std::int32_t distance, std::size_t list) { take(q, distance, list); });
       }
       select(found_[q], nprobe, to + q * nprobe);
     }

@@ -38,12 +38,26 @@ Neighbours PreparedCodes::places(std::size_t k, const SearchOptions& options) co
 }
 
 CodeScan::CodeScan(const PreparedCodes& queries, Range range)
-    : all_(queries), range_(range), prefix_(queries.dim()), rest_norms_(range.size(), 0) {}
+    : all_(queries),
+      range_(range),
+      codes_(queries[range.begin]),
+      n_(range.size()),
+      prefix_(queries.dim()),
+      rest_norms_(range.size(), 0) {}
+
+void CodeScan::select(std::span<const std::uint32_t> queries) {
+  const std::size_t dim = all_.dim();
+  selected_.resize(queries.size() * dim);
+  for (std::size_t i = 0; i < queries.size(); ++i) {
+    std::copy_n(all_[range_.begin + queries[i]], dim, &selected_[i * dim]);
+  }
+  codes_ = selected_.data();
+  n_ = queries.size();
+}
 
 std::size_t CodeScan::chunk_rows() const {
-  const std::size_t n = range_.size();
   const auto bytes =
-      std::clamp<std::size_t>(256 * n, n <= kernels::kFewQueries ? 16384 : 8192, 65536);
+      std::clamp<std::size_t>(256 * n_, n_ <= kernels::kFewQueries ? 16384 : 8192, 65536);
   return std::max<std::size_t>(bytes / all_.dim() / kPackedRows, 1) * kPackedRows;
 }
 
@@ -51,7 +65,7 @@ void CodeScan::choose_prefix(std::size_t met) {
   // Few queries wait for memory, which is read whole. The more rows were met, the nearer are the
   // neighbours, and the fewer dimensions tell.
   constexpr std::size_t kManyRows = std::size_t{1} << 18;
-  if (range_.size() <= kernels::kFewQueries) return;
+  if (n_ <= kernels::kFewQueries) return;
   const std::size_t eighths = met < kManyRows ? 6 : 5;
   const std::size_t prefix = (all_.dim() * eighths / 8 + 3) / 4 * 4;
   if (prefix == prefix_) return;
@@ -61,17 +75,9 @@ void CodeScan::choose_prefix(std::size_t met) {
   }
 }
 
-void CodeScan::gather(std::span<const std::uint32_t> queries) {
-  const std::size_t dim = all_.dim();
-  gathered_.resize(queries.size() * dim);
-  for (std::size_t i = 0; i < queries.size(); ++i) {
-    std::copy_n(all_[range_.begin + queries[i]], dim, &gathered_[i * dim]);
-  }
-}
-
-kernels::PackedCodes CodeScan::prepare(const std::int8_t* packed, std::size_t rows, std::size_t n) {
+kernels::PackedCodes CodeScan::prepare(const std::int8_t* packed, std::size_t rows) {
   const std::size_t dim = all_.dim(), blocks = (rows + kPackedRows - 1) / kPackedRows;
-  if (n <= kernels::kFewQueries) return {packed, nullptr, nullptr, blocks, dim, prefix_};
+  if (n_ <= kernels::kFewQueries) return {packed, nullptr, nullptr, blocks, dim, prefix_};
   biases_.resize(std::max(biases_.size(), blocks * kPackedRows));
   prefix_biases_.resize(biases_.size());
   kernels::active().code_biases(packed, blocks, dim, prefix_, biases_.data(),
@@ -97,14 +103,15 @@ void PrototypeScan::scan(Range rows) {
 void PrototypeScan::scan(std::span<const std::uint32_t> queries,
                          std::span<const std::uint32_t> blocks, std::size_t rows) {
   constexpr std::size_t kChunk = 32;
+  scan_.select(queries);
   for (std::size_t first = 0; first < blocks.size(); first += kChunk) {
     const auto chunk = blocks.subspan(first, std::min(kChunk, blocks.size() - first));
     const std::size_t n = std::min(chunk.size() * kPackedRows, rows - first * kPackedRows);
     scan_.compare(
-        queries, blocks_.read(chunk), n, [&](std::size_t q) { return nearest_.limit(q); },
-        [&](std::size_t q, std::int32_t distance, std::size_t i) {
-          const std::size_t row = chunk[i / kPackedRows] * kPackedRows + i % kPackedRows;
-          landmarks_.offer(nearest_[q], distance, {static_cast<std::uint32_t>(row)});
+        blocks_.read(chunk), n, [&](std::size_t i) { return nearest_.limit(queries[i]); },
+        [&](std::size_t i, std::int32_t distance, std::size_t at) {
+          const std::size_t row = chunk[at / kPackedRows] * kPackedRows + at % kPackedRows;
+          landmarks_.offer(nearest_[queries[i]], distance, {static_cast<std::uint32_t>(row)});
         });
   }
 }
