@@ -39,14 +39,14 @@ from protomark.tracks.file import Tracks, sequence_name
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
 RATIOS = (0.7, 0.8, 0.9, 0.95)
 FRAMES = 40
-# A rule: distances (n, 2) -> a score of each match, and the least one that is accepted.
+# A rule: squared distances (n, 2) -> a score of each match, and the least one that is accepted.
 Rule = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], float]]
 
 
 def ratio(distances: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n,) from 0, the two nearest are as far away, to 1."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(distances[:, 1] > 0, 1 - distances[:, 0] / distances[:, 1], 0.0)
+        return np.where(distances[:, 1] > 0, 1 - np.sqrt(distances[:, 0] / distances[:, 1]), 0.0)
 
 
 def rules(acceptance: Acceptance) -> dict[str, Rule]:

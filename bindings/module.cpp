@@ -37,15 +37,18 @@ auto without_gil(const Work& work) {
   return work();
 }
 
-SearchOptions search_options(std::optional<float> max_distance, std::optional<float> ratio,
+SearchOptions search_options(std::optional<std::int64_t> max_distance, std::optional<double> ratio,
                              int threads, std::optional<double> recall,
                              std::optional<std::size_t> probes) {
   SearchOptions options;
-  options.max_distance = max_distance;
+  if (max_distance) {
+    options.max_distance =
+        static_cast<std::int32_t>(std::clamp<std::int64_t>(*max_distance, -1, INT32_MAX));
+  }
   options.ratio = ratio;
   options.threads = threads;
   options.recall = recall;
-  options.probes = probes;
+  options.nprobe = probes;
   return options;
 }
 
@@ -74,7 +77,7 @@ nb::tuple hamming(nb::object queries, nb::object database, std::size_t k,
 template <typename Run>
 nb::tuple answer(std::size_t queries, std::size_t k, const Run& run) {
   NewMatrix<std::int64_t> ids(queries, k);
-  NewMatrix<float> distances(queries, k);
+  NewMatrix<std::int32_t> distances(queries, k);
   {
     const nb::gil_scoped_release release;
     run(ids.view(), distances.view());
@@ -85,24 +88,27 @@ nb::tuple answer(std::size_t queries, std::size_t k, const Run& run) {
 // Open and sealed maps search alike.
 template <typename Map>
 nb::tuple search(const Map& map, nb::object queries, std::size_t k,
-                 std::optional<float> max_distance, std::optional<float> ratio, int threads,
+                 std::optional<std::int64_t> max_distance, std::optional<double> ratio, int threads,
                  std::optional<double> recall, std::optional<std::size_t> probes) {
   const auto q = descriptors(queries);
   const SearchOptions options = search_options(max_distance, ratio, threads, recall, probes);
-  return answer(q.shape(0), k, [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
-    map.search(view(q), options, ids, distances);
-  });
+  return answer(q.shape(0), k,
+                [&](MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
+                  map.search(view(q), options, ids, distances);
+                });
 }
 
 template <typename Map>
 nb::tuple search_codes(const Map& map, nb::object queries, std::size_t k,
-                       std::optional<float> max_distance, std::optional<float> ratio, int threads,
-                       std::optional<double> recall, std::optional<std::size_t> probes) {
+                       std::optional<std::int64_t> max_distance, std::optional<double> ratio,
+                       int threads, std::optional<double> recall,
+                       std::optional<std::size_t> probes) {
   const auto q = codes(queries);
   const SearchOptions options = search_options(max_distance, ratio, threads, recall, probes);
-  return answer(q.shape(0), k, [&](MatrixView<std::int64_t> ids, MatrixView<float> distances) {
-    map.search_codes(view(q), options, ids, distances);
-  });
+  return answer(q.shape(0), k,
+                [&](MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
+                  map.search_codes(view(q), options, ids, distances);
+                });
 }
 
 template <typename Map>
@@ -229,25 +235,26 @@ Returns:
            "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
            "probes"_a = nb::none(),
            nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
-                   "max_distance: float | None = None, ratio: float | None = None, "
+                   "max_distance: int | None = None, ratio: float | None = None, "
                    "threads: int = 1, recall: float | None = None, probes: int | None = None) -> "
-                   "tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
+                   "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
            R"(The k nearest landmarks of each descriptor; ties go to the smaller id.
 
 Args:
     descriptors: (q, bits / 8) uint8.
     k: neighbours to return.
-    max_distance: neighbours further away are left out (Euclidean, code units).
+    max_distance: the largest squared distance at which a neighbour is reported.
     ratio: Lowe's ratio test, in (0, 1]: a query keeps its neighbours only where the nearest
-        landmark is closer than ratio times the second nearest.
+        landmark is nearer than ratio times the second nearest, by root distances: squared
+        distances must fulfil nearest < ratio * ratio * second.
     threads: threads to use.
     recall: in (0, 1]: an approximate search in a map with an index that finds the nearest landmark
         of this share of the queries, as measured on the map (probes()). None: an exact search.
     probes: instead of recall, the number of cells to search.
 
 Returns:
-    ids (q, k) int64, nearest first, -1 where there is none, and distances (q, k) float32,
-    Euclidean in code units, infinite where there is none.
+    ids (q, k) int64, nearest first, -1 where there is none, and squared Euclidean distances
+    (q, k) int32, in code units, 2^31 - 1 where there is none.
 
 Raises:
     TypeError: descriptors are not (q, bits / 8) uint8.
@@ -258,9 +265,9 @@ Raises:
            "ratio"_a = nb::none(), "threads"_a = 1, "recall"_a = nb::none(),
            "probes"_a = nb::none(),
            nb::sig("def search_codes(self, codes: NDArray[numpy.int8], k: int = 2, "
-                   "max_distance: float | None = None, ratio: float | None = None, "
+                   "max_distance: int | None = None, ratio: float | None = None, "
                    "threads: int = 1, recall: float | None = None, probes: int | None = None) -> "
-                   "tuple[NDArray[numpy.int64], NDArray[numpy.float32]]"),
+                   "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
            "Like search, for descriptors that are encoded already: (q, dim) int8. ValueError where "
            "they have another length.");
 }
@@ -916,7 +923,7 @@ Args:
 
 Returns:
     Rows of database, or landmark ids, (q, k) int64, nearest first, ties to the smaller, -1 where
-    there is none; and distances (q, k) int32, bits + 1 where there is none.
+    there is none; and distances (q, k) int32, in bits, 2^31 - 1 where there is none.
 
 Raises:
     TypeError: queries or database are not (rows, bits / 8) uint8.

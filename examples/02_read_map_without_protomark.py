@@ -117,11 +117,11 @@ class Map:
             self.positions = np.where(xyz == none, np.nan, origin + step * xyz)
 
     def search(self, descriptors: Any) -> tuple[Any, Any]:
-        """The nearest landmark of each descriptor, ties to the smaller id, and its distance."""
+        """The nearest landmark of each descriptor, ties to the smaller id; squared distances."""
         codes, p = self.encoder.encode(descriptors, self.prototypes.shape[1]), self.prototypes
         squared = (codes**2).sum(1)[:, None] - 2 * codes @ p.T + (p**2).sum(1)
         nearest = squared.argmin(1)  # the first: prototypes are sorted by id
-        return self.landmarks[nearest], np.sqrt(squared.min(1).astype(np.float32))
+        return self.landmarks[nearest], squared.min(1).astype(np.int32)
 
 
 def sealed_prototypes(parts: dict[str, bytes], n: int, k: int, m: int) -> Any:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 import protomark as pm
 
+NO_DISTANCE = int(np.iinfo(np.int32).max)  # where there is no neighbour
+
 # A busy machine is no failure of a property.
 settings.register_profile("protomark", deadline=None)
 settings.load_profile("protomark")

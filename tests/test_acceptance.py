@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark import models, sample
-from protomark.acceptance import KEY, Acceptance, parse, with_acceptance
+from protomark.acceptance import KEY, NO_DISTANCE, Acceptance, parse, with_acceptance
 from protomark.calibration import encoder_answers, measure
 from protomark.cli import app
 from protomark.logistic import fit, sigmoid
@@ -46,7 +46,7 @@ def test_what_is_told_apart_without_exception_has_finite_weights() -> None:
 
 def test_probability() -> None:
     acceptance = Acceptance((1.0, -0.05, 0.02))
-    away = np.array([[4, 8], [4, np.inf], [0, 0], [np.inf, np.inf]], np.float32)
+    away = np.array([[16, 64], [16, NO_DISTANCE], [0, 0], [NO_DISTANCE] * 2], np.int32)
     p = acceptance.probability(away)
     logits = [1 - 0.8 + 0.96, 1 - 0.8 + 0.96, 1]
     assert p[:3] == pytest.approx(1 / (1 + np.exp(-np.array(logits))))
@@ -106,7 +106,7 @@ def test_what_ships_is_calibrated_and_as_its_card_says(name: str) -> None:
     for test_sequence in ("toy", "kitchen", "castle", "kitti07"):
         assert test_sequence not in encoder.notes["acceptance_data"]
     for dim in encoder.dims:
-        near, far = encoder.acceptance(dim).probability([[1.0, 100.0], [99.0, 100.0]])
+        near, far = encoder.acceptance(dim).probability([[1, 10_000], [9801, 10_000]])
         assert near > 0.8
         assert near - far > 0.3
 

@@ -8,21 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
-from conftest import random_descriptors
+from conftest import NO_DISTANCE, random_descriptors
 
 
 def reference(
     queries: Any, database: Any, k: int, landmarks: Any, limit: int
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Sorts everything by distance and id."""
-    bits = 8 * queries.shape[1]
     ids = np.full((len(queries), k), -1, np.int64)
-    distances = np.full((len(queries), k), bits + 1, np.int32)
+    distances = np.full((len(queries), k), NO_DISTANCE, np.int32)
     for q, query in enumerate(queries):
         nearest: dict[int, int] = {}
         for landmark, row in zip(landmarks, database, strict=True):
             d = int(np.unpackbits(query ^ row).sum())
-            nearest[landmark] = min(d, nearest.get(landmark, bits + 1))
+            nearest[landmark] = min(d, nearest.get(landmark, d))
         best = sorted((d, i) for i, d in nearest.items() if d <= limit)[:k]
         for j, (d, i) in enumerate(best):
             ids[q, j], distances[q, j] = i, d

@@ -269,7 +269,7 @@ def test_errors(coder: pm.Encoder, tmp_path: Path) -> None:
     for recall in (0.0, 1.5, float("nan")):
         with pytest.raises(ValueError, match="above 0 and at most 1"):
             scene.search_codes(codes, recall=recall)
-    with pytest.raises(ValueError, match="probes must be at least 1"):
+    with pytest.raises(ValueError, match="nprobe must be at least 1"):
         scene.search_codes(codes, probes=0)
     with pytest.raises(ValueError, match="exclude each other"):
         scene.search_codes(codes, probes=1, recall=0.5)

@@ -55,7 +55,7 @@ def test_sealed_map_answers_like_the_open_one(scene: pm.PrototypeMap, tmp_path: 
         np.testing.assert_array_equal(m.counts(ids), scene.counts(ids))
         np.testing.assert_array_equal(m.prototype(ids), rounded(scene.prototype(ids)))
         np.testing.assert_allclose(m.positions(ids), scene.positions(ids), atol=1e-5)
-        for kwargs in ({"k": 3}, {"k": 1, "ratio": 0.9}, {"k": 2, "max_distance": 200.0}):
+        for kwargs in ({"k": 3}, {"k": 1, "ratio": 0.9}, {"k": 2, "max_distance": 40_000}):
             for a, b in zip(
                 m.search(queries, **kwargs), scene.search(queries, **kwargs), strict=True
             ):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
-from conftest import random_descriptors, rounded
+from conftest import NO_DISTANCE, random_descriptors, rounded
 
 
 class Reference:
@@ -169,7 +169,7 @@ def test_extreme_codes_fit(encoder: pm.Encoder) -> None:
     k=st.integers(1, 4),
     dim=st.sampled_from([5, 12]),
     values=st.integers(1, 127),
-    max_distance=st.none() | st.floats(0, 300),
+    max_distance=st.none() | st.integers(0, 90_000),
     ratio=st.none() | st.floats(0.25, 1),
     seed=st.integers(0, 2**32 - 1),
 )
@@ -178,7 +178,7 @@ def test_search_equals_sorting(
     k: int,
     dim: int,
     values: int,
-    max_distance: float | None,
+    max_distance: int | None,
     ratio: float | None,
     seed: int,
     encoder: pm.Encoder,
@@ -201,15 +201,31 @@ def test_search_equals_sorting(
         order = np.argsort(squared, kind="stable")
         keep = True
         if ratio is not None and len(order) > 1:
-            r = float(np.float32(ratio))
-            keep = float(squared[order[0]]) < r * r * float(squared[order[1]])
-        limit = np.inf if max_distance is None else float(np.float32(max_distance)) ** 2
+            keep = float(squared[order[0]]) < ratio * ratio * float(squared[order[1]])
+        limit = NO_DISTANCE if max_distance is None else max_distance
         expected = [(known[o], squared[o]) for o in order[:k] if keep and squared[o] <= limit]
-        expected += [(-1, np.inf)] * (k - len(expected))
+        expected += [(-1, NO_DISTANCE)] * (k - len(expected))
         np.testing.assert_array_equal(ids[q], [i for i, _ in expected])
-        np.testing.assert_array_equal(
-            distances[q], np.sqrt(np.array([s for _, s in expected], np.float32))
-        )
+        np.testing.assert_array_equal(distances[q], [s for _, s in expected])
+    assert distances.dtype == np.int32
+
+
+def test_a_neighbour_at_just_the_limit_is_reported(encoder: pm.Encoder) -> None:
+    """A regression: half of them were lost where distances were rounded roots."""
+    rng = np.random.default_rng(3)
+    scene = pm.PrototypeMap(encoder)
+    scene.add_codes(np.arange(500), rng.integers(-127, 128, (500, 12)).astype(np.int8))
+    for query in rng.integers(-127, 128, (100, 1, 12)).astype(np.int8):
+        ids, distances = scene.search_codes(query, k=1)
+        limit = int(distances[0, 0])
+        assert scene.search_codes(query, k=1, max_distance=limit)[0] == ids
+        assert scene.search_codes(query, k=1, max_distance=limit - 1)[0] == -1
+    for limit in (2**31 - 1, 2**40):
+        assert (scene.search_codes(query, k=1, max_distance=limit)[0] == ids).all()
+    with pytest.raises(ValueError, match="max_distance must not be negative"):
+        scene.search_codes(query, max_distance=-1)
+    with pytest.raises(TypeError):
+        scene.search_codes(query, max_distance=1.5)  # type: ignore[arg-type]
 
 
 def test_ties_go_to_the_smaller_id(encoder: pm.Encoder) -> None:
@@ -238,7 +254,7 @@ def test_empty_map_has_no_neighbours(encoder: pm.Encoder) -> None:
     scene = pm.PrototypeMap(encoder)
     ids, distances = scene.search(random_descriptors(3), k=2)
     np.testing.assert_array_equal(ids, np.full((3, 2), -1))
-    assert np.isinf(distances).all()
+    assert (distances == NO_DISTANCE).all()
     assert len(scene) == 0
     scene.add(np.zeros(0, np.int64), np.zeros((0, 8), np.uint8))
     assert scene.search(np.zeros((0, 8), np.uint8))[0].shape == (0, 2)

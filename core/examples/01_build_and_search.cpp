@@ -48,7 +48,7 @@ int main(int argc, char** argv) try {
   std::vector<std::uint8_t> frame;
   for (std::size_t landmark = 0; landmark < landmarks; ++landmark) observe(landmark, frame);
   pm::SearchOptions options;
-  options.ratio = 0.9f;
+  options.ratio = 0.9;
   const auto [found, distances] = map.search({frame.data(), landmarks, bytes}, 2, options);
   std::size_t accepted = 0, right = 0;
   for (std::size_t i = 0; i < landmarks; ++i) {

@@ -13,12 +13,10 @@ int main() {
   const std::size_t bytes = 61, n = 1500, q = 20, k = 3;
   const auto database = random.integers<std::uint8_t>(n * bytes, 0, 3);
   const auto queries = random.integers<std::uint8_t>(q * bytes, 0, 3);
-  std::vector<std::int64_t> ids(q * k);
-  std::vector<std::int32_t> distances(q * k);
   HammingOptions options;
   options.threads = 2;
-  hamming_search({queries.data(), q, bytes}, {database.data(), n, bytes}, options,
-                 {ids.data(), q, k}, {distances.data(), q, k});
+  const auto [ids, distances] =
+      hamming_search({queries.data(), q, bytes}, {database.data(), n, bytes}, k, options);
   for (std::size_t i = 0; i < q; ++i) {
     std::vector<std::pair<int, std::int64_t>> all;
     for (std::size_t j = 0; j < n; ++j) {
@@ -30,15 +28,12 @@ int main() {
     }
     std::sort(all.begin(), all.end());
     for (std::size_t j = 0; j < k; ++j) {
-      CHECK(ids[i * k + j] == all[j].second);
-      CHECK(distances[i * k + j] == all[j].first);
+      CHECK(ids.row(i)[j] == all[j].second);
+      CHECK(distances.row(i)[j] == all[j].first);
     }
   }
   CHECK(check::throws<std::invalid_argument>(
-      [&] {
-        hamming_search({queries.data(), q, 60}, {database.data(), n, bytes}, {}, {ids.data(), q, k},
-                       {distances.data(), q, k});
-      },
+      [&] { hamming_search({queries.data(), q, 60}, {database.data(), n, bytes}); },
       "queries have 60 bytes"));
   return check::result();
 }

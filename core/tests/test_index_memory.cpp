@@ -86,7 +86,7 @@ struct State {
 State state_of(const PrototypeMap& map, Codes queries) {
   const auto ids = map.ids();
   SearchOptions options;
-  if (map.nlist() != 0) options.probes = 1;
+  if (map.nlist() != 0) options.nprobe = 1;
   State s{ids,
           map.counts(ids),
           map.prototypes(ids),

@@ -174,7 +174,7 @@ std::vector<kernels::Hit> expected_hits(const std::vector<std::vector<std::int32
   return hits;
 }
 
-void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, std::size_t head,
+void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, std::size_t prefix,
                    std::size_t blocks, std::size_t n, int style) {
   const std::size_t rows = 16 * blocks;
   const auto packed = values<std::int8_t>(random, rows * dim, style, -128, 127);
@@ -188,24 +188,24 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
       }
     }
   }
-  std::vector<std::int32_t> tails(n);
+  std::vector<std::int32_t> rest_norms(n);
   for (std::size_t q = 0; q < n; ++q) {
-    for (std::size_t d = head; d < dim; ++d) {
-      tails[q] += (queries[q * dim + d] - 128) * (queries[q * dim + d] - 128);
+    for (std::size_t d = prefix; d < dim; ++d) {
+      rest_norms[q] += (queries[q * dim + d] - 128) * (queries[q * dim + d] - 128);
     }
   }
-  std::vector<std::int32_t> biases(rows), head_biases(rows);
-  set.code_biases(packed.data(), blocks, dim, head, biases.data(), head_biases.data());
-  std::size_t put_off = 0;
+  std::vector<std::int32_t> biases(rows), prefix_biases(rows);
+  set.code_biases(packed.data(), blocks, dim, prefix, biases.data(), prefix_biases.data());
+  std::size_t steps_in_full = 0;
   for (int repeat = 0; repeat < 6; ++repeat) {
     // Few queries do without biases.
     const bool biased = n > kernels::kFewQueries || repeat % 2 == 0;
     const auto limits = some_limits(random, distances);
     const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
-      return set.code_scan(
-          {queries.data(), limits.data(), tails.data(), n, &put_off},
-          {packed.data(), biased ? biases.data() : nullptr, head_biases.data(), blocks, dim, head},
-          block, hits);
+      return set.code_scan({queries.data(), limits.data(), rest_norms.data(), n, &steps_in_full},
+                           {packed.data(), biased ? biases.data() : nullptr, prefix_biases.data(),
+                            blocks, dim, prefix},
+                           block, hits);
     });
     CHECK(found == expected_hits(distances, limits));
   }
@@ -265,12 +265,12 @@ void compare_code_scans(const Kernels& set, test::Random& random) {
     for (std::size_t dim = 4; dim <= 256; dim += dim < 72 ? 4 : 28) {
       for (const std::size_t n : {1, 2, 3, 4, 6, 16}) {
         const auto blocks = static_cast<std::size_t>(random.integer(0, 13));
-        const auto head =
+        const auto prefix =
             4 * static_cast<std::size_t>(random.integer(1, static_cast<int>(dim / 4)));
-        compare_codes(set, random, dim, head, blocks, n, style);
+        compare_codes(set, random, dim, prefix, blocks, n, style);
       }
     }
-    // A look at heads is put off, and comes again.
+    // Steps are compared in full, and then the prefix again.
     for (const std::size_t n : {4, 15, 16}) compare_codes(set, random, 32, 20, 150, n, style);
   }
 }

@@ -162,12 +162,12 @@ void test_ids_and_codes(const std::shared_ptr<const Encoder>& encoder) {
   options.threads = 0;
   CHECK(refused([&] { with(options); }, "threads must be at least 1"));
   options = {};
-  for (const float d : {-1.0f, NAN}) {
+  for (const std::int32_t d : {-1, INT32_MIN}) {
     options.max_distance = d;
     CHECK(refused([&] { with(options); }, "max_distance"));
   }
   options = {};
-  for (const float ratio : {0.0f, 1.01f, NAN}) {
+  for (const double ratio : {0.0, 1.01, std::nan("")}) {
     options.ratio = ratio;
     CHECK(refused([&] { with(options); }, "ratio must be above 0"));
   }
@@ -459,27 +459,18 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
 void test_hamming() {
   const std::vector<std::uint8_t> rows(4 * 8);
   const Descriptors database{rows.data(), 4, 8}, queries{rows.data(), 2, 8};
-  Ids ids(4);
-  std::vector<std::int32_t> distances(4);
-  const MatrixView<std::int64_t> found{ids.data(), 2, 2};
-  const MatrixView<std::int32_t> far{distances.data(), 2, 2};
-  CHECK(refused([&] { hamming_search({rows.data(), 2, 0}, {rows.data(), 2, 0}, {}, found, far); },
+  CHECK(refused([&] { hamming_search({rows.data(), 2, 0}, {rows.data(), 2, 0}); },
                 "1 to 4096 bytes"));
-  CHECK(refused([&] { hamming_search(queries, database, {}, {ids.data(), 2, 0}, far); },
-                "k must be at least 1"));
-  CHECK(refused([&] { hamming_search(queries, database, {}, {ids.data(), 1, 2}, far); },
-                "queries x k"));
+  CHECK(refused([&] { hamming_search(queries, database, 0); }, "k must be at least 1"));
   HammingOptions options;
   options.max_distance = -1;
-  CHECK(refused([&] { hamming_search(queries, database, options, found, far); }, "max_distance"));
+  CHECK(refused([&] { hamming_search(queries, database, 2, options); }, "max_distance"));
   const Ids three = {1, 2, 3}, negative = {1, 2, 3, -4}, repeated = {7, 7, 5, 7};
-  CHECK(refused([&] { hamming_search(queries, database, three, {}, found, far); },
-                "4 rows, landmarks has 3"));
-  CHECK(refused([&] { hamming_search(queries, database, negative, {}, found, far); }, "negative"));
-  hamming_search(queries, database, repeated, {}, found, far);
-  CHECK(ids == Ids{5, 7, 5, 7});
-  hamming_search(queries, {rows.data(), 0, 8}, {}, found, far);
-  CHECK(ids == Ids{-1, -1, -1, -1} && distances[0] == 65);
+  CHECK(refused([&] { hamming_search(queries, database, three); }, "4 rows, landmarks has 3"));
+  CHECK(refused([&] { hamming_search(queries, database, negative); }, "negative"));
+  CHECK(hamming_search(queries, database, repeated).ids.data == Ids{5, 7, 5, 7});
+  const Matches none = hamming_search(queries, {rows.data(), 0, 8});
+  CHECK(none.ids.data == Ids{-1, -1, -1, -1} && none.distances.data[0] == INT32_MAX);
 }
 
 }  // namespace

@@ -45,7 +45,7 @@ void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path
   for (const std::size_t k : {1, 3}) {
     SearchOptions options;
     options.threads = 2;
-    if (k == 1) options.ratio = 0.9f;
+    if (k == 1) options.ratio = 0.9;
     CHECK(expanded.search_codes(queries, k, options) == mapped.search_codes(queries, k, options));
   }
 }

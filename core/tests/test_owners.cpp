@@ -58,7 +58,7 @@ std::vector<std::byte> changed(const std::vector<std::byte>& bytes, const Change
 template <typename Map>
 Matches search(const Map& map, Codes queries, std::optional<std::size_t> probes, int threads = 1) {
   SearchOptions options;
-  options.probes = probes;
+  options.nprobe = probes;
   options.threads = threads;
   return map.search_codes(queries, 2, options);
 }

@@ -20,6 +20,8 @@ from protomark.logistic import sigmoid
 
 KEY = "acceptance"
 SOURCE_KEY = "acceptance_data"
+# The squared distance that stands where there is no landmark.
+NO_DISTANCE = np.iinfo(np.int32).max
 _WEIGHTS = 3
 
 
@@ -40,9 +42,12 @@ class Acceptance:
     weights: tuple[float, ...]
 
     def probability(self, distances: ArrayLike) -> NDArray[np.float64]:
-        """(n, 2 or more) distances as `search` gives them -> (n,) float64; 0 where all are inf."""
+        """(n, 2 or more) squared distances as `search` gives them -> (n,) float64.
+
+        It is 0 where there is no landmark.
+        """
         nearest, second = np.asarray(distances, np.float64)[:, :2].T
-        there = np.isfinite(nearest)
+        there = nearest < NO_DISTANCE
         x = features(np.where(there, nearest, 0.0), second)
         return np.where(there, sigmoid(self.weights[0] + x @ np.array(self.weights[1:])), 0.0)
 
@@ -66,9 +71,8 @@ class Acceptance:
 
 
 def features(nearest: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) and (n,) distances -> (n, 2): d^2 and s^2 - d^2."""
-    square = nearest**2
-    return np.column_stack([square, np.where(np.isfinite(second), second**2, 4 * square) - square])
+    """(n,) and (n,) squared distances -> (n, 2): d^2 and s^2 - d^2."""
+    return np.column_stack([nearest, np.where(second < NO_DISTANCE, second, 4 * nearest) - nearest])
 
 
 def parse(note: str) -> dict[int, Acceptance]:

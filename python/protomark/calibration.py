@@ -24,7 +24,7 @@ from protomark.tracks.file import Tracks, sequence_name
 from protomark.upright import SUFFIX, upright_tracks
 
 FRAMES = 40
-Search = Callable[[NDArray[np.uint8]], tuple[NDArray[np.int64], NDArray[np.float32]]]
+Search = Callable[[NDArray[np.uint8]], tuple[NDArray[np.int64], NDArray[np.int32]]]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Answers:
     """What a map answered to all keypoints of some frames, with and without landmark.
 
     Attributes:
-        distances: (n, 2) float64, to the two nearest landmarks.
+        distances: (n, 2) float64, squared, to the two nearest landmarks.
         right: (n,) bool, whether the nearest is the keypoint's own, or projects to within half a
             percent of the image's longer side.
         frame: (n,) int64, which frame each keypoint is of.

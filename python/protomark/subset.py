@@ -46,7 +46,7 @@ class Subset:
 
     def search_codes(
         self, codes: NDArray[np.int8], k: int = 2, threads: int = 1
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """As `PrototypeMap.search_codes`: ids (q, k) and distances (q, k)."""
         if not self._looks:
             return self._map.search_codes(codes, k=k, threads=threads)
@@ -54,7 +54,7 @@ class Subset:
         rows, distances = self._map.search_codes(codes, k=(k - 1) * self._most + 1, threads=threads)
         landmarks = np.append(self._landmarks, -1)[rows]  # the last is for row -1
         ids = np.full((len(codes), k), -1, np.int64)
-        found = np.full((len(codes), k), np.inf, np.float32)
+        found = np.full((len(codes), k), np.iinfo(np.int32).max, np.int32)
         for i, (row, away) in enumerate(zip(landmarks, distances, strict=True)):
             _, first = np.unique(row, return_index=True)
             first = np.sort(first[row[first] >= 0])[:k]

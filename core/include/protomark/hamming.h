@@ -1,6 +1,7 @@
 // Exact nearest neighbours of binary descriptors in Hamming distance.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <optional>
 #include <span>
@@ -10,23 +11,20 @@
 namespace protomark {
 
 struct HammingOptions {
-  // Neighbours further away than this many bits are not reported.
-  std::optional<std::int32_t> max_distance;
+  // The largest distance, in bits, at which a neighbour is reported.
+  std::optional<std::int32_t> max_distance = std::nullopt;
   int threads = 1;
 };
 
-// The k nearest rows of `database` for each query, nearest first, ties to the smaller row.
-//
-// ids and distances are (queries x k), k = ids.columns; where there is no neighbour the id is -1
-// and the distance is one more than the descriptor has bits. Throws std::invalid_argument where
-// shapes do not fit.
-void hamming_search(Descriptors queries, Descriptors database, const HammingOptions& options,
-                    MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances);
+// Finds the k nearest rows of `database` for each query, nearest first, ties to the smaller row.
+// Throws std::invalid_argument if shapes do not fit.
+PROTOMARK_API Matches hamming_search(Descriptors queries, Descriptors database, std::size_t k = 2,
+                                     const HammingOptions& options = {});
 
-// The same for the k nearest *landmarks*: row i of `database` is a descriptor of landmarks[i], a
-// landmark is as far away as its nearest descriptor, and ids are landmark ids, ties to the smaller.
-void hamming_search(Descriptors queries, Descriptors database,
-                    std::span<const std::int64_t> landmarks, const HammingOptions& options,
-                    MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances);
+// Finds the k nearest *landmarks*: row i of `database` is a descriptor of landmarks[i], a landmark
+// is as far away as its nearest descriptor, and ids are landmark ids, ties to the smaller.
+PROTOMARK_API Matches hamming_search(Descriptors queries, Descriptors database,
+                                     std::span<const std::int64_t> landmarks, std::size_t k = 2,
+                                     const HammingOptions& options = {});
 
 }  // namespace protomark

@@ -69,8 +69,8 @@ using Position = std::array<double, 3>;
 
 // The k nearest neighbours of each query, nearest first.
 struct Matches {
-  Matrix<std::int64_t> ids;  // (queries x k); -1 where there is no neighbour
-  Matrix<float> distances;   // (queries x k)
+  Matrix<std::int64_t> ids;        // (queries x k); -1 where there is no neighbour
+  Matrix<std::int32_t> distances;  // (queries x k); INT32_MAX where there is none
   bool operator==(const Matches&) const = default;
 };
 

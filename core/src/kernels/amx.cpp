@@ -1,8 +1,7 @@
 // AMX with int8 tiles, beside AVX-512: Sapphire Rapids and later.
 #include <immintrin.h>
 
-#include "avx512_hits.h"
-#include "kernels.h"
+#include "kernels/generic_search.h"
 #ifdef PROTOMARK_EMULATE_AMX
 #include "emulated_tiles.h"
 #else
@@ -26,14 +25,13 @@ struct alignas(64) TileConfig {
 };
 static_assert(sizeof(TileConfig) == 64);
 
-// Dimensions of a full tile.
-constexpr std::size_t kTileDim = 64;
-// Blocks that are compared at a time, as many as products must be under way at once.
+constexpr std::size_t kTileDim = 64;  // dimensions of a full tile
+// Blocks compared at a time: four independent products hide the latency of a tile product.
 constexpr std::size_t kStep = 4;
 
-// Packed blocks are tiles as they stand, and so are queries. Tiles 0 to 3 are the results of four
+// Packed blocks are tiles as they stand, and so are queries. Tiles 0 to 3 hold the results of four
 // blocks, 4 and 5 queries, 6 and 7 a block; the first of each pair is for 64 dimensions, the second
-// for those that are left.
+// for the rest.
 TileConfig configuration(std::size_t queries, std::size_t dim) {
   TileConfig config;
   for (int tile = 0; tile < 4; ++tile) config.set(tile, queries, 4 * kCodeRows);
@@ -49,6 +47,19 @@ TileConfig configuration(std::size_t queries, std::size_t dim) {
   return config;
 }
 
+// Adds the products of queries in tile `a` and of four blocks, in tile `b`, from dimension d on,
+// to tiles 0 to 3.
+#define PROTOMARK_ADD_PRODUCTS(a, b)          \
+  TILE_LOAD(a, queries.codes + d, rows.dim);  \
+  TILE_LOAD(b, codes[0] + d * kCodeRows, 64); \
+  TILE_DPBUSD(0, a, b);                       \
+  TILE_LOAD(b, codes[1] + d * kCodeRows, 64); \
+  TILE_DPBUSD(1, a, b);                       \
+  TILE_LOAD(b, codes[2] + d * kCodeRows, 64); \
+  TILE_DPBUSD(2, a, b);                       \
+  TILE_LOAD(b, codes[3] + d * kCodeRows, 64); \
+  TILE_DPBUSD(3, a, b)
+
 // halves: blocks x queries x 16. Blocks beyond `blocks` repeat the last one.
 void scan_step(const CodeQueries& queries, const PackedCodes& rows, std::size_t block,
                std::size_t blocks, std::int32_t (*halves)[kScanQueries][kCodeRows]) {
@@ -60,33 +71,17 @@ void scan_step(const CodeQueries& queries, const PackedCodes& rows, std::size_t 
     _mm512_store_si512(start[i], _mm512_srai_epi32(bias, 1));
     codes[i] = rows.codes + b * kCodeRows * rows.dim;
   }
-  // All rows of a result tile start alike.
+  // A stride of 0: all queries start alike.
   TILE_LOAD(0, start[0], 0);
   TILE_LOAD(1, start[1], 0);
   TILE_LOAD(2, start[2], 0);
   TILE_LOAD(3, start[3], 0);
   std::size_t d = 0;
   for (; d + kTileDim <= rows.dim; d += kTileDim) {
-    TILE_LOAD(4, queries.codes + d, rows.dim);
-    TILE_LOAD(6, codes[0] + d * kCodeRows, 64);
-    TILE_DPBUSD(0, 4, 6);
-    TILE_LOAD(6, codes[1] + d * kCodeRows, 64);
-    TILE_DPBUSD(1, 4, 6);
-    TILE_LOAD(6, codes[2] + d * kCodeRows, 64);
-    TILE_DPBUSD(2, 4, 6);
-    TILE_LOAD(6, codes[3] + d * kCodeRows, 64);
-    TILE_DPBUSD(3, 4, 6);
+    PROTOMARK_ADD_PRODUCTS(4, 6);
   }
   if (d < rows.dim) {
-    TILE_LOAD(5, queries.codes + d, rows.dim);
-    TILE_LOAD(7, codes[0] + d * kCodeRows, 64);
-    TILE_DPBUSD(0, 5, 7);
-    TILE_LOAD(7, codes[1] + d * kCodeRows, 64);
-    TILE_DPBUSD(1, 5, 7);
-    TILE_LOAD(7, codes[2] + d * kCodeRows, 64);
-    TILE_DPBUSD(2, 5, 7);
-    TILE_LOAD(7, codes[3] + d * kCodeRows, 64);
-    TILE_DPBUSD(3, 5, 7);
+    PROTOMARK_ADD_PRODUCTS(5, 7);
   }
   TILE_STORE(0, halves[0], 64);
   TILE_STORE(1, halves[1], 64);
@@ -111,12 +106,13 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
       for (std::size_t i = 1; i < kStep; ++i) {
         best = _mm512_max_epi32(best, _mm512_load_si512(halves[i][q]));
       }
-      const __m512i enough = _mm512_set1_epi32(threshold(queries.limits[q]));
-      if (_mm512_cmpge_epi32_mask(best, enough) == 0) continue;
+      const __m512i least = _mm512_set1_epi32(threshold(queries.limits[q]));
+      if (_mm512_cmpgt_epi32_mask(best, least) == 0) continue;
       for (std::size_t i = 0; i < blocks; ++i) {
         const std::size_t row = (*block + i) * kCodeRows;
         found +=
-            collect_hits(halves[i][q], rows.biases + row, queries.limits[q], q, row, hits + found);
+            append_hits(_mm512_cmpgt_epi32_mask(_mm512_load_si512(halves[i][q]), least),
+                        halves[i][q], rows.biases + row, queries.limits[q], q, row, hits + found);
       }
     }
     *block += blocks;

@@ -1,5 +1,4 @@
 // Which kernels run on this CPU.
-#include <algorithm>
 #include <array>
 #include <cstdlib>
 #include <cstring>
@@ -16,7 +15,7 @@
 #endif
 #endif
 
-#include "kernels.h"
+#include "kernels/kernels.h"
 #include "protomark/types.h"
 
 namespace protomark::kernels {
@@ -32,7 +31,7 @@ bool has_avx512() {
 }
 
 #if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
-// Linux gives a process the room that tiles need when it asks for it. Elsewhere AMX is not used.
+// Linux gives a process room for tiles if it asks for it. Elsewhere AMX is not used.
 bool has_amx() {
   constexpr unsigned kTile = 1u << 24, kInt8 = 1u << 25;
   unsigned a = 0, b = 0, c = 0, d = 0;
@@ -56,49 +55,33 @@ bool has_dot_product() {
 }
 #endif
 
-// What `set` does and, for what it leaves out, what `below` does.
-Kernels over(const Kernels& set, const Kernels& below) {
-  Kernels result = below;
-  result.name = set.name;
-  const auto take = [](auto& mine, auto theirs) {
-    if (theirs != nullptr) mine = theirs;
-  };
-  take(result.bit_sums, set.bit_sums);
-  take(result.bit_sum, set.bit_sum);
-  take(result.dense, set.dense);
-  take(result.activate16, set.activate16);
-  take(result.activate32, set.activate32);
-  take(result.code_biases, set.code_biases);
-  take(result.code_unpack4, set.code_unpack4);
-  take(result.code_scan, set.code_scan);
-  take(result.hamming_scan, set.hamming_scan);
-  return result;
-}
-
-// All that run here, complete, best first.
+// All that run here, best first.
 struct Sets {
   std::array<Kernels, 4> kernels;
   std::array<const char*, 5> names{};
   std::size_t size = 0;
 
   Sets() {
-    add(portable);
 #if defined(__x86_64__)
-    if (has_avx2()) add(avx2);
-    if (has_avx512()) add(avx512);
 #if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
-    if (has_amx()) add(amx);
+    if (has_amx()) {
+      Kernels set = avx512;
+      set.name = amx.name;
+      set.code_scan = amx.code_scan;
+      add(set);
+    }
 #endif
+    if (has_avx512()) add(avx512);
+    if (has_avx2()) add(avx2);
 #elif defined(__aarch64__)
     if (has_dot_product()) add(neon);
 #endif
-    std::reverse(kernels.begin(), kernels.begin() + size);
-    for (std::size_t i = 0; i < size; ++i) names[i] = kernels[i].name;
+    add(portable);
   }
 
   void add(const Kernels& set) {
-    kernels[size] = size == 0 ? set : over(set, kernels[size - 1]);
-    ++size;
+    kernels[size] = set;
+    names[size++] = set.name;
   }
 };
 
@@ -111,13 +94,13 @@ const Kernels& choose() {
   const char* wanted = std::getenv("PROTOMARK_ISA");
   if (wanted == nullptr || *wanted == '\0') return sets().kernels.front();
   if (const Kernels* found = find(wanted)) return *found;
-  std::string known;
+  std::string available;
   for (const char* const* name = names(); *name != nullptr; ++name) {
-    known += (known.empty() ? "" : ", ") + std::string(*name);
+    available += (available.empty() ? "" : ", ") + std::string(*name);
   }
   throw std::invalid_argument("PROTOMARK_ISA=" + std::string(wanted) +
                               ": no such instruction set on this machine; leave it unset or use " +
-                              known);
+                              available);
 }
 
 }  // namespace

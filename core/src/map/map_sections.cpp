@@ -9,7 +9,7 @@
 
 #include "base/utf8.h"
 #include "file/sections.h"
-#include "search/ivf.h"
+#include "search/coarse_quantizer.h"
 
 namespace protomark {
 namespace {
@@ -120,7 +120,7 @@ std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {
 std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim) {
   if (!file.has(section::kCentroids)) return {};
   const std::size_t size = file.map(section::kCentroids).size(), lists = size / dim;
-  if (lists == 0 || lists > Cells::kMaxCells || size % dim != 0) {
+  if (lists == 0 || lists > CoarseQuantizer::kMaxLists || size % dim != 0) {
     file.fail_size(section::kCentroids);
   }
   auto centroids = read_section<std::int8_t>(file, section::kCentroids, size);

@@ -49,8 +49,8 @@ struct MapState {
   // Returns the recall table as measured on the map now, or earlier if little has changed since or
   // others measure or change the map; with these centroids at any rate. `lock` holds `searching`,
   // and is released while the table is measured.
-  std::shared_ptr<const MeasuredRanks> recall(std::shared_lock<FairSharedMutex>& lock,
-                                              double recall, int threads);
+  std::shared_ptr<const MeasuredRecall> recall(std::shared_lock<FairSharedMutex>& lock,
+                                               double recall, int threads);
 
   // A map of some of the landmarks.
   PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;
@@ -61,11 +61,11 @@ struct MapState {
   void fold();
 
  private:
-  bool is_stale(const MeasuredRanks& table) const;
+  bool is_stale(const MeasuredRecall& table) const;
   void measure(int threads, bool wait);
 
   std::mutex recall_mutex;
-  std::shared_ptr<const MeasuredRanks> recall_table;
+  std::shared_ptr<const MeasuredRecall> recall_table;
 };
 
 // Reads a map file and the commits to it. Throws FileError.
@@ -74,8 +74,9 @@ std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalCon
 // Measures which part of queries the inverted lists of a store serve, by lists visited. value(v)
 // tells what is searched in place of a rounded prototype's number v, and search_two finds the two
 // nearest landmarks of queries in that.
-ProbeRanks measure_recall(const PrototypeStore& store, const std::function<int(std::int8_t)>& value,
-                          const SearchTwo& search_two);
+RecallTable measure_recall_of(const PrototypeStore& store,
+                              const std::function<int(std::int8_t)>& value,
+                              const SearchTwo& search_two);
 
 // A change of a map: while it is there no other one begins, and whatever reads the map for long
 // waits. Searches go on between its pieces.
@@ -145,7 +146,7 @@ class MapChange {
   // Puts rows into the lists of other centroids; none drop the index. `in_place`: within the map,
   // which takes 5 bytes per row and, if arrays have to grow, the largest of them once more, but
   // makes searches wait. Otherwise in a copy of it.
-  void set_centroids(Cells centroids, int threads, bool in_place);
+  void set_quantizer(CoarseQuantizer quantizer, int threads, bool in_place);
 
  private:
   MapState* state_;

@@ -101,7 +101,7 @@ void PrototypeMap::add(std::span<const std::int64_t> ids, Descriptors descriptor
   std::size_t begin = 0;
   for (std::size_t next = kEncodeChunk; next < descriptors.rows; next += kEncodeChunk) {
     const auto chunk = codes(next);
-    if (state_->store.centroids().size() == 0) {
+    if (state_->store.quantizer().nlist() == 0) {
       // One thread adds what is encoded, mostly waiting for memory, while the others encode.
       const std::size_t share = std::clamp<std::size_t>(
           chunk.rows / (4 * static_cast<std::size_t>(threads)), kMinShare, kMaxShare);

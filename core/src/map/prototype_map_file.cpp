@@ -145,7 +145,7 @@ class Reading {
     state_.metadata = std::move(metadata_ ? *metadata_ : metadata);
     if (centroids_) centroids = std::move(*centroids_);
     if (centroids.empty()) return;
-    MapChange(state_).set_centroids({std::move(centroids), store_.dim()}, 1, true);
+    MapChange(state_).set_quantizer({std::move(centroids), store_.dim()}, 1, true);
   }
 
  private:
@@ -273,7 +273,7 @@ ContainerWriter file_of(const MapState& state, const LandmarkSections& landmarks
   ContainerWriter file(FileKind::learning_map);
   file.add(section::kEncoder, state.encoder->serialize());
   add_metadata(file, state.metadata);
-  const std::vector<std::int8_t>& centroids = state.store.centroids().centroids();
+  const std::vector<std::int8_t>& centroids = state.store.quantizer().centroids();
   if (!centroids.empty()) file.add(section::kCentroids, std::as_bytes(std::span(centroids)));
   landmarks.add_to(file);
   return file;
@@ -302,7 +302,7 @@ std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
                            : add_metadata(record, state.metadata);
   }
   if (changes.centroids) {
-    record.add(section::kCentroids, std::as_bytes(std::span(state.store.centroids().centroids())));
+    record.add(section::kCentroids, std::as_bytes(std::span(state.store.quantizer().centroids())));
   }
   return record.serialize();
 }

@@ -4,7 +4,7 @@
 #include <utility>
 
 #include "map/map_state.h"
-#include "search/ivf_search.h"
+#include "search/inverted_lists.h"
 
 namespace protomark {
 namespace {
@@ -14,12 +14,12 @@ constexpr char kRemedy[] = "call build_index first";
 constexpr std::size_t kStalePart = 10;
 
 // From prototypes by id, so that centroids do not depend on how the map came about.
-Cells learn_centroids(const PrototypeStore& store, std::size_t nlist, int threads) {
+CoarseQuantizer learn(const PrototypeStore& store, std::size_t nlist, int threads) {
   const std::size_t rows = store.prototype_count();
-  std::vector<std::size_t> sample(std::min(rows, Cells::sample_for(nlist)));
+  std::vector<std::size_t> sample(std::min(rows, CoarseQuantizer::sample_size(nlist)));
   for (std::size_t i = 0; i < sample.size(); ++i) sample[i] = i * rows / sample.size();
   const std::vector<std::int8_t> codes = store.rounded(store.sorted_rows_at(sample));
-  return Cells::learn({codes.data(), sample.size(), store.dim()}, nlist, threads);
+  return CoarseQuantizer::learn({codes.data(), sample.size(), store.dim()}, nlist, threads);
 }
 
 }  // namespace
@@ -31,20 +31,20 @@ void PrototypeMap::build_index(const IndexOptions& options, int threads) {
   const std::size_t rows = store.prototype_count();
   if (rows == 0) throw std::invalid_argument("a map without landmarks has nothing to index");
   const std::size_t nlist =
-      options.nlist.value_or(Cells::number_for(rows, store.dim(), store.row_bytes()));
-  const std::size_t limit = std::min(rows, Cells::kMaxCells);
+      options.nlist.value_or(CoarseQuantizer::default_nlist(rows, store.dim(), store.row_bytes()));
+  const std::size_t limit = std::min(rows, CoarseQuantizer::kMaxLists);
   if (nlist < 1 || nlist > limit) {
     throw std::invalid_argument("nlist must be 1 to " + std::to_string(limit) +
                                 " for this map, not " + std::to_string(nlist));
   }
-  change.set_centroids(learn_centroids(store, nlist, threads), threads, options.in_place);
+  change.set_quantizer(learn(store, nlist, threads), threads, options.in_place);
 }
 
-void PrototypeMap::drop_index() { MapChange(*state_).set_centroids({}, 1, false); }
+void PrototypeMap::drop_index() { MapChange(*state_).set_quantizer({}, 1, false); }
 
-void MapChange::set_centroids(Cells centroids, int threads, bool in_place) {
+void MapChange::set_quantizer(CoarseQuantizer quantizer, int threads, bool in_place) {
   PrototypeStore& store = state_->store;
-  auto arrangement = store.arrange(std::move(centroids), threads);
+  auto arrangement = store.arrange(std::move(quantizer), threads);
   if (in_place) {
     store.make_room_for(arrangement, state_->searching);
     const auto lock = write();
@@ -61,13 +61,13 @@ void MapChange::set_centroids(Cells centroids, int threads, bool in_place) {
 
 std::size_t PrototypeMap::nlist() const {
   const std::shared_lock lock(state_->searching);
-  return state_->store.centroids().size();
+  return state_->store.quantizer().nlist();
 }
 
 std::size_t PrototypeMap::nprobe(double recall, int threads) const {
   std::shared_lock lock(state_->searching);
   const auto table = state_->recall(lock, recall, threads);
-  return probes_for(table->ranks, recall, state_->store.centroids().size());
+  return nprobe_for(table->table, recall, state_->store.quantizer().nlist());
 }
 
 Matches PrototypeMap::search(Descriptors queries, std::size_t k,
@@ -80,24 +80,24 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
   Matches matches{{queries.rows, k}, {queries.rows, k}};
   std::shared_lock lock(state_->searching);
   const PrototypeStore& store = state_->store;
-  auto nprobe = asked_probes(options, store.centroids().size(), kRemedy);
+  auto nprobe = requested_nprobe(options, store.quantizer().nlist(), kRemedy);
   if (options.recall) {
     const auto table = state_->recall(lock, *options.recall, options.threads);
-    nprobe = probes_for(table->ranks, *options.recall, store.centroids().size());
+    nprobe = nprobe_for(table->table, *options.recall, store.quantizer().nlist());
   }
-  if (!nprobe || *nprobe >= store.centroids().size()) {
-    protomark::search(store.view(), queries, exact(options), matches.ids.view(),
-                      matches.distances.view());
+  if (!nprobe) {
+    search_exact(store.view(), queries, options, matches.ids.view(), matches.distances.view());
   } else {
-    search_cells(store.view(), CellView(store.lists()), store.centroids().packed(), *nprobe,
-                 queries, exact(options), matches.ids.view(), matches.distances.view());
+    search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(), *nprobe,
+                 queries, options, matches.ids.view(), matches.distances.view());
   }
   return matches;
 }
 
 // Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.
-ProbeRanks measure_recall(const PrototypeStore& store, const std::function<int(std::int8_t)>& value,
-                          const SearchTwo& search_two) {
+RecallTable measure_recall_of(const PrototypeStore& store,
+                              const std::function<int(std::int8_t)>& value,
+                              const SearchTwo& search_two) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
   std::vector<std::int64_t> own;
   for (const Row row : rows) own.push_back(store.id(store.owner(row)));
@@ -115,24 +115,24 @@ ProbeRanks measure_recall(const PrototypeStore& store, const std::function<int(s
       }
       if (distance >= least) continue;
       least = distance;
-      list = store.lists().cell_of(row.value);
+      list = store.lists().list_of(row);
     }
     return list;
   };
-  return measure_ranks({codes.data(), rows.size(), store.dim()}, own, store.centroids().centroids(),
-                       search_two, list_of);
+  return measure_recall({codes.data(), rows.size(), store.dim()}, own, store.quantizer(),
+                        search_two, list_of);
 }
 
-std::shared_ptr<const MeasuredRanks> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
-                                                      double recall, int threads) {
+std::shared_ptr<const MeasuredRecall> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
+                                                       double recall, int threads) {
   for (bool tried = false;; tried = true) {
-    check_recall(recall, store.centroids().size(), kRemedy);
-    std::shared_ptr<const MeasuredRanks> known;
+    check_recall(recall, store.quantizer().nlist(), kRemedy);
+    std::shared_ptr<const MeasuredRecall> known;
     {
       const std::scoped_lock reading(recall_mutex);
       known = recall_table;
     }
-    const bool of_these = known && known->cells_version == store.centroids_version();
+    const bool of_these = known && known->lists_version == store.lists_version();
     if (of_these && (tried || !is_stale(*known))) return known;
     lock.unlock();
     measure(threads, !of_these);
@@ -140,8 +140,8 @@ std::shared_ptr<const MeasuredRanks> MapState::recall(std::shared_lock<FairShare
   }
 }
 
-bool MapState::is_stale(const MeasuredRanks& table) const {
-  return table.cells_version != store.centroids_version() ||
+bool MapState::is_stale(const MeasuredRecall& table) const {
+  return table.lists_version != store.lists_version() ||
          (store.changes() - table.changes) * kStalePart >= store.prototype_count();
 }
 
@@ -155,16 +155,16 @@ void MapState::measure(int threads, bool wait) {
   } else if (!one.try_lock() || !still.try_lock()) {
     return;
   }
-  if (store.centroids().size() == 0 || (recall_table && !is_stale(*recall_table))) return;
-  auto measured = std::make_shared<MeasuredRanks>();
-  measured->ranks = measure_recall(
+  if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
+  auto measured = std::make_shared<MeasuredRecall>();
+  measured->table = measure_recall_of(
       store, [](std::int8_t code) { return int{code}; },
-      [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float> distances) {
+      [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
         SearchOptions options;
         options.threads = threads;
-        protomark::search(store.view(), queries, options, ids, distances);
+        search_exact(store.view(), queries, options, ids, distances);
       });
-  measured->cells_version = store.centroids_version();
+  measured->lists_version = store.lists_version();
   measured->changes = store.changes();
   const std::scoped_lock writing(recall_mutex);
   recall_table = std::move(measured);

@@ -2,9 +2,7 @@
 // memory beside the map.
 #include <algorithm>
 #include <array>
-#include <cmath>
 #include <cstring>
-#include <numeric>
 #include <optional>
 #include <span>
 #include <stdexcept>
@@ -20,7 +18,7 @@
 #include "map/map_state.h"
 #include "map/positions.h"
 #include "map/sealed_store.h"
-#include "search/top_k.h"
+#include "search/scan.h"
 
 namespace protomark {
 namespace {
@@ -28,8 +26,8 @@ namespace {
 using Sink = ContainerWriter::Sink;
 using Sinks = std::span<const Sink>;
 
-// Packs blocks of kPackedRows rows as PackedPrototypes has them, or with a scale as
-// PackedPrototypes4.
+// Packs blocks of kPackedRows rows as search reads them, with numbers of 8 bits, or of 4 with a
+// scale.
 class BlockPacker {
  public:
   // A scale of 0 means 8 bits per number.
@@ -161,33 +159,23 @@ class RowWriter {
 // Finds the two nearest landmarks of each query among the levels of 4-bit prototypes, piece by
 // piece.
 void search_levels(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
-                   MatrixView<std::int64_t> ids) {
+                   MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
   // As much memory as is little beside the map.
   const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   const std::size_t dim = store.dim();
-  LargeVector<CodeVector> packed(packed_size(size, dim) / sizeof(CodeVector));
+  std::vector<CodeVector> packed(packed_size(size, dim) / sizeof(CodeVector));
   auto* levels = reinterpret_cast<std::int8_t*>(packed.data());
-  std::vector<std::uint32_t> own_index(size);  // several rows may have the same id
-  std::iota(own_index.begin(), own_index.end(), 0u);
+  std::vector<LandmarkIndex> own_index(size);  // several rows may have the same id
+  for (std::uint32_t i = 0; i < size; ++i) own_index[i].value = i;
   std::vector<std::int64_t> owners;
   std::vector<std::int8_t> code(dim);
-  Matrix<std::int64_t> found(queries.rows, 2);
-  Matrix<float> distances(queries.rows, 2);
-  std::vector<std::int32_t> best_distances(2 * queries.rows);
-  std::vector<TopK> best;
-  for (std::size_t q = 0; q < queries.rows; ++q) {
-    best.emplace_back(ids.row(q), &best_distances[2 * q], 2, INT32_MAX - 1);
-  }
+  const PreparedCodes prepared(queries);
+  Neighbours nearest = prepared.places(2, {});
   const auto search_piece = [&] {
-    PackedPrototypes piece{levels, owners.size(), dim, owners.data()};
+    PackedPrototypes piece{levels, owners.size(), dim};
     piece.landmarks.of_row = own_index.data();
-    search(piece, queries, {}, found.view(), distances.view());
-    for (std::size_t i = 0; i < found.data.size(); ++i) {
-      if (found.data[i] < 0) continue;
-      const float distance = distances.data[i];
-      best[i / 2].offer_distinct(static_cast<std::int32_t>(std::lround(distance * distance)),
-                                 found.data[i]);
-    }
+    piece.landmarks.ids = owners.data();
+    PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, owners.size()});
     owners.clear();
   };
   store.each_row([&](Row row) {
@@ -199,6 +187,7 @@ void search_levels(const PrototypeStore& store, const BlockPacker& packer, Codes
     if (owners.size() == size) search_piece();
   });
   search_piece();
+  write_answer(nearest, prepared.norms(), std::nullopt, std::nullopt, ids, distances);
 }
 
 // The sections that have something per landmark or row. They come into being in one pass over
@@ -220,7 +209,7 @@ class SealedContent {
 
   // Adds the sections to a file that is written as long as this is there.
   void add_to(ContainerWriter& file) {
-    const std::size_t n = store_.landmark_count(), nlist = store_.centroids().size();
+    const std::size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
     const ContainerWriter::Part prototypes{section::kPrototypes,
                                            store_.lists().blocks() * packer_.size()};
     std::vector<ContainerWriter::Part> parts{{section::kCounts, n}};
@@ -238,18 +227,21 @@ class SealedContent {
                       [this](Sinks sinks) { put_lists(sinks); });
     file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(std::uint32_t),
              [this](const Sink& sink) { sink(std::as_bytes(std::span(owner_checksums_))); });
-    file.add(section::kCentroids, std::as_bytes(std::span(store_.centroids().centroids())));
+    file.add(section::kCentroids, std::as_bytes(std::span(store_.quantizer().centroids())));
     file.add(section::kListRows, nlist * sizeof(std::uint32_t), [this, nlist](const Sink& sink) {
       put_values<std::uint32_t>(sink, nlist, 1, [&](std::size_t list, std::uint32_t* to) {
         *to = static_cast<std::uint32_t>(store_.lists().rows(static_cast<std::uint32_t>(list)));
       });
     });
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
-      const ProbeRanks table = measure_recall(
+      const RecallTable table = measure_recall_of(
           store_, [this](std::int8_t code) { return packer_.value(code); },
-          [this](Codes queries, MatrixView<std::int64_t> ids, MatrixView<float> distances) {
-            if (packer_.scale() == 0) return search(store_.view(), queries, {}, ids, distances);
-            search_levels(store_, packer_, queries, ids);
+          [this](Codes queries, MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
+            if (packer_.scale() == 0) {
+              search_exact(store_.view(), queries, {}, ids, distances);
+            } else {
+              search_levels(store_, packer_, queries, ids, distances);
+            }
           });
       sink(std::as_bytes(std::span(table)));
     });
@@ -264,7 +256,7 @@ class SealedContent {
     const Sink* row_counts = has_row_counts() ? &*sink++ : nullptr;
     const Sink* positions = codec_ ? &*sink++ : nullptr;
     std::optional<RowWriter> prototypes;
-    if (store_.centroids().size() == 0) prototypes.emplace(packer_, *sink++);
+    if (store_.quantizer().nlist() == 0) prototypes.emplace(packer_, *sink++);
     std::optional<IdBlockWriter> ids;
     if (ids_are_stored_) ids.emplace(sink[0], sink[1]);
     if (!prototypes && ids_are_stored_) landmarks_.emplace(store_);
@@ -304,7 +296,7 @@ class SealedContent {
 
   void put_lists(Sinks sinks) {
     RowWriter writer(packer_, sinks[0], &sinks[1], owner_bits_, store_.landmark_count());
-    for (std::uint32_t list = 0; list < store_.centroids().size(); ++list) {
+    for (std::uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
       store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
         for (const Row row : rows) {
           const LandmarkIndex owner = store_.owner(row);

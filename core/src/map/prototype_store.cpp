@@ -30,7 +30,7 @@ void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
 void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                                FairSharedMutex& searching) {
   // New rows begin in the first list, and each that moves on may be the first of a block.
-  const std::size_t moving = centroids_.size() == 0 ? 0 : std::min(changed, centroids_.size());
+  const std::size_t moving = quantizer_.nlist() == 0 ? 0 : std::min(changed, quantizer_.nlist());
   const std::size_t blocks = 2 * ((rows + kPackedRows - 1) / kPackedRows) + moving;
   for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more, const auto&) {
     if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), searching);
@@ -81,7 +81,7 @@ Row PrototypeStore::take_row(std::uint32_t list) {
   lists_.make_room();
   for_each_array(0, kPackedRows,
                  [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
-  const Row row{lists_.append(list)};
+  const Row row = lists_.append(list);
   if (row_end() != counts_.size()) resize(row_end());
   ++prototype_count_;
   std::fill_n(sum(row), dim_, std::int16_t{0});
@@ -122,12 +122,12 @@ void PrototypeStore::relocate(Row from, Row to) {
 // block of all takes its place.
 void PrototypeStore::close_gap(Row row) {
   vacate(row);
-  const std::uint32_t list = lists_.cell_of(row.value);
-  if (const Row last{lists_.last(list)}; last != row) relocate(last, row);
+  const std::uint32_t list = lists_.list_of(row);
+  if (const Row last = lists_.last(list); last != row) relocate(last, row);
   const std::uint32_t emptied = lists_.pop(list);
   --prototype_count_;
   ++changes_;
-  if (emptied == CellBlocks::kNone) return;
+  if (emptied == ListBlocks::kNone) return;
   const std::size_t moved = lists_.blocks();
   for (std::size_t i = 0; emptied != moved && i < kPackedRows; ++i) {
     const Row from = row_at(moved * kPackedRows + i);
@@ -196,9 +196,7 @@ void PrototypeStore::visit_sorted_landmarks(const VisitLandmarks& visit) const {
 }
 
 void PrototypeStore::visit_sorted_rows(std::uint32_t list, const VisitRows& visit) const {
-  const auto each = [&](const auto& take) {
-    lists_.each_row(list, [&](std::uint32_t row) { take(Row{row}); });
-  };
+  const auto each = [&](const auto& take) { lists_.each_row(list, take); };
   visit_sorted<Row>(
       lists_.rows(list), each, [&](Row row) { return std::pair(id(owner(row)), appearance(row)); },
       visit);
@@ -235,10 +233,9 @@ void PrototypeStore::set_position(LandmarkIndex landmark, const Position& positi
 }
 
 PackedPrototypes PrototypeStore::view() const {
-  PackedPrototypes result{packed(), row_end(), dim_, ids_.data()};
-  if (several_) {
-    result.landmarks.of_row = reinterpret_cast<const std::uint32_t*>(owners_.data());
-  }
+  PackedPrototypes result{packed(), row_end(), dim_};
+  result.landmarks.ids = ids_.data();
+  if (several_) result.landmarks.of_row = owners_.data();
   return result;
 }
 

@@ -11,8 +11,8 @@
 
 #include "base/fair_shared_mutex.h"
 #include "map/row_table.h"
-#include "search/cell_blocks.h"
-#include "search/ivf.h"
+#include "search/coarse_quantizer.h"
+#include "search/list_blocks.h"
 
 namespace protomark {
 
@@ -140,23 +140,23 @@ class PrototypeStore : private RowTable {
   void set_position(LandmarkIndex landmark, const Position& position);
 
   // Centroids of the inverted lists; none without an index.
-  const Cells& centroids() const { return centroids_; }
-  const CellBlocks& lists() const { return lists_; }
+  const CoarseQuantizer& quantizer() const { return quantizer_; }
+  const ListBlocks& lists() const { return lists_; }
   // Where rows will stand by other centroids.
   struct Arrangement {
-    Cells centroids;
-    CellBlocks lists;
+    CoarseQuantizer quantizer;
+    ListBlocks lists;
     std::vector<Row> to;  // of each row; kNoRow for padding
   };
   // By these centroids; none drop the index.
-  Arrangement arrange(Cells centroids, int threads) const;
+  Arrangement arrange(CoarseQuantizer quantizer, int threads) const;
   // Arranges this map within its memory, for which make_room_for must have been called; uses up the
   // arrangement, and takes its centroids.
   void rearrange(Arrangement& arrangement) noexcept;
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching);
 
   // A number that each set of centroids has for itself.
-  std::size_t centroids_version() const { return centroids_version_; }
+  std::size_t lists_version() const { return lists_version_; }
   // A number that grows with each row that came, changed or went while there was an index.
   std::size_t changes() const { return changes_; }
   // What to commit; nullptr as long as nobody does. Only whoever commits may take it, while no
@@ -217,9 +217,9 @@ class PrototypeStore : private RowTable {
   std::vector<std::uint8_t> counts_;
   LargeVector<CodeVector> packed_;  // rounded prototypes, as PackedPrototypes has them
 
-  CellBlocks lists_;
-  Cells centroids_;
-  std::size_t centroids_version_ = 0;
+  ListBlocks lists_;
+  CoarseQuantizer quantizer_;
+  std::size_t lists_version_ = 0;
   std::vector<Key> to_reassign_;
   std::size_t changes_ = 0;
 };

@@ -38,7 +38,7 @@ void PrototypeStore::find_rows(std::span<const std::int64_t> ids, Codes codes,
 void PrototypeStore::add(std::span<const std::int64_t> ids, Codes codes,
                          std::span<const Row> rows) {
   const std::size_t n = rows.size();
-  if (centroids_.size() != 0) to_reassign_.reserve(to_reassign_.size() + n);
+  if (quantizer_.nlist() != 0) to_reassign_.reserve(to_reassign_.size() + n);
   for (std::size_t i = 0; i < n + kAhead; ++i) {
     if (i < n && rows[i] != kNoRow) prefetch_prototype(rows[i]);
     if (i < kAhead) continue;
@@ -101,7 +101,7 @@ void PrototypeStore::refresh(Row row) {
     differences |= before ^ after;
   }
   if (uncommitted) uncommitted->insert(id(owner(row)));
-  if (differences != 0 && centroids_.size() != 0) {
+  if (differences != 0 && quantizer_.nlist() != 0) {
     to_reassign_.push_back({id(owner(row)), appearance(row)});
   }
 }

@@ -32,16 +32,16 @@ void PrototypeStore::reassign(int threads) {
       rows.push_back(row);
     }
     const std::vector<std::int8_t> codes = rounded(rows);
-    auto lists = centroids_.assign({codes.data(), rows.size(), dim_}, threads);
+    auto lists = quantizer_.assign({codes.data(), rows.size(), dim_}, threads);
     std::size_t moving = 0;
     for (std::size_t i = 0; i < rows.size(); ++i) {
-      if (lists_.cell_of(rows[i].value) == lists[i]) continue;
+      if (lists_.list_of(rows[i]) == lists[i]) continue;
       keys[moving] = keys[i];
       lists[moving++] = lists[i];
     }
     for (std::size_t i = 0; i < moving; ++i) {
       const Row row = find_key(keys[i]);
-      if (lists_.cell_of(row.value) == lists[i]) continue;  // its key was there twice
+      if (lists_.list_of(row) == lists[i]) continue;  // its key was there twice
       relocate(row, take_row(lists[i]));
       close_gap(row);
     }
@@ -50,17 +50,17 @@ void PrototypeStore::reassign(int threads) {
   to_reassign_.clear();
 }
 
-PrototypeStore::Arrangement PrototypeStore::arrange(Cells centroids, int threads) const {
-  const std::size_t nlist = std::max<std::size_t>(centroids.size(), 1);
+PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, int threads) const {
+  const std::size_t nlist = std::max<std::size_t>(quantizer.nlist(), 1);
   std::vector<Row> to(row_end(), kNoRow);  // for now the list of each row
   std::vector<std::size_t> counts(nlist);
   std::vector<Row> rows;
   rows.reserve(std::min(prototype_count_, kAssignChunk));
   const auto assign = [&] {
     std::vector<std::uint32_t> lists(rows.size(), 0);
-    if (centroids.size() != 0) {
+    if (quantizer.nlist() != 0) {
       const std::vector<std::int8_t> codes = rounded(rows);
-      lists = centroids.assign({codes.data(), rows.size(), dim_}, threads);
+      lists = quantizer.assign({codes.data(), rows.size(), dim_}, threads);
     }
     for (std::size_t i = 0; i < rows.size(); ++i) {
       to[rows[i].value].value = lists[i];
@@ -73,7 +73,7 @@ PrototypeStore::Arrangement PrototypeStore::arrange(Cells centroids, int threads
     if (rows.size() == kAssignChunk) assign();
   });
   assign();
-  Arrangement result{std::move(centroids), CellBlocks(nlist), std::move(to)};
+  Arrangement result{std::move(quantizer), ListBlocks(nlist), std::move(to)};
   std::size_t blocks = 0;
   for (const std::size_t n : counts) blocks += (n + kPackedRows - 1) / kPackedRows;
   result.lists.reserve(blocks);
@@ -97,19 +97,20 @@ void PrototypeStore::make_room_for(const Arrangement& arrangement, FairSharedMut
 }
 
 void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
-  const CellBlocks& lists = arrangement.lists;
+  const ListBlocks& lists = arrangement.lists;
   const std::size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
   relink(arrangement.to);
   resize(end + kPackedRows);
   permute(arrangement.to, Row{static_cast<std::uint32_t>(end)});
-  for (std::uint32_t list = 0; list < lists.cells(); ++list) {
+  for (std::uint32_t list = 0; list < lists.nlist(); ++list) {
     if (lists.rows(list) == 0) continue;
-    for (Row row{lists.last(list) + 1}; row.value % kPackedRows != 0; ++row.value) vacate(row);
+    for (Row row{lists.last(list).value + 1}; row.value % kPackedRows != 0; ++row.value)
+      vacate(row);
   }
-  std::swap(centroids_, arrangement.centroids);
+  std::swap(quantizer_, arrangement.quantizer);
   std::swap(lists_, arrangement.lists);
   resize(row_end());
-  ++centroids_version_;
+  ++lists_version_;
   changes_ += prototype_count_;
   if (uncommitted) uncommitted->centroids = true;
 }

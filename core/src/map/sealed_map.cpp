@@ -13,8 +13,8 @@
 #include "map/map_sections.h"
 #include "map/positions.h"
 #include "map/sealed_store.h"
-#include "search/ivf.h"
-#include "search/ivf_search.h"
+#include "search/coarse_quantizer.h"
+#include "search/inverted_lists.h"
 #include "search/recall.h"
 
 namespace protomark {
@@ -39,33 +39,27 @@ struct SealedMap::Content {
     const std::size_t n = shape.landmarks;
     prototype_count = n;
     if (file.has(section::kRows)) read_row_counts();
-    RowLandmarks owner_of;
-    std::size_t row_end = prototype_count;
+    prototypes.rows = prototype_count;
+    prototypes.dim = shape.dim;
     if (file.has(section::kCentroids)) {
-      row_end = read_index();
-      owner_of.order = owners.get();
-      owner_of.end = static_cast<std::uint32_t>(n);
+      read_index();
+      prototypes.landmarks.look_up = [this](Row row) { return owner(row); };
+      prototypes.landmarks.end = LandmarkIndex{static_cast<std::uint32_t>(n)};
     } else {
-      owner_of.rows_of = row_counts.empty() ? nullptr : row_counts.data();
+      prototypes.landmarks.row_counts = row_counts.empty() ? nullptr : row_counts.data();
     }
     if (file.has(section::kScale)) {
-      code_bits = 4;
       const auto scale = read_value<std::uint32_t>(file, section::kScale);
       if (scale < 1 || scale > kMaxScale) {
         file.fail("the scale of its prototypes is " + std::to_string(scale) + ", not 1 to " +
                   std::to_string(kMaxScale));
       }
-      prototypes4.data =
-          file.map<std::uint8_t>(section::kPrototypes, packed4_size(row_end, shape.dim)).data();
-      prototypes4.half_step = static_cast<int>(scale);
-      if (nlist() == 0) check_padding();
-    } else {
-      prototypes.data =
-          file.map<std::int8_t>(section::kPrototypes, packed_size(row_end, shape.dim)).data();
+      prototypes.scale = static_cast<int>(scale);
     }
-    prototypes.rows = prototypes4.rows = row_end;
-    prototypes.dim = prototypes4.dim = shape.dim;
-    prototypes.landmarks = prototypes4.landmarks = owner_of;
+    const std::size_t size = code_bits() == 4 ? packed4_size(prototypes.rows, shape.dim)
+                                              : packed_size(prototypes.rows, shape.dim);
+    prototypes.data = file.map<std::byte>(section::kPrototypes, size).data();
+    if (code_bits() == 4 && nlist() == 0) check_padding();
     counts = file.map<std::uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
     if (!file.has(section::kPositions)) return;
@@ -83,8 +77,8 @@ struct SealedMap::Content {
     }
   }
 
-  // Reads the inverted lists, and returns how many rows they have, padding included.
-  std::size_t read_index() {
+  // Reads the inverted lists, and how many rows they have, padding included.
+  void read_index() {
     centroids = read_centroids(file, shape.dim);
     const std::size_t lists = centroids.size() / shape.dim;
     packed_centroids = pack_codes({centroids.data(), lists, shape.dim});
@@ -98,9 +92,10 @@ struct SealedMap::Content {
       first_blocks.push_back(first_blocks.back() + static_cast<std::uint32_t>(blocks));
     }
     if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
-    const std::size_t row_end = std::size_t{first_blocks.back()} * kPackedRows;
+    prototypes.rows = std::size_t{first_blocks.back()} * kPackedRows;
     const int bits = owner_bits(shape.landmarks);
-    const auto words = file.map<std::uint64_t>(section::kOwners, packed_words(row_end, bits));
+    const auto words =
+        file.map<std::uint64_t>(section::kOwners, packed_words(prototypes.rows, bits));
     owners = std::make_unique<const CheckedNumbers>(
         words, bits,
         file.read<std::uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
@@ -111,8 +106,11 @@ struct SealedMap::Content {
         (size > 0 && (recall_table.front() < 1 || recall_table.back() > lists))) {
       file.fail("its recall table is impossible");
     }
-    return row_end;
   }
+
+  int code_bits() const { return prototypes.scale == 0 ? 8 : 4; }
+  // With an index. Throws FileError if the owners are broken there.
+  LandmarkIndex owner(Row row) const { return {static_cast<std::uint32_t>((*owners)[row.value])}; }
 
   std::size_t nlist() const { return list_rows.size(); }
 
@@ -136,15 +134,14 @@ struct SealedMap::Content {
     std::call_once(rows_found, [&] {
       std::vector<Row> found(prototype_count);
       std::vector<std::uint32_t> taken(shape.landmarks, 0);
-      const std::size_t end = std::size_t{first_blocks.back()} * kPackedRows;
       std::size_t total = 0;
-      for (std::size_t row = 0; row < end; ++row) {
-        const std::uint64_t owner = (*owners)[row];
-        if (owner >= shape.landmarks) continue;
-        const auto [first, last] = prototypes_of(landmark_at(owner));
-        const std::size_t at = first + taken[owner]++;
+      for (Row row{0}; row.value < prototypes.rows; ++row.value) {
+        const LandmarkIndex landmark = owner(row);
+        if (landmark.value >= shape.landmarks) continue;
+        const auto [first, last] = prototypes_of(landmark);
+        const std::size_t at = first + taken[landmark.value]++;
         if (at == last) file.fail("it has more prototypes of a landmark than it says");
-        found[at].value = static_cast<std::uint32_t>(row);
+        found[at] = row;
         ++total;
       }
       if (total != prototype_count) file.fail("it lacks prototypes of a landmark");
@@ -165,13 +162,14 @@ struct SealedMap::Content {
   }
 
   std::uint8_t value4(std::size_t row, std::size_t d) const {
-    const std::uint8_t byte = prototypes4.data[packed4_index(row, d, shape.dim)];
+    const auto* data = static_cast<const std::uint8_t*>(prototypes.data);
+    const std::uint8_t byte = data[packed4_index(row, d, shape.dim)];
     return static_cast<std::uint8_t>(packed4_high(d) ? byte >> 4 : byte & 15);
   }
 
   int value(Row row, std::size_t d) const {
-    if (code_bits == 4) return sq4_level(value4(row.value, d), prototypes4.half_step);
-    return prototypes.data[packed_index(row.value, d, shape.dim)];
+    if (code_bits() == 4) return sq4_level(value4(row.value, d), prototypes.scale);
+    return static_cast<const std::int8_t*>(prototypes.data)[packed_index(row.value, d, shape.dim)];
   }
 
   static constexpr std::size_t kFirstRowStep = 64;  // landmarks
@@ -184,16 +182,14 @@ struct SealedMap::Content {
   std::size_t prototype_count = 0;
   std::span<const std::uint8_t> row_counts;  // empty if each landmark has one row
   std::vector<std::uint32_t> first_rows;     // of every kFirstRowStep-th landmark
-  int code_bits = 8;
-  PackedPrototypes prototypes;    // if it is 8
-  PackedPrototypes4 prototypes4;  // if it is 4
+  PackedPrototypes prototypes;
   // The index, if there is one.
   std::vector<std::int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
   std::span<const std::uint32_t> list_rows;
   std::vector<std::uint32_t> first_blocks;       // of each list, and the end
   std::unique_ptr<const CheckedNumbers> owners;  // of each row
-  ProbeRanks recall_table;
+  RecallTable recall_table;
   mutable std::once_flag rows_found;
   mutable std::vector<Row> rows;  // of prototypes by id
 
@@ -225,7 +221,7 @@ const Metadata& SealedMap::metadata() const { return content_->metadata; }
 std::size_t SealedMap::dim() const { return content_->shape.dim; }
 std::size_t SealedMap::size() const { return content_->shape.landmarks; }
 std::size_t SealedMap::prototype_count() const { return content_->prototype_count; }
-int SealedMap::code_bits() const { return content_->code_bits; }
+int SealedMap::code_bits() const { return content_->code_bits(); }
 std::size_t SealedMap::nlist() const { return content_->nlist(); }
 std::vector<std::int64_t> SealedMap::ids() const { return content_->ids.all(); }
 
@@ -237,7 +233,7 @@ double SealedMap::bytes_per_landmark() const {
 
 std::size_t SealedMap::nprobe(double recall) const {
   check_recall(recall, nlist(), kRemedy);
-  return probes_for(content_->recall_table, recall, nlist());
+  return nprobe_for(content_->recall_table, recall, nlist());
 }
 
 int SealedMap::position_bits() const { return content_->codec ? content_->codec->bits() : 0; }
@@ -304,23 +300,14 @@ Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOption
 Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
   const Content& c = *content_;
   Matches matches{{queries.rows, k}, {queries.rows, k}};
-  auto nprobe = asked_probes(options, nlist(), kRemedy);
-  if (options.recall) nprobe = this->nprobe(*options.recall);
-  const auto run = [&](const auto& prototypes) {
-    if (!nprobe || *nprobe >= nlist()) {
-      protomark::search(prototypes, queries, exact(options), matches.ids.view(),
-                        matches.distances.view());
-      return;
-    }
-    const PackedPrototypes centroids{
-        reinterpret_cast<const std::int8_t*>(c.packed_centroids.data()), nlist(), dim()};
-    search_cells(prototypes, CellView(c.list_rows, c.first_blocks), centroids, *nprobe, queries,
-                 exact(options), matches.ids.view(), matches.distances.view());
-  };
-  if (c.code_bits == 4) {
-    run(c.prototypes4);
+  auto lists = requested_nprobe(options, nlist(), kRemedy);
+  if (options.recall) lists = nprobe(*options.recall);
+  if (!lists) {
+    search_exact(c.prototypes, queries, options, matches.ids.view(), matches.distances.view());
   } else {
-    run(c.prototypes);
+    const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
+    search_lists(c.prototypes, InvertedLists(c.list_rows, c.first_blocks), centroids, *lists,
+                 queries, options, matches.ids.view(), matches.distances.view());
   }
   // Search gives landmark indices. Ids ascend with them, so that ties went to the smaller id.
   if (c.ids.are_indices()) return matches;

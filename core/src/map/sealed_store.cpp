@@ -148,9 +148,9 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std
       result.refresh(row);
     }
   }
-  if (store.centroids().size() != 0) {
+  if (store.quantizer().nlist() != 0) {
     FairSharedMutex nobody_searches;
-    auto arrangement = result.arrange(store.centroids(), 1);
+    auto arrangement = result.arrange(store.quantizer(), 1);
     result.make_room_for(arrangement, nobody_searches);
     result.rearrange(arrangement);
   }

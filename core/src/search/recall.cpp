@@ -5,28 +5,9 @@
 #include <stdexcept>
 #include <string>
 
+#include "search/scan.h"
+
 namespace protomark {
-namespace {
-
-std::int32_t squared_distance(const std::int8_t* a, const std::int8_t* b, std::size_t dim) {
-  std::int32_t sum = 0;
-  for (std::size_t d = 0; d < dim; ++d) sum += (a[d] - b[d]) * (a[d] - b[d]);
-  return sum;
-}
-
-}  // namespace
-
-std::vector<std::size_t> test_rows(std::size_t rows) {
-  const std::size_t n = std::min(rows, kTestQueries);
-  std::vector<std::size_t> result(n);
-  // Multiples of the golden ratio are as even, and in no step with what cells are learned from.
-  for (std::size_t i = 0; i < n; ++i) {
-    const std::uint64_t x = (i + 1) * std::uint64_t{0x9e3779b97f4a7c15};
-    result[i] = static_cast<std::size_t>((x >> 32) * rows >> 32);
-  }
-  return result;
-}
-
 namespace {
 
 // Codes as far from these as observations are from the prototypes of their landmarks: the
@@ -45,85 +26,101 @@ std::vector<std::int8_t> like_observations(Codes codes) {
   return result;
 }
 
-// own(q): the landmark that is not to be found.
-ProbeRanks ranks_of(Codes queries, const std::function<std::int64_t(std::size_t)>& own,
-                    const std::vector<std::int8_t>& centroids, const SearchTwo& search_two,
-                    const CellOf& cell_of) {
-  const std::size_t n = queries.rows, dim = queries.columns, cells = centroids.size() / dim;
+// owner(q) is the landmark that is not to be found.
+template <typename Owner>
+RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& quantizer,
+                    const SearchTwo& search_two, const ListOf& list_of) {
+  const std::size_t n = queries.rows, dim = queries.columns;
   std::vector<std::int64_t> ids(2 * n);
-  std::vector<float> distances(2 * n);
+  std::vector<std::int32_t> distances(2 * n);
   search_two(queries, {ids.data(), n, 2}, {distances.data(), n, 2});
-  ProbeRanks ranks;
+  // The list in which a query's landmark is, and how far away its centroid is.
+  const PreparedCodes prepared(queries);
+  std::vector<std::uint32_t> lists(n);
+  std::vector<std::int32_t> limits(n, INT32_MIN);
   for (std::size_t q = 0; q < n; ++q) {
-    // Where others are as near, the own landmark need not be the first, or among the two.
-    const std::int64_t nearest = ids[2 * q] == own(q) ? ids[2 * q + 1] : ids[2 * q];
+    // Where others are as near, the owner need not be the first, or among the two.
+    const std::int64_t nearest = ids[2 * q] == owner(q) ? ids[2 * q + 1] : ids[2 * q];
     if (nearest < 0) continue;
-    const std::int8_t* query = queries.row(q);
-    const std::uint32_t cell = cell_of(nearest, query);
-    const std::int32_t limit = squared_distance(query, &centroids[cell * dim], dim);
-    std::uint32_t rank = 1;
-    for (std::uint32_t c = 0; c < cells; ++c) {
-      const std::int32_t distance = squared_distance(query, &centroids[c * dim], dim);
-      if (distance < limit || (distance == limit && c < cell)) ++rank;
+    lists[q] = list_of(nearest, queries.row(q));
+    const std::int8_t* centroid = &quantizer.centroids()[lists[q] * dim];
+    limits[q] = 0;
+    for (std::size_t d = 0; d < dim; ++d) {
+      limits[q] += centroid[d] * (centroid[d] - 2 * queries.row(q)[d]);
     }
-    ranks.push_back(rank);
   }
-  std::sort(ranks.begin(), ranks.end());
-  return ranks;
+  // Count the lists up to that one.
+  RecallTable table(n, 0);
+  const PackedPrototypes centroids = quantizer.packed();
+  CodeScan(prepared, {0, n})
+      .compare(
+          static_cast<const std::int8_t*>(centroids.data), centroids.rows,
+          [&](std::size_t q) { return limits[q]; },
+          [&](std::size_t q, std::int32_t distance, std::size_t list) {
+            if (distance < limits[q] || list <= lists[q]) ++table[q];
+          });
+  std::erase(table, 0u);
+  std::sort(table.begin(), table.end());
+  return table;
 }
 
 }  // namespace
 
-ProbeRanks measure_ranks(Codes prototypes, const std::vector<std::int64_t>& own,
-                         const std::vector<std::int8_t>& centroids, const SearchTwo& search_two,
-                         const CellOf& cell_of) {
-  const ProbeRanks others =
-      ranks_of(prototypes, [&](std::size_t q) { return own[q]; }, centroids, search_two, cell_of);
+std::vector<std::size_t> test_rows(std::size_t rows) {
+  const std::size_t n = std::min(rows, kTestQueries);
+  std::vector<std::size_t> result(n);
+  // Multiples of the golden ratio are as even, and in no step with the rows that lists are learned
+  // from.
+  for (std::size_t i = 0; i < n; ++i) {
+    const std::uint64_t x = (i + 1) * std::uint64_t{0x9e3779b97f4a7c15};
+    result[i] = static_cast<std::size_t>((x >> 32) * rows >> 32);
+  }
+  return result;
+}
+
+RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& owners,
+                           const CoarseQuantizer& quantizer, const SearchTwo& search_two,
+                           const ListOf& list_of) {
+  const RecallTable others =
+      measure(prototypes, [&](std::size_t q) { return owners[q]; }, quantizer, search_two, list_of);
   const std::vector<std::int8_t> moved = like_observations(prototypes);
-  ProbeRanks ranks = ranks_of(
+  RecallTable table = measure(
       {moved.data(), prototypes.rows, prototypes.columns}, [](std::size_t) { return -1; },
-      centroids, search_two, cell_of);
+      quantizer, search_two, list_of);
   // A map with a single landmark has no others.
-  for (std::size_t i = 0; i < others.size(); ++i) ranks[i] = std::max(ranks[i], others[i]);
-  return ranks;
+  for (std::size_t i = 0; i < others.size(); ++i) table[i] = std::max(table[i], others[i]);
+  return table;
 }
 
-std::size_t probes_for(const ProbeRanks& ranks, double recall, std::size_t cells) {
-  if (recall >= 1 || ranks.empty()) return cells;
-  // A share of n test queries is uncertain: two standard errors on top.
-  const auto n = static_cast<double>(ranks.size());
+std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlist) {
+  if (recall >= 1 || table.empty()) return nlist;
+  // The share that n test queries show is uncertain: two standard errors on top.
+  const auto n = static_cast<double>(table.size());
   const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
-  if (enough > n) return cells;
-  return ranks[static_cast<std::size_t>(std::ceil(enough)) - 1];
+  if (enough > n) return nlist;
+  return table[static_cast<std::size_t>(std::ceil(enough)) - 1];
 }
 
-std::optional<std::size_t> asked_probes(const SearchOptions& options, std::size_t cells,
-                                        const char* remedy) {
-  if (!options.recall && !options.probes) return std::nullopt;
-  if (options.recall && options.probes) {
-    throw std::invalid_argument("recall and probes exclude each other");
+std::optional<std::size_t> requested_nprobe(const SearchOptions& options, std::size_t nlist,
+                                            const char* remedy) {
+  if (!options.recall && !options.nprobe) return std::nullopt;
+  if (options.recall && options.nprobe) {
+    throw std::invalid_argument("recall and nprobe exclude each other");
   }
   if (options.recall) {
-    check_recall(*options.recall, cells, remedy);
+    check_recall(*options.recall, nlist, remedy);
     return 0;
   }
-  if (cells == 0) throw std::invalid_argument(std::string("probes needs an index: ") + remedy);
-  if (*options.probes == 0) throw std::invalid_argument("probes must be at least 1");
-  return std::min(*options.probes, cells);
+  if (nlist == 0) throw std::invalid_argument(std::string("nprobe needs an index: ") + remedy);
+  if (*options.nprobe == 0) throw std::invalid_argument("nprobe must be at least 1");
+  return std::min(*options.nprobe, nlist);
 }
 
-void check_recall(double recall, std::size_t cells, const char* remedy) {
+void check_recall(double recall, std::size_t nlist, const char* remedy) {
   if (!(recall > 0 && recall <= 1)) {
     throw std::invalid_argument("recall must be above 0 and at most 1");
   }
-  if (cells == 0) throw std::invalid_argument(std::string("recall needs an index: ") + remedy);
-}
-
-SearchOptions exact(const SearchOptions& options) {
-  SearchOptions result = options;
-  result.recall = std::nullopt;
-  result.probes = std::nullopt;
-  return result;
+  if (nlist == 0) throw std::invalid_argument(std::string("recall needs an index: ") + remedy);
 }
 
 }  // namespace protomark

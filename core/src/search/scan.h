@@ -1,7 +1,6 @@
-// int8 queries against packed blocks of prototypes: what exact search and search by cells share.
+// Queries against packed prototypes.
 #pragma once
 
-#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <span>
@@ -9,103 +8,174 @@
 
 #include "kernels/kernels.h"
 #include "protomark/search.h"
+#include "search/driver.h"
+#include "search/packed.h"
 #include "search/top_k.h"
 
 namespace protomark {
 
-// Codes of 16 rows x 4 dimensions. Aligned: a scan whose loads cross cache lines takes a quarter
-// longer.
-struct alignas(64) CodeVector {
-  std::int8_t codes[4 * kPackedRows];
+// Queries as kernels take them: unsigned, padded to whole steps of 4 dimensions.
+class PreparedCodes {
+ public:
+  explicit PreparedCodes(Codes codes);
+
+  std::size_t queries() const { return norms_.size(); }
+  std::size_t dim() const { return dim_; }
+  const std::uint8_t* operator[](std::size_t query) const { return codes_.data() + query * dim_; }
+  // Squared norms, which the distances of kernels lack.
+  const std::vector<std::int32_t>& norms() const { return norms_; }
+
+  // Places for the k nearest of each query, two if the ratio test needs them.
+  Neighbours places(std::size_t k, const SearchOptions& options) const;
+
+ private:
+  std::size_t dim_;
+  std::vector<std::uint8_t> codes_;
+  std::vector<std::int32_t> norms_;
 };
 
-// Throws std::invalid_argument where the arguments of a search in prototypes of `dim` dimensions do
-// not fit.
-void check_search(std::size_t dim, Codes queries, const SearchOptions& options,
-                  const MatrixView<std::int64_t>& ids, const MatrixView<float>& distances);
-
-// Some queries, and the nearest landmarks that each has met so far. For one thread.
+// Compares queries with codes. For one thread.
 class CodeScan {
  public:
-  // Keeps k landmarks a query, two where the ratio test needs them. `queries` must outlive this.
-  CodeScan(Codes queries, std::size_t k, const SearchOptions& options);
-  // Its TopKs point into its own arrays.
-  CodeScan(const CodeScan&) = delete;
-  CodeScan& operator=(const CodeScan&) = delete;
+  // Beyond all distances without norms, whose magnitude is below 2^24.
+  static constexpr std::int32_t kNoLimit = 1 << 25;
 
-  std::size_t queries() const { return codes_.rows; }
-  // Rows that are compared with all queries at a time, a multiple of 16: what a caller that makes
-  // packed blocks as it goes had best make at a time.
-  std::size_t chunk_rows() const { return chunk_rows_; }
+  // Compares the queries of this range, which are counted from 0 from here on.
+  CodeScan(const PreparedCodes& queries, Range range);
+  // Compares only these from now on.
+  void select(std::span<const std::uint32_t> queries);
+
+  // Rows to compare at a time, a multiple of 16. Many queries come back to them from the L2 cache;
+  // for few, rows should come from memory while the last ones are compared.
+  std::size_t chunk_rows() const;
 
   // For scans of many rows, of which `met` were compared before: from now on a row is first
-  // compared in some dimensions only. Encoders put those first that tell most, so that a distance
-  // over them mostly shows that a row is not among the nearest.
-  void look_at_heads(std::size_t met);
+  // compared over a prefix of the dimensions. Encoders put those first that tell most, so that the
+  // distance over them usually shows that a row is not among the nearest.
+  void choose_prefix(std::size_t met);
 
-  // Compares the queries of these indices with the first `rows` rows of `packed`, blocks of 16 rows
-  // as in PackedPrototypes, and calls offer(TopK& best, std::int32_t distance, std::size_t row) for
-  // those that may be among the k nearest. `offer` calls best.offer(distance, id of the row), or
-  // best.offer_distinct where several rows may share an id. `distance` is squared and lacks the
-  // query's own norm, which does not change the order.
-  template <typename Offer>
-  void compare(std::span<const std::uint32_t> queries, const std::int8_t* packed, std::size_t rows,
-               const Offer& offer) {
-    gather(queries);
-    for (std::size_t row = 0; row < rows; row += chunk_rows_) {
-      const std::size_t chunk = std::min(chunk_rows_, rows - row);
-      start_chunk(packed + packed_size(row, codes_.columns), chunk, queries.size());
-      for (std::size_t first = 0; first < queries.size(); first += kernels::kScanQueries) {
-        const auto group =
-            queries.subspan(first, std::min(kernels::kScanQueries, queries.size() - first));
-        for (std::size_t block = 0; block < blocks_;) {
-          const std::size_t found = scan_chunk(group, first, &block);
-          for (std::size_t i = 0; i < found; ++i) {
-            const kernels::Hit& hit = hits_[i];
-            // Those before it may have left no room for it.
-            if (hit.row >= chunk || hit.distance > limits_[hit.query]) continue;
-            TopK& best = best_[group[hit.query]];
-            offer(best, hit.distance, row + hit.row);
-            limits_[hit.query] = best.limit();
-          }
-        }
-      }
+  // Calls take(i, distance, row) for rows of a packed chunk that are within limit_of(i), for the
+  // i-th of the queries. Distances are squared and lack the query's norm, which does not change
+  // their order.
+  template <typename LimitOf, typename Take>
+  void compare(const std::int8_t* packed, std::size_t rows, const LimitOf& limit_of,
+               const Take& take) {
+    const kernels::PackedCodes chunk = prepare(packed, rows);
+    each_hit(
+        n_, rows, chunk.blocks,
+        [&](std::size_t first, std::size_t n, const std::int32_t* limits, std::size_t* block,
+            kernels::Hit* hits) {
+          return kernels::active().code_scan(
+              {codes_ + first * chunk.dim, limits, &rest_norms_[first], n, &steps_in_full_}, chunk,
+              block, hits);
+        },
+        limit_of, take);
+  }
+
+ private:
+  kernels::PackedCodes prepare(const std::int8_t* packed, std::size_t rows);
+
+  const PreparedCodes& all_;
+  Range range_;
+  const std::uint8_t* codes_;  // of the queries to compare
+  std::size_t n_;              // their number
+  std::vector<std::uint8_t> selected_;
+  std::size_t prefix_;                    // dimensions that are compared first
+  std::vector<std::int32_t> rest_norms_;  // see kernels::CodeQueries
+  std::size_t steps_in_full_ = 0;
+  std::vector<std::int32_t> biases_, prefix_biases_;
+};
+
+// Offers landmarks of rows to the places of queries. For one thread.
+class LandmarkReader {
+ public:
+  explicit LandmarkReader(const RowLandmarks& landmarks) : landmarks_(landmarks) {}
+
+  // Rows of this chunk come next. If only numbers of rows are known, chunks must ascend.
+  void start_chunk(std::size_t first_row, std::size_t rows) {
+    first_row_ = first_row;
+    rows_ = rows;
+    of_chunk_.clear();
+  }
+
+  // Does nothing if the row is padding.
+  void offer(TopK best, std::int32_t distance, Row row) {
+    const LandmarkIndex landmark = landmark_of(row);
+    if (landmark >= landmarks_.end) return;
+    const std::int64_t id =
+        landmarks_.ids != nullptr ? landmarks_.ids[landmark.value] : std::int64_t{landmark.value};
+    if (id < 0) return;
+    if (several_rows_) {
+      best.offer_distinct(distance, id);
+    } else {
+      best.offer(distance, id);
     }
   }
 
-  // Takes what another scan of the same queries has found in other rows.
-  void merge(const CodeScan& other);
+ private:
+  LandmarkIndex landmark_of(Row row) {
+    if (!several_rows_) return {row.value};
+    if (landmarks_.of_row != nullptr) return landmarks_.of_row[row.value];
+    if (landmarks_.look_up) return landmarks_.look_up(row);
+    // Once neighbours are near, most chunks have no hits and need not be counted.
+    if (of_chunk_.empty()) count_chunk();
+    return of_chunk_[row.value - first_row_];
+  }
 
-  // Writes (queries x k) landmarks and distances as protomark::search gives them back.
-  void finish(MatrixView<std::int64_t> ids, MatrixView<float> distances) const;
+  void count_chunk() {
+    const std::uint8_t* counts = landmarks_.row_counts;
+    while (counted_ + counts[landmark_.value] <= first_row_) counted_ += counts[landmark_.value++];
+    LandmarkIndex landmark = landmark_;
+    std::size_t end = counted_ + counts[landmark.value];
+    for (std::size_t row = first_row_; row < first_row_ + rows_; ++row) {
+      if (row == end) end += counts[++landmark.value];
+      of_chunk_.push_back(landmark);
+    }
+  }
+
+  const RowLandmarks& landmarks_;
+  bool several_rows_ =
+      landmarks_.of_row != nullptr || landmarks_.row_counts != nullptr || landmarks_.look_up;
+  std::size_t first_row_ = 0;
+  std::size_t rows_ = 0;
+  std::vector<LandmarkIndex> of_chunk_;
+  LandmarkIndex landmark_;   // no row of the chunk is of an earlier one
+  std::size_t counted_ = 0;  // rows of earlier landmarks
+};
+
+// Keeps the nearest landmarks of queries. For one thread.
+class PrototypeScan {
+ public:
+  // Neighbours of the queries of this range.
+  PrototypeScan(const PackedPrototypes& prototypes, const PreparedCodes& queries, Range range,
+                Neighbours& nearest)
+      : blocks_(prototypes),
+        landmarks_(prototypes.landmarks),
+        scan_(queries, range),
+        nearest_(nearest) {}
+
+  // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16.
+  void scan(Range rows);
+  // Compares some queries with the rows of some blocks, `rows` of them: all blocks but the last one
+  // are full.
+  void scan(std::span<const std::uint32_t> queries, std::span<const std::uint32_t> blocks,
+            std::size_t rows);
 
  private:
-  void gather(std::span<const std::uint32_t> queries);
-  void start_chunk(const std::int8_t* packed, std::size_t rows, std::size_t queries);
-  // Hits of gathered queries from `first` on, from a block of the chunk on.
-  std::size_t scan_chunk(std::span<const std::uint32_t> group, std::size_t first,
-                         std::size_t* block);
-
-  Codes codes_;
-  SearchOptions options_;
-  std::size_t dim_;   // of packed blocks
-  std::size_t kept_;  // landmarks a query
-  std::vector<std::uint8_t> unsigned_codes_;
-  std::vector<std::int64_t> best_ids_;
-  std::vector<std::int32_t> best_distances_;
-  std::vector<TopK> best_;
-  std::size_t head_;                 // dimensions that are compared first
-  std::vector<std::int32_t> tails_;  // squared norm of each query's other dimensions
-  std::size_t put_off_ = 0;          // see kernels::CodeQueries
-
-  std::vector<std::uint8_t> gathered_;   // codes of the queries that are compared
-  std::size_t chunk_rows_;               // compared with all queries at a time
-  const std::int8_t* packed_ = nullptr;  // the chunk
-  std::size_t blocks_ = 0;
-  bool biased_ = false;  // whether its biases are known
-  std::vector<std::int32_t> biases_, head_biases_;
-  std::array<std::int32_t, kernels::kScanQueries> limits_;  // of the queries that were scanned last
-  std::vector<kernels::Hit> hits_;
+  BlockReader blocks_;
+  LandmarkReader landmarks_;
+  CodeScan scan_;
+  Neighbours& nearest_;
 };
+
+// Finds the nearest landmarks of all prototypes (protomark/search.h). `options` are those of an
+// exact search, whatever recall and nprobe say. Throws std::invalid_argument if the arguments do
+// not fit.
+void search_exact(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
+                  MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances);
+
+// Throws std::invalid_argument if the arguments of a search do not fit.
+void check_search(std::size_t dim, Codes queries, const SearchOptions& options,
+                  const MatrixView<std::int64_t>& ids, const MatrixView<std::int32_t>& distances);
 
 }  // namespace protomark

@@ -1,29 +1,36 @@
-// The k nearest seen so far, kept sorted in the caller's arrays; ties go to the smaller id.
+// The k nearest that queries have met so far, sorted; ties go to the smaller id.
 #pragma once
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <span>
+#include <vector>
 
 namespace protomark {
 
+// A range of indices.
+struct Range {
+  std::size_t begin;
+  std::size_t end;
+  std::size_t size() const { return end - begin; }
+};
+
+// The places of one query, in arrays of others. Empty places have id -1, which is behind all other
+// ids, and the limit as their distance.
 class TopK {
  public:
-  // Distances above `limit` never enter; empty places hold id -1 and distance limit + 1.
-  TopK(std::int64_t* ids, std::int32_t* distances, std::size_t k, std::int32_t limit)
-      : ids_(ids), distances_(distances), k_(k), limit_(limit) {
-    std::fill_n(ids_, k_, std::int64_t{-1});
-    std::fill_n(distances_, k_, limit + 1);
-  }
+  TopK(std::int64_t* ids, std::int32_t* distances, std::size_t k)
+      : ids_(ids), distances_(distances), k_(k) {}
 
   // What a candidate must not exceed to have a chance.
-  std::int32_t limit() const { return std::min(limit_, distances_[k_ - 1]); }
+  std::int32_t limit() const { return distances_[k_ - 1]; }
 
-  // Takes a candidate whose id has not been offered before. One or two places, which most searches
-  // ask for, need no loop.
+  // Takes a candidate whose id has not been offered before. Most searches ask for one or two
+  // places, which need no loop.
   void offer(std::int32_t distance, std::int64_t id) {
     if (k_ > 2) {
-      if (before(distance, id, k_ - 1)) place(distance, id, k_ - 1);
+      if (before(distance, id, k_ - 1)) insert(distance, id, k_ - 1);
     } else if (before(distance, id, 0)) {
       if (k_ == 2) set(1, distances_[0], ids_[0]);
       set(0, distance, id);
@@ -37,19 +44,21 @@ class TopK {
     if (!before(distance, id, k_ - 1)) return;
     const auto at = static_cast<std::size_t>(std::find(ids_, ids_ + k_, id) - ids_);
     if (at == k_) {
-      place(distance, id, k_ - 1);
+      insert(distance, id, k_ - 1);
     } else if (distance < distances_[at]) {
-      place(distance, id, at);
+      insert(distance, id, at);
     }
   }
 
  private:
   bool before(std::int32_t distance, std::int64_t id, std::size_t i) const {
-    return distance < distances_[i] || (distance == distances_[i] && id < ids_[i]);
+    return distance < distances_[i] ||
+           (distance == distances_[i] &&
+            static_cast<std::uint64_t>(id) < static_cast<std::uint64_t>(ids_[i]));
   }
 
   // Overwrites place i and moves the newcomer up to where it belongs.
-  void place(std::int32_t distance, std::int64_t id, std::size_t i) {
+  void insert(std::int32_t distance, std::int64_t id, std::size_t i) {
     for (; i > 0 && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
     set(i, distance, id);
   }
@@ -62,7 +71,47 @@ class TopK {
   std::int64_t* ids_;
   std::int32_t* distances_;
   std::size_t k_;
-  std::int32_t limit_;
+};
+
+// The places of some queries.
+class Neighbours {
+ public:
+  // Distances above its limit never enter a query's places.
+  Neighbours(std::size_t k, std::span<const std::int32_t> limits)
+      : k_(k), ids_(limits.size() * k, -1) {
+    distances_.reserve(ids_.size());
+    for (const std::int32_t limit : limits) distances_.insert(distances_.end(), k, limit);
+  }
+
+  std::size_t queries() const { return ids_.size() / k_; }
+  std::size_t k() const { return k_; }
+  std::int32_t limit(std::size_t query) const { return distances_[query * k_ + k_ - 1]; }
+  TopK operator[](std::size_t query) { return {&ids_[query * k_], &distances_[query * k_], k_}; }
+  const std::int64_t* ids(std::size_t query) const { return &ids_[query * k_]; }
+  const std::int32_t* distances(std::size_t query) const { return &distances_[query * k_]; }
+
+  Neighbours part(Range queries) const {
+    Neighbours result(k_, {});
+    const auto copy = [&](const auto& from, auto& to) {
+      to.assign(from.begin() + static_cast<std::ptrdiff_t>(queries.begin * k_),
+                from.begin() + static_cast<std::ptrdiff_t>(queries.end * k_));
+    };
+    copy(ids_, result.ids_);
+    copy(distances_, result.distances_);
+    return result;
+  }
+  // Takes what `part`, of the queries from `first` on, has found.
+  void merge(std::size_t first, const Neighbours& part) {
+    for (std::size_t i = 0; i < part.ids_.size(); ++i) {
+      if (part.ids_[i] < 0) continue;
+      (*this)[first + i / k_].offer_distinct(part.distances_[i], part.ids_[i]);
+    }
+  }
+
+ private:
+  std::size_t k_;
+  std::vector<std::int64_t> ids_;
+  std::vector<std::int32_t> distances_;
 };
 
 }  // namespace protomark

@@ -72,9 +72,9 @@ def prototypes(encoder: pm.Encoder, dim: int) -> Variant:
 def _hamming(descriptors: NDArray[np.uint8], landmarks: NDArray[np.int64]) -> Search:
     descriptors = np.ascontiguousarray(descriptors)
 
-    def search(queries: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        ids, distances = pm.hamming_search(queries, descriptors, k=CANDIDATES, landmarks=landmarks)
-        return ids, np.where(ids >= 0, distances, np.inf).astype(np.float32)
+    def search(queries: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        ids, bits = pm.hamming_search(queries, descriptors, k=CANDIDATES, landmarks=landmarks)
+        return ids, np.where(ids >= 0, bits**2, bits)  # squared, as a map's distances are
 
     return search
 

@@ -57,8 +57,10 @@ class Memory(ABC):
     @abstractmethod
     def search(
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """The two nearest landmarks of each, exactly: ids (q, 2), -1 for none, and distances.
+
+        These are squared if they are Euclidean, and 2^31 - 1 for none.
 
         Args:
             encoded: (q, width).
@@ -134,14 +136,14 @@ class Prototypes(Memory):
 
     def search(
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """See `Memory.search`."""
         if among is None:
             return self.map.search_codes(encoded, k=2, threads=threads)
         # Sums of integers far below 2^24: exact in float32.
         codes, places = encoded.astype(np.float32), self._rounded(among)
         ids = np.full((len(codes), 2), -1, np.int64)
-        distances = np.full((len(codes), 2), np.inf, np.float32)
+        distances = np.full((len(codes), 2), np.iinfo(np.int32).max, np.int32)
         if not len(among):
             return ids, distances
         lengths = (places * places).sum(1)
@@ -152,7 +154,7 @@ class Prototypes(Memory):
                 best = np.argmin(squares, axis=1)
                 rows = np.arange(len(some))
                 ids[at : at + _CHUNK, k] = among[best]
-                distances[at : at + _CHUNK, k] = np.sqrt(squares[rows, best])
+                distances[at : at + _CHUNK, k] = squares[rows, best]
                 squares[rows, best] = np.inf
         return ids, distances
 
@@ -267,16 +269,13 @@ class Descriptors(Memory):
 
     def search(
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """See `Memory.search`."""
         owners, descriptors = self.table()
         if among is not None:
             chosen = np.isin(owners, among)
             owners, descriptors = owners[chosen], descriptors[chosen]
-        ids, distances = pm.hamming_search(
-            encoded, descriptors, k=2, landmarks=owners, threads=threads
-        )
-        return ids, np.where(ids >= 0, distances, np.inf).astype(np.float32)
+        return pm.hamming_search(encoded, descriptors, k=2, landmarks=owners, threads=threads)
 
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.acceptance import NO_DISTANCE
 from protomark.mapping.memory import Medoids, Memory, Prototypes
 
 # As `protomark localize` accepts.
@@ -45,14 +46,14 @@ def thresholds(memory: Memory) -> Thresholds:
     return _MEDOID if isinstance(memory, Medoids) else _HAMMING
 
 
-def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64]:
+def accepted(memory: Memory, distances: NDArray[np.int32]) -> NDArray[np.int64]:
     """Which nearest landmarks of the whole map are accepted, the clearest first.
 
     Where the encoder was calibrated its probability decides, else the ratio of the two distances.
 
     Args:
         memory: what was searched.
-        distances: (q, 2) float32, to the two nearest landmarks.
+        distances: (q, 2) int32, to the two nearest landmarks, as `Memory.search` gives them.
 
     Returns:
         (k,) int64, rows of `distances`.
@@ -64,6 +65,6 @@ def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64
     else:
         with np.errstate(invalid="ignore", divide="ignore"):
             doubt = np.where(second > 0, nearest / second, 1.0)
-        limit = thresholds(memory).ratio
-    rows = np.flatnonzero(np.isfinite(nearest) & (doubt < limit))
+        limit = thresholds(memory).ratio ** (2 if memory.euclidean else 1)
+    rows = np.flatnonzero((nearest < NO_DISTANCE) & (doubt < limit))
     return rows[np.lexsort((nearest[rows], doubt[rows]))]

@@ -98,5 +98,5 @@ def _since(before: int | None) -> int | None:
     return None if before is None or now is None else max(now - before, 0)
 
 
-def _recall(found: NDArray[np.float32], exact: NDArray[np.float32]) -> float:
+def _recall(found: NDArray[np.int32], exact: NDArray[np.int32]) -> float:
     return float((found[:, 0] <= exact[:, 0]).mean())

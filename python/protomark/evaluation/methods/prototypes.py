@@ -34,8 +34,8 @@ class PrototypeMethod(Method):
         self, descriptors: NDArray[np.uint8], threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Method.match`."""
-        ids, distances = self.map.search(descriptors, k=2, threads=threads)
-        return ids, distances
+        ids, squared = self.map.search(descriptors, k=2, threads=threads)
+        return ids, np.where(ids >= 0, np.sqrt(squared.astype(np.float32)), np.float32(np.inf))
 
 
 def prototypes(

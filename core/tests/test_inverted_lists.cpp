@@ -1,3 +1,4 @@
+// Inverted lists: all of them are the exact answer, whatever happened to the map.
 #include <unistd.h>
 
 #include <algorithm>
@@ -13,9 +14,10 @@
 #include "protomark/protomark.h"
 #include "random.h"
 #include "sealing.h"
-#include "search/cell_blocks.h"
-#include "search/ivf.h"
-#include "search/ivf_search.h"
+#include "search/coarse_quantizer.h"
+#include "search/inverted_lists.h"
+#include "search/list_blocks.h"
+#include "search/scan.h"
 
 using namespace protomark;
 namespace fs = std::filesystem;
@@ -29,9 +31,9 @@ Matches search(const Map& map, Codes queries, std::size_t k, SearchOptions optio
   return map.search_codes(queries, k, options);
 }
 
-SearchOptions with_probes(std::size_t probes, int threads = 1) {
+SearchOptions with_nprobe(std::size_t nprobe, int threads = 1) {
   SearchOptions options;
-  options.probes = probes;
+  options.nprobe = nprobe;
   options.threads = threads;
   return options;
 }
@@ -54,58 +56,58 @@ std::vector<std::int8_t> clumped(test::Random& random, std::size_t n, std::size_
   return result;
 }
 
-// What a learning map answers in all ways that are exact.
+// What a map answers in all ways that are exact.
 template <typename Map>
 void check_exact(const Map& map, const Matches& expected, Codes queries) {
   CHECK(search(map, queries, 3) == expected);
   for (const int threads : {1, 3}) {
-    CHECK(search(map, queries, 3, with_probes(map.nlist(), threads)) == expected);
+    CHECK(search(map, queries, 3, with_nprobe(map.nlist(), threads)) == expected);
   }
   CHECK(search(map, queries, 3, with_recall(1)) == expected);
 }
 
-void blocks() {
+void list_blocks() {
   test::Random random(3);
-  CellBlocks blocks(5);
-  // Of each cell its rows in order, and what stands in each row.
+  ListBlocks blocks(5);
+  // Of each list its rows in order, and what stands in each row.
   std::map<std::uint32_t, std::vector<int>> expected;
   std::vector<int> stands;
   int next = 0;
   for (int step = 0; step < 4000; ++step) {
-    const auto cell = static_cast<std::uint32_t>(random.integer(0, 4));
+    const auto list = static_cast<std::uint32_t>(random.integer(0, 4));
     // Rises, then falls to nothing.
     if (random.integer(0, 99) < (step < 2000 ? 65 : 25)) {
-      const std::uint32_t row = blocks.append(cell);
+      const Row row = blocks.append(list);
       stands.resize(blocks.blocks() * kPackedRows, -1);
-      stands[row] = next;
-      expected[cell].push_back(next++);
-    } else if (!expected[cell].empty()) {
-      const std::uint32_t last = blocks.last(cell);
-      CHECK(stands[last] == expected[cell].back());
-      stands[last] = -1;
-      expected[cell].pop_back();
-      const std::uint32_t gone = blocks.pop(cell);
-      if (gone != CellBlocks::kNone) {
+      stands[row.value] = next;
+      expected[list].push_back(next++);
+    } else if (!expected[list].empty()) {
+      const Row last = blocks.last(list);
+      CHECK(stands[last.value] == expected[list].back());
+      stands[last.value] = -1;
+      expected[list].pop_back();
+      const std::uint32_t emptied = blocks.pop(list);
+      if (emptied != ListBlocks::kNone) {
         const std::size_t moved = blocks.blocks() * kPackedRows;
         std::copy_n(stands.begin() + static_cast<long>(moved), kPackedRows,
-                    stands.begin() + gone * kPackedRows);
+                    stands.begin() + emptied * kPackedRows);
         stands.resize(moved);
       }
     }
     if (step % 50 != 0) continue;
     std::size_t all = 0;
-    const CellView view(blocks);
+    const InvertedLists lists(blocks);
     for (std::uint32_t c = 0; c < 5; ++c) {
-      std::vector<std::uint32_t> list;
-      view.list(c, list);
-      CHECK(view.rows(c) == expected[c].size());
-      CHECK(list.size() == (expected[c].size() + kPackedRows - 1) / kPackedRows);
-      for (std::size_t i = 0; i < expected[c].size(); ++i) {
-        const std::size_t row = list[i / kPackedRows] * kPackedRows + i % kPackedRows;
-        CHECK(stands[row] == expected[c][i]);
-        CHECK(blocks.cell_of(row) == c);
+      std::vector<std::uint32_t> list_of_blocks;
+      lists.read(c, list_of_blocks);
+      CHECK(lists.rows(c) == expected[c].size());
+      CHECK(list_of_blocks.size() == (expected[c].size() + kPackedRows - 1) / kPackedRows);
+      for (std::uint32_t i = 0; i < expected[c].size(); ++i) {
+        const Row row{list_of_blocks[i / kPackedRows] * 16 + i % 16};
+        CHECK(stands[row.value] == expected[c][i]);
+        CHECK(blocks.list_of(row) == c);
       }
-      all += list.size();
+      all += list_of_blocks.size();
     }
     CHECK(all == blocks.blocks());
   }
@@ -130,29 +132,62 @@ void learning() {
   const std::size_t n = 3000;
   const auto codes = clumped(random, n);
   const Codes view{codes.data(), n, kDim};
-  const Cells cells = Cells::learn(view, 40, 1);
-  CHECK(cells.size() == 40);
-  CHECK(Cells::learn(view, 40, 3).centroids() == cells.centroids());
-  const auto own = cells.assign(view, 1);
-  CHECK(cells.assign(view, 4) == own);
+  const CoarseQuantizer quantizer = CoarseQuantizer::learn(view, 40, 1);
+  CHECK(quantizer.nlist() == 40);
+  CHECK(CoarseQuantizer::learn(view, 40, 3).centroids() == quantizer.centroids());
+  const auto own = quantizer.assign(view, 1);
+  CHECK(quantizer.assign(view, 4) == own);
   // One code alone is where it is among others.
   for (const std::size_t i : {0, 17, 2999})
-    CHECK(cells.assign({view.row(i), 1, kDim}, 1)[0] == own[i]);
-  // All cells are used, and nearly all codes are in that of the nearest centroid.
+    CHECK(quantizer.assign({view.row(i), 1, kDim}, 1)[0] == own[i]);
+  // All lists are used, and nearly all codes are in that of the nearest centroid.
   CHECK(std::set(own.begin(), own.end()).size() == 40);
   std::vector<std::int64_t> nearest(n);
-  std::vector<float> distances(n);
-  protomark::search(cells.packed(), view, {}, {nearest.data(), n, 1}, {distances.data(), n, 1});
+  std::vector<std::int32_t> distances(n);
+  search_exact(quantizer.packed(), view, {}, {nearest.data(), n, 1}, {distances.data(), n, 1});
   std::size_t same = 0;
   for (std::size_t i = 0; i < n; ++i) same += nearest[i] == own[i] ? 1 : 0;
   CHECK(same > n * 98 / 100);
-  // Equal codes, and as many cells as codes.
+  // Equal codes, and as many lists as codes.
   const std::vector<std::int8_t> equal(50 * kDim, 7);
-  const Cells alike = Cells::learn({equal.data(), 50, kDim}, 50, 1);
-  CHECK(alike.size() == 50);
+  const CoarseQuantizer alike = CoarseQuantizer::learn({equal.data(), 50, kDim}, 50, 1);
+  CHECK(alike.nlist() == 50);
   CHECK(alike.assign({equal.data(), 50, kDim}, 1) == std::vector<std::uint32_t>(50, 0));
-  CHECK(Cells::learn({codes.data(), 1, kDim}, 1, 1).assign(view, 1) ==
+  CHECK(CoarseQuantizer::learn({codes.data(), 1, kDim}, 1, 1).assign(view, 1) ==
         std::vector<std::uint32_t>(n, 0));
+}
+
+// Which lists are searched, against the definition; few, many and all of them.
+void nearest() {
+  test::Random random(14);
+  for (const std::size_t nlist : {1, 15, 300, 2000}) {
+    const std::size_t n = nlist == 300 ? 600 : 40;
+    const auto centroids = clumped(random, nlist), codes = clumped(random, n);
+    const std::vector<CodeVector> packed = pack_codes({centroids.data(), nlist, kDim});
+    const PreparedCodes queries(Codes{codes.data(), n, kDim});
+    for (const std::size_t nprobe : {1, 3, 40, 300, 2000}) {
+      if (nprobe > nlist) continue;
+      const auto found = nearest_lists({packed.data(), nlist, kDim}, queries, nprobe, 2);
+      bool right = true;
+      for (std::size_t q = 0; q < n; ++q) {
+        std::vector<std::pair<int, std::uint32_t>> expected;
+        for (std::uint32_t c = 0; c < nlist; ++c) {
+          int distance = 0;
+          for (std::size_t d = 0; d < kDim; ++d) {
+            const int difference = codes[q * kDim + d] - centroids[c * kDim + d];
+            distance += difference * difference;
+          }
+          expected.emplace_back(distance, c);
+        }
+        std::sort(expected.begin(), expected.end());
+        right = right && found[q * nprobe] == expected[0].second;
+        std::set<std::uint32_t> lists;
+        for (std::size_t p = 0; p < nprobe; ++p) lists.insert(expected[p].second);
+        right = right && lists == std::set(&found[q * nprobe], &found[q * nprobe] + nprobe);
+      }
+      CHECK(right);
+    }
+  }
 }
 
 std::vector<std::byte> content(const fs::path& path) {
@@ -230,13 +265,13 @@ void histories(std::size_t appearance_bits) {
     CHECK(with.counts(with.ids()) == without.counts(without.ids()));
     check_exact(with, search(without, queries, 3), queries);
 
-    // The cells do not depend on how the map came about: built anew from its file it answers alike.
+    // Lists do not depend on how the map came about: built anew from its file it answers alike.
     const fs::path path =
-        fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
+        fs::temp_directory_path() / ("test_inverted_lists_" + std::to_string(::getpid()) + ".pmk");
     with.save(path);
     const PrototypeMap again = PrototypeMap::load(path);
     CHECK(again.nlist() == 16);
-    CHECK(search(again, queries, 3, with_probes(2)) == search(with, queries, 3, with_probes(2)));
+    CHECK(search(again, queries, 3, with_nprobe(2)) == search(with, queries, 3, with_nprobe(2)));
     const auto bytes = content(path);
     again.save(path);
     CHECK(content(path) == bytes);
@@ -250,7 +285,7 @@ void histories(std::size_t appearance_bits) {
   }
   // To nothing and up again.
   both([&](PrototypeMap& map) { map.remove(map.ids()); });
-  CHECK(search(with, queries, 2, with_probes(4)).ids.data == std::vector<std::int64_t>(128, -1));
+  CHECK(search(with, queries, 2, with_nprobe(4)).ids.data == std::vector<std::int64_t>(128, -1));
   add(300, 100);
   check_exact(with, search(without, queries, 3), queries);
 }
@@ -259,7 +294,7 @@ void histories(std::size_t appearance_bits) {
 void ways(std::size_t appearance_bits, bool placed) {
   const auto encoder = test::random_encoder();
   const fs::path path =
-      fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
+      fs::temp_directory_path() / ("test_inverted_lists_" + std::to_string(::getpid()) + ".pmk");
   PrototypeMap beside(encoder, kDim, appearance_bits), within(encoder, kDim, appearance_bits);
   test::Random random(12);
   const auto codes = clumped(random, 64);
@@ -283,10 +318,10 @@ void ways(std::size_t appearance_bits, bool placed) {
     CHECK(ids == beside.ids());
     CHECK(within.counts(ids) == beside.counts(ids));
     CHECK(search(within, queries, 3) == search(beside, queries, 3));
-    for (const std::size_t probes : {1, 3}) {
+    for (const std::size_t nprobe : {1, 3}) {
       if (within.nlist() == 0) continue;
-      CHECK(search(within, queries, 3, with_probes(probes)) ==
-            search(beside, queries, 3, with_probes(probes)));
+      CHECK(search(within, queries, 3, with_nprobe(nprobe)) ==
+            search(beside, queries, 3, with_nprobe(nprobe)));
       CHECK(search(within, queries, 3, with_recall(0.9)) ==
             search(beside, queries, 3, with_recall(0.9)));
     }
@@ -300,19 +335,19 @@ void ways(std::size_t appearance_bits, bool placed) {
     CHECK(content(path) == sealed);
   };
   add(900, 0);
-  // More cells, fewer, as many, one, and none in between.
-  for (const std::size_t cells : {7, 60, 60, 3, 1, 200}) {
-    beside.build_index({cells});
-    within.build_index({cells, true});
+  // More lists, fewer, as many, one, and none in between.
+  for (const std::size_t nlist : {7, 60, 60, 3, 1, 200}) {
+    beside.build_index({nlist});
+    within.build_index({nlist, true});
     check_equal();
-    // Of cells in which rows are gone, and others have come.
+    // Of lists in which rows are gone, and others have come.
     const auto ids = beside.ids();
     const std::vector<std::int64_t> gone(ids.begin() + 40, ids.begin() + 200);
     both([&](PrototypeMap& map) { map.remove(gone); });
     check_equal();
-    add(300, static_cast<std::int64_t>(cells) * 10);
+    add(300, static_cast<std::int64_t>(nlist) * 10);
     check_equal();
-    if (cells == 60) both([](PrototypeMap& map) { map.drop_index(); });
+    if (nlist == 60) both([](PrototypeMap& map) { map.drop_index(); });
     check_equal();
   }
   both([](PrototypeMap& map) {
@@ -345,11 +380,11 @@ void sealed(std::size_t appearance_bits, int bits, std::optional<double> prototy
   for (PrototypeMap* map : {&with, &without}) map->add_codes(landmarks, {codes.data(), n, kDim});
   with.build_index({30});
   const fs::path path =
-      fs::temp_directory_path() / ("test_cells_" + std::to_string(::getpid()) + ".pmk");
+      fs::temp_directory_path() / ("test_inverted_lists_" + std::to_string(::getpid()) + ".pmk");
   const fs::path plain_path = path.string() + ".plain";
-  const SealOptions options = bits == 4 ? test::four_bits(with, prototypes) : SealOptions();
-  with.seal(path, options);
-  without.seal(plain_path, options);
+  const SealOptions seal = bits == 4 ? test::four_bits(with, prototypes) : SealOptions();
+  with.seal(path, seal);
+  without.seal(plain_path, seal);
   const SealedMap map(path), plain(plain_path);
   CHECK(map.nlist() == 30);
   CHECK(map.prototype_count() == plain.prototype_count());
@@ -365,8 +400,8 @@ void sealed(std::size_t appearance_bits, int bits, std::optional<double> prototy
   CHECK(map.code_bits() == bits);
   if (bits == 8) {
     CHECK(map.nprobe(0.9) == with.nprobe(0.9));
-    for (const SearchOptions& search_options : {with_recall(0.9), with_probes(3)}) {
-      CHECK(search(map, queries, 2, search_options) == search(with, queries, 2, search_options));
+    for (const SearchOptions& options : {with_recall(0.9), with_nprobe(3)}) {
+      CHECK(search(map, queries, 2, options) == search(with, queries, 2, options));
     }
   }
   CHECK(fs::file_size(path) > fs::file_size(plain_path));
@@ -394,7 +429,7 @@ void errors() {
       check::throws<std::invalid_argument>([&] { map.build_index({0}); }, "nlist must be 1 to 3"));
   CHECK(check::throws<std::invalid_argument>([&] { map.build_index({2}, 0); }, "threads"));
   CHECK(check::throws<std::invalid_argument>([&] { map.nprobe(0.9); }, "build_index"));
-  for (const SearchOptions& options : {with_recall(0.9), with_probes(2)}) {
+  for (const SearchOptions& options : {with_recall(0.9), with_nprobe(2)}) {
     CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, options); },
                                                "needs an index: call build_index first"));
   }
@@ -403,12 +438,12 @@ void errors() {
     CHECK(check::throws<std::invalid_argument>(
         [&] { search(map, queries, 1, with_recall(recall)); }, "recall must be above 0"));
   }
-  CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, with_probes(0)); },
-                                             "probes must be at least 1"));
-  SearchOptions two = with_probes(1);
+  CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, with_nprobe(0)); },
+                                             "nprobe must be at least 1"));
+  SearchOptions two = with_nprobe(1);
   two.recall = 0.9;
   CHECK(check::throws<std::invalid_argument>([&] { search(map, queries, 1, two); }, "exclude"));
-  CHECK(search(map, queries, 1, with_probes(1000)).ids.data == landmarks);
+  CHECK(search(map, queries, 1, with_nprobe(1000)).ids.data == landmarks);
   map.build_index();
   CHECK(map.nlist() == 1);
 }
@@ -416,9 +451,10 @@ void errors() {
 }  // namespace
 
 int main() {
-  blocks();
+  list_blocks();
   means();
   learning();
+  nearest();
   histories(0);
   histories(5);
   for (const std::size_t appearance_bits : {0, 5}) {

@@ -1,0 +1,139 @@
+// The encoder's kernels, written once over a set S of vector operations. What S has to offer stands
+// with the functions that use it. Everything here has internal linkage: see kernels.h.
+#pragma once
+
+#include "kernels/kernels.h"
+#include "kernels/vectors.h"
+
+namespace protomark::kernels {
+namespace {
+
+// The sums of all subsets of 4 inputs, for each 4 of 64 inputs.
+//   S::Sums16             16-bit sums of outputs, so many that a table fits the L1 cache: widen()
+//                         loads weights
+template <typename S>
+void fill_table(const std::int8_t* weights, typename S::Sums16* table) {
+  using Sums16 = typename S::Sums16;
+  for (int group = 0; group < 16; ++group, weights += 4 * kOutputs) {
+    const auto a = S::widen(weights), b = S::widen(weights + kOutputs);
+    const auto c = S::widen(weights + 2 * kOutputs), d = S::widen(weights + 3 * kOutputs);
+    const Sums16 low[4] = {{}, a, b, a + b}, high[4] = {{}, c, d, c + d};
+    for (const Sums16& h : high) {
+      for (const Sums16& l : low) *table++ = h + l;
+    }
+  }
+}
+
+template <typename S>
+void bit_sums(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
+              std::size_t n, std::int16_t* sums) {
+  using Sums16 = typename S::Sums16;
+  Sums16 table[256];
+  for (std::size_t w = 0; w < count; ++w, words += n, weights += 64 * kOutputs) {
+    for (std::size_t o = 0; o < kOutputs; o += Sums16::kLanes) {
+      fill_table<S>(weights + o, table);
+      std::int16_t* sum = sums + o;
+      for (std::size_t i = 0; i < n; ++i, sum += kOutputs) {
+        Sums16 acc = w == 0 ? Sums16{} : load_pack<Sums16>(sum);
+        for (int group = 0; group < 16; ++group) {
+          acc = acc + table[16 * group + (words[i] >> (4 * group) & 15)];
+        }
+        store_pack(sum, acc);
+      }
+    }
+  }
+}
+
+template <typename S>
+void bit_sum(const std::int8_t* weights, const std::uint16_t* set, std::size_t count,
+             std::int16_t* sums) {
+  using Sums16 = typename S::Sums16;
+  constexpr std::size_t kParts = kOutputs / Sums16::kLanes;
+  Sums16 acc[kParts] = {};
+  for (std::size_t i = 0; i < count; ++i) {
+    const std::int8_t* row = weights + set[i] * kOutputs;
+    for (std::size_t p = 0; p < kParts; ++p) {
+      acc[p] = acc[p] + S::widen(row + p * Sums16::kLanes);
+    }
+  }
+  for (std::size_t p = 0; p < kParts; ++p) store_pack(sums + p * Sums16::kLanes, acc[p]);
+}
+
+// `Batch` inputs share each load of the weights, `Groups` times 16 outputs each load of the inputs.
+//   S::Sums, S::Codes, S::dot, S::query  as in generic_search.h, for 16 outputs and their weights
+template <typename S, int Batch, int Groups>
+void dense_tile(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+                std::size_t stride, const typename S::Sums* start, std::int32_t* sums) {
+  typename S::Sums acc[Batch][Groups];
+  for (auto& row : acc) {
+    for (int g = 0; g < Groups; ++g) row[g] = start[g];
+  }
+  for (std::size_t j = 0; j < inputs; j += 4) {
+    typename S::Codes w[Groups];
+    for (int g = 0; g < Groups; ++g) w[g] = S::load_codes(weights + 16 * (g * inputs + j));
+    for (int i = 0; i < Batch; ++i) {
+      const auto four = S::query(x + i * stride + j);
+      for (int g = 0; g < Groups; ++g) S::dot(acc[i][g], four, w[g]);
+    }
+  }
+  for (int i = 0; i < Batch; ++i) {
+    for (int g = 0; g < Groups; ++g) store_pack(sums + i * kOutputs + 16 * g, acc[i][g]);
+  }
+}
+
+//   S::dense_start(weights, inputs)  where S has it: sums of no inputs at all, for 16 outputs
+template <typename S, int Groups>
+void dense_groups(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+                  std::size_t stride, std::size_t n, std::int32_t* sums) {
+  typename S::Sums start[Groups] = {};
+  if constexpr (requires { S::dense_start(weights, inputs); }) {
+    for (int g = 0; g < Groups; ++g) start[g] = S::dense_start(weights + 16 * g * inputs, inputs);
+  }
+  std::size_t i = 0;
+  for (; i + S::kDenseBatch <= n; i += S::kDenseBatch) {
+    dense_tile<S, S::kDenseBatch, Groups>(weights, inputs, x + i * stride, stride, start,
+                                          sums + i * kOutputs);
+  }
+  for (; i < n; ++i) {
+    dense_tile<S, 1, Groups>(weights, inputs, x + i * stride, stride, start, sums + i * kOutputs);
+  }
+}
+
+template <typename S>
+void dense(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
+           std::size_t stride, std::size_t n, std::size_t outputs, std::int32_t* sums) {
+  std::size_t o = 0;
+  for (; o + 16 * S::kDenseGroups <= outputs; o += 16 * S::kDenseGroups) {
+    dense_groups<S, S::kDenseGroups>(weights + o * inputs, inputs, x, stride, n, sums + o);
+  }
+  if (o < outputs) dense_groups<S, 1>(weights + o * inputs, inputs, x, stride, n, sums + o);
+}
+
+// Only for shifts of 32 and more.
+//   S::Ints               a vector of 32-bit numbers: load_ints() from either kind of sums
+//   S::scaled(sums, factors(bias, multipliers), rounding(shift))  the numbers before they are
+//                         clamped, for as many outputs
+//   S::Table(bytes)       256 bytes: table(t, u, v, w) clamps numbers to int8 and looks them up
+template <typename S, typename Sum>
+void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
+              std::size_t stride) {
+  using Ints = typename S::Ints;
+  constexpr std::size_t kLanes = sizeof(Ints) / 4, kParts = kOutputs / kLanes;
+  const typename S::Table table(a.table);
+  const typename S::Rounding rounding = S::rounding(a.shift);
+  typename S::Factors factors[kParts];
+  for (std::size_t p = 0; p < kParts; ++p) {
+    factors[p] = S::factors(a.bias + p * kLanes, a.multipliers + p * kLanes);
+  }
+  for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
+    for (std::size_t p = 0; p < kParts; p += 4) {
+      const auto part = [&](std::size_t q) {
+        return S::scaled(S::load_ints(sums + q * kLanes), factors[q], rounding);
+      };
+      store(next + p * kLanes, table(part(p), part(p + 1), part(p + 2), part(p + 3)));
+    }
+  }
+}
+
+}  // namespace
+}  // namespace protomark::kernels

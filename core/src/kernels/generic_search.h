@@ -1,0 +1,413 @@
+// The search kernels, written once over a set S of vector operations. What S has to offer stands
+// with the functions that use it. Everything here has internal linkage: see kernels.h.
+#pragma once
+
+#include "kernels/kernels.h"
+#include "kernels/vectors.h"
+
+// Under ThreadSanitizer (-O1 -fPIC) g++ 12 mixes up the sums of tiles that are inlined.
+#ifdef __SANITIZE_THREAD__
+#define PROTOMARK_TILE [[gnu::noinline]]
+#else
+#define PROTOMARK_TILE
+#endif
+#define PROTOMARK_INLINE [[gnu::always_inline]] inline
+
+namespace protomark::kernels {
+namespace {
+
+// Queries that share each load of the rows.
+constexpr int kTileQueries = 4;
+
+// A negated distance is 2 p . q + bias. Sums start from half the bias and end as half the negated
+// distance, both rounded down; the bit that was lost is in the bias. A row may be a hit where its
+// half is above this.
+std::int32_t threshold(std::int32_t limit) { return -((limit >> 1) + (limit & 1)) - 1; }
+
+// Appends the hits among those of a block's 16 rows whose bits are set in `near`.
+std::size_t append_hits(unsigned near, const std::int32_t* halves, const std::int32_t* biases,
+                        std::int32_t limit, std::size_t query, std::size_t first_row, Hit* hits) {
+  std::size_t found = 0;
+  for (; near != 0; near &= near - 1) {
+    const auto r = static_cast<std::size_t>(__builtin_ctz(near));
+    const std::int32_t distance = -2 * halves[r] - (biases[r] & 1);
+    if (distance > limit) continue;
+    hits[found++] = {static_cast<std::uint32_t>(query), static_cast<std::uint32_t>(first_row + r),
+                     distance};
+  }
+  return found;
+}
+
+// Whether to compare the dimension prefix (PackedCodes::prefix) first. That pays where it leaves
+// few queries; where it does not, some steps are compared in full before it is tried again.
+class Prefix {
+ public:
+  Prefix(const CodeQueries& queries, const PackedCodes& rows)
+      : queries_(queries.n),
+        never_(rows.biases == nullptr || rows.prefix >= rows.dim || queries.n < kTileQueries),
+        steps_in_full_(queries.steps_in_full) {
+    // |p|^2 - 2 p . q over the other dimensions is at least minus the query's squared norm there.
+    for (std::size_t q = 0; q < queries_; ++q) {
+      const std::int32_t limit = queries.limits[q], rest = queries.rest_norms[q];
+      thresholds_[q] = threshold(limit > INT32_MAX - rest ? INT32_MAX : limit + rest);
+    }
+  }
+
+  const std::int32_t* thresholds() const { return thresholds_; }
+  bool pays() {
+    if (never_) return false;
+    if (*steps_in_full_ == 0) return true;
+    --*steps_in_full_;
+    return false;
+  }
+  void left(std::size_t queries) {
+    if (4 * queries > queries_) *steps_in_full_ = 15;
+  }
+
+ private:
+  std::size_t queries_;
+  bool never_;
+  std::size_t* steps_in_full_;
+  std::int32_t thresholds_[kScanQueries];
+};
+
+// Queries, and rows from one on that they are compared with.
+//   S::Step              4 dimensions of a query, as S reads them best
+template <typename S>
+struct CodeTile {
+  const typename S::Step* queries;
+  const std::int32_t* limits;
+  const std::int32_t* thresholds;
+  const std::int32_t* prefix_thresholds;
+  const std::int8_t* codes;
+  const std::int32_t* biases;
+  const std::int32_t* prefix_biases;
+  std::size_t dim;
+  std::size_t prefix;
+  std::size_t first_row;
+};
+
+// Half the negated distances of the queries from `query` on over the first `dims` dimensions.
+// Inlined, so that they stay in registers.
+//   S::Sums               16 numbers of 32 bits
+//   S::Codes              4 dimensions of 16 rows: load_codes()
+//   S::dot(sums, query(step), codes)  adds the products of 4 dimensions
+template <typename S, int Queries, int Blocks>
+PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std::int32_t* biases,
+                             std::size_t dims, typename S::Sums (&acc)[Queries][Blocks]) {
+#pragma GCC unroll 8
+  for (int b = 0; b < Blocks; ++b) {
+    const auto half = load_pack<typename S::Sums>(biases + b * kCodeRows) >> 1;
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) acc[q][b] = half;
+  }
+  const std::int8_t* p = t.codes;
+  const std::size_t steps = t.dim / 4;
+  const typename S::Step* step = t.queries + query * steps;
+  for (std::size_t s = 0; s < dims / 4; ++s, p += 4 * kCodeRows) {
+    typename S::Codes codes[Blocks];
+#pragma GCC unroll 8
+    for (int b = 0; b < Blocks; ++b) codes[b] = S::load_codes(p + b * kCodeRows * t.dim);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) {
+      const auto four = S::query(step[q * steps + s]);
+#pragma GCC unroll 8
+      for (int b = 0; b < Blocks; ++b) S::dot(acc[q][b], four, codes[b]);
+    }
+  }
+}
+
+// The same over all dimensions of rows whose biases are computed on the way. Rows are read in
+// order, which memory is fastest at.
+//   S::Norms              sums for the biases of 16 rows: add(codes), biases()
+template <typename S, int Queries, int Blocks>
+PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query,
+                                         typename S::Sums (&biases)[Blocks],
+                                         typename S::Sums (&acc)[Queries][Blocks]) {
+  const std::int8_t* p = t.codes;
+  const std::size_t steps = t.dim / 4;
+  const typename S::Step* step = t.queries + query * steps;
+#pragma GCC unroll 8
+  for (int b = 0; b < Blocks; ++b) {
+    typename S::Norms norms;
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) acc[q][b] = {};
+    for (std::size_t s = 0; s < steps; ++s, p += 4 * kCodeRows) {
+      const typename S::Codes codes = S::load_codes(p);
+      norms.add(codes);
+#pragma GCC unroll 8
+      for (int q = 0; q < Queries; ++q) {
+        S::dot(acc[q][b], S::query(step[q * steps + s]), codes);
+      }
+    }
+    biases[b] = norms.biases();
+    const typename S::Sums half = biases[b] >> 1;
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) acc[q][b] = acc[q][b] + half;
+  }
+}
+
+// Where the rows of some blocks may be hits.
+//   S::Flags              of above(sums, threshold), joined by |, asked by any()
+//   S::max(a, b)          where S compares several blocks at a time
+template <typename S, int Blocks>
+PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
+                                        std::int32_t threshold) {
+  typename S::Sums best = acc[0];
+  if constexpr (Blocks > 1) {
+#pragma GCC unroll 8
+    for (int b = 1; b < Blocks; ++b) best = S::max(best, acc[b]);
+  }
+  return S::above(best, threshold);
+}
+
+// Appends the hits of a tile.
+//   S::near_rows(sums, threshold)  a bit for each row above it
+template <typename S, int Queries, int Blocks, bool HasBiases>
+PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hit* hits) {
+  typename S::Sums acc[Queries][Blocks];
+  [[maybe_unused]] typename S::Sums own_biases[Blocks];
+  if constexpr (HasBiases) {
+    sum_up(t, query, t.biases, t.dim, acc);
+  } else {
+    sum_up_with_biases(t, query, own_biases, acc);
+  }
+  const std::int32_t* thresholds = t.thresholds + query;
+  typename S::Flags any = near<S>(acc[0], thresholds[0]);
+#pragma GCC unroll 8
+  for (int q = 1; q < Queries; ++q) any = any | near<S>(acc[q], thresholds[q]);
+  if (!S::any(any)) [[likely]]
+    return 0;
+
+  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows];
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+#pragma GCC unroll 8
+    for (int b = 0; b < Blocks; ++b) store_pack(halves[q][b], acc[q][b]);
+  }
+  const std::int32_t* biases = t.biases;
+  alignas(64) std::int32_t stored[HasBiases ? 1 : Blocks * kCodeRows];
+  if constexpr (!HasBiases) {
+#pragma GCC unroll 8
+    for (int b = 0; b < Blocks; ++b) store_pack(stored + b * kCodeRows, own_biases[b]);
+    biases = stored;
+  }
+  std::size_t found = 0;
+  for (std::size_t q = 0; q < Queries; ++q) {
+    for (std::size_t b = 0; b < Blocks; ++b) {
+      found += append_hits(S::near_rows(load_pack<typename S::Sums>(halves[q][b]), thresholds[q]),
+                           halves[q][b], biases + b * kCodeRows, t.limits[query + q], query + q,
+                           t.first_row + b * kCodeRows, hits + found);
+    }
+  }
+  return found;
+}
+
+// Calls take<Queries>(query) for all n queries, kTileQueries at a time.
+template <typename Take>
+void each_tile(std::size_t n, const Take& take) {
+  std::size_t q = 0;
+  for (; q + kTileQueries <= n; q += kTileQueries) take.template operator()<kTileQueries>(q);
+  static_assert(kTileQueries == 4);
+  switch (n - q) {
+    case 1:
+      return take.template operator()<1>(q);
+    case 2:
+      return take.template operator()<2>(q);
+    case 3:
+      return take.template operator()<3>(q);
+    default:
+      return;
+  }
+}
+
+template <typename S, int Blocks>
+std::size_t scan_blocks(const CodeTile<S>& t, std::size_t n, Hit* hits) {
+  std::size_t found = 0;
+  each_tile(n, [&]<int Queries>(std::size_t query) {
+    found += t.biases != nullptr ? scan_tile<S, Queries, Blocks, true>(t, query, hits + found)
+                                 : scan_tile<S, Queries, Blocks, false>(t, query, hits + found);
+  });
+  return found;
+}
+
+// Lists the queries that may have hits in S::kBlocks blocks, by the prefix.
+template <typename S>
+std::size_t near_by_prefix(const CodeTile<S>& t, std::size_t n, std::uint8_t* queries) {
+  std::size_t size = 0;
+  each_tile(n, [&]<int Queries>(std::size_t query) {
+    typename S::Sums acc[Queries][S::kBlocks];
+    sum_up(t, query, t.prefix_biases, t.prefix, acc);
+#pragma GCC unroll 8
+    for (int q = 0; q < Queries; ++q) {
+      // No branch: which queries are near cannot be foretold.
+      queries[size] = static_cast<std::uint8_t>(query + static_cast<std::size_t>(q));
+      size += S::any(near<S>(acc[q], t.prefix_thresholds[query + static_cast<std::size_t>(q)]));
+    }
+  });
+  return size;
+}
+
+//   S::convert(codes, n, steps)  where S::Step is not 4 bytes of the codes
+template <typename S>
+std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
+                      Hit* hits) {
+  [[maybe_unused]] typename S::Step room[kScanQueries * 64];
+  std::int32_t thresholds[kScanQueries];
+  for (std::size_t q = 0; q < queries.n; ++q) thresholds[q] = threshold(queries.limits[q]);
+  Prefix prefix(queries, rows);
+  CodeTile<S> tile{};
+  if constexpr (requires { S::convert(queries.codes, 0, room); }) {
+    S::convert(queries.codes, queries.n * rows.dim / 4, room);
+    tile.queries = room;
+  } else {
+    tile.queries = reinterpret_cast<const typename S::Step*>(queries.codes);
+  }
+  tile.limits = queries.limits;
+  tile.thresholds = thresholds;
+  tile.prefix_thresholds = prefix.thresholds();
+  tile.dim = rows.dim;
+  tile.prefix = rows.prefix;
+  std::size_t found = 0;
+  std::size_t b = *block;
+  while (b < rows.blocks && found < kHitsEnough) {
+    tile.first_row = b * kCodeRows;
+    tile.codes = rows.codes + tile.first_row * rows.dim;
+    tile.biases = rows.biases == nullptr ? nullptr : rows.biases + tile.first_row;
+    tile.prefix_biases = rows.prefix_biases + tile.first_row;
+    if (b + S::kBlocks > rows.blocks) {
+      found += scan_blocks<S, 1>(tile, queries.n, hits + found);
+      b += 1;
+      continue;
+    }
+    if (prefix.pays()) {
+      std::uint8_t near[kScanQueries];
+      const std::size_t n = near_by_prefix(tile, queries.n, near);
+      for (std::size_t i = 0; i < n; ++i) {
+        found += scan_tile<S, 1, S::kBlocks, true>(tile, near[i], hits + found);
+      }
+      prefix.left(n);
+    } else {
+      found += scan_blocks<S, S::kBlocks>(tile, queries.n, hits + found);
+    }
+    b += S::kBlocks;
+  }
+  *block = b;
+  return found;
+}
+
+template <typename S>
+void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t prefix,
+                 std::int32_t* biases, std::int32_t* prefix_biases) {
+  for (std::size_t b = 0; b < blocks; ++b) {
+    typename S::Norms norms;
+    std::size_t d = 0;
+    for (; d < prefix; d += 4, packed += 4 * kCodeRows) norms.add(S::load_codes(packed));
+    if (prefix < dim) store_pack(prefix_biases + b * kCodeRows, norms.biases());
+    for (; d < dim; d += 4, packed += 4 * kCodeRows) norms.add(S::load_codes(packed));
+    store_pack(biases + b * kCodeRows, norms.biases());
+  }
+}
+
+template <typename S>
+void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
+                  std::int8_t* codes) {
+  constexpr std::size_t kBytes = sizeof(typename S::Sums::Vector);
+  using Bytes = Vector<std::uint8_t, kBytes>;
+  using Shorts = Vector<std::uint16_t, kBytes>;
+  const auto twice = static_cast<std::uint16_t>(2 * scale);
+  const auto offset = static_cast<std::uint8_t>(15 * scale);
+  // Two bytes at a time, whose products stay within them.
+  const auto level = [&](Bytes u) { return (Bytes)((Shorts)u * twice) - offset; };
+  // Which of the last 4 dimensions there are.
+  const std::uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
+  const std::size_t steps = (dim + 3) / 4;
+  for (std::size_t b = 0; b < blocks; ++b) {
+    for (std::size_t s = 0; s < steps; ++s, codes += 4 * kCodeRows) {
+      for (std::size_t i = 0; i < 4 * kCodeRows; i += kBytes) {
+        const auto bytes = load<Bytes>(packed + i);
+        store(codes + i, level(s % 2 == 0 ? bytes & 15 : bytes >> 4));
+      }
+      // Go on where both halves of the bytes were read, or there is no second half.
+      if (s % 2 == 1 || s + 1 == steps) packed += 4 * kCodeRows;
+    }
+    for (std::size_t i = 4 * kCodeRows; last != ~0u && i > 0; i -= 4) {
+      store(codes - i, load<std::uint32_t>(codes - i) & last);
+    }
+  }
+}
+
+// `Queries` queries share each load of the rows.
+//   S::Words              8 numbers of 64 bits, one of each row: add_bits(counts, query, words);
+//                         near_words(counts, limit) has a bit for each row within the limit
+//   S::BitCounts          where S counts S::kByteWords words in bytes first: add_bits() adds to
+//                         these, add_counts(counts, bytes) adds them up
+template <typename S, int Queries>
+std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limits,
+                         const std::uint64_t* packed, std::size_t words, std::size_t first_query,
+                         std::size_t first_row, Hit* hits) {
+  const auto count = [&](std::size_t w, std::size_t end, auto& sums) {
+    for (; w < end; ++w, packed += kWordRows) {
+      const auto row = load_pack<typename S::Words>(packed);
+#pragma GCC unroll 8
+      for (int q = 0; q < Queries; ++q) S::add_bits(sums[q], queries[q * words + w], row);
+    }
+  };
+  typename S::Words counts[Queries] = {};
+  if constexpr (!requires { typename S::BitCounts; }) {
+    count(0, words, counts);
+  } else {
+    for (std::size_t w = 0; w < words; w += S::kByteWords) {
+      typename S::BitCounts bytes[Queries] = {};
+      count(w, words - w < S::kByteWords ? words : w + S::kByteWords, bytes);
+#pragma GCC unroll 8
+      for (int q = 0; q < Queries; ++q) S::add_counts(counts[q], bytes[q]);
+    }
+  }
+  unsigned near[Queries], any = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    near[q] = S::near_words(counts[q], limits[q]);
+    any |= near[q];
+  }
+  if (any == 0) [[likely]]
+    return 0;
+
+  std::size_t found = 0;
+#pragma GCC unroll 8
+  for (int q = 0; q < Queries; ++q) {
+    alignas(64) std::int64_t distances[kWordRows];
+    store_pack(distances, counts[q]);
+    for (; near[q] != 0; near[q] &= near[q] - 1) {
+      const auto r = static_cast<std::size_t>(__builtin_ctz(near[q]));
+      hits[found++] = {static_cast<std::uint32_t>(first_query + static_cast<std::size_t>(q)),
+                       static_cast<std::uint32_t>(first_row + r),
+                       static_cast<std::int32_t>(distances[r])};
+    }
+  }
+  return found;
+}
+
+template <typename S>
+std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, std::size_t* block,
+                         Hit* hits) {
+  const std::size_t words = rows.words;
+  std::size_t found = 0;
+  for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
+    const std::size_t row = *block * kWordRows;
+    const auto scan = [&]<int Queries>(std::size_t q) {
+      found +=
+          hamming_tile<S, Queries>(queries.words + q * words, queries.limits + q,
+                                   rows.words_of_rows + row * words, words, q, row, hits + found);
+    };
+    std::size_t q = 0;
+    for (; q + S::kWordQueries <= queries.n; q += S::kWordQueries) {
+      scan.template operator()<S::kWordQueries>(q);
+    }
+    for (; q < queries.n; ++q) scan.template operator()<1>(q);
+  }
+  return found;
+}
+
+}  // namespace
+}  // namespace protomark::kernels

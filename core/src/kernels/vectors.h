@@ -1,0 +1,128 @@
+// Vectors of GCC and Clang, which have the arithmetic of their elements, as all sets use them.
+// Everything here has internal linkage: see kernels.h.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <type_traits>
+
+namespace protomark::kernels {
+namespace {
+
+template <typename T, std::size_t Bytes>
+struct VectorOf {
+  typedef T Type __attribute__((vector_size(Bytes)));
+};
+template <typename T, std::size_t Bytes>
+using Vector = typename VectorOf<T, Bytes>::Type;
+
+// Numbers or vectors from and to any address. Not by memcpy, of which GCC makes copies in parts.
+template <typename V>
+struct Unaligned {
+  typedef V Type __attribute__((aligned(1), may_alias));
+};
+template <typename V>
+V load(const void* p) {
+  return *static_cast<const typename Unaligned<V>::Type*>(p);
+}
+template <typename V>
+void store(void* p, const V& v) {
+  *static_cast<typename Unaligned<V>::Type*>(p) = v;
+}
+
+// Vectors that are used as one.
+template <typename V, int N>
+struct Pack {
+  using Vector = V;
+  static constexpr std::size_t kLanes = N * sizeof(V) / sizeof(V{}[0]);
+  V v[N];
+
+  friend Pack operator+(const Pack& a, const Pack& b) {
+    Pack sum;
+    for (int i = 0; i < N; ++i) sum.v[i] = a.v[i] + b.v[i];
+    return sum;
+  }
+  friend Pack operator>>(const Pack& a, int bits) {
+    Pack result;
+    for (int i = 0; i < N; ++i) result.v[i] = a.v[i] >> bits;
+    return result;
+  }
+};
+
+template <typename P>
+P load_pack(const void* p) {
+  P result;
+  for (auto& v : result.v) {
+    v = load<std::remove_reference_t<decltype(v)>>(p);
+    p = static_cast<const char*>(p) + sizeof v;
+  }
+  return result;
+}
+template <typename P>
+void store_pack(void* p, const P& pack) {
+  for (const auto& v : pack.v) {
+    store(p, v);
+    p = static_cast<char*>(p) + sizeof v;
+  }
+}
+
+// Byte products by 16-bit ones, for sets whose instruction for bytes saturates or that have none:
+// 4 dimensions of a row, a 32-bit lane, become 16-bit numbers (0, 2) and (1, 3). `Set` has
+// multiply_pairs(a, b), which sums up the two products of each lane.
+template <typename Set, std::size_t Bytes>
+struct ByPairs {
+  static constexpr int kVectors = 64 / Bytes;
+  using Shorts = Vector<std::int16_t, Bytes>;
+  using Ints = Vector<std::int32_t, Bytes>;
+  using Sums = Pack<Ints, kVectors>;
+
+  struct Codes {
+    Shorts even[kVectors], odd[kVectors];
+  };
+  static Codes load_codes(const std::int8_t* p) {
+    Codes codes;
+    for (int i = 0; i < kVectors; ++i) {
+      const auto both = load<Shorts>(p + Bytes * i);
+      codes.even[i] = both << 8 >> 8;
+      codes.odd[i] = both >> 8;
+    }
+    return codes;
+  }
+  struct Query {
+    Shorts even, odd;
+  };
+  static void dot(Sums& sums, const Query& q, const Codes& codes) {
+    for (int i = 0; i < kVectors; ++i) {
+      sums.v[i] +=
+          Set::multiply_pairs(codes.even[i], q.even) + Set::multiply_pairs(codes.odd[i], q.odd);
+    }
+  }
+  // Four bytes for all rows.
+  static Query query(const std::uint8_t* codes) {
+    const auto four = (Vector<std::uint16_t, Bytes>)(Ints{} + load<std::int32_t>(codes));
+    return {(Shorts)(four & 0xff), (Shorts)(four >> 8)};
+  }
+
+  // The biases are -|p|^2 - 256 sum(p), as queries come as q + 128.
+  class Norms {
+   public:
+    void add(const Codes& p) {
+      for (int i = 0; i < kVectors; ++i) {
+        squares_.v[i] +=
+            Set::multiply_pairs(p.even[i], p.even[i]) + Set::multiply_pairs(p.odd[i], p.odd[i]);
+        sums_.v[i] += Set::multiply_pairs(p.even[i] + p.odd[i], Shorts{} + 1);
+      }
+    }
+    Sums biases() const {
+      Sums biases;
+      for (int i = 0; i < kVectors; ++i) biases.v[i] = -squares_.v[i] - (sums_.v[i] << 8);
+      return biases;
+    }
+
+   private:
+    Sums squares_ = {}, sums_ = {};
+  };
+};
+
+}  // namespace
+}  // namespace protomark::kernels

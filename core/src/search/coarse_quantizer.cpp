@@ -1,0 +1,187 @@
+#include "search/coarse_quantizer.h"
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <queue>
+#include <utility>
+
+#include "base/rounded_mean.h"
+#include "search/inverted_lists.h"
+#include "search/recall.h"
+#include "search/scan.h"
+
+namespace protomark {
+namespace {
+
+constexpr int kIterations = 8;
+constexpr std::size_t kGroupProbes = 4;
+// Codes whose lists are looked for at a time.
+constexpr std::size_t kAssignChunk = 1 << 14;
+
+// The id that find(codes, ids, distances) finds for each code.
+template <typename Find>
+std::vector<std::uint32_t> nearest_ids(Codes codes, const Find& find) {
+  std::vector<std::uint32_t> result(codes.rows);
+  std::vector<std::int64_t> ids(std::min(codes.rows, kAssignChunk));
+  std::vector<std::int32_t> distances(ids.size());
+  for (std::size_t first = 0; first < codes.rows; first += kAssignChunk) {
+    const std::size_t n = std::min(kAssignChunk, codes.rows - first);
+    find(Codes{codes.row(first), n, codes.columns}, MatrixView<std::int64_t>{ids.data(), n, 1},
+         MatrixView<std::int32_t>{distances.data(), n, 1});
+    std::transform(ids.begin(), ids.begin() + static_cast<std::ptrdiff_t>(n),
+                   result.begin() + static_cast<std::ptrdiff_t>(first),
+                   [](std::int64_t id) { return static_cast<std::uint32_t>(id); });
+  }
+  return result;
+}
+
+// Centroids without codes take one code each of the largest lists.
+void refill(Codes codes, std::vector<std::uint32_t> list_of,
+            const std::vector<std::uint32_t>& counts, std::vector<std::int8_t>& centroids) {
+  const std::size_t nlist = counts.size(), dim = codes.columns;
+  std::vector<std::uint32_t> first(nlist + 1, 0), members(codes.rows);
+  for (std::size_t c = 0; c < nlist; ++c) first[c + 1] = first[c] + counts[c];
+  std::vector<std::uint32_t> next(first.begin(), first.end() - 1);
+  for (std::uint32_t i = 0; i < codes.rows; ++i) members[next[list_of[i]]++] = i;
+  struct Large {
+    std::size_t share;  // codes for each centroid that the list has got
+    std::size_t list;
+    std::size_t parts;
+    bool operator<(const Large& other) const {
+      return std::pair(share, other.list) < std::pair(other.share, list);
+    }
+  };
+  std::priority_queue<Large> largest;
+  for (std::size_t c = 0; c < nlist; ++c) largest.push({counts[c], c, 1});
+  for (std::size_t c = 0; c < nlist; ++c) {
+    if (counts[c] != 0) continue;
+    Large from = largest.top();
+    largest.pop();
+    // A different code each time, spread over the list.
+    const std::size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
+    std::copy_n(codes.row(members[at]), dim, &centroids[c * dim]);
+    ++from.parts;
+    from.share = counts[from.list] / from.parts;
+    largest.push(from);
+  }
+}
+
+// `assign(centroids)` gives the list of each code.
+template <typename Assign>
+std::vector<std::int8_t> k_means(Codes codes, std::size_t nlist, const Assign& assign) {
+  const std::size_t dim = codes.columns;
+  std::vector<std::int8_t> centroids(nlist * dim);
+  for (std::size_t c = 0; c < nlist; ++c) {
+    std::copy_n(codes.row(c * codes.rows / nlist), dim, &centroids[c * dim]);
+  }
+  for (int i = 0; i < kIterations; ++i) {
+    const std::vector<std::uint32_t> list_of = assign(centroids);
+    std::vector<std::int64_t> sums(centroids.size(), 0);
+    std::vector<std::uint32_t> counts(nlist, 0);
+    for (std::size_t row = 0; row < codes.rows; ++row) {
+      const std::size_t c = list_of[row];
+      for (std::size_t d = 0; d < dim; ++d) sums[c * dim + d] += codes.row(row)[d];
+      ++counts[c];
+    }
+    for (std::size_t c = 0; c < nlist; ++c) {
+      if (counts[c] == 0) continue;
+      for (std::size_t d = 0; d < dim; ++d) {
+        centroids[c * dim + d] = rounded_mean<std::int64_t>(sums[c * dim + d], counts[c]);
+      }
+    }
+    refill(codes, list_of, counts, centroids);
+  }
+  return centroids;
+}
+
+}  // namespace
+
+ListOrder::ListOrder(std::vector<std::uint32_t> list_of_row, std::size_t nlist)
+    : sizes(nlist, 0), first_blocks(nlist + 1, 0), new_rows(std::move(list_of_row)) {
+  for (const std::uint32_t list : new_rows) {
+    if (list != kNone) ++sizes[list];
+  }
+  std::vector<std::uint32_t> next(nlist);
+  for (std::size_t c = 0; c < nlist; ++c) {
+    next[c] = first_blocks[c] * static_cast<std::uint32_t>(kPackedRows);
+    first_blocks[c + 1] =
+        first_blocks[c] + static_cast<std::uint32_t>((sizes[c] + kPackedRows - 1) / kPackedRows);
+  }
+  for (std::uint32_t& list_or_row : new_rows) {
+    if (list_or_row != kNone) list_or_row = next[list_or_row]++;
+  }
+}
+
+CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim)
+    : dim_(dim), centroids_(std::move(centroids)) {
+  const std::size_t n = nlist();
+  const Codes all{centroids_.data(), n, dim_};
+  packed_ = pack_codes(all);
+
+  const auto groups =
+      std::min(n, static_cast<std::size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
+  const auto assign = [&](const std::vector<std::int8_t>& to) {
+    const std::vector<CodeVector> packed = pack_codes({to.data(), groups, dim_});
+    return nearest_ids(all, [&](Codes codes, auto ids, auto distances) {
+      search_exact(packed_view(packed, groups), codes, {}, ids, distances);
+    });
+  };
+  const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
+  const ListOrder order(assign(group_centroids), groups);
+  // A group that is nearest to no centroid, as centroids of a broken file might have, is left out.
+  std::vector<std::int8_t> used;
+  for (std::size_t g = 0; g < groups; ++g) {
+    if (order.sizes[g] == 0) continue;
+    used.insert(used.end(), &group_centroids[g * dim_], &group_centroids[g * dim_] + dim_);
+    group_sizes_.push_back(order.sizes[g]);
+    group_blocks_.push_back(order.first_blocks[g]);
+  }
+  group_blocks_.push_back(order.first_blocks.back());
+  group_centroids_ = pack_codes({used.data(), group_sizes_.size(), dim_});
+  const std::size_t rows = order.first_blocks.back() * kPackedRows;
+  std::vector<std::int8_t> grouped(rows * dim_, 0);
+  list_of_.assign(rows, kNoLandmark);
+  for (std::uint32_t list = 0; list < n; ++list) {
+    std::copy_n(all.row(list), dim_, &grouped[order.new_rows[list] * dim_]);
+    list_of_[order.new_rows[list]] = {list};
+  }
+  grouped_ = pack_codes({grouped.data(), rows, dim_});
+}
+
+CoarseQuantizer CoarseQuantizer::learn(Codes codes, std::size_t nlist, int threads) {
+  const auto assign = [&](const std::vector<std::int8_t>& centroids) {
+    return CoarseQuantizer(centroids, codes.columns).assign(codes, threads);
+  };
+  return {k_means(codes, nlist, assign), codes.columns};
+}
+
+std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t dim,
+                                           std::size_t row_bytes) {
+  const auto n = static_cast<double>(prototypes), k = static_cast<double>(packed_dim(dim));
+  constexpr double kBytes = 4;
+  // A sealed map has what docs/format.md has: landmarks of rows, the recall table, and for each
+  // list its centroid, its number of rows and half a block of padding, somewhat rounded up.
+  const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
+  const double sealed = (n * (kBytes - std::bit_width(prototypes) / 8.0) - table) / (9.5 * k + 4);
+  // A learning map has for each list its centroid three times and some numbers, half a block of
+  // rows and half of the 12 bytes of a block.
+  const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
+  const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
+  const double nlist = std::min({4 * std::sqrt(n), sealed, learning});
+  return static_cast<std::size_t>(std::clamp(nlist, 1.0, static_cast<double>(kMaxLists)));
+}
+
+std::vector<std::uint32_t> CoarseQuantizer::assign(Codes codes, int threads) const {
+  PackedPrototypes grouped = packed_view(grouped_, list_of_.size());
+  grouped.landmarks.of_row = list_of_.data();
+  const InvertedLists groups(group_sizes_, group_blocks_);
+  SearchOptions options;
+  options.threads = threads;
+  return nearest_ids(codes, [&](Codes some, auto ids, auto distances) {
+    search_lists(grouped, groups, packed_view(group_centroids_, group_sizes_.size()), kGroupProbes,
+                 some, options, ids, distances);
+  });
+}
+
+}  // namespace protomark

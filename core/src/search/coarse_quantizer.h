@@ -1,0 +1,69 @@
+// The coarse quantizer of an inverted file: centroids of lists, learned from the prototypes of a
+// map.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "search/packed.h"
+
+namespace protomark {
+
+// Which list a code belongs to depends on the code and the centroids alone, so that the lists of a
+// map do not depend on its history. Centroids have lists themselves, *groups*: a code's list is
+// that of the nearest centroid in the few nearest groups, ties to the smaller, which is almost
+// always the nearest of all and takes some hundreds of comparisons for thousands of lists.
+class CoarseQuantizer {
+ public:
+  static constexpr std::size_t kMaxLists = 1 << 16;
+
+  // Without lists.
+  CoarseQuantizer() = default;
+  // Of these centroids, (nlist x dim), at least one.
+  CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim);
+  // Learns by Lloyd's k-means, in integers; `nlist` is at most the number of codes.
+  static CoarseQuantizer learn(Codes codes, std::size_t nlist, int threads);
+  // A number of lists for that many prototypes, so small that the index of a learning map, in which
+  // a row takes `row_bytes`, and that of a sealed one take at most 4 bytes a prototype.
+  static std::size_t default_nlist(std::size_t prototypes, std::size_t dim, std::size_t row_bytes);
+  // Prototypes that suffice to learn so many lists.
+  static std::size_t sample_size(std::size_t nlist) { return 48 * nlist; }
+
+  std::size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }
+  // (nlist x dim)
+  const std::vector<std::int8_t>& centroids() const { return centroids_; }
+  PackedPrototypes packed() const { return packed_view(packed_, nlist()); }
+
+  // Returns the list of each code.
+  std::vector<std::uint32_t> assign(Codes codes, int threads) const;
+
+ private:
+  PackedPrototypes packed_view(const std::vector<CodeVector>& codes, std::size_t rows) const {
+    return {codes.data(), rows, dim_};
+  }
+
+  std::size_t dim_ = 0;
+  std::vector<std::int8_t> centroids_;
+  std::vector<CodeVector> packed_;
+
+  std::vector<CodeVector> group_centroids_;
+  std::vector<CodeVector> grouped_;          // centroids by group
+  std::vector<LandmarkIndex> list_of_;       // the list of each row of grouped_
+  std::vector<std::uint32_t> group_sizes_;   // of each group
+  std::vector<std::uint32_t> group_blocks_;  // first block of each group, and the end
+};
+
+// Where rows stand if lists follow each other, each from a new block on, rows in the order in which
+// they come. A row of list kNone stands nowhere: kNone.
+struct ListOrder {
+  static constexpr std::uint32_t kNone = UINT32_MAX;
+
+  ListOrder(std::vector<std::uint32_t> list_of_row, std::size_t nlist);
+
+  std::vector<std::uint32_t> sizes;         // of each list
+  std::vector<std::uint32_t> first_blocks;  // of each list, and the end
+  std::vector<std::uint32_t> new_rows;      // of each row
+};
+
+}  // namespace protomark

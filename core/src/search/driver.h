@@ -1,0 +1,108 @@
+// What every search shares: how it is divided among threads, its loop over the hits of a kernel,
+// and how it gives its answer.
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+#include <mutex>
+#include <optional>
+#include <span>
+
+#include "base/parallel.h"
+#include "kernels/kernels.h"
+#include "protomark/types.h"
+#include "search/top_k.h"
+
+namespace protomark {
+
+// Ranges of queries, each times ranges of work: of rows, or of lists.
+struct Division {
+  std::size_t query_ranges = 1;
+  std::size_t work_ranges = 1;
+
+  // Queries are divided first, as those of a range share the work on each row that does not depend
+  // on the query; if they are too few for all threads, rows are divided as well.
+  static Division of_rows(int threads, std::size_t queries, std::size_t rows) {
+    constexpr std::size_t kQueries = 64, kRows = 4096;
+    if (threads <= 1 || queries == 0) return {};
+    const auto n = static_cast<std::size_t>(threads);
+    const std::size_t query_ranges = std::min(4 * n, divide_up(queries, kQueries));
+    const std::size_t work_ranges = std::min(divide_up(n, query_ranges), divide_up(rows, kRows));
+    return {query_ranges, std::max<std::size_t>(work_ranges, 1)};
+  }
+  // All queries go through their lists together, so that they share the reading of a list.
+  static Division of_lists(int threads, std::size_t probes) {
+    constexpr std::size_t kProbes = 64;
+    if (threads <= 1) return {};
+    return {1, std::clamp<std::size_t>(divide_up(probes, kProbes), 1,
+                                       4 * static_cast<std::size_t>(threads))};
+  }
+
+  static Range range(std::size_t n, std::size_t ranges, std::size_t i) {
+    constexpr std::size_t kGrain = 16;
+    const std::size_t grains = divide_up(n, kGrain);
+    return {std::min(n, grains * i / ranges * kGrain),
+            std::min(n, grains * (i + 1) / ranges * kGrain)};
+  }
+
+ private:
+  static std::size_t divide_up(std::size_t a, std::size_t b) { return (a + b - 1) / b; }
+};
+
+// Calls scan(queries, work, neighbours of these queries) for all ranges.
+template <typename Scan>
+void run_search(int threads, const Division& division, std::size_t work, Neighbours& nearest,
+                const Scan& scan) {
+  std::mutex mutex;
+  const std::size_t tasks = division.query_ranges * division.work_ranges;
+  run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](std::size_t i) {
+    if (tasks == 1) return scan(Range{0, nearest.queries()}, Range{0, work}, nearest);
+    const Range queries =
+        Division::range(nearest.queries(), division.query_ranges, i / division.work_ranges);
+    std::unique_lock lock(mutex);
+    Neighbours part = nearest.part(queries);
+    lock.unlock();
+    scan(queries, Division::range(work, division.work_ranges, i % division.work_ranges), part);
+    lock.lock();
+    nearest.merge(queries.begin, part);
+  });
+}
+
+// The loop over the hits of n queries among the rows of a chunk. `kernel(first, n, limits, &block,
+// hits)` scans for some queries from block on; take(query, distance, row) gets those that are
+// within limit_of(query), which may become smaller by it.
+template <typename Kernel, typename LimitOf, typename Take>
+void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel& kernel,
+              const LimitOf& limit_of, const Take& take) {
+  kernels::Hit hits[kernels::kHitRoom];
+  std::int32_t limits[kernels::kScanQueries];
+  for (std::size_t first = 0; first < n; first += kernels::kScanQueries) {
+    const std::size_t group = std::min(kernels::kScanQueries, n - first);
+    for (std::size_t block = 0; block < blocks;) {
+      for (std::size_t i = 0; i < group; ++i) limits[i] = limit_of(first + i);
+      const std::size_t found = kernel(first, group, limits, &block, hits);
+      for (std::size_t i = 0; i < found; ++i) {
+        const kernels::Hit& hit = hits[i];
+        // Hits before it may have left no room for it.
+        if (hit.row >= rows || hit.distance > limits[hit.query]) continue;
+        take(first + hit.query, hit.distance, hit.row);
+        limits[hit.query] = limit_of(first + hit.query);
+      }
+    }
+  }
+}
+
+// Writes (queries x k) ids and distances. `norms`, if there are any, are added to the distances of
+// each query.
+void write_answer(const Neighbours& nearest, std::span<const std::int32_t> norms,
+                  std::optional<std::int32_t> max_distance, std::optional<double> ratio,
+                  MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances);
+
+// Throws std::invalid_argument if ids and distances are not (queries x k), k at least 1, or
+// max_distance is negative.
+void check_answer(std::size_t queries, std::optional<std::int32_t> max_distance,
+                  const MatrixView<std::int64_t>& ids, const MatrixView<std::int32_t>& distances);
+
+}  // namespace protomark

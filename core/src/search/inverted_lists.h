@@ -1,0 +1,48 @@
+// Approximate search: in the inverted lists whose centroids are nearest to a query.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "search/list_blocks.h"
+#include "search/scan.h"
+
+namespace protomark {
+
+// A view of the blocks of each list: chained in a learning map, one after the other elsewhere.
+class InvertedLists {
+ public:
+  explicit InvertedLists(const ListBlocks& chained) : chained_(&chained) {}
+  // Rows of each list, and the first block of each list and the end.
+  InvertedLists(std::span<const std::uint32_t> rows, std::span<const std::uint32_t> first_blocks)
+      : rows_(rows), first_blocks_(first_blocks) {}
+
+  std::size_t nlist() const { return chained_ != nullptr ? chained_->nlist() : rows_.size(); }
+  std::size_t rows(std::uint32_t list) const {
+    return chained_ != nullptr ? chained_->rows(list) : rows_[list];
+  }
+  // The blocks of a list, in order, into `blocks`; all are full but the last one.
+  void read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const;
+
+ private:
+  const ListBlocks* chained_ = nullptr;
+  std::span<const std::uint32_t> rows_;
+  std::span<const std::uint32_t> first_blocks_;
+};
+
+// Returns (queries x nprobe) indices of the centroids that are nearest to each query, ties to the
+// smaller, the nearest first, the others in no order. `nprobe` is 1 to the number of centroids.
+std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
+                                         const PreparedCodes& queries, std::size_t nprobe,
+                                         int threads);
+
+// As search_exact, but in the `nprobe` lists (at least 1) nearest to each query, ties to the
+// smaller list; exactly if these are all. Prototype i of `centroids` is the centroid of list i.
+void search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
+                  const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
+                  const SearchOptions& options, MatrixView<std::int64_t> ids,
+                  MatrixView<std::int32_t> distances);
+
+}  // namespace protomark
