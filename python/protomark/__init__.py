@@ -12,7 +12,6 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
 from protomark._core import (
-    Encoder,
     PrototypeMap,
     SealedMap,
     file_journal,
@@ -22,6 +21,7 @@ from protomark._core import (
     open,
     verify_file,
 )
+from protomark.encoders import Encoder
 from protomark.errors import FileError
 from protomark.sized import sized_descriptors
 from protomark.upright import upright_descriptors

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
+from protomark._core import FileError
 
-class FileError(OSError, ValueError):
-    """A file that cannot be read or written, or that is not what it should be."""
+__all__ = ["FileError"]

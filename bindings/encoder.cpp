@@ -1,0 +1,169 @@
+// Encoder.
+#include "protomark/encoder.h"
+
+#include <nanobind/stl/map.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <map>
+
+#include "module.h"
+
+namespace protomark::python {
+namespace {
+
+Layer to_layer(nb::dict d, bool last) {
+  const auto weights =
+      array_of<Array2<std::int8_t>>(d["weights"], "int8", 2, "weights: a (out, in) int8");
+  const auto bias = array_of<Array1<std::int32_t>>(d["bias"], "int32", 1, "bias: a (out,) int32");
+  const auto mult = array_of<Array1<std::int32_t>>(d["mult"], "int32", 1, "mult: a (out,) int32");
+  Layer layer;
+  layer.outputs = weights.shape(0);
+  layer.inputs = weights.shape(1);
+  layer.weights.assign(weights.data(), weights.data() + weights.size());
+  layer.bias.assign(bias.data(), bias.data() + bias.size());
+  layer.multipliers.assign(mult.data(), mult.data() + mult.size());
+  layer.shift = nb::cast<int>(nb::module_::import_("operator").attr("index")(d["shift"]));
+  const nb::object table = d["table"];
+  if (table.is_none()) {
+    if (!last) throw nb::value_error("a hidden layer needs a table, only the last one has None");
+    return layer;
+  }
+  const auto bytes =
+      array_of<Array1<std::uint8_t>>(table, "uint8", 1, "table: a (256,) uint8");
+  if (bytes.size() != layer.table.size()) {
+    throw nb::value_error("a layer's table must have 256 entries");
+  }
+  std::copy_n(bytes.data(), bytes.size(), layer.table.begin());
+  return layer;
+}
+
+nb::dict from_layer(const Layer& layer, bool last) {
+  Matrix<std::int8_t> weights(layer.outputs, layer.inputs);
+  weights.data = layer.weights;
+  nb::dict d;
+  d["weights"] = to_numpy(std::move(weights));
+  d["bias"] = to_numpy(layer.bias);
+  d["mult"] = to_numpy(layer.multipliers);
+  d["shift"] = layer.shift;
+  d["table"] = last ? nb::none()
+                    : to_numpy(std::vector<std::uint8_t>(layer.table.begin(), layer.table.end()));
+  return d;
+}
+
+// A text of the encoder's info.
+auto info(std::string EncoderInfo::*text) {
+  return [text](const Encoder& encoder) { return encoder.info().*text; };
+}
+
+}  // namespace
+
+void bind_encoder(nb::module_& m) {
+  nb::class_<Encoder>(m, "Encoder",
+                      "A network from packed bits to int8 codes that gives the same bytes on every "
+                      "machine.")
+      .def(
+          "__init__",
+          [](Encoder* self, nb::list layers, std::vector<std::size_t> dims, std::string name,
+             std::string descriptor, float scale, std::string data, std::string licence,
+             std::map<std::string, std::string> notes) {
+            std::vector<Layer> built;
+            for (nb::handle layer : layers) {
+              built.push_back(
+                  to_layer(nb::cast<nb::dict>(layer), built.size() + 1 == layers.size()));
+            }
+            EncoderInfo texts{std::move(name),
+                              std::move(descriptor),
+                              std::move(data),
+                              std::move(licence),
+                              {notes.begin(), notes.end()}};
+            const nb::gil_scoped_release release;
+            new (self) Encoder(std::move(texts), std::move(built), std::move(dims), scale);
+          },
+          "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
+          "licence"_a = "", "notes"_a = nb::dict(),
+          nb::sig(
+              "def __init__(self, layers: list[dict[str, Any]], dims: Sequence[int], name: str, "
+              "descriptor: str, scale: float, data: str = '', licence: str = '', "
+              "notes: dict[str, str] = {}) -> None"),
+          R"(Build an encoder from integer layers.
+
+Args:
+    layers: each a dict of weights (out, in) int8, bias (out,) int32, mult (out,) int32, shift, and
+        table (256,) uint8, None in the last layer; docs/format.md says what is computed.
+    dims: lengths at which a code may be cut, ascending, the last one its full length.
+    name, descriptor, data, licence, notes: what the model says of itself. No note may have the key
+        name, descriptor, data or licence.
+    scale: real value of one code unit.
+
+Raises:
+    TypeError: an array is of another type.
+    ValueError: layers do not fit together, or a note has such a key.)")
+      .def_static(
+          "load", [](const Path& path) { return without_gil([&] { return Encoder::load(path); }); },
+          "path"_a, nb::sig("def load(path: str | os.PathLike[str]) -> Encoder"),
+          "Load a model file. Raises FileError.")
+      .def("save", &Encoder::save, "path"_a, ReleaseGil(),
+           nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
+           "Write the model file, whole or not at all. Raises FileError.")
+      .def(
+          "encode",
+          [](const Encoder& encoder, nb::object array, std::optional<std::size_t> dim,
+             int threads) {
+            const auto d = descriptors(array);
+            if (dim == 0) throw nb::value_error("dim must be at least 1");
+            return to_numpy(
+                without_gil([&] { return encoder.encode(view(d), dim.value_or(0), threads); }));
+          },
+          "descriptors"_a, "dim"_a = nb::none(), "threads"_a = 1,
+          nb::sig("def encode(self, descriptors: NDArray[numpy.uint8], dim: int | None = None, "
+                  "threads: int = 1) -> NDArray[numpy.int8]"),
+          R"(Encode descriptors.
+
+Args:
+    descriptors: (n, bits / 8) uint8, the bytes that OpenCV gives.
+    dim: length of a code, one of `dims`; None means the full length.
+    threads: threads to use.
+
+Returns:
+    (n, dim) int8, -127 to 127.
+
+Raises:
+    TypeError: descriptors are not (n, bits / 8) uint8.
+    ValueError: they are of another size than the encoder's, dim is none of `dims`, or threads is
+        below 1.)")
+      .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor.")
+      .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
+      .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")
+      .def_prop_ro("scale", &Encoder::scale, "Real value of one code unit.")
+      .def_prop_ro("identity", &Encoder::identity, "SHA-256 of the network, in hexadecimal.")
+      .def_prop_ro("multiply_adds", &Encoder::multiply_adds, "Multiply-adds per descriptor.")
+      .def_prop_ro("name", info(&EncoderInfo::name), "Name of the model.")
+      .def_prop_ro("descriptor", info(&EncoderInfo::descriptor),
+                   "Name of the descriptor that it takes.")
+      .def_prop_ro("data", info(&EncoderInfo::data), "What it was trained on.")
+      .def_prop_ro("licence", info(&EncoderInfo::licence), "Licence of the model.")
+      .def_prop_ro(
+          "notes",
+          [](const Encoder& e) {
+            return std::map<std::string, std::string>(e.info().notes.begin(), e.info().notes.end());
+          },
+          "Whatever else the model says of itself.")
+      .def_prop_ro(
+          "layers",
+          [](const Encoder& e) {
+            nb::list result;
+            for (const Layer& layer : e.layers()) {
+              result.append(from_layer(layer, &layer == &e.layers().back()));
+            }
+            return result;
+          },
+          nb::sig("def layers(self) -> list[dict[str, Any]]"),
+          "The integer layers, as the constructor takes them.")
+      .def("__repr__", [](const Encoder& e) {
+        return "<protomark.Encoder '" + e.info().name + "': " + std::to_string(e.bits()) +
+               " bits -> " + std::to_string(e.dim()) + " int8>";
+      });
+}
+
+}  // namespace protomark::python

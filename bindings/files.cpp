@@ -1,0 +1,96 @@
+// Files of any kind.
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/vector.h>
+
+#include "module.h"
+#include "protomark/map_file.h"
+#include "protomark/prototype_map.h"
+#include "protomark/sealed_map.h"
+
+namespace protomark::python {
+namespace {
+
+// Checks a map file before a journal is made for it, or anything large is read.
+void check_map(const Path& path, const Encoder* encoder,
+               const std::optional<std::string>& descriptor) {
+  if (encoder == nullptr && !descriptor) return;
+  without_gil([&] {
+    const auto own = map_encoder(path);
+    if (encoder != nullptr) expect_encoder(*own, *encoder, path.string());
+    if (descriptor) expect_descriptor(*own, *descriptor, path.string());
+  });
+}
+
+}  // namespace
+
+void bind_files(nb::module_& m) {
+  // What can commit is a learning map, which the first overload tells type checkers.
+  m.def(
+      "open",
+      [](const Path& path, bool journal, const Encoder* encoder,
+         const std::optional<std::string>& descriptor) {
+        if (!journal) throw nb::next_overload();
+        check_map(path, encoder, descriptor);
+        return without_gil([&] { return PrototypeMap::load(path, true); });
+      },
+      "path"_a, nb::kw_only(), "journal"_a, "encoder"_a.none() = nb::none(),
+      "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, journal: Literal[True], "
+              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap"));
+  m.def(
+      "open",
+      [](const Path& path, bool, const Encoder* encoder,
+         const std::optional<std::string>& descriptor) -> nb::object {
+        check_map(path, encoder, descriptor);
+        if (without_gil([&] { return map_kind(path); }) == MapKind::learning) {
+          return nb::cast(without_gil([&] { return PrototypeMap::load(path); }));
+        }
+        return nb::cast(without_gil([&] { return SealedMap(path); }));
+      },
+      "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),
+      "descriptor"_a = nb::none(),
+      nb::sig("def open(path: str | os.PathLike[str], *, journal: bool = False, "
+              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap | "
+              "SealedMap"),
+      R"(Open a map file: read a learning map, with what was committed to its journal, or map a
+sealed one.
+
+A map encodes descriptors itself, with the encoder that it was built with. If they are encoded
+elsewhere, or come from a detector that the map has not seen, say what you have:
+
+Args:
+    path: the map file.
+    journal: let the map commit to the journal beside the file, which is made if there is none. No
+        other map can be opened so until this one is closed or gone.
+    encoder: the map must have been made with this encoder, or one of equal identity.
+    descriptor: the map must be one of this descriptor, for example "orb".
+
+Raises:
+    FileError: the file is not a map, or is broken; with journal also if it is sealed, or if another
+        map has the journal.
+    ValueError: the map is of another encoder or descriptor.)");
+  m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
+        nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
+        "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");
+  m.def("verify_file", &verify_file, "path"_a, ReleaseGil(),
+        nb::sig("def verify_file(path: str | os.PathLike[str]) -> None"),
+        "Check every checksum of a model or map file, and of the journal beside it. Raises "
+        "FileError.");
+  m.def(
+      "file_journal",
+      [](const Path& path) -> nb::object {
+        const auto journal = without_gil([&] { return file_journal(path); });
+        if (!journal) return nb::none();
+        nb::dict result;
+        result["commits"] = journal->commits;
+        result["bytes"] = journal->bytes;
+        result["torn_bytes"] = journal->torn_bytes;
+        return result;
+      },
+      "path"_a, nb::sig("def file_journal(path: str | os.PathLike[str]) -> dict[str, int] | None"),
+      "The journal beside a map file: commits since the file was written, bytes, and how many of "
+      "these are of an interrupted commit, which does not count. None if there is no journal. "
+      "Raises FileError.");
+}
+
+}  // namespace protomark::python

@@ -1,0 +1,52 @@
+// Hamming search.
+#include "module.h"
+#include "protomark/hamming.h"
+
+namespace protomark::python {
+
+void bind_hamming(nb::module_& m) {
+  m.def(
+      "hamming_search",
+      [](nb::object queries, nb::object database, std::size_t k,
+         std::optional<nb::object> landmarks, std::optional<int> max_distance, int threads) {
+        const auto q = descriptors(queries);
+        const auto d = descriptors(database);
+        const HammingOptions options{max_distance, threads};
+        if (!landmarks) {
+          return to_numpy(
+              without_gil([&] { return hamming_search(view(q), view(d), k, options); }));
+        }
+        const auto l = landmark_ids(*landmarks);
+        return to_numpy(
+            without_gil([&] { return hamming_search(view(q), view(d), view(l), k, options); }));
+      },
+      "queries"_a, "database"_a, "k"_a = 2, "landmarks"_a = nb::none(),
+      "max_distance"_a = nb::none(), "threads"_a = 1,
+      nb::sig("def hamming_search(queries: NDArray[numpy.uint8], database: NDArray[numpy.uint8], "
+              "k: int = 2, landmarks: ArrayLike | None = None, max_distance: int | None = None, "
+              "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
+      R"(Exact k nearest neighbours of binary descriptors in Hamming distance.
+
+Args:
+    queries: (q, bits / 8) uint8.
+    database: (n, bits / 8) uint8.
+    k: neighbours to return.
+    landmarks: (n,) int64, the landmark of each row of database. With it, the k nearest *distinct*
+        landmarks are returned, each as far away as its nearest descriptor.
+    max_distance: the largest distance, in bits, at which a neighbour is reported.
+    threads: threads to use.
+
+Returns:
+    Rows of database, or landmark ids, (q, k) int64, nearest first, ties to the smaller, -1 where
+    there is none; and distances in bits (q, k) int32, 2^31 - 1 where there is none.
+
+Raises:
+    TypeError: queries or database are not (rows, bits / 8) uint8.
+    ValueError: queries and database are of different sizes, landmarks does not have an id for each
+        row, k or threads is below 1, or max_distance is negative.)");
+  m.def("instruction_set", &instruction_set,
+        "The instruction set in use, for example avx512; the environment variable PROTOMARK_ISA "
+        "chooses another one. All give the same bytes.");
+}
+
+}  // namespace protomark::python

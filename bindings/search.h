@@ -1,0 +1,140 @@
+// What learning and sealed maps have in common: they answer.
+#pragma once
+
+#include <algorithm>
+#include <optional>
+#include <string>
+
+#include "module.h"
+#include "protomark/encoder.h"
+#include "protomark/search.h"
+
+namespace protomark::python {
+
+nb::dict from_summary(const MapSummary& summary);
+
+// Binds Map::search or Map::search_codes, whose queries are of type `Queries`.
+template <typename Map, typename Queries, typename Search>
+auto bind_search(Queries (*to_queries)(nb::handle), Search search) {
+  return [=](const Map& map, nb::object queries, std::size_t k,
+             std::optional<std::int64_t> max_distance, std::optional<double> ratio, int threads,
+             std::optional<double> recall, std::optional<std::size_t> nprobe) {
+    const auto q = to_queries(queries);
+    SearchOptions options{recall, nprobe, std::nullopt, ratio, threads};
+    if (max_distance) {
+      options.max_distance =
+          static_cast<std::int32_t>(std::clamp<std::int64_t>(*max_distance, -1, INT32_MAX));
+    }
+    return to_numpy(without_gil([&] { return (map.*search)(view(q), k, options); }));
+  };
+}
+
+// Binds a function from ids to something per landmark.
+template <typename Map, typename Of>
+auto bind_of_landmarks(Of of) {
+  return [of](const Map& map, nb::object ids) {
+    const auto l = landmark_ids(ids);
+    return to_numpy(without_gil([&] { return (map.*of)(view(l)); }));
+  };
+}
+
+// As in "2 landmarks, 3 prototypes, 48 dimensions, encoder 'freak'".
+template <typename Map>
+std::string describe_map(const Map& map) {
+  const auto [landmarks, prototypes] =
+      without_gil([&] { return std::pair(map.size(), map.prototype_count()); });
+  return std::to_string(landmarks) + " landmarks" +
+         (prototypes == landmarks ? "" : ", " + std::to_string(prototypes) + " prototypes") + ", " +
+         std::to_string(map.dim()) + " dimensions, encoder '" + map.encoder()->info().name + "'";
+}
+
+template <typename Map>
+void bind_answers(nb::class_<Map>& map) {
+  map.def("__len__", &Map::size, ReleaseGil())
+      .def_prop_ro("encoder", &Map::encoder, "The encoder of this map.")
+      .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
+      .def_prop_ro("prototype_count", &Map::prototype_count, ReleaseGil(),
+                   "Number of prototypes: one per landmark, or one per appearance.")
+      .def_prop_ro("nlist", &Map::nlist, ReleaseGil(),
+                   "Number of inverted lists; 0 means that there is no index.")
+      .def_prop_ro(
+          "ids", [](const Map& m) { return to_numpy(without_gil([&] { return m.ids(); })); },
+          nb::sig("def ids(self) -> NDArray[numpy.int64]"),
+          "The ids of all landmarks in ascending order, (n,) int64.")
+      .def("prototypes", bind_of_landmarks<Map>(&Map::prototypes), "landmark_ids"_a,
+           nb::sig("def prototypes(self, landmark_ids: ArrayLike) -> NDArray[numpy.float32]"),
+           "Mean codes (Komorowski and Trzcinski, Eq. 1), (n, dim) float32, in code units, over "
+           "all appearances. A sealed map gives them rounded, to one of 16 levels if its code_bits "
+           "is 4, and the plain mean of several. Raises KeyError for an id that is not in the map.")
+      .def("positions", bind_of_landmarks<Map>(&Map::positions), "landmark_ids"_a,
+           nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
+           "World coordinates, (n, 3) float64, NaN where a landmark has none. Raises KeyError for "
+           "an id that is not in the map.")
+      .def("counts", bind_of_landmarks<Map>(&Map::counts), "landmark_ids"_a,
+           nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint32]"),
+           "Numbers of observations, over all appearances, (n,) uint32; a sealed map gives at most "
+           "255. Raises KeyError for an id that is not in the map.")
+      .def(
+          "appearances",
+          [](const Map& m, std::int64_t id) {
+            return to_numpy(without_gil([&] { return m.appearances(id); }));
+          },
+          "landmark_id"_a,
+          nb::sig("def appearances(self, landmark_id: int) -> NDArray[numpy.float32]"),
+          "The prototypes of one landmark, one per appearance, (r, dim) float32, in code units; in "
+          "a sealed map with an index they come in no particular order. Raises KeyError for an id "
+          "that is not in the map.")
+      .def(
+          "summary",
+          [](const Map& m) { return from_summary(without_gil([&] { return m.summary(); })); },
+          nb::sig("def summary(self) -> dict[str, Any]"),
+          R"(The map at a glance, in one pass that keeps nothing in memory.
+
+Returns:
+    observations: their number; a sealed map counts at most 255 per landmark.
+    count_histogram: (256,) int64, how many landmarks have i observations at index i, and that many
+        or more at the last index.
+    landmarks_with_position: their number.
+    extent: (2, 3) float64, the lowest and highest coordinates; None if no landmark has a position.)")
+      .def("search", bind_search<Map>(&descriptors, &Map::search), "descriptors"_a, "k"_a = 2,
+           "max_distance"_a = nb::none(), "ratio"_a = nb::none(), "threads"_a = 1,
+           "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+           nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
+                   "max_distance: int | None = None, ratio: float | None = None, "
+                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None) -> "
+                   "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
+           R"(Find the k nearest landmarks of each descriptor; ties go to the smaller id.
+
+Args:
+    descriptors: (q, bits / 8) uint8.
+    k: neighbours to return.
+    max_distance: the largest squared distance at which a neighbour is reported.
+    ratio: Lowe's ratio test, in (0, 1]: a query keeps its neighbours only if the nearest landmark
+        is nearer than ratio times the second nearest, by root distances: squared distances must
+        fulfil nearest < ratio * ratio * second.
+    threads: threads to use.
+    recall: in (0, 1]: an approximate search in a map with an index that finds the nearest landmark
+        of this part of the queries, as measured on the map (nprobe()). None: an exact search.
+    nprobe: instead of recall, the number of inverted lists to search.
+
+Returns:
+    ids (q, k) int64, nearest first, -1 where there is none, and squared Euclidean distances
+    (q, k) int32, in code units, 2^31 - 1 where there is none.
+
+Raises:
+    TypeError: descriptors are not (q, bits / 8) uint8.
+    ValueError: descriptors are of another size than the encoder's; k, threads or nprobe is below 1;
+        max_distance is negative; ratio or recall is out of its range; recall and nprobe are both
+        given, or one of them and the map has no index (PrototypeMap.build_index).)")
+      .def("search_codes", bind_search<Map>(&codes, &Map::search_codes), "codes"_a, "k"_a = 2,
+           "max_distance"_a = nb::none(), "ratio"_a = nb::none(), "threads"_a = 1,
+           "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+           nb::sig("def search_codes(self, codes: NDArray[numpy.int8], k: int = 2, "
+                   "max_distance: int | None = None, ratio: float | None = None, "
+                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None) -> "
+                   "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
+           "Like search, for descriptors that are encoded already: (q, dim) int8. Raises "
+           "ValueError if they have another length.");
+}
+
+}  // namespace protomark::python

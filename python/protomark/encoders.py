@@ -1,0 +1,44 @@
+"""What encoders have beyond the core: models that ship, and match calibration."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from protomark._core import Encoder as Encoder
+from protomark.models import resolve
+
+if TYPE_CHECKING:
+    from protomark.acceptance import Acceptance
+
+_load_file = Encoder.load
+
+
+def load(source: str | os.PathLike[str]) -> Encoder:
+    """Load an encoder by the name of one that ships ("freak", "orb") or the path of a model file.
+
+    Raises:
+        FileNotFoundError: there is no such model.
+        FileError: the file is not a model.
+    """
+    return _load_file(resolve(source))
+
+
+def match_calibration(self: Encoder, dim: int | None = None) -> Acceptance:
+    """How likely a match is right, by the distances to the two nearest landmarks.
+
+    Args:
+        self: the encoder.
+        dim: length of a code, one of `dims`; None: the full length.
+
+    Raises:
+        ValueError: the encoder was not calibrated for codes of this length.
+    """
+    from protomark.acceptance import Acceptance
+
+    return Acceptance.of(self, dim)
+
+
+# The stub of the core declares them (bindings/stub_patterns.txt).
+setattr(Encoder, "load", staticmethod(load))  # noqa: B010
+setattr(Encoder, "match_calibration", match_calibration)  # noqa: B010
