@@ -209,16 +209,9 @@ void each_tile(std::size_t n, const Take& take) {
   std::size_t q = 0;
   for (; q + kTileQueries <= n; q += kTileQueries) take.template operator()<kTileQueries>(q);
   static_assert(kTileQueries == 4);
-  switch (n - q) {
-    case 1:
-      return take.template operator()<1>(q);
-    case 2:
-      return take.template operator()<2>(q);
-    case 3:
-      return take.template operator()<3>(q);
-    default:
-      return;
-  }
+  if (n - q == 1) take.template operator()<1>(q);
+  if (n - q == 2) take.template operator()<2>(q);
+  if (n - q == 3) take.template operator()<3>(q);
 }
 
 template <typename S, int Blocks>
@@ -273,8 +266,10 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   while (b < rows.blocks && found < kHitsEnough) {
     tile.first_row = b * kCodeRows;
     tile.codes = rows.codes + tile.first_row * rows.dim;
-    tile.biases = rows.biases == nullptr ? nullptr : rows.biases + tile.first_row;
-    tile.prefix_biases = rows.prefix_biases + tile.first_row;
+    if (rows.biases != nullptr) {
+      tile.biases = rows.biases + tile.first_row;
+      tile.prefix_biases = rows.prefix_biases + tile.first_row;
+    }
     if (b + S::kBlocks > rows.blocks) {
       found += scan_blocks<S, 1>(tile, queries.n, hits + found);
       b += 1;
@@ -312,7 +307,7 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
 template <typename S>
 void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
                   std::int8_t* codes) {
-  constexpr std::size_t kBytes = sizeof(typename S::Sums::Vector);
+  constexpr std::size_t kBytes = sizeof(S::Sums::v[0]);
   using Bytes = Vector<std::uint8_t, kBytes>;
   using Shorts = Vector<std::uint16_t, kBytes>;
   const auto twice = static_cast<std::uint16_t>(2 * scale);
