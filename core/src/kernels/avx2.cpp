@@ -1,8 +1,7 @@
 // AVX2: x86 since Haswell and Zen.
 #include <immintrin.h>
 
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -126,15 +125,6 @@ struct Avx2 : ByPairs<Avx2, 32> {
 
 }  // namespace
 
-const Kernels avx2 = {.name = "avx2",
-                      .bit_sums = bit_sums<Avx2>,
-                      .bit_sum = bit_sum<Avx2>,
-                      .dense = dense<Avx2>,
-                      .activate16 = activate<Avx2, std::int16_t>,
-                      .activate32 = activate<Avx2, std::int32_t>,
-                      .code_biases = code_biases<Avx2>,
-                      .code_unpack4 = code_unpack4<Avx2>,
-                      .code_scan = code_scan<Avx2>,
-                      .hamming_scan = hamming_scan<Avx2>};
+constinit const Kernels avx2 = kernels_of<Avx2>("avx2");
 
 }  // namespace protomark::kernels

@@ -1,8 +1,7 @@
 // AVX-512 with VBMI, VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
 #include <immintrin.h>
 
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -101,15 +100,6 @@ struct Avx512 {
 
 }  // namespace
 
-const Kernels avx512 = {.name = "avx512",
-                        .bit_sums = bit_sums<Avx512>,
-                        .bit_sum = bit_sum<Avx512>,
-                        .dense = dense<Avx512>,
-                        .activate16 = activate<Avx512, std::int16_t>,
-                        .activate32 = activate<Avx512, std::int32_t>,
-                        .code_biases = code_biases<Avx512>,
-                        .code_unpack4 = code_unpack4<Avx512>,
-                        .code_scan = code_scan<Avx512>,
-                        .hamming_scan = hamming_scan<Avx512>};
+constinit const Kernels avx512 = kernels_of<Avx512>("avx512");
 
 }  // namespace protomark::kernels

@@ -165,8 +165,7 @@ PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
 //   S::near_rows(sums, threshold)  a bit for each row above it
 template <typename S, int Queries, int Blocks, bool HasBiases>
 PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hit* hits) {
-  typename S::Sums acc[Queries][Blocks];
-  [[maybe_unused]] typename S::Sums own_biases[Blocks];
+  typename S::Sums acc[Queries][Blocks], own_biases[Blocks];
   if constexpr (HasBiases) {
     sum_up(t, query, t.biases, t.dim, acc);
   } else {
@@ -179,24 +178,19 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hi
   if (!S::any(any)) [[likely]]
     return 0;
 
-  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows];
+  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows], biases[Blocks][kCodeRows];
 #pragma GCC unroll 8
-  for (int q = 0; q < Queries; ++q) {
+  for (int b = 0; b < Blocks; ++b) {
+    if constexpr (HasBiases) own_biases[b] = load_pack<typename S::Sums>(t.biases + b * kCodeRows);
+    store_pack(biases[b], own_biases[b]);
 #pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) store_pack(halves[q][b], acc[q][b]);
-  }
-  const std::int32_t* biases = t.biases;
-  alignas(64) std::int32_t stored[HasBiases ? 1 : Blocks * kCodeRows];
-  if constexpr (!HasBiases) {
-#pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) store_pack(stored + b * kCodeRows, own_biases[b]);
-    biases = stored;
+    for (int q = 0; q < Queries; ++q) store_pack(halves[q][b], acc[q][b]);
   }
   std::size_t found = 0;
   for (std::size_t q = 0; q < Queries; ++q) {
     for (std::size_t b = 0; b < Blocks; ++b) {
       found += append_hits(S::near_rows(load_pack<typename S::Sums>(halves[q][b]), thresholds[q]),
-                           halves[q][b], biases + b * kCodeRows, t.limits[query + q], query + q,
+                           halves[q][b], biases[b], t.limits[query + q], query + q,
                            t.first_row + b * kCodeRows, hits + found);
     }
   }

@@ -1,8 +1,7 @@
 // NEON with dot products (ARMv8.2 and later): phones since 2018, Apple silicon, Graviton 2.
 #include <arm_neon.h>
 
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -140,15 +139,6 @@ struct Neon {
 
 }  // namespace
 
-const Kernels neon = {.name = "neon",
-                      .bit_sums = bit_sums<Neon>,
-                      .bit_sum = bit_sum<Neon>,
-                      .dense = dense<Neon>,
-                      .activate16 = activate<Neon, std::int16_t>,
-                      .activate32 = activate<Neon, std::int32_t>,
-                      .code_biases = code_biases<Neon>,
-                      .code_unpack4 = code_unpack4<Neon>,
-                      .code_scan = code_scan<Neon>,
-                      .hamming_scan = hamming_scan<Neon>};
+constinit const Kernels neon = kernels_of<Neon>("neon");
 
 }  // namespace protomark::kernels

@@ -89,12 +89,10 @@ class Selection {
   // Compares all queries with centroids from `first` on, a multiple of 16.
   template <typename LimitOf, typename Take>
   void compare(std::size_t first, std::size_t n, const LimitOf& limit_of, const Take& take) {
+    const auto* codes = static_cast<const std::int8_t*>(centroids_.data);
     scan_.compare(
-        codes(first), n, limit_of,
+        codes + packed_size(first, centroids_.dim), n, limit_of,
         [&](std::size_t q, std::int32_t distance, std::size_t i) { take(q, distance, first + i); });
-  }
-  const std::int8_t* codes(std::size_t first) const {
-    return static_cast<const std::int8_t*>(centroids_.data) + packed_size(first, centroids_.dim);
   }
 
   const PackedPrototypes& centroids_;

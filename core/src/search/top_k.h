@@ -86,18 +86,16 @@ class Neighbours {
   std::size_t queries() const { return ids_.size() / k_; }
   std::size_t k() const { return k_; }
   std::int32_t limit(std::size_t query) const { return distances_[query * k_ + k_ - 1]; }
-  TopK operator[](std::size_t query) { return {&ids_[query * k_], &distances_[query * k_], k_}; }
-  const std::int64_t* ids(std::size_t query) const { return &ids_[query * k_]; }
-  const std::int32_t* distances(std::size_t query) const { return &distances_[query * k_]; }
+  TopK operator[](std::size_t query) {
+    return {ids_.data() + query * k_, distances_.data() + query * k_, k_};
+  }
+  const std::int64_t* ids(std::size_t query) const { return ids_.data() + query * k_; }
+  const std::int32_t* distances(std::size_t query) const { return distances_.data() + query * k_; }
 
   Neighbours part(Range queries) const {
     Neighbours result(k_, {});
-    const auto copy = [&](const auto& from, auto& to) {
-      to.assign(from.begin() + static_cast<std::ptrdiff_t>(queries.begin * k_),
-                from.begin() + static_cast<std::ptrdiff_t>(queries.end * k_));
-    };
-    copy(ids_, result.ids_);
-    copy(distances_, result.distances_);
+    result.ids_.assign(ids(queries.begin), ids(queries.end));
+    result.distances_.assign(distances(queries.begin), distances(queries.end));
     return result;
   }
   // Takes what `part`, of the queries from `first` on, has found.
