@@ -38,8 +38,8 @@ std::size_t append_hits(unsigned near, const std::int32_t* halves, const std::in
   return found;
 }
 
-// Whether to compare the dimension prefix (PackedCodes::prefix) first. That pays where it leaves
-// few queries; where it does not, some steps are compared in full before it is tried again.
+// Decides whether to compare the dimension prefix (PackedCodes::prefix) first. That pays if it
+// leaves few queries; if not, some steps are compared in full before it is tried again.
 class Prefix {
  public:
   Prefix(const CodeQueries& queries, const PackedCodes& rows)
@@ -71,8 +71,8 @@ class Prefix {
   std::int32_t thresholds_[kScanQueries];
 };
 
-// Queries, and rows from one on that they are compared with.
-//   S::Step              4 dimensions of a query, as S reads them best
+// Queries, and the rows from one on to compare them with.
+//   S::Step               4 dimensions of a query, as S reads them best
 template <typename S>
 struct CodeTile {
   const typename S::Step* queries;
@@ -117,8 +117,8 @@ PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std:
   }
 }
 
-// The same over all dimensions of rows whose biases are computed on the way. Rows are read in
-// order, which memory is fastest at.
+// The same over all dimensions, and the biases on the way. Reads rows in order, as memory is
+// fastest at that.
 //   S::Norms              sums for the biases of 16 rows: add(codes), biases()
 template <typename S, int Queries, int Blocks>
 PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query,
@@ -147,7 +147,7 @@ PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query
   }
 }
 
-// Where the rows of some blocks may be hits.
+// Tells whether some blocks may have hits.
 //   S::Flags              of above(sums, threshold), joined by |, asked by any()
 //   S::max(a, b)          where S compares several blocks at a time
 template <typename S, int Blocks>
@@ -317,7 +317,7 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
         const auto bytes = load<Bytes>(packed + i);
         store(codes + i, level(s % 2 == 0 ? bytes & 15 : bytes >> 4));
       }
-      // Go on where both halves of the bytes were read, or there is no second half.
+      // Go on once both halves of the bytes were read, or if there is no second half.
       if (s % 2 == 1 || s + 1 == steps) packed += 4 * kCodeRows;
     }
     for (std::size_t i = 4 * kCodeRows; last != ~0u && i > 0; i -= 4) {

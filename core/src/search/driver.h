@@ -1,5 +1,5 @@
-// What every search shares: how it is divided among threads, its loop over the hits of a kernel,
-// and how it gives its answer.
+// What exact, inverted-list and Hamming search share: how they are divided among threads, their
+// loop over the hits of a kernel, and how they write their answer.
 #pragma once
 
 #include <algorithm>
@@ -17,13 +17,13 @@
 
 namespace protomark {
 
-// Ranges of queries, each times ranges of work: of rows, or of lists.
+// How many ranges of queries, each with how many ranges of work (rows, or lists), a search has.
 struct Division {
   std::size_t query_ranges = 1;
   std::size_t work_ranges = 1;
 
-  // Queries are divided first, as those of a range share the work on each row that does not depend
-  // on the query; if they are too few for all threads, rows are divided as well.
+  // Divides the queries first, as those of a range share the work on each row that does not depend
+  // on the query. If they are too few for all threads, divides the rows as well.
   static Division of_rows(int threads, std::size_t queries, std::size_t rows) {
     constexpr std::size_t kQueries = 64, kRows = 4096;
     if (threads <= 1 || queries == 0) return {};
@@ -32,7 +32,7 @@ struct Division {
     const std::size_t work_ranges = std::min(divide_up(n, query_ranges), divide_up(rows, kRows));
     return {query_ranges, std::max<std::size_t>(work_ranges, 1)};
   }
-  // All queries go through their lists together, so that they share the reading of a list.
+  // Divides only the probes, as all queries of a list share the reading of it.
   static Division of_lists(int threads, std::size_t probes) {
     constexpr std::size_t kProbes = 64;
     if (threads <= 1) return {};
@@ -70,9 +70,9 @@ void run_search(int threads, const Division& division, std::size_t work, Neighbo
   });
 }
 
-// The loop over the hits of n queries among the rows of a chunk. `kernel(first, n, limits, &block,
-// hits)` scans for some queries from block on; take(query, distance, row) gets those that are
-// within limit_of(query), which may become smaller by it.
+// Visits the hits of n queries among the rows of a chunk. kernel(first, n, limits, &block, hits)
+// scans for some queries from a block on. take(query, distance, row) gets the rows within
+// limit_of(query), which it may tighten.
 template <typename Kernel, typename LimitOf, typename Take>
 void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel& kernel,
               const LimitOf& limit_of, const Take& take) {
@@ -85,7 +85,7 @@ void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel&
       const std::size_t found = kernel(first, group, limits, &block, hits);
       for (std::size_t i = 0; i < found; ++i) {
         const kernels::Hit& hit = hits[i];
-        // Hits before it may have left no room for it.
+        // Earlier hits may have tightened the limit.
         if (hit.row >= rows || hit.distance > limits[hit.query]) continue;
         take(first + hit.query, hit.distance, hit.row);
         limits[hit.query] = limit_of(first + hit.query);

@@ -1,5 +1,4 @@
-// Selects the lists that queries look into. TopK is for a few neighbours, here they may be
-// hundreds.
+// Selects the lists nearest to queries. TopK serves a few neighbours, here they may be hundreds.
 
 #include <algorithm>
 
@@ -9,10 +8,10 @@
 namespace protomark {
 namespace {
 
-// One block of centroids in so many, or fewer, is a sample that tells how near the nearest ones
-// are: by the distance of at most about so many of them.
-constexpr std::size_t kLeastStep = 16, kMostRank = 64;
-// Up to here a heap of the nearest is faster than selection.
+// A sample of one block of centroids in kMinStep or more limits the distance of the nearest ones,
+// by that of about its kMaxRank-th nearest at most.
+constexpr std::size_t kMinStep = 16, kMaxRank = 64;
+// Up to so many lists a heap is faster than selection.
 constexpr std::size_t kFewProbes = 16;
 // Queries that are compared with the centroids together.
 constexpr std::size_t kBatch = 256;
@@ -61,7 +60,7 @@ class Selection {
  private:
   // Sets limits that are likely to leave some more than `nprobe` centroids.
   void guess_limits(std::size_t nprobe) {
-    const std::size_t step = std::max(kLeastStep, nprobe * 3 / 2 / kMostRank);
+    const std::size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxRank);
     const std::size_t rank = nprobe * 3 / 2 / step + 5;
     Neighbours sample(rank, limits_);
     for (std::size_t row = 0; row < centroids_.rows; row += step * kPackedRows) {
