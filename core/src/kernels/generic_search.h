@@ -301,7 +301,7 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
 template <typename S>
 void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
                   std::int8_t* codes) {
-  constexpr std::size_t kBytes = sizeof(S::Sums::v[0]);
+  constexpr std::size_t kBytes = sizeof(S::Sums::v[0]), kStep = 4 * kCodeRows;
   using Bytes = Vector<std::uint8_t, kBytes>;
   using Shorts = Vector<std::uint16_t, kBytes>;
   const auto twice = static_cast<std::uint16_t>(2 * scale);
@@ -312,15 +312,16 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
   const std::uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
   const std::size_t steps = (dim + 3) / 4;
   for (std::size_t b = 0; b < blocks; ++b) {
-    for (std::size_t s = 0; s < steps; ++s, codes += 4 * kCodeRows) {
-      for (std::size_t i = 0; i < 4 * kCodeRows; i += kBytes) {
+    for (std::size_t s = 0; s < steps; s += 2, packed += kStep) {
+      const bool two = s + 1 < steps;
+      for (std::size_t i = 0; i < kStep; i += kBytes) {
         const auto bytes = load<Bytes>(packed + i);
-        store(codes + i, level(s % 2 == 0 ? bytes & 15 : bytes >> 4));
+        store(codes + i, level(bytes & 15));
+        if (two) store(codes + kStep + i, level(bytes >> 4));
       }
-      // Go on once both halves of the bytes were read, or if there is no second half.
-      if (s % 2 == 1 || s + 1 == steps) packed += 4 * kCodeRows;
+      codes += two ? 2 * kStep : kStep;
     }
-    for (std::size_t i = 4 * kCodeRows; last != ~0u && i > 0; i -= 4) {
+    for (std::size_t i = kStep; last != ~0u && i > 0; i -= 4) {
       store(codes - i, load<std::uint32_t>(codes - i) & last);
     }
   }
