@@ -1,8 +1,7 @@
 // AVX2: x86 since Haswell and Zen.
 #include <immintrin.h>
 
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -29,31 +28,19 @@ struct Avx2 : ByPairs<Avx2, 32> {
   static constexpr int kDenseBatch = 4;
   static constexpr int kDenseGroups = 1;
 
-  static __m256i load_ints(const std::int32_t* sums) { return load<__m256i>(sums); }
-  static __m256i load_ints(const std::int16_t* sums) {
-    return _mm256_cvtepi16_epi32(load<__m128i>(sums));
-  }
-  struct Factors {
-    __m256i bias, even, odd;
-  };
-  static Factors factors(const std::int32_t* bias, const std::int32_t* multipliers) {
-    const auto even = load<__m256i>(multipliers);
-    return {load<__m256i>(bias), even, _mm256_srli_epi64(even, 32)};
-  }
-  struct Rounding {
-    __m256i half;
-    __m128i shift;
-  };
-  static Rounding rounding(int shift) {
-    return {_mm256_set1_epi64x(std::int64_t{1} << (shift - 1)), _mm_cvtsi32_si128(shift - 32)};
+  static Ints load_ints(const std::int32_t* sums) { return load<Ints>(sums); }
+  static Ints load_ints(const std::int16_t* sums) {
+    return (Ints)_mm256_cvtepi16_epi32(load<__m128i>(sums));
   }
   // The upper halves of 64-bit products.
-  static __m256i scaled(__m256i sums, const Factors& f, const Rounding& r) {
-    const __m256i s = _mm256_add_epi32(sums, f.bias);
-    const __m256i even = _mm256_add_epi64(_mm256_mul_epi32(s, f.even), r.half);
-    const __m256i odd = _mm256_add_epi64(_mm256_mul_epi32(_mm256_srli_epi64(s, 32), f.odd), r.half);
+  static Ints scaled(Ints sums, Ints bias, Ints multipliers, int shift) {
+    const auto s = (__m256i)(sums + bias), m = (__m256i)multipliers;
+    const __m256i half = _mm256_set1_epi64x(std::int64_t{1} << (shift - 1));
+    const __m256i even = _mm256_add_epi64(_mm256_mul_epi32(s, m), half);
+    const __m256i odd = _mm256_add_epi64(
+        _mm256_mul_epi32(_mm256_srli_epi64(s, 32), _mm256_srli_epi64(m, 32)), half);
     const __m256i upper = _mm256_blend_epi32(_mm256_srli_epi64(even, 32), odd, 0b10101010);
-    return _mm256_sra_epi32(upper, r.shift);
+    return (Ints)_mm256_sra_epi32(upper, _mm_cvtsi32_si128(shift - 32));
   }
   // Looks bytes up in 256 entries, 16 at a time: in step k of each half, only bytes that are not
   // negative after 16 k was taken away choose an entry. Entries are stored as differences to those
@@ -66,11 +53,12 @@ struct Avx2 : ByPairs<Avx2, 32> {
         if (k % 8 != 0) steps_[k] = _mm256_xor_si256(steps_[k], part(entries + 16 * (k - 1)));
       }
     }
-    __m256i operator()(__m256i a, __m256i b, __m256i c, __m256i d) const {
+    __m256i operator()(Ints a, Ints b, Ints c, Ints d) const {
       // Packing works within each 128 bits.
       const __m256i order = _mm256_set_epi32(7, 3, 6, 2, 5, 1, 4, 0);
-      __m256i t = _mm256_permutevar8x32_epi32(
-          _mm256_packs_epi16(_mm256_packs_epi32(a, b), _mm256_packs_epi32(c, d)), order);
+      const __m256i low = _mm256_packs_epi32((__m256i)a, (__m256i)b);
+      const __m256i high = _mm256_packs_epi32((__m256i)c, (__m256i)d);
+      __m256i t = _mm256_permutevar8x32_epi32(_mm256_packs_epi16(low, high), order);
       __m256i below = _mm256_xor_si256(t, _mm256_set1_epi8(-128));
       __m256i result = _mm256_setzero_si256();
       for (int k = 0; k < 8; ++k) {
@@ -137,15 +125,6 @@ struct Avx2 : ByPairs<Avx2, 32> {
 
 }  // namespace
 
-const Kernels avx2 = {.name = "avx2",
-                      .bit_sums = bit_sums<Avx2>,
-                      .bit_sum = bit_sum<Avx2>,
-                      .dense = dense<Avx2>,
-                      .activate16 = activate<Avx2, std::int16_t>,
-                      .activate32 = activate<Avx2, std::int32_t>,
-                      .code_biases = code_biases<Avx2>,
-                      .code_unpack4 = code_unpack4<Avx2>,
-                      .code_scan = code_scan<Avx2>,
-                      .hamming_scan = hamming_scan<Avx2>};
+constinit const Kernels avx2 = kernels_of<Avx2>("avx2");
 
 }  // namespace protomark::kernels

@@ -1,8 +1,7 @@
 // AVX-512 with VBMI, VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
 #include <immintrin.h>
 
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -27,41 +26,31 @@ struct Avx512 {
   static constexpr int kDenseBatch = 8;
   static constexpr int kDenseGroups = 2;
 
-  static __m512i load_ints(const std::int32_t* sums) { return load<__m512i>(sums); }
-  static __m512i load_ints(const std::int16_t* sums) {
-    return _mm512_cvtepi16_epi32(load<__m256i>(sums));
-  }
-  struct Factors {
-    __m512i bias, even, odd;
-  };
-  static Factors factors(const std::int32_t* bias, const std::int32_t* multipliers) {
-    const auto even = load<__m512i>(multipliers);
-    return {load<__m512i>(bias), even, _mm512_srli_epi64(even, 32)};
-  }
-  struct Rounding {
-    __m512i half;
-    __m128i shift;
-  };
-  static Rounding rounding(int shift) {
-    return {_mm512_set1_epi64(std::int64_t{1} << (shift - 1)), _mm_cvtsi32_si128(shift - 32)};
+  static Ints load_ints(const std::int32_t* sums) { return load<Ints>(sums); }
+  static Ints load_ints(const std::int16_t* sums) {
+    return (Ints)_mm512_cvtepi16_epi32(load<__m256i>(sums));
   }
   // The upper halves of 64-bit products.
-  static __m512i scaled(__m512i sums, const Factors& f, const Rounding& r) {
-    const __m512i s = _mm512_add_epi32(sums, f.bias);
-    const __m512i even = _mm512_add_epi64(_mm512_mul_epi32(s, f.even), r.half);
-    const __m512i odd = _mm512_add_epi64(_mm512_mul_epi32(_mm512_srli_epi64(s, 32), f.odd), r.half);
-    return _mm512_sra_epi32(_mm512_mask_shuffle_epi32(odd, 0x5555, even, _MM_PERM_DDBB), r.shift);
+  static Ints scaled(Ints sums, Ints bias, Ints multipliers, int shift) {
+    const auto s = (__m512i)(sums + bias), m = (__m512i)multipliers;
+    const __m512i half = _mm512_set1_epi64(std::int64_t{1} << (shift - 1));
+    const __m512i even = _mm512_add_epi64(_mm512_mul_epi32(s, m), half);
+    const __m512i odd = _mm512_add_epi64(
+        _mm512_mul_epi32(_mm512_srli_epi64(s, 32), _mm512_srli_epi64(m, 32)), half);
+    const __m512i upper = _mm512_mask_shuffle_epi32(odd, 0x5555, even, _MM_PERM_DDBB);
+    return (Ints)_mm512_sra_epi32(upper, _mm_cvtsi32_si128(shift - 32));
   }
   class Table {
    public:
     explicit Table(const std::uint8_t* bytes) {
       for (int q = 0; q < 4; ++q) table_[q] = load<__m512i>(bytes + 64 * q);
     }
-    __m512i operator()(__m512i a, __m512i b, __m512i c, __m512i d) const {
+    __m512i operator()(Ints a, Ints b, Ints c, Ints d) const {
       // Packing works within each 128 bits.
       const __m512i order = _mm512_set_epi32(15, 11, 7, 3, 14, 10, 6, 2, 13, 9, 5, 1, 12, 8, 4, 0);
-      const __m512i t = _mm512_permutexvar_epi32(
-          order, _mm512_packs_epi16(_mm512_packs_epi32(a, b), _mm512_packs_epi32(c, d)));
+      const __m512i low = _mm512_packs_epi32((__m512i)a, (__m512i)b);
+      const __m512i high = _mm512_packs_epi32((__m512i)c, (__m512i)d);
+      const __m512i t = _mm512_permutexvar_epi32(order, _mm512_packs_epi16(low, high));
       // The lower 7 bits choose in each half of the table, the sign bit the half.
       const __m512i above = _mm512_permutex2var_epi8(table_[2], t, table_[3]);
       const __m512i below = _mm512_permutex2var_epi8(table_[0], t, table_[1]);
@@ -111,15 +100,6 @@ struct Avx512 {
 
 }  // namespace
 
-const Kernels avx512 = {.name = "avx512",
-                        .bit_sums = bit_sums<Avx512>,
-                        .bit_sum = bit_sum<Avx512>,
-                        .dense = dense<Avx512>,
-                        .activate16 = activate<Avx512, std::int16_t>,
-                        .activate32 = activate<Avx512, std::int32_t>,
-                        .code_biases = code_biases<Avx512>,
-                        .code_unpack4 = code_unpack4<Avx512>,
-                        .code_scan = code_scan<Avx512>,
-                        .hamming_scan = hamming_scan<Avx512>};
+constinit const Kernels avx512 = kernels_of<Avx512>("avx512");
 
 }  // namespace protomark::kernels

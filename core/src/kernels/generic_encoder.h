@@ -111,26 +111,27 @@ void dense(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x
 
 // Only for shifts of 32 and more.
 //   S::Ints               a vector of 32-bit numbers: load_ints() from either kind of sums
-//   S::scaled(sums, factors(bias, multipliers), rounding(shift))  the numbers before they are
-//                         clamped, for as many outputs
+//   S::scaled(sums, bias, multipliers, shift)  the numbers before they are clamped
 //   S::Table(bytes)       256 bytes: table(t, u, v, w) clamps numbers to int8 and looks them up
 template <typename S, typename Sum>
 void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
               std::size_t stride) {
   using Ints = typename S::Ints;
-  constexpr std::size_t kLanes = sizeof(Ints) / 4, kParts = kOutputs / kLanes;
+  constexpr std::size_t kLanes = sizeof(Ints) / 4;
   const typename S::Table table(a.table);
-  const typename S::Rounding rounding = S::rounding(a.shift);
-  typename S::Factors factors[kParts];
-  for (std::size_t p = 0; p < kParts; ++p) {
-    factors[p] = S::factors(a.bias + p * kLanes, a.multipliers + p * kLanes);
-  }
-  for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
-    for (std::size_t p = 0; p < kParts; p += 4) {
+  const int shift = a.shift;
+  for (std::size_t o = 0; o < kOutputs; o += 4 * kLanes) {
+    Ints bias[4], multipliers[4];
+    for (std::size_t q = 0; q < 4; ++q) {
+      bias[q] = load<Ints>(a.bias + o + q * kLanes);
+      multipliers[q] = load<Ints>(a.multipliers + o + q * kLanes);
+    }
+    for (std::size_t i = 0; i < n; ++i) {
       const auto part = [&](std::size_t q) {
-        return S::scaled(S::load_ints(sums + q * kLanes), factors[q], rounding);
+        const Sum* some = sums + i * kOutputs + o + q * kLanes;
+        return S::scaled(S::load_ints(some), bias[q], multipliers[q], shift);
       };
-      store(next + p * kLanes, table(part(p), part(p + 1), part(p + 2), part(p + 3)));
+      store(next + i * stride + o, table(part(0), part(1), part(2), part(3)));
     }
   }
 }

@@ -38,8 +38,8 @@ std::size_t append_hits(unsigned near, const std::int32_t* halves, const std::in
   return found;
 }
 
-// Whether to compare the dimension prefix (PackedCodes::prefix) first. That pays where it leaves
-// few queries; where it does not, some steps are compared in full before it is tried again.
+// Decides whether to compare the dimension prefix (PackedCodes::prefix) first. That pays if it
+// leaves few queries; if not, some steps are compared in full before it is tried again.
 class Prefix {
  public:
   Prefix(const CodeQueries& queries, const PackedCodes& rows)
@@ -71,8 +71,8 @@ class Prefix {
   std::int32_t thresholds_[kScanQueries];
 };
 
-// Queries, and rows from one on that they are compared with.
-//   S::Step              4 dimensions of a query, as S reads them best
+// Queries, and the rows from one on to compare them with.
+//   S::Step               4 dimensions of a query, as S reads them best
 template <typename S>
 struct CodeTile {
   const typename S::Step* queries;
@@ -117,8 +117,8 @@ PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std:
   }
 }
 
-// The same over all dimensions of rows whose biases are computed on the way. Rows are read in
-// order, which memory is fastest at.
+// The same over all dimensions, and the biases on the way. Reads rows in order, as memory is
+// fastest at that.
 //   S::Norms              sums for the biases of 16 rows: add(codes), biases()
 template <typename S, int Queries, int Blocks>
 PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query,
@@ -147,7 +147,7 @@ PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query
   }
 }
 
-// Where the rows of some blocks may be hits.
+// Tells whether some blocks may have hits.
 //   S::Flags              of above(sums, threshold), joined by |, asked by any()
 //   S::max(a, b)          where S compares several blocks at a time
 template <typename S, int Blocks>
@@ -165,8 +165,7 @@ PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
 //   S::near_rows(sums, threshold)  a bit for each row above it
 template <typename S, int Queries, int Blocks, bool HasBiases>
 PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hit* hits) {
-  typename S::Sums acc[Queries][Blocks];
-  [[maybe_unused]] typename S::Sums own_biases[Blocks];
+  typename S::Sums acc[Queries][Blocks], own_biases[Blocks];
   if constexpr (HasBiases) {
     sum_up(t, query, t.biases, t.dim, acc);
   } else {
@@ -179,24 +178,19 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hi
   if (!S::any(any)) [[likely]]
     return 0;
 
-  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows];
+  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows], biases[Blocks][kCodeRows];
 #pragma GCC unroll 8
-  for (int q = 0; q < Queries; ++q) {
+  for (int b = 0; b < Blocks; ++b) {
+    if constexpr (HasBiases) own_biases[b] = load_pack<typename S::Sums>(t.biases + b * kCodeRows);
+    store_pack(biases[b], own_biases[b]);
 #pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) store_pack(halves[q][b], acc[q][b]);
-  }
-  const std::int32_t* biases = t.biases;
-  alignas(64) std::int32_t stored[HasBiases ? 1 : Blocks * kCodeRows];
-  if constexpr (!HasBiases) {
-#pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) store_pack(stored + b * kCodeRows, own_biases[b]);
-    biases = stored;
+    for (int q = 0; q < Queries; ++q) store_pack(halves[q][b], acc[q][b]);
   }
   std::size_t found = 0;
   for (std::size_t q = 0; q < Queries; ++q) {
     for (std::size_t b = 0; b < Blocks; ++b) {
       found += append_hits(S::near_rows(load_pack<typename S::Sums>(halves[q][b]), thresholds[q]),
-                           halves[q][b], biases + b * kCodeRows, t.limits[query + q], query + q,
+                           halves[q][b], biases[b], t.limits[query + q], query + q,
                            t.first_row + b * kCodeRows, hits + found);
     }
   }
@@ -209,16 +203,9 @@ void each_tile(std::size_t n, const Take& take) {
   std::size_t q = 0;
   for (; q + kTileQueries <= n; q += kTileQueries) take.template operator()<kTileQueries>(q);
   static_assert(kTileQueries == 4);
-  switch (n - q) {
-    case 1:
-      return take.template operator()<1>(q);
-    case 2:
-      return take.template operator()<2>(q);
-    case 3:
-      return take.template operator()<3>(q);
-    default:
-      return;
-  }
+  if (n - q == 1) take.template operator()<1>(q);
+  if (n - q == 2) take.template operator()<2>(q);
+  if (n - q == 3) take.template operator()<3>(q);
 }
 
 template <typename S, int Blocks>
@@ -273,8 +260,10 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   while (b < rows.blocks && found < kHitsEnough) {
     tile.first_row = b * kCodeRows;
     tile.codes = rows.codes + tile.first_row * rows.dim;
-    tile.biases = rows.biases == nullptr ? nullptr : rows.biases + tile.first_row;
-    tile.prefix_biases = rows.prefix_biases + tile.first_row;
+    if (rows.biases != nullptr) {
+      tile.biases = rows.biases + tile.first_row;
+      tile.prefix_biases = rows.prefix_biases + tile.first_row;
+    }
     if (b + S::kBlocks > rows.blocks) {
       found += scan_blocks<S, 1>(tile, queries.n, hits + found);
       b += 1;
@@ -312,7 +301,7 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
 template <typename S>
 void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
                   std::int8_t* codes) {
-  constexpr std::size_t kBytes = sizeof(typename S::Sums::Vector);
+  constexpr std::size_t kBytes = sizeof(S::Sums::v[0]), kStep = 4 * kCodeRows;
   using Bytes = Vector<std::uint8_t, kBytes>;
   using Shorts = Vector<std::uint16_t, kBytes>;
   const auto twice = static_cast<std::uint16_t>(2 * scale);
@@ -323,15 +312,16 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
   const std::uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
   const std::size_t steps = (dim + 3) / 4;
   for (std::size_t b = 0; b < blocks; ++b) {
-    for (std::size_t s = 0; s < steps; ++s, codes += 4 * kCodeRows) {
-      for (std::size_t i = 0; i < 4 * kCodeRows; i += kBytes) {
+    for (std::size_t s = 0; s < steps; s += 2, packed += kStep) {
+      const bool two = s + 1 < steps;
+      for (std::size_t i = 0; i < kStep; i += kBytes) {
         const auto bytes = load<Bytes>(packed + i);
-        store(codes + i, level(s % 2 == 0 ? bytes & 15 : bytes >> 4));
+        store(codes + i, level(bytes & 15));
+        if (two) store(codes + kStep + i, level(bytes >> 4));
       }
-      // Go on where both halves of the bytes were read, or there is no second half.
-      if (s % 2 == 1 || s + 1 == steps) packed += 4 * kCodeRows;
+      codes += two ? 2 * kStep : kStep;
     }
-    for (std::size_t i = 4 * kCodeRows; last != ~0u && i > 0; i -= 4) {
+    for (std::size_t i = kStep; last != ~0u && i > 0; i -= 4) {
       store(codes - i, load<std::uint32_t>(codes - i) & last);
     }
   }

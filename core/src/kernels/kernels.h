@@ -18,9 +18,9 @@ inline constexpr std::size_t kWordRows = 8;
 // The encoder works on blocks of 64 outputs; layers are padded to whole blocks.
 inline constexpr std::size_t kOutputs = 64;
 
-// What follows the sums of 64 outputs: with s = sum + bias[o],
+// What follows the sums of 64 outputs: with s = sum + bias[o], which fits 32 bits,
 //   next = table[clamp((s * multipliers[o] + 2^(shift - 1)) >> shift, -128, 127) + 128].
-// s fits 32 bits, multipliers are positive.
+// Multipliers are positive.
 struct Activation {
   const std::int32_t* bias;
   const std::int32_t* multipliers;
@@ -37,7 +37,7 @@ struct Hit {
 
 // Queries that a scan takes at a time, so that they share its loads.
 inline constexpr std::size_t kScanQueries = 16;
-// Up to so many queries a scan computes the biases itself, which costs less than to read them.
+// Up to so many queries a scan computes the biases itself: that costs less than to read them.
 inline constexpr std::size_t kFewQueries = 4;
 // A scan pauses once it has this many hits, so that the caller can tighten the limits. Its last
 // step may exceed that by what kScanQueries queries can hit in 64 rows.
@@ -109,8 +109,7 @@ struct Kernels {
   void (*activate32)(const Activation& activation, const std::int32_t* sums, std::size_t n,
                      std::uint8_t* next, std::size_t stride) = nullptr;
 
-  // The numbers that code_scan of the same set starts from: for each row, one over all dimensions
-  // and one over the prefix.
+  // Computes what code_scan of the same set starts from, for all dimensions and for the prefix.
   void (*code_biases)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
                       std::size_t prefix, std::int32_t* biases,
                       std::int32_t* prefix_biases) = nullptr;
@@ -122,7 +121,7 @@ struct Kernels {
   void (*code_unpack4)(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
                        std::int8_t* codes) = nullptr;
 
-  // Finds all rows with |p|^2 - 2 p . q <= limits[q], and that value, from block *block on. Stops
+  // Finds the rows with |p|^2 - 2 p . q <= limits[q], and that value, from block *block on. Stops
   // at the end, or after a step that brings kHitsEnough hits; *block is then where to go on.
   // Returns the number of hits, which are in no order.
   std::size_t (*code_scan)(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
@@ -133,8 +132,8 @@ struct Kernels {
                               std::size_t* block, Hit* hits) = nullptr;
 };
 
-// The best set that this CPU runs, or the one that the environment variable PROTOMARK_ISA
-// names. Throws std::invalid_argument where that is unknown or does not run here.
+// The best set that this CPU runs, or the one that the environment variable PROTOMARK_ISA names.
+// Throws std::invalid_argument if that is unknown or does not run here.
 const Kernels& active();
 
 // The set of that name, or nullptr if it is not built in or does not run on this CPU.

@@ -1,8 +1,7 @@
 // NEON with dot products (ARMv8.2 and later): phones since 2018, Apple silicon, Graviton 2.
 #include <arm_neon.h>
 
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -58,25 +57,14 @@ struct Neon {
   using Ints = int32x4_t;
   static Ints load_ints(const std::int32_t* sums) { return vld1q_s32(sums); }
   static Ints load_ints(const std::int16_t* sums) { return vmovl_s16(vld1_s16(sums)); }
-  struct Factors {
-    int32x4_t bias, multipliers;
-  };
-  static Factors factors(const std::int32_t* bias, const std::int32_t* multipliers) {
-    return {vld1q_s32(bias), vld1q_s32(multipliers)};
-  }
-  struct Rounding {
-    int64x2_t half;
-    int32x4_t shift;
-  };
-  static Rounding rounding(int shift) {
-    return {vdupq_n_s64(std::int64_t{1} << (shift - 1)), vdupq_n_s32(32 - shift)};
-  }
   // The upper halves of 64-bit products.
-  static Ints scaled(Ints sums, const Factors& f, const Rounding& r) {
-    const int32x4_t s = vaddq_s32(sums, f.bias);
-    const int64x2_t low = vmull_s32(vget_low_s32(s), vget_low_s32(f.multipliers));
-    const int64x2_t high = vmull_high_s32(s, f.multipliers);
-    return vshlq_s32(vaddhn_high_s64(vaddhn_s64(low, r.half), high, r.half), r.shift);
+  static Ints scaled(Ints sums, Ints bias, Ints multipliers, int shift) {
+    const int32x4_t s = vaddq_s32(sums, bias);
+    const int64x2_t half = vdupq_n_s64(std::int64_t{1} << (shift - 1));
+    const int64x2_t low = vmull_s32(vget_low_s32(s), vget_low_s32(multipliers));
+    const int64x2_t high = vmull_high_s32(s, multipliers);
+    const int32x4_t upper = vaddhn_high_s64(vaddhn_s64(low, half), high, half);
+    return vshlq_s32(upper, vdupq_n_s32(32 - shift));
   }
   class Table {
    public:
@@ -151,15 +139,6 @@ struct Neon {
 
 }  // namespace
 
-const Kernels neon = {.name = "neon",
-                      .bit_sums = bit_sums<Neon>,
-                      .bit_sum = bit_sum<Neon>,
-                      .dense = dense<Neon>,
-                      .activate16 = activate<Neon, std::int16_t>,
-                      .activate32 = activate<Neon, std::int32_t>,
-                      .code_biases = code_biases<Neon>,
-                      .code_unpack4 = code_unpack4<Neon>,
-                      .code_scan = code_scan<Neon>,
-                      .hamming_scan = hamming_scan<Neon>};
+constinit const Kernels neon = kernels_of<Neon>("neon");
 
 }  // namespace protomark::kernels

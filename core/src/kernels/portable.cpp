@@ -1,6 +1,5 @@
 // For every machine: 128-bit vectors as GCC and Clang translate them to what the target has.
-#include "kernels/generic_encoder.h"
-#include "kernels/generic_search.h"
+#include "kernels/generic.h"
 
 namespace protomark::kernels {
 namespace {
@@ -25,6 +24,20 @@ struct Portable : ByPairs<Portable, 16> {
   using Step = std::uint8_t[4];
   static constexpr int kDenseBatch = 1;
   static constexpr int kDenseGroups = 1;
+  // For shifts of any size. Rounds half up; s * multiplier is below 2^62, so adding 2^61 at most
+  // cannot overflow.
+  template <typename Sum>
+  static void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
+                       std::size_t stride) {
+    const std::int64_t half = std::int64_t{1} << (a.shift - 1);
+    for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
+      for (std::size_t o = 0; o < kOutputs; ++o) {
+        const std::int64_t s = std::int64_t{sums[o]} + a.bias[o];
+        const std::int64_t t = (s * a.multipliers[o] + half) >> a.shift;
+        next[o] = a.table[t < -128 ? 0 : t > 127 ? 255 : t + 128];
+      }
+    }
+  }
 
   static constexpr std::size_t kBlocks = 1;
   using Flags = Ints;
@@ -69,31 +82,8 @@ struct Portable : ByPairs<Portable, 16> {
   }
 };
 
-// Rounds half up. s * multiplier is below 2^62, so adding 2^61 at most cannot overflow.
-template <typename Sum>
-void activate_any_shift(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t* next,
-                        std::size_t stride) {
-  const std::int64_t half = std::int64_t{1} << (a.shift - 1);
-  for (std::size_t i = 0; i < n; ++i, sums += kOutputs, next += stride) {
-    for (std::size_t o = 0; o < kOutputs; ++o) {
-      const std::int64_t s = std::int64_t{sums[o]} + a.bias[o];
-      const std::int64_t t = (s * a.multipliers[o] + half) >> a.shift;
-      next[o] = a.table[t < -128 ? 0 : t > 127 ? 255 : t + 128];
-    }
-  }
-}
-
 }  // namespace
 
-const Kernels portable = {.name = "portable",
-                          .bit_sums = bit_sums<Portable>,
-                          .bit_sum = bit_sum<Portable>,
-                          .dense = dense<Portable>,
-                          .activate16 = activate_any_shift<std::int16_t>,
-                          .activate32 = activate_any_shift<std::int32_t>,
-                          .code_biases = code_biases<Portable>,
-                          .code_unpack4 = code_unpack4<Portable>,
-                          .code_scan = code_scan<Portable>,
-                          .hamming_scan = hamming_scan<Portable>};
+constinit const Kernels portable = kernels_of<Portable>("portable");
 
 }  // namespace protomark::kernels

@@ -33,7 +33,6 @@ void store(void* p, const V& v) {
 // Vectors that are used as one.
 template <typename V, int N>
 struct Pack {
-  using Vector = V;
   static constexpr std::size_t kLanes = N * sizeof(V) / sizeof(V{}[0]);
   V v[N];
 

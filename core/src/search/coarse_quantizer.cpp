@@ -16,10 +16,10 @@ namespace {
 
 constexpr int kIterations = 8;
 constexpr std::size_t kGroupProbes = 4;
-// Codes whose lists are looked for at a time.
+// Codes that are assigned at a time.
 constexpr std::size_t kAssignChunk = 1 << 14;
 
-// The id that find(codes, ids, distances) finds for each code.
+// Returns the id that find(codes, ids, distances) finds for each code.
 template <typename Find>
 std::vector<std::uint32_t> nearest_ids(Codes codes, const Find& find) {
   std::vector<std::uint32_t> result(codes.rows);
@@ -36,8 +36,8 @@ std::vector<std::uint32_t> nearest_ids(Codes codes, const Find& find) {
   return result;
 }
 
-// Centroids without codes take one code each of the largest lists.
-void refill(Codes codes, std::vector<std::uint32_t> list_of,
+// Gives each centroid without codes one code of the largest lists.
+void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
             const std::vector<std::uint32_t>& counts, std::vector<std::int8_t>& centroids) {
   const std::size_t nlist = counts.size(), dim = codes.columns;
   std::vector<std::uint32_t> first(nlist + 1, 0), members(codes.rows);
@@ -45,7 +45,7 @@ void refill(Codes codes, std::vector<std::uint32_t> list_of,
   std::vector<std::uint32_t> next(first.begin(), first.end() - 1);
   for (std::uint32_t i = 0; i < codes.rows; ++i) members[next[list_of[i]]++] = i;
   struct Large {
-    std::size_t share;  // codes for each centroid that the list has got
+    std::size_t share;  // codes per centroid that the list has got
     std::size_t list;
     std::size_t parts;
     bool operator<(const Large& other) const {
@@ -129,7 +129,7 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
   };
   const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
   const ListOrder order(assign(group_centroids), groups);
-  // A group that is nearest to no centroid, as centroids of a broken file might have, is left out.
+  // Leave out groups that are nearest to no centroid, as a broken file may have them.
   std::vector<std::int8_t> used;
   for (std::size_t g = 0; g < groups; ++g) {
     if (order.sizes[g] == 0) continue;
@@ -160,12 +160,12 @@ std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t d
                                            std::size_t row_bytes) {
   const auto n = static_cast<double>(prototypes), k = static_cast<double>(packed_dim(dim));
   constexpr double kBytes = 4;
-  // A sealed map has what docs/format.md has: landmarks of rows, the recall table, and for each
-  // list its centroid, its number of rows and half a block of padding, somewhat rounded up.
+  // A sealed map stores the landmark of each row, the recall table, and for each list its centroid,
+  // its number of rows and half a block of padding, somewhat rounded up.
   const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
   const double sealed = (n * (kBytes - std::bit_width(prototypes) / 8.0) - table) / (9.5 * k + 4);
-  // A learning map has for each list its centroid three times and some numbers, half a block of
-  // rows and half of the 12 bytes of a block.
+  // A learning map keeps for each list its centroid three times, some numbers, half a block of rows
+  // and half of the 12 bytes of a block.
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
   const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
   const double nlist = std::min({4 * std::sqrt(n), sealed, learning});

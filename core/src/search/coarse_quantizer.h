@@ -1,5 +1,4 @@
-// The coarse quantizer of an inverted file: centroids of lists, learned from the prototypes of a
-// map.
+// The centroids of inverted lists, learned from the prototypes of a map.
 #pragma once
 
 #include <cstddef>
@@ -24,10 +23,10 @@ class CoarseQuantizer {
   CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim);
   // Learns by Lloyd's k-means, in integers; `nlist` is at most the number of codes.
   static CoarseQuantizer learn(Codes codes, std::size_t nlist, int threads);
-  // A number of lists for that many prototypes, so small that the index of a learning map, in which
-  // a row takes `row_bytes`, and that of a sealed one take at most 4 bytes a prototype.
+  // Returns a number of lists so small that the index takes at most 4 bytes per prototype, both in
+  // a learning map, where a row takes `row_bytes`, and in a sealed one.
   static std::size_t default_nlist(std::size_t prototypes, std::size_t dim, std::size_t row_bytes);
-  // Prototypes that suffice to learn so many lists.
+  // How many prototypes suffice to learn so many lists.
   static std::size_t sample_size(std::size_t nlist) { return 48 * nlist; }
 
   std::size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }

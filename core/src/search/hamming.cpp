@@ -15,7 +15,7 @@ namespace {
 
 using kernels::kWordRows;
 
-// Packs some rows as the kernels want them (kernels.h), the last word of each with zeros behind it.
+// Packs some rows as kernels::PackedWords, the last word of each padded with zeros.
 void pack(Descriptors database, Range rows, std::size_t words, std::uint64_t* packed) {
   const std::size_t rest = database.columns % 8;
   for (std::size_t i = 0; i < rows.size(); ++i) {
@@ -43,13 +43,11 @@ void check(Descriptors queries, Descriptors database) {
   if (database.rows > UINT32_MAX) throw std::invalid_argument("the database has over 2^32 rows");
 }
 
-// Compares queries with some rows of the database and calls offer(places of a query, distance,
-// row).
+// Compares queries with some rows, and calls offer(places of a query, distance, row).
 template <typename Offer>
 void scan(Descriptors queries, Descriptors database, Range rows, Neighbours& nearest,
           const Offer& offer) {
-  // Descriptors that are packed at a time and then compared with all queries; they stay in the L1
-  // cache.
+  // So much is packed and then compared with all queries, from the L1 cache.
   constexpr std::size_t kChunkBytes = 16384;
   const std::size_t words = (queries.columns + 7) / 8;
   std::vector<std::uint64_t> query_words(queries.rows * words, 0);

@@ -5,7 +5,7 @@
 namespace protomark {
 namespace {
 
-// Queries that go through the lists together. For more of them the probes would take much memory.
+// Queries that go through the lists together; the probes of more would take much memory.
 constexpr std::size_t kQueries = 1 << 14;
 
 // A list that a query looks into.
@@ -14,7 +14,7 @@ struct Probe {
   std::uint32_t query;
 };
 
-// Probes `first` to `last` of each query's `nprobe` nearest lists, sorted by list.
+// Returns those of a range of each query's `nprobe` nearest lists, sorted by list.
 std::vector<Probe> sorted_probes(const std::vector<std::uint32_t>& nearest, std::size_t nprobe,
                                  Range range, std::size_t nlist) {
   const std::size_t queries = nearest.size() / nprobe;
@@ -70,7 +70,7 @@ void search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists
     const std::vector<std::uint32_t> nearest_to =
         nearest_lists(centroids, prepared, nprobe, options.threads);
     Neighbours nearest = prepared.places(ids.columns, options);
-    // The nearest list first: it leaves little that others have to offer.
+    // The nearest list goes first, as it leaves little for the others to find.
     for (const Range& range : {Range{0, 1}, Range{1, nprobe}}) {
       const std::vector<Probe> probes = sorted_probes(nearest_to, nprobe, range, lists.nlist());
       run_search(options.threads, Division::of_lists(options.threads, probes.size()), probes.size(),

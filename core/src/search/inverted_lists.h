@@ -1,4 +1,4 @@
-// Approximate search: in the inverted lists whose centroids are nearest to a query.
+// Approximate search in the inverted lists whose centroids are nearest to a query.
 #pragma once
 
 #include <cstddef>
@@ -23,7 +23,7 @@ class InvertedLists {
   std::size_t rows(std::uint32_t list) const {
     return chained_ != nullptr ? chained_->rows(list) : rows_[list];
   }
-  // The blocks of a list, in order, into `blocks`; all are full but the last one.
+  // Sets `blocks` to those of a list, in order; all are full but the last one.
   void read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const;
 
  private:
@@ -38,8 +38,8 @@ std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
                                          const PreparedCodes& queries, std::size_t nprobe,
                                          int threads);
 
-// As search_exact, but in the `nprobe` lists (at least 1) nearest to each query, ties to the
-// smaller list; exactly if these are all. Prototype i of `centroids` is the centroid of list i.
+// Searches as search_exact does, but only in the `nprobe` lists (at least 1) nearest to each query,
+// ties to the smaller list. Prototype i of `centroids` is the centroid of list i.
 void search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
                   const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
                   const SearchOptions& options, MatrixView<std::int64_t> ids,

@@ -10,8 +10,8 @@
 
 namespace protomark {
 
-// A list is a chain of blocks of kPackedRows rows, all full but the last one, so that kernels scan
-// it and 12 bytes a block are all it costs. Every block has a row.
+// A list is a chain of blocks of kPackedRows rows, all full but the last one. So kernels scan it,
+// and it costs 12 bytes per block. No block is empty.
 class ListBlocks {
  public:
   static constexpr std::uint32_t kNone = UINT32_MAX;
@@ -67,8 +67,8 @@ class ListBlocks {
     }
     return last(list);
   }
-  // Removes the last row of a list. If that empties its block, the caller must move the rows of the
-  // last of all blocks there; returns the emptied block, else kNone.
+  // Removes the last row of a list. If that empties its block, returns the block, where the caller
+  // must move the rows of the last of all blocks; else kNone.
   std::uint32_t pop(std::uint32_t list) {
     List& l = lists_[list];
     if (--l.rows % kPackedRows != 0) return kNone;

@@ -1,5 +1,4 @@
-// Selects the lists that queries look into. TopK is for a few neighbours, here they may be
-// hundreds.
+// Selects the lists nearest to queries. TopK serves a few neighbours, here they may be hundreds.
 
 #include <algorithm>
 
@@ -9,10 +8,10 @@
 namespace protomark {
 namespace {
 
-// One block of centroids in so many, or fewer, is a sample that tells how near the nearest ones
-// are: by the distance of at most about so many of them.
-constexpr std::size_t kLeastStep = 16, kMostRank = 64;
-// Up to here a heap of the nearest is faster than selection.
+// A sample of one block of centroids in kMinStep or more limits the distance of the nearest ones,
+// by that of about its kMaxRank-th nearest at most.
+constexpr std::size_t kMinStep = 16, kMaxRank = 64;
+// Up to so many lists a heap is faster than selection.
 constexpr std::size_t kFewProbes = 16;
 // Queries that are compared with the centroids together.
 constexpr std::size_t kBatch = 256;
@@ -61,7 +60,7 @@ class Selection {
  private:
   // Sets limits that are likely to leave some more than `nprobe` centroids.
   void guess_limits(std::size_t nprobe) {
-    const std::size_t step = std::max(kLeastStep, nprobe * 3 / 2 / kMostRank);
+    const std::size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxRank);
     const std::size_t rank = nprobe * 3 / 2 / step + 5;
     Neighbours sample(rank, limits_);
     for (std::size_t row = 0; row < centroids_.rows; row += step * kPackedRows) {
@@ -89,12 +88,10 @@ class Selection {
   // Compares all queries with centroids from `first` on, a multiple of 16.
   template <typename LimitOf, typename Take>
   void compare(std::size_t first, std::size_t n, const LimitOf& limit_of, const Take& take) {
+    const auto* codes = static_cast<const std::int8_t*>(centroids_.data);
     scan_.compare(
-        codes(first), n, limit_of,
+        codes + packed_size(first, centroids_.dim), n, limit_of,
         [&](std::size_t q, std::int32_t distance, std::size_t i) { take(q, distance, first + i); });
-  }
-  const std::int8_t* codes(std::size_t first) const {
-    return static_cast<const std::int8_t*>(centroids_.data) + packed_size(first, centroids_.dim);
   }
 
   const PackedPrototypes& centroids_;

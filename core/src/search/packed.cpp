@@ -1,5 +1,6 @@
 #include "search/packed.h"
 
+#include <algorithm>
 #include <cstring>
 
 #include "kernels/kernels.h"
@@ -55,7 +56,7 @@ void BlockReader::copy(std::size_t first_block, std::size_t n, std::int8_t* code
 }
 
 std::int8_t* BlockReader::room(std::size_t blocks) {
-  room_.resize(blocks * code_bytes_ / sizeof(CodeVector));
+  room_.resize(std::max(room_.size(), blocks * code_bytes_ / sizeof(CodeVector)));
   return reinterpret_cast<std::int8_t*>(room_.data());
 }
 

@@ -50,8 +50,8 @@ struct alignas(64) CodeVector {
 // Packs int8 codes.
 std::vector<CodeVector> pack_codes(Codes codes);
 
-// Which landmark each row is of. At most one of the first three is set; if none is, each row is a
-// landmark.
+// Says which landmark each row is of. At most one of the first three members is set; if none is,
+// row i is landmark i.
 struct RowLandmarks {
   const LandmarkIndex* of_row = nullptr;
   // Number of rows of each landmark, at least 1; a landmark's rows follow each other.
@@ -59,7 +59,7 @@ struct RowLandmarks {
   std::function<LandmarkIndex(Row)> look_up;
   // Rows of this landmark and of those behind it are padding.
   LandmarkIndex end = kNoLandmark;
-  // The id of each landmark; a negative one says that its rows are padding. nullptr: its index.
+  // The id of each landmark, negative if its rows are padding. nullptr: ids are indices.
   const std::int64_t* ids = nullptr;
 };
 
@@ -76,8 +76,9 @@ class BlockReader {
  public:
   explicit BlockReader(const PackedPrototypes& prototypes);
 
-  // The codes of these blocks, one after the other, until the next call. sq4 numbers are unpacked
-  // into the cache once for all queries, so that memory is read at 4 bits a number.
+  // Returns the codes of these blocks, one after the other; they are there until the next call. sq4
+  // numbers are unpacked into the cache, once for all queries, so that memory is read at 4 bits a
+  // number.
   const std::int8_t* read(std::size_t first_block, std::size_t n);
   const std::int8_t* read(std::span<const std::uint32_t> blocks);
 

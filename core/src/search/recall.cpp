@@ -10,9 +10,8 @@
 namespace protomark {
 namespace {
 
-// Codes as far from these as observations are from the prototypes of their landmarks: the
-// difference of two others has twice the variance of all, 0.4 of it 0.32 times; observations of the
-// encoders that ship have 0.2 to 0.5 times.
+// Moves codes as far as observations are from their prototypes, by 0.4 of the difference of two
+// others: that has 0.32 times the variance of all codes, observations have 0.2 to 0.5 times.
 std::vector<std::int8_t> like_observations(Codes codes) {
   std::vector<std::int8_t> result(codes.rows * codes.columns);
   for (std::size_t i = 0; i < codes.rows; ++i) {
@@ -26,7 +25,7 @@ std::vector<std::int8_t> like_observations(Codes codes) {
   return result;
 }
 
-// owner(q) is the landmark that is not to be found.
+// owner(q) is the landmark that query q must not find.
 template <typename Owner>
 RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& quantizer,
                     const SearchTwo& search_two, const ListOf& list_of) {
@@ -34,12 +33,12 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
   std::vector<std::int64_t> ids(2 * n);
   std::vector<std::int32_t> distances(2 * n);
   search_two(queries, {ids.data(), n, 2}, {distances.data(), n, 2});
-  // The list in which a query's landmark is, and how far away its centroid is.
+  // The list of the landmark that a query looks for, and how far away its centroid is.
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
   std::vector<std::int32_t> limits(n, INT32_MIN);
   for (std::size_t q = 0; q < n; ++q) {
-    // Where others are as near, the owner need not be the first, or among the two.
+    // If others are as near, the owner may come second, or not at all.
     const std::int64_t nearest = ids[2 * q] == owner(q) ? ids[2 * q + 1] : ids[2 * q];
     if (nearest < 0) continue;
     lists[q] = list_of(nearest, queries.row(q));
@@ -49,8 +48,7 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
       limits[q] += centroid[d] * (centroid[d] - 2 * queries.row(q)[d]);
     }
   }
-  // Count the lists up to that one.
-  RecallTable table(n, 0);
+  RecallTable table(n, 0);  // the lists up to that one
   const PackedPrototypes centroids = quantizer.packed();
   CodeScan(prepared, {0, n})
       .compare(
@@ -69,8 +67,8 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
 std::vector<std::size_t> test_rows(std::size_t rows) {
   const std::size_t n = std::min(rows, kTestQueries);
   std::vector<std::size_t> result(n);
-  // Multiples of the golden ratio are as even, and in no step with the rows that lists are learned
-  // from.
+  // Multiples of the golden ratio are evenly spread, but in no step with the rows that lists are
+  // learned from.
   for (std::size_t i = 0; i < n; ++i) {
     const std::uint64_t x = (i + 1) * std::uint64_t{0x9e3779b97f4a7c15};
     result[i] = static_cast<std::size_t>((x >> 32) * rows >> 32);
@@ -94,7 +92,7 @@ RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& ow
 
 std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlist) {
   if (recall >= 1 || table.empty()) return nlist;
-  // The share that n test queries show is uncertain: two standard errors on top.
+  // Add two standard errors, as the share that n test queries show is uncertain.
   const auto n = static_cast<double>(table.size());
   const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
   if (enough > n) return nlist;

@@ -1,4 +1,4 @@
-// How many inverted lists have to be searched for a recall, as measured on a map.
+// Tells how many inverted lists to search for a recall, as measured on a map.
 #pragma once
 
 #include <cstddef>
@@ -12,19 +12,18 @@
 
 namespace protomark {
 
-// For each of some test queries, the number of lists that had to be searched until its nearest
-// landmark was found; ascending.
+// For each of some test queries, how many lists had to be searched until its nearest landmark was
+// found; ascending.
 using RecallTable = std::vector<std::uint32_t>;
 
-// The table of a learning map, and of which lists and after how many changes of the map.
+// The table of a learning map, with the version of its lists and the changes up to then.
 struct MeasuredRecall {
   RecallTable table;
   std::size_t lists_version = 0;
   std::size_t changes = 0;
 };
 
-// The rows of a map that are taken as test queries: evenly spread over `rows`, at most
-// kTestQueries.
+// Returns at most kTestQueries of `rows`, evenly spread, that serve as test queries.
 inline constexpr std::size_t kTestQueries = 2048;
 std::vector<std::size_t> test_rows(std::size_t rows);
 
@@ -33,15 +32,15 @@ using SearchTwo = std::function<void(Codes, MatrixView<std::int64_t>, MatrixView
 // The list of the prototype of a landmark that is nearest to a query.
 using ListOf = std::function<std::uint32_t(std::int64_t landmark, const std::int8_t* query)>;
 
-// Test queries are of two kinds: prototypes of the map itself, which look for the nearest prototype
-// of another landmark (owners[i] is the landmark of prototype i), as keypoints do whose landmark is
-// not in the map; and codes as far from these prototypes as observations are, which look for any,
-// and in a dense map find it harder. The larger number of each share counts.
+// Asks two kinds of test queries. Prototypes of the map, of the landmarks `owners`, look for the
+// nearest prototype of another landmark, as keypoints do whose landmark is not in the map. Codes as
+// far from these prototypes as observations are look for any landmark, which is harder in a dense
+// map. Of each share the larger number counts.
 RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& owners,
                            const CoarseQuantizer& quantizer, const SearchTwo& search_two,
                            const ListOf& list_of);
 
-// Lists to search for a recall above 0 and at most 1; all of them for 1.
+// Returns how many lists to search for a recall above 0 and at most 1; all of them for 1.
 std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlist);
 
 // Checks `recall` and `nprobe` of a search in a map of `nlist` lists. Returns nullopt for an exact

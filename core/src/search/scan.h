@@ -86,19 +86,19 @@ class CodeScan {
   std::vector<std::int32_t> biases_, prefix_biases_;
 };
 
-// Offers landmarks of rows to the places of queries. For one thread.
+// Offers the landmarks of rows to the places of queries. For one thread.
 class LandmarkReader {
  public:
   explicit LandmarkReader(const RowLandmarks& landmarks) : landmarks_(landmarks) {}
 
-  // Rows of this chunk come next. If only numbers of rows are known, chunks must ascend.
+  // Announces the rows that come next. With RowLandmarks::row_counts, chunks must ascend.
   void start_chunk(std::size_t first_row, std::size_t rows) {
     first_row_ = first_row;
     rows_ = rows;
     of_chunk_.clear();
   }
 
-  // Does nothing if the row is padding.
+  // Does nothing if the row is padding. A filter of landmarks would stand here, too.
   void offer(TopK best, std::int32_t distance, Row row) {
     const LandmarkIndex landmark = landmark_of(row);
     if (landmark >= landmarks_.end) return;
@@ -156,8 +156,7 @@ class PrototypeScan {
 
   // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16.
   void scan(Range rows);
-  // Compares some queries with the rows of some blocks, `rows` of them: all blocks but the last one
-  // are full.
+  // Compares some queries with the `rows` rows of some blocks, all of them full but the last.
   void scan(std::span<const std::uint32_t> queries, std::span<const std::uint32_t> blocks,
             std::size_t rows);
 
@@ -168,9 +167,8 @@ class PrototypeScan {
   Neighbours& nearest_;
 };
 
-// Finds the nearest landmarks of all prototypes (protomark/search.h). `options` are those of an
-// exact search, whatever recall and nprobe say. Throws std::invalid_argument if the arguments do
-// not fit.
+// Finds the nearest landmarks among all prototypes (protomark/search.h), whatever options.recall
+// and options.nprobe say. Throws std::invalid_argument if the arguments do not fit.
 void search_exact(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
                   MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances);
 

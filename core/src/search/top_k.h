@@ -16,18 +16,18 @@ struct Range {
   std::size_t size() const { return end - begin; }
 };
 
-// The places of one query, in arrays of others. Empty places have id -1, which is behind all other
-// ids, and the limit as their distance.
+// The places of one query, in the caller's arrays. Empty places have id -1, which counts as larger
+// than all others, and the limit as their distance.
 class TopK {
  public:
   TopK(std::int64_t* ids, std::int32_t* distances, std::size_t k)
       : ids_(ids), distances_(distances), k_(k) {}
 
-  // What a candidate must not exceed to have a chance.
+  // The distance that a candidate must not exceed.
   std::int32_t limit() const { return distances_[k_ - 1]; }
 
-  // Takes a candidate whose id has not been offered before. Most searches ask for one or two
-  // places, which need no loop.
+  // Takes a candidate whose id has not been offered before. One or two places, which most searches
+  // ask for, need no loop.
   void offer(std::int32_t distance, std::int64_t id) {
     if (k_ > 2) {
       if (before(distance, id, k_ - 1)) insert(distance, id, k_ - 1);
@@ -86,18 +86,16 @@ class Neighbours {
   std::size_t queries() const { return ids_.size() / k_; }
   std::size_t k() const { return k_; }
   std::int32_t limit(std::size_t query) const { return distances_[query * k_ + k_ - 1]; }
-  TopK operator[](std::size_t query) { return {&ids_[query * k_], &distances_[query * k_], k_}; }
-  const std::int64_t* ids(std::size_t query) const { return &ids_[query * k_]; }
-  const std::int32_t* distances(std::size_t query) const { return &distances_[query * k_]; }
+  TopK operator[](std::size_t query) {
+    return {ids_.data() + query * k_, distances_.data() + query * k_, k_};
+  }
+  const std::int64_t* ids(std::size_t query) const { return ids_.data() + query * k_; }
+  const std::int32_t* distances(std::size_t query) const { return distances_.data() + query * k_; }
 
   Neighbours part(Range queries) const {
     Neighbours result(k_, {});
-    const auto copy = [&](const auto& from, auto& to) {
-      to.assign(from.begin() + static_cast<std::ptrdiff_t>(queries.begin * k_),
-                from.begin() + static_cast<std::ptrdiff_t>(queries.end * k_));
-    };
-    copy(ids_, result.ids_);
-    copy(distances_, result.distances_);
+    result.ids_.assign(ids(queries.begin), ids(queries.end));
+    result.distances_.assign(distances(queries.begin), distances(queries.end));
     return result;
   }
   // Takes what `part`, of the queries from `first` on, has found.
