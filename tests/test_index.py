@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import protomark as pm
+from allocation import allocated_bytes
 from conftest import balanced_encoder
 from map_container import SEALED_MAP, Section, container, sections
 from protomark import sample
-from protomark.bench.machine import allocated_bytes
 from protomark.build import build_file, build_map
 from protomark.evaluation.protocol import split
 from protomark.info import describe

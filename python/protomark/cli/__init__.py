@@ -7,22 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.bench import bench
 from protomark.cli.build import build
 from protomark.cli.calibrate import calibrate
 from protomark.cli.demo import demo
 from protomark.cli.evaluate import evaluate
-from protomark.cli.evaluate_mapping import evaluate_mapping
 from protomark.cli.info import info
 from protomark.cli.join import join
 from protomark.cli.localize import localize
 from protomark.cli.map import map_
-from protomark.cli.reproduce import reproduce
+from protomark.cli.plugins import CommandGroup
 from protomark.cli.split import split
 from protomark.cli.tracks import tracks
 from protomark.cli.train import train
 
 app = typer.Typer(
+    cls=CommandGroup,
     help="One small integer prototype per landmark instead of all its binary descriptors.",
     no_args_is_help=True,
     add_completion=False,
@@ -41,9 +40,6 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "info": info,
     "demo": demo,
     "evaluate": evaluate,
-    "evaluate-mapping": evaluate_mapping,
-    "reproduce": reproduce,
-    "bench": bench,
 }
 for name, command in _COMMANDS.items():
     app.command(name)(command)

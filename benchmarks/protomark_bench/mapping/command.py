@@ -1,0 +1,249 @@
+"""What `protomark evaluate-mapping` does: runs of the pipeline and of COLMAP, and a report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.progress import Progress, TaskID
+from threadpoolctl import threadpool_limits
+
+import protomark as pm
+from protomark.console import progress_bar, progress_console
+from protomark.evaluation.scene_plot import view_from_above
+from protomark.mapping.settings import Settings
+from protomark.tracks.colmap import pycolmap
+from protomark_bench import machine
+from protomark_bench.cache import ResultCache, key_of
+from protomark_bench.mapping import colmap, pipeline
+from protomark_bench.mapping.results import (
+    COLMAP,
+    PROTOTYPES,
+    TRADITIONAL,
+    MappedSequence,
+    MappingResults,
+    MappingRun,
+)
+from protomark_bench.mapping.sequences import ImageSequence, error, open_sequences
+
+# Name -> memory and dimensions, as `protomark map` takes them.
+MEMORIES = {
+    TRADITIONAL: ("descriptors", 32),
+    "medoid": ("medoids", 32),
+    PROTOTYPES: ("prototypes", 32),
+    "prototypes-16": ("prototypes", 16),
+}
+
+
+@dataclass(frozen=True)
+class MappingRequest:
+    """What is asked for.
+
+    Attributes:
+        sequences: folders with images/ and sparse/.
+        output: folder of the cache.
+        memories: names of `MEMORIES`.
+        descriptor, encoder, max_keypoints: as `protomark map` takes them.
+        colmap: whether COLMAP runs beside them.
+        every: take every n-th image only.
+        frames: take the first so many of them only; 0: all.
+        threads: of every run.
+        command: the command line, as the report tells it.
+    """
+
+    sequences: Sequence[Path]
+    output: Path
+    memories: Sequence[str]
+    descriptor: str = "akaze"
+    encoder: str = ""
+    max_keypoints: int = 2000
+    colmap: bool = True
+    every: int = 1
+    frames: int = 0
+    threads: int = 1
+    command: str = "protomark evaluate-mapping"
+
+    def settings(self, memory: str) -> Settings:
+        """How to make a map with a memory."""
+        kind, dim = MEMORIES[memory]
+        return Settings(
+            descriptor=self.descriptor,
+            encoder=self.encoder,
+            max_keypoints=self.max_keypoints,
+            memory=kind,
+            dim=dim,
+        )
+
+
+def choose_memories(text: str) -> list[str]:
+    """The memories of a list such as traditional,medoid, in the order of tables; empty: all.
+
+    Raises:
+        ValueError: there is no memory of some name.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in MEMORIES:
+            raise ValueError(f"there is no memory {name!r}: choose from {', '.join(MEMORIES)}")
+    return [name for name in MEMORIES if not names or name in names]
+
+
+def evaluate_mapping(request: MappingRequest) -> MappingResults:
+    """Runs every memory on every sequence.
+
+    Raises:
+        FileNotFoundError, ValueError: a sequence is missing or broken.
+    """
+    sequences = open_sequences(request.sequences, request.every, request.frames)
+    cache = ResultCache(request.output / "cache")
+    cv2.setNumThreads(request.threads)
+    runs: dict[str, dict[str, MappingRun]] = {s.name: {} for s in sequences}
+    interrupted = False
+    with threadpool_limits(limits=1, user_api="blas"):
+        try:
+            _make_runs(request, sequences, cache, runs)
+        except KeyboardInterrupt:
+            interrupted = True
+    order = [*request.memories, *([COLMAP] if request.colmap else [])]
+    results = MappingResults(
+        [_mapped(s, {m: runs[s.name][m] for m in order if m in runs[s.name]}) for s in sequences],
+        [f"{s.name}, {m}" for s in sequences for m in order if m not in runs[s.name]],
+        _conditions(request),
+    )
+    if interrupted:
+        results.report().publish(request.output)
+        raise KeyboardInterrupt
+    return results
+
+
+def _mapped(s: ImageSequence, runs: dict[str, MappingRun]) -> MappedSequence:
+    """The runs on a sequence, with their errors."""
+    true, other = s.centers, runs.get(TRADITIONAL)
+    for memory, run in runs.items():
+        errors = None
+        if other is not None:
+            own = error(run.centers, true, other.centers)
+            others = error(other.centers, true, run.centers)
+            errors = None if own is None or others is None else (own, others)
+        runs[memory] = replace(run, error=error(run.centers, true), common_errors=errors)
+    plane = view_from_above(np.array(list(s.poses.values()))).tolist()
+    return MappedSequence(s.name, len(s.source), s.available, s.truth, s.extent, runs, true, plane)
+
+
+@dataclass(frozen=True)
+class _MappingJob:
+    """One run that is not cached yet; `run` takes a function that shows the share that is done."""
+
+    sequence: ImageSequence
+    memory: str
+    key: str
+    run: Callable[[Callable[[float], None]], MappingRun]
+
+
+def _make_runs(
+    request: MappingRequest,
+    sequences: list[ImageSequence],
+    cache: ResultCache,
+    runs: dict[str, dict[str, MappingRun]],
+) -> None:
+    """Fills in sequence -> memory -> its run, from the cache or made now."""
+    jobs = []
+    for sequence in sequences:
+        for job in _jobs(request, sequence):
+            found = _cached(cache, job.key)
+            if found is None:
+                jobs.append(job)
+            else:
+                runs[sequence.name][job.memory] = found
+    with progress_bar() as bar:
+        task = bar.add_task("mapping", total=sum(len(job.sequence.source) for job in jobs))
+        for job in jobs:
+            made = job.run(_advancing(bar, task, job))
+            cache.save(job.key, asdict(made))
+            runs[job.sequence.name][job.memory] = made
+            progress_console.print(
+                f"{job.sequence.name}, {job.memory}: {made.registered} of "
+                f"{len(job.sequence.source)} frames, {made.wall_seconds:.0f} s",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+
+def _advancing(bar: Progress, task: TaskID, job: _MappingJob) -> Callable[[float], None]:
+    before = bar.tasks[0].completed
+    bar.update(task, description=f"{job.sequence.name}, {job.memory}")
+
+    def advance(share: float) -> None:
+        bar.update(task, completed=before + round(share * len(job.sequence.source)))
+
+    return advance
+
+
+def _jobs(request: MappingRequest, sequence: ImageSequence) -> list[_MappingJob]:
+    files = [(n, (sequence.source.path / n).stat().st_size) for n in sequence.source.names]
+    shared = {
+        "sequence": sequence.name,
+        "camera": sequence.camera.as_dict(),
+        "files": files,
+        "threads": request.threads,
+    }
+    jobs = []
+    for memory in request.memories:
+        settings = request.settings(memory)
+        encoder = pm.Encoder.load(settings.encoder or settings.descriptor)
+        code = pipeline.code_digest()
+        key = key_of(mapping=code, settings=asdict(settings), encoder=encoder.identity, **shared)
+
+        def mapped(
+            advance: Callable[[float], None], memory: str = memory, settings: Settings = settings
+        ) -> MappingRun:
+            done = 0
+
+            def one_more() -> None:
+                nonlocal done
+                done += 1
+                advance(done / len(sequence.source))
+
+            return pipeline.run(sequence, memory, settings, request.threads, one_more)
+
+        jobs.append(_MappingJob(sequence, memory, key, mapped))
+    if request.colmap:
+        key = key_of(colmap=pycolmap.__version__, exhaustive=colmap.EXHAUSTIVE, **shared)
+
+        def reconstructed(advance: Callable[[float], None]) -> MappingRun:
+            return colmap.run(sequence, request.threads, advance)
+
+        jobs.append(_MappingJob(sequence, COLMAP, key, reconstructed))
+    return jobs
+
+
+def _cached(cache: ResultCache, key: str) -> MappingRun | None:
+    found = cache.load(key)
+    try:
+        return None if found is None else MappingRun.from_dict(found)
+    except (KeyError, TypeError):
+        return None
+
+
+def _conditions(request: MappingRequest) -> dict[str, str]:
+    taken = f"every {request.every}th image" if request.every > 1 else "every image"
+    limit = f"the first {request.frames} of them" if request.frames else "to the end"
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    return {
+        "scale": f"{taken}, {limit}",
+        "pipeline": f"{request.descriptor.upper()}, at most {request.max_keypoints} keypoints an "
+        f"image, window of {Settings().window} keyframes; poses unknown, camera known and fixed",
+        "COLMAP": "SIFT on the CPU, its default options but with any distortion, camera known and "
+        f"fixed; of more than {colmap.EXHAUSTIVE} images pairs are matched that lie up to ten "
+        "apart or a power of two"
+        if request.colmap
+        else "left out",
+        "time": f"CPU seconds of the process, {request.threads} thread(s); load of the machine at "
+        f"the end {load:.1f}",
+        **machine.describe("opencv-contrib-python-headless", "pycolmap", "numpy"),
+        "again": f"`{request.command}`",
+    }

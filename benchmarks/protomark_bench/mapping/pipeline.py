@@ -1,0 +1,230 @@
+"""One run of the pipeline on one sequence, and whether its prototypes drift.
+
+All that this distribution takes from `protomark.mapping` stands in this file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import protomark as pm
+from protomark import mapping
+from protomark.localization.absolute_pose import centre
+from protomark.mapping.clock import Clock
+from protomark.mapping.mapper import Mapper, Picture
+from protomark.mapping.memory import Prototypes
+from protomark.mapping.settings import Settings
+from protomark.mapping.source import Folder
+from protomark.mapping.summary import summarise
+from protomark.tracks.features import Extractor
+from protomark_bench.mapping.results import Drift, MappingRun
+from protomark_bench.mapping.sequences import ImageSequence
+
+Ids = NDArray[np.int64]
+# Frames whose search of the whole map is timed, and how often each; the quickest counts.
+_TIMED_FRAMES, _TIMES = 9, 3
+_COUNT_LIMIT = 255  # observations that a prototype counts before it is halved
+
+
+def code_digest() -> str:
+    """A digest of the pipeline's code: cached runs of other code are not used."""
+    digest = hashlib.sha256(pm.__version__.encode())
+    for path in sorted(Path(mapping.__path__[0]).glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def run(
+    sequence: ImageSequence,
+    memory: str,
+    settings: Settings,
+    threads: int,
+    advance: Callable[[], None] = lambda: None,
+) -> MappingRun:
+    """Maps a sequence, its poses unknown and its camera known.
+
+    Args:
+        sequence: the images.
+        memory: name of what the settings say.
+        settings: of the map.
+        threads: threads to search and adjust on.
+        advance: called after each frame.
+    """
+    begin = time.perf_counter()
+    mapper = Mapper(settings, sequence.camera, threads)
+    # Time that other programs on the machine take does not count.
+    mapper.clock = Clock(time.process_time)
+    for picture in sequence.source.pictures():
+        _record(mapper)
+        mapper.add(picture)
+        advance()
+
+    def again(names: set[str], backward: bool) -> Iterable[Picture]:
+        return sequence.source.pictures(only=names, backward=backward)
+
+    mapper.finish(again)
+    wall = time.perf_counter() - begin
+    facts = summarise(mapper)
+    entries = list(mapper.history.entries.values())
+    frames = mapper.structure.frames
+    recorded = isinstance(mapper.memory, RecordedPrototypes) and frames
+    return MappingRun(
+        memory=memory,
+        registered=len(frames),
+        landmarks=facts["landmarks"],
+        observations=facts["observations"],
+        memory_bytes=facts["memory_bytes"],
+        peak_bytes=max(e.memory_bytes for e in entries),
+        peak_window_bytes=max(e.memory_bytes + e.window_bytes for e in entries),
+        learning_bytes=facts["open_map_bytes"],
+        seconds=facts["seconds"],
+        wall_seconds=wall,
+        search_ms=_search_ms(mapper, sequence) if facts["landmarks"] > 1 else None,
+        error_pixels=facts["reprojection_error_mean"],
+        not_registered={why: len(names) for why, names in facts["not_registered"].items()},
+        events=facts["events"],
+        drift=measure_drift(mapper, mapper.memory, sequence.source) if recorded else None,
+        centers={f.name: [float(f"{x:.6g}") for x in centre(f.pose)] for f in frames},
+        growth=[e.memory_bytes for e in entries],
+    )
+
+
+def _record(mapper: Mapper) -> None:
+    """Replaces a memory of prototypes that is still empty by one that records its input."""
+    memory = mapper.memory
+    if type(memory) is Prototypes and not len(memory.map):
+        mapper.memory = RecordedPrototypes(memory.encoder, memory.dim)
+
+
+def _search_ms(mapper: Mapper, sequence: ImageSequence) -> float:
+    """Median over frames spread over the sequence."""
+    names = sequence.source.names
+    chosen = {names[i] for i in np.linspace(0, len(names) - 1, _TIMED_FRAMES).astype(int)}
+    extractor = Extractor(mapper.settings.descriptor, mapper.settings.max_keypoints)
+    found = []
+    for picture in sequence.source.pictures(only=chosen):
+        if picture.image is None:
+            continue
+        descriptors = extractor(picture.image).descriptors
+        times = []
+        for _ in range(_TIMES):
+            begin = time.process_time()
+            mapper.memory.search(mapper.memory.encode(descriptors), mapper.threads)
+            times.append(time.process_time() - begin)
+        found.append(1e3 * min(times))
+    return float(np.median(found)) if found else 0.0
+
+
+class RecordedPrototypes(Prototypes):
+    """A memory of prototypes that records what was done to it, so that the map can be made again.
+
+    Recording costs next to nothing while frames come in; `observations` replays the record later.
+    """
+
+    def __init__(self, encoder: pm.Encoder, dim: int) -> None:
+        super().__init__(encoder, dim)
+        self._record: list[tuple[str, Ids, NDArray[Any]]] = []
+
+    def add(self, ids: Ids, encoded: NDArray[Any]) -> None:
+        """See `Memory.add`."""
+        super().add(ids, encoded)
+        self._record.append(("add", ids.copy(), encoded.copy()))
+
+    def remove(self, ids: Ids, encoded: NDArray[Any]) -> None:
+        """See `Memory.remove`."""
+        super().remove(ids, encoded)
+        self._record.append(("subtract", ids.copy(), encoded.copy()))
+
+    def merge(self, into: Ids, source: Ids) -> None:
+        """See `Memory.merge`."""
+        super().merge(into, source)
+        self._record.append(("merge", into.copy(), source.copy()))
+
+    def discard(self, ids: Ids) -> None:
+        """See `Memory.discard`."""
+        super().discard(ids)
+        self._record.append(("remove", ids.copy(), ids[:0]))
+
+    def observations(self) -> tuple[Ids, NDArray[np.int8]]:
+        """Landmark (n,) and code (n, dim) of all observations that are in the prototypes."""
+        codes: dict[int, list[bytes]] = {}
+        for what, ids, given in self._record:
+            if what == "remove":
+                for i in ids.tolist():
+                    codes.pop(i, None)
+            elif what == "merge":
+                for into, source in zip(ids.tolist(), given.tolist(), strict=True):
+                    codes.setdefault(into, []).extend(codes.pop(source, []))
+            else:
+                for i, code in zip(ids.tolist(), given, strict=True):
+                    if what == "add":
+                        codes.setdefault(i, []).append(code.tobytes())
+                    else:
+                        codes[i].remove(code.tobytes())
+        ids = np.repeat(np.array(list(codes), np.int64), [len(c) for c in codes.values()])
+        joined = b"".join(code for one in codes.values() for code in one)
+        return ids, np.frombuffer(joined, np.int8).reshape(-1, self.dim)
+
+
+def measure_drift(mapper: Mapper, memory: RecordedPrototypes, source: Folder) -> Drift:
+    """Makes the map of prototypes anew, at once, and compares.
+
+    The pipeline added and subtracted observations frame by frame, merged and removed landmarks. One
+    map is made of the observations that were added and not subtracted; another one from the images,
+    of what the frames see at the end.
+    """
+    ids, codes = memory.observations()
+    fresh = pm.PrototypeMap(memory.encoder, memory.dim)
+    fresh.add_codes(ids, codes)
+    seen, descriptors = _final_observations(mapper, source)
+    of_frames = pm.PrototypeMap(memory.encoder, memory.dim)
+    of_frames.add(seen, descriptors)
+    return Drift(
+        landmarks=len(memory.map),
+        observations=len(ids),
+        same_file=_saved(memory.map) == _saved(fresh),
+        different=_different(memory.map, fresh),
+        dropped=len(ids) - len(seen),
+        different_from_frames=_different(memory.map, of_frames),
+        halved=int((np.unique(ids, return_counts=True)[1] > _COUNT_LIMIT).sum()),
+    )
+
+
+def _different(one: pm.PrototypeMap, other: pm.PrototypeMap) -> int:
+    """Landmarks that only one map has, or whose count or prototype differs."""
+    both = np.intersect1d(one.ids, other.ids)
+    off = one.counts(both) != other.counts(both)
+    off |= (one.prototype(both) != other.prototype(both)).any(axis=1)
+    return int(off.sum()) + len(one) + len(other) - 2 * len(both)
+
+
+def _final_observations(mapper: Mapper, source: Folder) -> tuple[Ids, NDArray[np.uint8]]:
+    """Landmark and descriptor of everything that the frames see at the end."""
+    extractor = Extractor(mapper.settings.descriptor, mapper.settings.max_keypoints)
+    frames = {frame.name: frame for frame in mapper.structure.frames}
+    ids, descriptors = [np.zeros(0, np.int64)], [np.zeros((0, mapper.width), np.uint8)]
+    for picture in source.pictures(only=set(frames)):
+        assert picture.image is not None
+        frame = frames[picture.name]
+        features = extractor(picture.image)
+        # No two keypoints of one image have the same coordinates (`features.MIN_DISTANCE`).
+        at = {point.tobytes(): row for row, point in enumerate(features.keypoints)}
+        rows = [at[point.tobytes()] for point in frame.keypoints[frame.observed]]
+        ids.append(frame.seen)
+        descriptors.append(features.descriptors[rows])
+    return np.concatenate(ids), np.concatenate(descriptors)
+
+
+def _saved(scene: pm.PrototypeMap) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
+        path = Path(folder) / "scene.pmk"
+        scene.save(path)
+        return path.read_bytes()
