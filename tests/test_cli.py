@@ -51,11 +51,41 @@ def test_help_lists_the_commands() -> None:
     assert done.returncode == 0
     for command in (
         *("demo", "tracks", "build", "join", "split", "info", "localize", "train"),
-        *("calibrate", "evaluate", "reproduce", "bench"),
+        *("calibrate", "evaluate"),
     ):
         assert command in done.stdout
         assert protomark(command, "--help").returncode == 0
     assert protomark("--version").stdout.strip() == f"protomark {pm.__version__}"
+
+
+def test_other_distributions_add_commands(tmp_path: Path) -> None:
+    info = tmp_path / "extra-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: extra\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[protomark.commands]\ngreet = extra:greet\nbroken = no_such_module:f\ninfo = extra:greet\n"
+    )
+    (tmp_path / "extra.py").write_text(
+        "def greet(name: str) -> None:\n"
+        "    'Says hello.'\n"
+        "    if name == 'nobody': raise ValueError('nobody is there')\n"
+        "    print('hello', name)\n"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(tmp_path))
+        assert protomark("greet", "you").stdout == "hello you\n"
+        assert protomark("greet", "nobody").stderr == "error: nobody is there\n"
+        assert "Says hello." in protomark("greet", "--help").stdout
+        # The package's own command of the same name goes first.
+        assert "Say what a file holds" in protomark("info", "--help").stdout
+        listed = protomark("--help")
+        assert "Says hello." in listed.stdout
+        broken = protomark("broken")
+    assert (broken.returncode, broken.stderr) == (
+        1,
+        "error: the command broken of another distribution cannot be loaded: No module named "
+        "'no_such_module'\n",
+    )
 
 
 def test_starting_imports_nothing_heavy() -> None:

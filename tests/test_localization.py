@@ -25,7 +25,6 @@ from protomark.evaluation.protocol import split
 from protomark.localization import Localization, Localizer, PosePrior
 from protomark.localization.absolute_pose import centre, pose_error
 from protomark.localization.cameras import camera_of_exif
-from protomark.localization.halves import calibrated, localize_halves, medoids, prototypes
 from protomark.tracks import Tracks
 from protomark.tracks.command import make_tracks
 from protomark.tracks.extract import Settings
@@ -176,21 +175,6 @@ def test_real_frames_of_the_sample() -> None:
         found = localizer.localize_features(frame.keypoints, frame.descriptors, frame.camera)
         assert close(found, frame.cam_from_world, 0.01 * scene_depth(tracks))
         assert found.confidence > 0.9
-
-
-def test_halves_of_the_sample() -> None:
-    tracks = Tracks.load(sample.path())
-    variants = [medoids(), prototypes(pm.Encoder.load("freak"), 32)]
-    results = []
-    for variant in variants:
-        acceptance = calibrated(variant, [tracks], frames=3)
-        result, found = localize_halves(tracks, variant, acceptance, share=0.8, stride=6)
-        assert result.frames == len(found) == 3
-        results.append(result)
-    one, ours = results
-    assert (one.bytes_per_landmark, ours.bytes_per_landmark) == (64, 33)
-    assert one.landmarks == ours.landmarks
-    assert ours.recall[-1] >= one.recall[-1] > 0
 
 
 @pytest.fixture

@@ -129,7 +129,7 @@ def save_svg(figure: Figure, path: Path, made_by: str) -> None:
     """Write a figure as SVG, whole or not at all; the same figure gives the same bytes."""
     import matplotlib
 
-    options: dict[str, Any] = {"svg.hashsalt": "protomark", "svg.fonttype": "none"}
+    options: Any = {"svg.hashsalt": "protomark", "svg.fonttype": "none"}
     with matplotlib.rc_context(options), replacing(path) as file:
         metadata = {"Creator": made_by, "Date": None}
         figure.savefig(file, format="svg", facecolor="white", metadata=metadata)

@@ -36,7 +36,7 @@ COLUMNS = {
     **{f"pca-{dim}": f"PCA {dim}" for dim in (16, 32, 64)},
     **{f"protomark-{dim}": f"**{dim}**" for dim in DIMS},
     **{f"protomark-{dim}x4": f"**{dim} x 4 bits**" for dim in (16, 32, 64)},
-    **{f"looks-{size}": f"**looks, {size} B**" for size in (17, 33, 65)},
+    **{f"looks-{size}": f"**appearances, {size} B**" for size in (17, 33, 65)},
 }
 # Bytes per landmark -> what is kept in them: int8, 4 bits, 4 bits and several appearances.
 BUDGETS = {

@@ -63,7 +63,7 @@ def sampled(run: Callable[[], object], seconds: float) -> list[tuple[float, str]
     thread = threading.Thread(target=repeat)
     thread.start()
     with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder) / "perf.data"
+        data = str(Path(folder) / "perf.data")
         record = ["perf", "record", "-q", "-e", "cpu-clock", "-F", "1000", "-o", data]
         try:
             command = [*record, "-t", str(thread.native_id), "--", "sleep", str(seconds)]

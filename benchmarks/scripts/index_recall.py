@@ -202,8 +202,8 @@ def main() -> None:
         [name, *(f"{true:.3f} ({landmarks:,})" for landmarks, true in found)]
         for name, found in steps.items()
     ]
-    heads = ("recall (landmarks) after round", *(str(i + 1) for i in range(ROUNDS)))
-    print(ReportTable(heads, rows).markdown())
+    numbers = [str(i + 1) for i in range(ROUNDS)]
+    print(ReportTable(["recall (landmarks) after round", *numbers], rows).markdown())
     if asked.plot:
         curves.append(plot.Series("", (0.8, 1), (0.8, 1), plot.INK, ":", 0.8))
         lines = [

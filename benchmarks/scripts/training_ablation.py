@@ -2,9 +2,10 @@
 
 python benchmarks/scripts/training_ablation.py TRACKS... -o FOLDER [--steps 300] [--only NAME]
 
-TRACKS are the FREAK (or other) tracks of hololens, caliterra, and, plain and augmented, of desk_rpy,
-viking, conch and seneca. Trained on the latter four, measured on hololens and caliterra, which are
-no test sequences. FOLDER caches finished variants. Writes docs/results/training.md and its plot.
+TRACKS are the FREAK (or other) tracks of hololens, caliterra, and, plain and augmented, of
+desk_rpy, viking, conch and seneca. Trained on the latter four, measured on hololens and caliterra,
+which are no test sequences. FOLDER caches finished trainings. Writes docs/results/training.md and
+its plot.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ def train(change: RecipeChange, steps: int, tracks: dict[str, Tracks]) -> dict[s
     views = [Views.from_tracks(t, n) for n, t in zip(change.sequences, learned, strict=True)]
     trials = [Trial.from_tracks(t, n, 0, QUERIES) for n, t in zip(MEASURED, measured, strict=True)]
     trainer = Trainer(views, trials[:1], options, half=has_fast_bfloat16("cpu"))
-    trainer.run()
+    trainer.run(lambda done, loss, progress: None)
     network, dims = trainer.network, [d for d in DIMS if d in options.dims]
     encoder = pm.Encoder(
         [{**layer} for layer in trainer.quantized.export()],
@@ -211,11 +212,11 @@ def main() -> None:
     raw = {s: next(iter(results.values()))[s]["unaggregated"] for s in MEASURED}
     text = (
         "# What each part of the training recipe brings\n\n"
-        "Written by `benchmarks/scripts/training_ablation.py`; [training](../training.md) says what to "
-        f"read from it. {tracks[MEASURED[0]].descriptor.upper()}, one seed, {asked.steps} steps where "
-        "nothing else is said. The last column of a sequence keeps every code of the support at the "
-        "greatest length, so that only the encoder loses, not the mean. Raw descriptors, all kept: "
-        f"{', '.join(f'{s} {p:.3f}' for s, p in raw.items())}.\n\n"
+        "Written by `benchmarks/scripts/training_ablation.py`; [training](../training.md) says "
+        f"what to read from it. {tracks[MEASURED[0]].descriptor.upper()}, one seed, {asked.steps} "
+        "steps where nothing else is said. The last column of a sequence keeps every code of the "
+        "support at the greatest length, so that only the encoder loses, not the mean. Raw "
+        f"descriptors, all kept: {', '.join(f'{s} {p:.3f}' for s, p in raw.items())}.\n\n"
     )
     write_text(PAGE, f"{text}{table(results).markdown()}\n\n![Precision](training.svg)\n")
     draw(results, PAGE.with_suffix(".svg"))

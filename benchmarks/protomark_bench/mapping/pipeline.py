@@ -75,7 +75,9 @@ def run(
     facts = summarise(mapper)
     entries = list(mapper.history.entries.values())
     frames = mapper.structure.frames
-    recorded = isinstance(mapper.memory, RecordedPrototypes) and frames
+    drift = None
+    if isinstance(mapper.memory, RecordedPrototypes) and frames:
+        drift = measure_drift(mapper, mapper.memory, sequence.source)
     return MappingRun(
         memory=memory,
         registered=len(frames),
@@ -91,7 +93,7 @@ def run(
         error_pixels=facts["reprojection_error_mean"],
         not_registered={why: len(names) for why, names in facts["not_registered"].items()},
         events=facts["events"],
-        drift=measure_drift(mapper, mapper.memory, sequence.source) if recorded else None,
+        drift=drift,
         centers={f.name: [float(f"{x:.6g}") for x in centre(f.pose)] for f in frames},
         growth=[e.memory_bytes for e in entries],
     )

@@ -230,7 +230,8 @@ class Workload:
         self.encoder = encoder
         self.dim = dim
         self.build_threads = build_threads
-        self.forget()
+        self._prototypes = np.empty((0, dim), np.int8)
+        self._map: tuple[int, pm.PrototypeMap] | None = None
 
     @cached_property
     def synthetic(self) -> SyntheticLandmarks:
@@ -252,8 +253,8 @@ class Workload:
 
     def forget(self) -> None:
         """Frees what is cached."""
-        self._prototypes = np.empty((0, self.dim), np.int8)
-        self._map: tuple[int, pm.PrototypeMap] | None = None
+        self._prototypes = self._prototypes[:0].copy()
+        self._map = None
 
     def queries(self, n: int, count: int) -> NDArray[np.uint8]:
         """(count, bits / 8), further observations of some of the first n landmarks."""

@@ -33,8 +33,22 @@ class CommandGroup(TyperGroup):
             pretty_exceptions_enable=False,
             context_settings={"help_option_names": ["-h", "--help"]},
         )
-        app.command(cmd_name)(found[cmd_name].load())
+        app.command(cmd_name)(_loaded(found[cmd_name]))
         return typer.main.get_command(app)
+
+
+def _loaded(entry: EntryPoint) -> Any:
+    """The function of an entry point, or one that fails when it is called: help goes on."""
+    try:
+        return entry.load()
+    except (ImportError, AttributeError) as error:
+        reason = f"the command {entry.name} of another distribution cannot be loaded: {error}"
+
+        def broken() -> None:
+            raise ModuleNotFoundError(reason)
+
+        broken.__doc__ = f"({reason})"
+        return broken
 
 
 def _found() -> dict[str, EntryPoint]:

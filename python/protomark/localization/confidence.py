@@ -13,8 +13,8 @@ from protomark.tracks.file import Camera
 # Inliers are counted once for each cell of a grid of so many cells a side: many inliers on one
 # spot of the image say little.
 CELLS = 10
-# Fitted by benchmarks/localization_confidence.py to the training and validation sequences, with
-# codes of 16 and 32 numbers: the constant, and what `Evidence.features` counts.
+# Fitted by benchmarks/scripts/localization_confidence.py to the training and validation sequences,
+# with codes of 16 and 32 numbers: the constant, and what `Evidence.features` counts.
 WEIGHTS = (-14.94, 3.716, 4.628, 3.015)
 
 
