@@ -111,10 +111,8 @@ def reproduce(
     data: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="DATA",
-            help="Tracks files, folders of them, or folders of sequences with images/ and "
-            "sparse/, whose tracks are made first. By default the sequences in data, ../data or "
-            "../shared/data.",
+            metavar="TRACKS",
+            help="Tracks files, or folders of them, as `protomark tracks` makes them.",
         ),
     ] = None,
     output: Annotated[
@@ -124,8 +122,8 @@ def reproduce(
     scale: Annotated[
         str,
         typer.Option(
-            help="small: minutes, on the sequences whose tracks are quickly made; medium: all "
-            "sequences, short trainings; full: trained until the validation loss stagnates, hours."
+            help="small: minutes, on some sequences; medium: all sequences, short trainings; full: "
+            "trained until the validation loss stagnates, hours."
         ),
     ] = "small",
     descriptor: Annotated[
@@ -168,6 +166,8 @@ def reproduce(
     if source is not None:
         results = PaperResults.load(source)
     else:
+        if not data:
+            raise ValueError("name tracks files, or the JSON of a run with --from")
         need("torch", "reproduce trains networks with PyTorch")
         from protomark_bench.paper import command
         from protomark_bench.paper.scale import find_scale
@@ -180,7 +180,7 @@ def reproduce(
             roles={"training": train or [], "validation": validation or [], "test": test or []},
         )
         with resumable(output):
-            results = command.reproduce(data or [], output, settings)
+            results = command.reproduce(data, output, settings)
     results.report().publish(output)
 
 

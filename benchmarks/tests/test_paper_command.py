@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    tiny = scale.Scale("small", steps=4, epoch=2, patience=2, quick=True)
+    tiny = scale.Scale("small", steps=4, epoch=2, patience=2, small=True)
     monkeypatch.setitem(scale.SCALES, "small", tiny)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from protomark_bench.paper.scale import SCALES
-from protomark_bench.paper.sequences import KNOWN, FoundSequence, assign, find
+from protomark_bench.paper.sequences import ROLES, assign, find
 
 NONE = {"training": [], "validation": [], "test": []}
 
@@ -14,49 +14,20 @@ def make(folder, *names):
     for name in names:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        if name.endswith("/images"):
-            path.mkdir(parents=True)
-        else:
-            path.touch()
+        path.touch()
 
 
 def there(*names):
-    return {name: FoundSequence(name, Path(name)) for name in names}
+    return {name: Path(name) for name in names}
 
 
-def names(roles):
-    return {role: [s.name for s in found] for role, found in roles.items()}
-
-
-def test_finds_files_folders_of_files_and_folders_of_images(tmp_path):
-    make(
-        tmp_path,
-        "tracks/a.freak.safetensors",
-        "tracks/a.orb.safetensors",
-        "data/a/images",
-        "data/b/images",
-        "other/c/images",
-        "d.freak.safetensors",
-    )
-    where = ["data", "tracks", "other/c", "d.freak.safetensors"]
-    found = find([tmp_path / name for name in where], "freak")
-    assert {name: one.path.relative_to(tmp_path).as_posix() for name, one in found.items()} == {
-        "a": "tracks/a.freak.safetensors",
-        "b": "data/b",
-        "c": "other/c",
+def test_finds_files_and_folders_of_them(tmp_path):
+    make(tmp_path, "t/a.freak.safetensors", "t/a.orb.safetensors", "d.freak.safetensors")
+    found = find([tmp_path / "t", tmp_path / "d.freak.safetensors"], "freak")
+    assert {name: path.relative_to(tmp_path).as_posix() for name, path in found.items()} == {
+        "a": "t/a.freak.safetensors",
         "d": "d.freak.safetensors",
     }
-
-
-def test_looks_in_known_places(tmp_path, monkeypatch, capsys):
-    here = tmp_path / "project"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    with pytest.raises(FileNotFoundError, match=r"no sequences in data, .*protomark tracks"):
-        find([], "freak")
-    make(tmp_path, "data/toy/images")
-    assert list(find([], "freak")) == ["toy"]
-    assert "taking the sequences in ../data" in capsys.readouterr().err
 
 
 def test_what_holds_no_sequence_is_named(tmp_path):
@@ -69,21 +40,21 @@ def test_what_holds_no_sequence_is_named(tmp_path):
         find([tmp_path / "x", tmp_path / "y"], "freak")
 
 
-def test_known_sequences_have_roles_and_small_takes_the_quick_ones(capsys):
-    every = there(*(name for role in KNOWN.values() for name in role), "mine")
-    assert names(assign(every, SCALES["full"], NONE)) == {k: list(v) for k, v in KNOWN.items()}
+def test_own_sequences_have_roles_and_small_takes_some(capsys):
+    every = there(*(name for role in ROLES.values() for name in role), "mine")
+    assert assign(every, SCALES["full"], NONE) == {k: list(v) for k, v in ROLES.items()}
     assert "left out, as they have no role at this scale: mine" in capsys.readouterr().err
-    assert names(assign(every, SCALES["small"], NONE)) == {
+    assert assign(every, SCALES["small"], NONE) == {
         "training": ["viking", "conch", "seneca"],
         "validation": ["caliterra"],
         "test": ["toy", "castle"],
     }
 
 
-def test_given_roles_replace_known_ones():
+def test_given_roles_replace_own_ones():
     found = there("hololens", "viking", "conch", "toy", "mine")
     given = {"training": [], "validation": ["viking"], "test": ["mine"]}
-    assert names(assign(found, SCALES["medium"], given)) == {
+    assert assign(found, SCALES["medium"], given) == {
         "training": ["hololens", "conch"],
         "validation": ["viking"],
         "test": ["mine"],

@@ -28,7 +28,6 @@ def test_networks_are_the_papers():
     assert Training("triplet", "funnel", 5).hidden(512) == (512, 256, 128, 64)
     assert Training("triplet", "fat", 4).hidden(512) == (512, 512, 512)
     assert Training("triplet", "fat", 2).hidden(512) == (512,)
-    assert PAPER_PICK.multiply_adds(512) == 512 * 512 + 512 * 256 + 256 * 16
 
 
 def test_every_training_is_asked_for_once():
@@ -86,8 +85,7 @@ def test_training_learns(data, objective):
     shorter = train(training, data, Scale("s", steps=1, epoch=1, patience=9), half=False)
     assert longer.precision > shorter.precision + 0.05
     assert longer.validation_loss < 0.9 * shorter.validation_loss
-    assert [step for step, *_ in longer.history] == [20, 40, 60]
-    assert longer.validation_loss == min(loss for _, _, loss, _ in longer.history)
+    assert longer.best_step in (20, 40, 60)
     network = longer.network(training, 128)
     (trial,) = data.trials
     assert precision(trial, lambda d: embed(network, d), (8,))[8] == longer.precision
@@ -95,7 +93,7 @@ def test_training_learns(data, objective):
 
 def test_a_limit_that_is_no_whole_number_of_epochs(data):
     outcome = train(PAPER_PICK, data, Scale("s", steps=5, epoch=3, patience=9), half=False)
-    assert [step for step, *_ in outcome.history] == [3, 5]
+    assert outcome.best_step in (3, 5)
     assert outcome.steps == 5
 
 
@@ -152,4 +150,8 @@ def test_another_process_trains_what_this_one_trains(data, tmp_path):
         for jobs in (1, 2)
     ]
     here, apart = (results[PAPER_PICK] for results in found)
-    assert (here.precision, here.history) == (apart.precision, apart.history)
+    assert dataclasses.replace(here, weights={}, seconds=0) == dataclasses.replace(
+        apart, weights={}, seconds=0
+    )
+    for name, value in here.weights.items():
+        np.testing.assert_array_equal(apart.weights[name], value)

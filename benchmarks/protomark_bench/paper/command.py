@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from protomark.console import progress_bar, progress_console
-from protomark.tracks.file import Tracks
+from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.data import load_training
 from protomark.training.sampling import Views
 from protomark.training.train import has_fast_bfloat16, keep_freed_memory
@@ -35,7 +35,7 @@ from protomark_bench.paper.scale import (
     depth_trainings,
     measured_trainings,
 )
-from protomark_bench.paper.sequences import FoundSequence, assign, find, tracks_file
+from protomark_bench.paper.sequences import assign, find
 from protomark_bench.paper.trainer import PaperData, TrainingOutcome
 from protomark_bench.paper.workers import Trainings
 
@@ -63,8 +63,8 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
     """Runs the paper's evaluation.
 
     Args:
-        data: tracks files, folders of them, or folders of sequences with images.
-        output: folder of the tracks that are made, and of the cache.
+        data: tracks files, or folders of them.
+        output: folder of the cache.
         settings: see `PaperSettings`.
 
     Raises:
@@ -74,18 +74,12 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
     begin = time.perf_counter()
     keep_freed_memory()
     together = settings.jobs * settings.threads
-    roles = assign(find(data, settings.descriptor), settings.scale, settings.roles)
-    output.mkdir(parents=True, exist_ok=True)
-    paths = {
-        role: [tracks_file(s, settings.descriptor, output / "tracks", together) for s in sequences]
-        for role, sequences in roles.items()
-    }
+    found = find(data, settings.descriptor)
+    roles = assign(found, settings.scale, settings.roles)
+    paths = {role: [found[name] for name in names] for role, names in roles.items()}
     cache = ResultCache(output / "cache")
-    training, sizes, descriptor = _load(roles, paths)
-    tests = [
-        _open_test(sequence, path, cache, descriptor, training.bits)
-        for sequence, path in zip(roles["test"], paths["test"], strict=True)
-    ]
+    training, sizes, descriptor = _load(paths)
+    tests = [_open_test(path, cache, descriptor, training.bits) for path in paths["test"]]
     for test in tests:
         t = test.tracks
         counts = (len(t.keyframe_names), len(t.landmark_ids), len(t.observations))
@@ -93,8 +87,7 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
     half = has_fast_bfloat16("cpu")
     trainings = Trainings(training, settings.scale, cache, half, settings.jobs, settings.threads)
 
-    extra = [t for t in measured_trainings(PAPER_PICK) if t != PAPER_PICK]
-    outcomes = trainings.run([*depth_trainings(), *extra], later=len(extra))
+    outcomes = trainings.run([*depth_trainings(), *measured_trainings(PAPER_PICK)])
     depth = [_point(t, outcomes[t], training.bits) for t in depth_trainings()]
     winner = max(depth, key=lambda point: point.precision).training
     picks = list(dict.fromkeys([PAPER_PICK, winner]))
@@ -127,14 +120,11 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
     )
 
 
-def _load(
-    roles: dict[str, list[FoundSequence]], paths: dict[str, list[Path]]
-) -> tuple[PaperData, list[SequenceSize], str]:
+def _load(paths: dict[str, list[Path]]) -> tuple[PaperData, list[SequenceSize], str]:
     """Training and validation sequences, checked."""
     data = load_training(paths["training"], paths["validation"], max_queries=10_000)
     validation = [
-        Views.from_tracks(Tracks.load(path), found.name)
-        for found, path in zip(roles["validation"], paths["validation"], strict=True)
+        Views.from_tracks(Tracks.load(path), sequence_name(path)) for path in paths["validation"]
     ]
     sources = [("training", s) for s in data.sources]
     sources += [("validation", s) for s in data.validation_sources]
@@ -145,10 +135,8 @@ def _load(
     return training, sizes, data.descriptor
 
 
-def _open_test(
-    sequence: FoundSequence, path: Path, cache: ResultCache, descriptor: str, bits: int
-) -> MeasuredSequence:
-    test = MeasuredSequence(sequence.name, path, cache)
+def _open_test(path: Path, cache: ResultCache, descriptor: str, bits: int) -> MeasuredSequence:
+    test = MeasuredSequence(sequence_name(path), path, cache)
     if (test.tracks.descriptor, test.tracks.bits) != (descriptor, bits):
         raise ValueError(
             f"{path}: {test.tracks.descriptor} descriptors of {test.tracks.bits} bits, but the "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 from typing import Literal
 
 Objective = Literal["triplet", "prototypical"]
@@ -42,25 +42,20 @@ class Scale:
         steps: batches of one training at most, None to go on until the plateaus end it.
         epoch: batches between two evaluations of the validation loss.
         patience: epochs without a lower validation loss after which the rate falls.
-        quick: whether only the sequences whose tracks are quickly made take part.
+        small: whether only the smaller ones of the project's own sequences take part.
     """
 
     name: str
     steps: int | None
     epoch: int
     patience: int
-    quick: bool = False
-
-    @property
-    def expected_steps(self) -> int:
-        """Steps of a training, for the time left; a guess where plateaus end it."""
-        return self.steps or 60 * self.epoch
+    small: bool = False
 
 
 SCALES = {
     scale.name: scale
     for scale in (
-        Scale("small", steps=600, epoch=50, patience=3, quick=True),
+        Scale("small", steps=600, epoch=50, patience=3, small=True),
         Scale("medium", steps=1500, epoch=100, patience=3),
         Scale("full", steps=None, epoch=250, patience=5),
     )
@@ -105,11 +100,6 @@ class Training:
         if self.shape == "fat":
             return (bits,) * (self.layers - 1)
         return tuple(bits >> i for i in range(self.layers - 1))
-
-    def multiply_adds(self, bits: int) -> int:
-        """Multiply-adds of the network per descriptor."""
-        widths = (bits, *self.hidden(bits), self.dim)
-        return sum(a * b for a, b in pairwise(widths))
 
     @property
     def label(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +65,6 @@ class TrainingOutcome:
         best_step: steps after which it was found.
         steps: steps in all.
         seconds: that they took, with the validations.
-        history: (step, training loss, validation loss, rate) of each epoch.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -74,7 +73,6 @@ class TrainingOutcome:
     best_step: int
     steps: int
     seconds: float
-    history: list[tuple[int, float, float, float]]
 
     def network(self, training: Training, bits: int) -> EncoderNetwork:
         """The trained network."""
@@ -138,7 +136,6 @@ def train(
     data: PaperData,
     scale: Scale,
     half: bool,
-    report: Callable[[int], None] = lambda _: None,
 ) -> TrainingOutcome:
     """Trains one network.
 
@@ -147,7 +144,6 @@ def train(
         data: what to train and validate on.
         scale: when to evaluate the validation loss, and when to end.
         half: whether matrix products of the steps run in bfloat16.
-        report: called with the number of steps done after each; what it raises ends the training.
 
     Raises:
         ValueError: the loss is no longer finite.
@@ -158,9 +154,8 @@ def train(
     optimizer = torch.optim.Adam(network.parameters())
     schedule = Plateau(scale.patience, scale.steps)
     sizes = np.array([len(views) for views in data.training], float)
-    history: list[tuple[int, float, float, float]] = []
     weights: dict[str, NDArray[np.float32]] = {}
-    step, best_step, losses = 0, 0, []
+    step, best_step = 0, 0
     while not schedule.finished:
         for group in optimizer.param_groups:
             group["lr"] = schedule.rate
@@ -174,17 +169,12 @@ def train(
         if not math.isfinite(value):
             raise ValueError(f"{training.label}: the loss is {value} at step {step}")
         optimizer.step()
-        losses.append(value)
         step += 1
         if step % scale.epoch == 0 or step == scale.steps:
-            rate = schedule.rate
             found = validation_loss(network, training.objective, data.validation, half)
-            history.append((step, float(np.mean(losses)), found, rate))
-            losses = []
             if schedule.update(step, found) or not weights:
                 best_step = step
                 weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-        report(step)
     network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
     network.eval()
     precision = mean_precision(data.trials, lambda d: embed(network, d), (training.dim,))
@@ -195,7 +185,6 @@ def train(
         best_step,
         step,
         time.perf_counter() - begin,
-        history,
     )
 
 
