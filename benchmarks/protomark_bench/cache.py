@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ class ResultCache:
         folder.mkdir(parents=True, exist_ok=True)
 
     def save(self, key: str, values: dict[str, Any]) -> None:
-        """Store JSON values."""
+        """Stores JSON values."""
         write_text(self.folder / f"{key}.json", json.dumps(values) + "\n")
 
     def load(self, key: str) -> dict[str, Any] | None:
@@ -47,10 +48,18 @@ class ResultCache:
             return None
         return found if isinstance(found, dict) else None
 
+    def get(self, key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """JSON values that were stored, or those that `make` gives, which are stored then."""
+        found = self.load(key)
+        if found is None:
+            found = make()
+            self.save(key, found)
+        return found
+
     def save_arrays(
         self, key: str, values: dict[str, Any], arrays: dict[str, NDArray[np.float32]]
     ) -> None:
-        """Store JSON values and arrays in one file."""
+        """Stores JSON values and arrays in one file."""
         from safetensors.numpy import save
 
         with replacing(self.folder / f"{key}.safetensors") as file:

@@ -20,14 +20,14 @@ EXHAUSTIVE = 40
 
 
 def run(
-    sequence: ImageSequence, threads: int, advance: Callable[[float], None] = lambda share: None
+    sequence: ImageSequence, threads: int, advance: Callable[[], None] = lambda: None
 ) -> MappingRun:
     """Reconstructs a sequence with COLMAP's defaults and the known camera, on the CPU.
 
     Args:
         sequence: the images.
         threads: of each step.
-        advance: called with the share of the work that is done, roughly.
+        advance: called after each image that is registered.
     """
     source, seconds = sequence.source, {}
     began, since = time.perf_counter(), time.process_time()
@@ -40,23 +40,15 @@ def run(
     with quiet(), tempfile.TemporaryDirectory(prefix="protomark-") as temporary:
         database = Path(temporary) / "database.db"
         _extract(sequence, database, threads)
-        advance(0.3)
         lap("detect")
         _match(database, len(source), threads)
-        advance(0.6)
         lap("match")
-        done = [2]
-
-        def registered() -> None:
-            done[0] += 1
-            advance(0.6 + 0.4 * min(done[0] / len(source), 1))
-
         models = pycolmap.incremental_mapping(
             database,
             source.path,
             temporary,
             options=_mapping_options(threads),
-            next_image_callback=registered,
+            next_image_callback=advance,
         )
         lap("map")
     best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)

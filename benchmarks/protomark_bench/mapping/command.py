@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from rich.progress import Progress, TaskID
 from threadpoolctl import threadpool_limits
 
 import protomark as pm
@@ -101,14 +101,14 @@ def evaluate_mapping(request: MappingRequest) -> MappingResults:
     sequences = open_sequences(request.sequences, request.every, request.frames)
     cache = ResultCache(request.output / "cache")
     cv2.setNumThreads(request.threads)
+    order = [*request.memories, *([COLMAP] if request.colmap else [])]
     runs: dict[str, dict[str, MappingRun]] = {s.name: {} for s in sequences}
     interrupted = False
     with threadpool_limits(limits=1, user_api="blas"):
         try:
-            _make_runs(request, sequences, cache, runs)
+            _make_runs(request, sequences, order, cache, runs)
         except KeyboardInterrupt:
             interrupted = True
-    order = [*request.memories, *([COLMAP] if request.colmap else [])]
     results = MappingResults(
         [_mapped(s, {m: runs[s.name][m] for m in order if m in runs[s.name]}) for s in sequences],
         [f"{s.name}, {m}" for s in sequences for m in order if m not in runs[s.name]],
@@ -134,91 +134,62 @@ def _mapped(s: ImageSequence, runs: dict[str, MappingRun]) -> MappedSequence:
     return MappedSequence(s.name, len(s.source), s.available, s.truth, s.extent, runs, true, plane)
 
 
-@dataclass(frozen=True)
-class _MappingJob:
-    """One run that is not cached yet; `run` takes a function that shows the share that is done."""
-
-    sequence: ImageSequence
-    memory: str
-    key: str
-    run: Callable[[Callable[[float], None]], MappingRun]
-
-
 def _make_runs(
     request: MappingRequest,
     sequences: list[ImageSequence],
+    order: Sequence[str],
     cache: ResultCache,
     runs: dict[str, dict[str, MappingRun]],
 ) -> None:
     """Fills in sequence -> memory -> its run, from the cache or made now."""
-    jobs = []
-    for sequence in sequences:
-        for job in _jobs(request, sequence):
-            found = _cached(cache, job.key)
-            if found is None:
-                jobs.append(job)
-            else:
-                runs[sequence.name][job.memory] = found
+    wanted = [(sequence, memory) for sequence in sequences for memory in order]
     with progress_bar() as bar:
-        task = bar.add_task("mapping", total=sum(len(job.sequence.source) for job in jobs))
-        for job in jobs:
-            made = job.run(_advancing(bar, task, job))
-            cache.save(job.key, asdict(made))
-            runs[job.sequence.name][job.memory] = made
-            progress_console.print(
-                f"{job.sequence.name}, {job.memory}: {made.registered} of "
-                f"{len(job.sequence.source)} frames, {made.wall_seconds:.0f} s",
-                highlight=False,
-                soft_wrap=True,
-            )
+        task = bar.add_task("mapping", total=len(wanted))
+        for sequence, memory in wanted:
+            title, done = f"{sequence.name}, {memory}", 0
+            bar.update(task, description=title)
 
-
-def _advancing(bar: Progress, task: TaskID, job: _MappingJob) -> Callable[[float], None]:
-    before = bar.tasks[0].completed
-    bar.update(task, description=f"{job.sequence.name}, {job.memory}")
-
-    def advance(share: float) -> None:
-        bar.update(task, completed=before + round(share * len(job.sequence.source)))
-
-    return advance
-
-
-def _jobs(request: MappingRequest, sequence: ImageSequence) -> list[_MappingJob]:
-    files = [(n, (sequence.source.path / n).stat().st_size) for n in sequence.source.names]
-    shared = {
-        "sequence": sequence.name,
-        "camera": sequence.camera.as_dict(),
-        "files": files,
-        "threads": request.threads,
-    }
-    jobs = []
-    for memory in request.memories:
-        settings = request.settings(memory)
-        encoder = pm.Encoder.load(settings.encoder or settings.descriptor)
-        code = pipeline.code_digest()
-        key = key_of(mapping=code, settings=asdict(settings), encoder=encoder.identity, **shared)
-
-        def mapped(
-            advance: Callable[[float], None], memory: str = memory, settings: Settings = settings
-        ) -> MappingRun:
-            done = 0
-
-            def one_more() -> None:
+            def one_more(title: str = title, frames: int = len(sequence.source)) -> None:
                 nonlocal done
                 done += 1
-                advance(done / len(sequence.source))
+                bar.update(task, description=f"{title}: frame {done} of {frames}")
 
-            return pipeline.run(sequence, memory, settings, request.threads, one_more)
+            key = _key(request, sequence, memory)
+            run = _cached(cache, key)
+            if run is None:
+                if memory == COLMAP:
+                    run = colmap.run(sequence, request.threads, one_more)
+                else:
+                    settings = request.settings(memory)
+                    run = pipeline.run(sequence, memory, settings, request.threads, one_more)
+                cache.save(key, asdict(run))
+                progress_console.print(
+                    f"{title}: {run.registered} of {len(sequence.source)} frames, "
+                    f"{run.wall_seconds:.0f} s",
+                    highlight=False,
+                    soft_wrap=True,
+                )
+            runs[sequence.name][memory] = run
+            bar.advance(task)
 
-        jobs.append(_MappingJob(sequence, memory, key, mapped))
-    if request.colmap:
-        key = key_of(colmap=pycolmap.__version__, exhaustive=colmap.EXHAUSTIVE, **shared)
 
-        def reconstructed(advance: Callable[[float], None]) -> MappingRun:
-            return colmap.run(sequence, request.threads, advance)
-
-        jobs.append(_MappingJob(sequence, COLMAP, key, reconstructed))
-    return jobs
+def _key(request: MappingRequest, sequence: ImageSequence, memory: str) -> str:
+    """The key of a run in the cache: everything that decides it."""
+    files = [(n, (sequence.source.path / n).stat().st_size) for n in sequence.source.names]
+    made_of: dict[str, Any] = {"version": pycolmap.__version__, "exhaustive": colmap.EXHAUSTIVE}
+    if memory != COLMAP:
+        settings = request.settings(memory)
+        encoder = pm.Encoder.load(settings.encoder or settings.descriptor)
+        made_of = {"code": pipeline.code_digest(), "settings": asdict(settings)}
+        made_of["encoder"] = encoder.identity
+    return key_of(
+        memory=memory,
+        sequence=sequence.name,
+        camera=sequence.camera.as_dict(),
+        files=files,
+        threads=request.threads,
+        **made_of,
+    )
 
 
 def _cached(cache: ResultCache, key: str) -> MappingRun | None:

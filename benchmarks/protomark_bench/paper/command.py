@@ -136,13 +136,12 @@ def _load(paths: dict[str, list[Path]]) -> tuple[PaperData, list[SequenceSize], 
 
 
 def _open_test(path: Path, cache: ResultCache, descriptor: str, bits: int) -> MeasuredSequence:
-    test = MeasuredSequence(sequence_name(path), path, cache)
+    test = MeasuredSequence(path, cache)
     if (test.tracks.descriptor, test.tracks.bits) != (descriptor, bits):
         raise ValueError(
             f"{path}: {test.tracks.descriptor} descriptors of {test.tracks.bits} bits, but the "
             f"training tracks have {descriptor} of {bits}; give tracks of one descriptor"
         )
-    test.check()
     return test
 
 
@@ -186,17 +185,17 @@ def _rows(
     threads: int,
 ) -> list[MethodRow]:
     """The table, in the paper's order; what the paper does not have comes last."""
-    methods, digest = compared(descriptor, bits, threads)
+    methods, encoder = compared(descriptor, bits, threads)
     by_sequence = {}
     with progress_bar() as bar:
         task = bar.add_task("measuring other methods", total=len(tests))
         for test in tests:
-            by_sequence[test.name] = test.of_methods(methods, digest, threads)
+            by_sequence[test.name] = test.of_methods(methods, encoder, threads)
             bar.advance(task)
 
     def baseline(name: str, label: str) -> MethodRow:
-        size = float(np.mean([one.bytes_per_landmark[name] for one in by_sequence.values()]))
-        precision = {sequence: one.precision[name] for sequence, one in by_sequence.items()}
+        size = float(np.mean([found[name][1] for found in by_sequence.values()]))
+        precision = {sequence: found[name][0] for sequence, found in by_sequence.items()}
         return MethodRow(name, label, size, precision)
 
     def prototypes(pick: Training, name: str, label: str) -> list[MethodRow]:
