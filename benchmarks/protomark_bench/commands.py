@@ -55,9 +55,6 @@ def bench(
         typer.Option(help="Folder that caches graphs for later runs on the same data."),
     ] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
-    scratch: Annotated[
-        Path | None, typer.Option(help="Folder for temporary maps; by default the system's.")
-    ] = None,
     source: Annotated[
         Path | None,
         typer.Option("--from", help="Measure nothing; write the report of this JSON of a run."),
@@ -67,11 +64,10 @@ def bench(
 
     All contenders take turns in one run, on the same data and as many threads. The report gives
     ratios with their spread, beside the machine's own ceilings. Peers that are not installed are
-    left out. Ctrl-C ends the run and reports what was measured by then. docs/results/benchmarks.md
+    left out. Ctrl-C ends the run and reports what was measured by then. TMPDIR says where temporary
+    maps lie. docs/results/benchmarks.md
     holds a whole run.
     """
-    import tempfile
-
     from protomark_bench import machine, report
     from protomark_bench.options import command_line, numbers
     from protomark_bench.speed import command
@@ -87,7 +83,6 @@ def bench(
             tuple(name.strip() for name in only.split(",") if name.strip()),
             threads,
             build_threads=machine.available_threads(),
-            scratch=scratch or Path(tempfile.gettempdir()),
             indexes=indexes,
         )
         settings = settings.at(numbers("--landmarks", landmarks)).with_graphs(graphs)

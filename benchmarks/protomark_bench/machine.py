@@ -8,6 +8,7 @@ import os
 import platform
 import shutil
 import sys
+import tempfile
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -98,12 +99,13 @@ def allocated_bytes() -> int | None:
     return int(info.uordblks + info.hblkhd)
 
 
-def shortage(memory: float, disk: float = 0, folder: Path | None = None) -> str | None:
-    """Says which of these bytes of memory and disk are not free, None if all are."""
+def shortage(memory: float, disk: float = 0) -> str | None:
+    """Says which of these bytes of memory and temporary disk are not free, None if all are."""
     free = memory_bytes("MemAvailable")
     if free is not None and free < memory:
         return f"needs {memory / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free"
-    if folder is not None and shutil.disk_usage(folder).free < disk:
+    folder = tempfile.gettempdir()
+    if shutil.disk_usage(folder).free < disk:
         return f"needs {disk / 2**30:.1f} GiB of disk at {folder}"
     return None
 

@@ -217,9 +217,8 @@ def _candidates(bench: Bench, searched: _SearchedSet, codes: NDArray[np.int8]) -
 
 def _inverted_lists(bench: Bench, rows: NDArray[np.int8], asked: IndexQueries) -> TunableIndex:
     """Protomark's own approximate search; setting: inverted lists that are searched."""
-    scratch = bench.settings.scratch
     scene = map_of(bench.workload.encoder, rows)
-    plain = _sealed_bytes(scene, scratch)
+    plain = _sealed_bytes(scene)
     scene.build_index(threads=asked.build_threads)
     nlist = scene.index_cells
 
@@ -230,14 +229,14 @@ def _inverted_lists(bench: Bench, rows: NDArray[np.int8], asked: IndexQueries) -
 
         return run
 
-    size = _sealed_bytes(scene, scratch)
+    size = _sealed_bytes(scene)
     more = (size - plain) / len(rows)
     return TunableIndex(prepare, nlist, size, "nprobe", f"nlist {nlist:,}", more=more)
 
 
-def _sealed_bytes(scene: pm.PrototypeMap, scratch: Path) -> int:
+def _sealed_bytes(scene: pm.PrototypeMap) -> int:
     """Size of the sealed map less the encoder, which it holds whatever its size."""
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+    with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
         path = Path(folder) / "map.pmk"
         scene.seal(path)
         return path.stat().st_size - dict(pm.file_sections(path))["encoder"]

@@ -31,7 +31,7 @@ def large(bench: Bench) -> None:
     workload, settings, n = bench.workload, bench.settings, bench.settings.large
     if n == 0:
         return
-    reason = shortage(n * _LEARNING_BYTES, n * _FILE_BYTES, settings.scratch)
+    reason = shortage(n * _LEARNING_BYTES, n * _FILE_BYTES)
     if reason:
         bench.results.skipped.append(f"large, {n:,} landmarks: {reason}")
         return
@@ -56,7 +56,7 @@ def large(bench: Bench) -> None:
     figures["index seconds"] = time.perf_counter() - begin
     landmarks = np.random.default_rng(7).integers(0, n, settings.queries)
     codes = workload.codes(synthetic.queries(landmarks))
-    with tempfile.TemporaryDirectory(dir=settings.scratch) as folder:
+    with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
         paths = {bits: Path(folder) / f"{bits}.pmk" for bits in CODE_BITS}
         for bits, path in paths.items():
             bench.advance(f"sealing, {bits} bits")

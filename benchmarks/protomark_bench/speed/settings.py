@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -32,7 +31,6 @@ class BenchSettings:
         map: landmarks of the map of the sections frame and add.
         growth: landmarks of the maps along the curve.
         large: landmarks of the largest map, 0 for none.
-        scratch: folder for maps that are sealed and deleted.
         indexes: folder that caches peers' indexes which take long to build, None for no cache.
     """
 
@@ -51,7 +49,6 @@ class BenchSettings:
     map: int = 1_000_000
     growth: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000)
     large: int = 0
-    scratch: Path = field(default_factory=lambda: Path(tempfile.gettempdir()))
     indexes: Path | None = None
 
     def at(self, landmarks: tuple[int, ...]) -> BenchSettings:
