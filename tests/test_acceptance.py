@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark import models, sample
-from protomark.acceptance import KEY, Acceptance, parse, with_acceptance
-from protomark.calibration import encoder_answers, measure
+from protomark.match_calibration import KEY, MatchCalibration, parse, with_calibration
+from protomark.training.calibration import encoder_answers, measure
 from protomark.cli import app
-from protomark.logistic import fit, sigmoid
+from protomark.match_calibration import fit, sigmoid
 from protomark.matching import MIN_PROBABILITY, accept
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 
 LIMIT = 600_000
 
@@ -45,7 +45,7 @@ def test_what_is_told_apart_without_exception_has_finite_weights() -> None:
 
 
 def test_probability() -> None:
-    acceptance = Acceptance((1.0, -0.05, 0.02))
+    acceptance = MatchCalibration((1.0, -0.05, 0.02))
     away = np.array([[4, 8], [4, np.inf], [0, 0], [np.inf, np.inf]], np.float32)
     p = acceptance.probability(away)
     logits = [1 - 0.8 + 0.96, 1 - 0.8 + 0.96, 1]
@@ -70,8 +70,8 @@ def test_accepted_are_the_likeliest_of_each_landmark(rows: list[tuple[int, float
 
 
 def test_the_note_changes_neither_identity_nor_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
-    fitted = {5: Acceptance((1.0, -2.5, 3e-7)), 12: Acceptance((0.0, 1.0, 12345.6))}
-    with_acceptance(encoder, fitted, "here, there").save(tmp_path / "x.pme")
+    fitted = {5: MatchCalibration((1.0, -2.5, 3e-7)), 12: MatchCalibration((0.0, 1.0, 12345.6))}
+    with_calibration(encoder, fitted, "here, there").save(tmp_path / "x.pme")
     read = pm.Encoder.load(tmp_path / "x.pme")
     assert read.identity == encoder.identity
     assert read.acceptance(5) == fitted[5]

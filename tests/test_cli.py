@@ -13,8 +13,9 @@ import pytest
 
 import protomark as pm
 from conftest import balanced_encoder, protomark, random_descriptors, random_layers
-from protomark.build import build_map
-from protomark.tracks import Camera, Tracks
+from protomark.maps.build import build_map
+from protomark.geometry.camera import Camera
+from protomark.tracks.file import Tracks
 
 
 @pytest.fixture

@@ -15,13 +15,13 @@ from safetensors.numpy import save
 import protomark as pm
 from protomark.mapping.settings import Settings
 from protomark.mapping.state import STATE, load_state
-from protomark.tracks import Camera
-from protomark.tracks.colmap import focal_length, project, pycolmap, rays
-from protomark.tracks.file import CAMERA_MODELS
+from protomark.geometry.camera import Camera
+from protomark.geometry.colmap import pycolmap
+from protomark.geometry.camera import CAMERA_MODELS
 
 USES: list[Callable[[Camera], Any]] = [
-    lambda camera: rays(camera, np.ones((2, 2))),
-    lambda camera: project(camera, np.ones((2, 3))),
+    lambda camera: camera.rays(np.ones((2, 2))),
+    lambda camera: camera.project(np.ones((2, 3))),
     focal_length,
 ]
 

@@ -14,10 +14,10 @@ import pytest
 import protomark as pm
 from evaluation_scene import looking_inwards, ring_scene
 from protomark import sample
-from protomark.demo import OPEN_MAP, PICTURE, SEALED_MAP, run_demo, size
+from protomark.evaluation.demo import OPEN_MAP, PICTURE, SEALED_MAP, run_demo, size
 from protomark.evaluation.protocol import split
 from protomark.evaluation.scene_plot import view_from_above
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 
 
 def demo(*arguments: Any, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -15,20 +15,14 @@ import protomark as pm
 from conftest import random_descriptors, random_layers
 from evaluation_scene import observations
 from protomark.evaluation.methods import choices, choose
-from protomark.evaluation.methods.bitwise import bitwise_and, majority
-from protomark.evaluation.methods.hamming_map import HammingMap
-from protomark.evaluation.methods.medoid import medoid
-from protomark.evaluation.methods.projection import (
-    RIDGE,
-    linear_discriminants,
-    mean_of_bits,
-    principal_components,
-    projected_mean,
-)
-from protomark.evaluation.methods.prototypes import prototypes
-from protomark.evaluation.methods.single import first_seen, random_sample
-from protomark.evaluation.methods.unaggregated import unaggregated
-from protomark.evaluation.support import Moments, Support, unpack
+from protomark.baselines.binary import bitwise_and, majority
+from protomark.baselines.binary import HammingMap
+from protomark.baselines.binary import medoid
+from protomark.baselines.linear import RIDGE, linear_discriminants, mean_of_bits, principal_components, projected_mean
+from protomark.evaluation.prototypes import prototypes
+from protomark.baselines.binary import first_seen, random_sample
+from protomark.baselines.binary import unaggregated
+from protomark.baselines.support import Moments, Support, unpack
 
 Observations = tuple[NDArray[np.int64], NDArray[np.uint8]]
 

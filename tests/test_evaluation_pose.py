@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from evaluation_scene import CAMERA, looking_inwards, radial_pixels, ring_scene
 from protomark.evaluation import pose
 from protomark.evaluation.methods import choices, choose
-from protomark.evaluation.methods.unaggregated import unaggregated
+from protomark.baselines.binary import unaggregated
 from protomark.evaluation.protocol import split
 from protomark.evaluation.run import Options, draw_frames, evaluate, positions_of
-from protomark.evaluation.support import Support
+from protomark.baselines.support import Support
 
 
 def test_projection_is_colmaps() -> None:

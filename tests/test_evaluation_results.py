@@ -10,13 +10,7 @@ import pytest
 
 from protomark.evaluation.plot import save_plot
 from protomark.evaluation.report import markdown, markdown_table, rich_table
-from protomark.evaluation.results import (
-    MethodResult,
-    SequenceResult,
-    load_json,
-    mean_rows,
-    save_json,
-)
+from protomark.evaluation.results import MethodResult, SequenceResult, load_json, mean_rows, save_json
 
 
 def result(sequence: str = "ring", lift: float = 0.0, descriptor: str = "freak") -> SequenceResult:

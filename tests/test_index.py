@@ -21,9 +21,10 @@ from conftest import balanced_encoder
 from map_container import SEALED_MAP, Section, container, sections
 from protomark import sample
 from protomark.bench.machine import allocated_bytes
-from protomark.build import build_file, build_map
+from protomark.build import build_file
+from protomark.maps.build import build_map
 from protomark.evaluation.protocol import split
-from protomark.info import describe
+from protomark.maps.info import describe
 
 DIM = 12
 

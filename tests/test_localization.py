@@ -18,18 +18,18 @@ from typer.testing import CliRunner, Result
 
 import protomark as pm
 from protomark import sample
-from protomark.build import build_map
+from protomark.maps.build import build_map
 from protomark.cli import app
 from protomark.evaluation.pose import Frame, scene_depth
 from protomark.evaluation.protocol import split
 from protomark.localization import Localization, Localizer, PosePrior
-from protomark.localization.absolute_pose import centre, pose_error
-from protomark.localization.cameras import camera_of_exif
+from protomark.geometry.pose import camera_centers, pose_error
+from protomark.geometry.camera_files import camera_from_exif
 from protomark.localization.halves import calibrated, localize_halves, medoids, prototypes
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 from protomark.tracks.command import make_tracks
 from protomark.tracks.extract import Settings
-from protomark.upright import upright_tracks
+from protomark.tracks.file import upright_tracks
 from tracks_scene import PINHOLE, poses, quaternion, render, texture, write_model, write_sequence
 
 KEYPOINTS = 600
@@ -232,9 +232,9 @@ def test_command(query: Path) -> None:
     assert "0 keypoints" in rows["black.png"]["note"]
     assert "32 x 24 pixels" in rows["small.png"]["note"]
     position = [float(rows["2.png"][axis]) for axis in "xyz"]
-    assert position == pytest.approx(centre(NEW_POSES[1]), abs=0.02)
+    assert position == pytest.approx(camera_centers(NEW_POSES[1]), abs=0.02)
 
-    from protomark.tracks.colmap import pycolmap
+    from protomark.geometry.colmap import pycolmap
 
     model = pycolmap.Reconstruction(str(out))
     assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
@@ -255,7 +255,7 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
     stamps = []
     for i, pose in enumerate(NEW_POSES):
         w, *v = quaternion(pose[:, :3].T)
-        stamps.append(" ".join(map(str, [f"{i + 1}.0", *centre(pose), *v, w])))
+        stamps.append(" ".join(map(str, [f"{i + 1}.0", *camera_centers(pose), *v, w])))
     (query / "tum.txt").write_text("# time x y z q\n" + "\n".join(stamps) + "\n")
     for camera in (
         "PINHOLE:300,300,160,120",
@@ -288,10 +288,10 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
     exif[0x8769] = {0xA405: 34}  # focal length of 35 mm film, by the image's diagonal 43.3 mm
     with Image.open(query / "images" / "1.png") as image:
         image.save(query / "exif.jpg", quality=98, exif=exif)
-    camera = camera_of_exif(query / "exif.jpg")
+    camera = camera_from_exif(query / "exif.jpg")
     assert camera is not None
     assert camera.params[0] == pytest.approx(34 / 43.27 * 400, rel=0.01)
-    assert camera_of_exif(query / "images" / "1.png") is None
+    assert camera_from_exif(query / "images" / "1.png") is None
     done = run(
         query / "scene.pmk", query / "exif.jpg", "-o", query / "o", "--json", query / "f.json"
     )

@@ -14,15 +14,16 @@ import pytest
 
 import protomark as pm
 from mapping_scene import show, walk, write_images
-from protomark.evaluation.trajectory import trajectory_error
-from protomark.localization.absolute_pose import centre
-from protomark.localization.poses import quaternion_of, read_poses
+from protomark.geometry.similarity import trajectory_error
+from protomark.geometry.pose import camera_centers
+from protomark.geometry.pose import quaternion_from_rotation
+from protomark.geometry.pose_files import read_poses
 from protomark.mapping.command import Interrupted, Request, make_map
 from protomark.mapping.mapper import Mapper, Picture
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.settings import Settings
 from protomark.mapping.state import load_state
-from protomark.tracks.colmap import pycolmap
+from protomark.geometry.colmap import pycolmap
 from test_tracks_command import fails
 from test_tracks_command import run as run_tracks
 from tracks_scene import PINHOLE
@@ -46,7 +47,7 @@ def error_of(scene: Path, poses) -> float:  # type: ignore[no-untyped-def]
     images = sorted(found.images.values(), key=lambda i: int(i.name[3:-4]))
     true = np.array([poses[int(i.name[3:-4]) - 1] for i in images])
     centers = np.array([i.projection_center() for i in images])
-    return trajectory_error(centers, centre(true)).rmse
+    return trajectory_error(centers, camera_centers(true)).rmse
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +193,7 @@ def test_given_poses_stay_and_structure_is_built(images: Path, tmp_path: Path) -
     poses = walk(COUNT)
     lines = []
     for i, pose in enumerate(poses, 1):
-        numbers = " ".join(repr(float(v)) for v in (*quaternion_of(pose[:, :3]), *pose[:, 3]))
+        numbers = " ".join(repr(float(v)) for v in (*quaternion_from_rotation(pose[:, :3]), *pose[:, 3]))
         lines.append(f"{i} {numbers} 1 img{i}.png\n\n" if i != 4 else "")
     (tmp_path / "images.txt").write_text("".join(lines))
     scene = tmp_path / "scene"
@@ -275,8 +276,8 @@ def test_gaps_do_not_bend_the_map(missing: tuple[int, ...]) -> None:
     mapper.finish()
     frames = mapper.structure.frames
     assert len(frames) == COUNT - len(missing)
-    found = centre(np.array([frame.pose for frame in frames]))
-    true = centre(poses[[frame.index for frame in frames]])
+    found = camera_centers(np.array([frame.pose for frame in frames]))
+    true = camera_centers(poses[[frame.index for frame in frames]])
     assert trajectory_error(found, true).rmse < 0.01
 
 

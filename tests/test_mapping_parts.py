@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from protomark.localization.cameras import read_cameras
-from protomark.localization.poses import quaternion_of, read_poses
+from protomark.geometry.camera_files import read_cameras
+from protomark.geometry.pose import quaternion_from_rotation
+from protomark.geometry.pose_files import read_poses
 from protomark.mapping.memory import Descriptors, Medoids, Prototypes
 from protomark.mapping.source import Folder, Video, open_source
-from protomark.tracks.nearby import near_pairs
+from protomark.geometry.neighbours import near_pairs
 from tracks_scene import PINHOLE
 
 
@@ -136,7 +137,7 @@ def test_camera_parameters_that_do_not_fit():
 def test_poses_as_tum_and_as_colmap_agree(tmp_path):
     rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     pose = np.column_stack([rotation, [1.0, 2, 3]])
-    w, x, y, z = quaternion_of(rotation)
+    w, x, y, z = quaternion_from_rotation(rotation)
     colmap = tmp_path / "images.txt"
     colmap.write_text(f"# images\n1 {w} {x} {y} {z} 1 2 3 1 a b.png\n\n")
     np.testing.assert_allclose(read_poses(colmap).of("a b.png", 0.0), pose, atol=1e-12)

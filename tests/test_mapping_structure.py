@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 from mapping_scene import walk
-from protomark.localization.absolute_pose import centre, project
+from protomark.geometry.pose import transform
+from protomark.geometry.pose import camera_centers
 from protomark.mapping import loop, merging
 from protomark.mapping.adjustment import adjust, adjust_global
 from protomark.mapping.culling import cull
 from protomark.mapping.memory import Descriptors
-from protomark.mapping.pose import refine_pose
+from protomark.geometry.absolute_pose import refine_pose
 from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Frame, Structure
 from protomark.mapping.triangulation import remember
-from protomark.tracks.colmap import rays
+from protomark.geometry.pose import transform
 from tracks_scene import PINHOLE
 
 MAX_ERROR, MIN_ANGLE = 0.01, 1.0
@@ -32,7 +33,7 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
     structure, memory = Structure({1: PINHOLE}), Descriptors(8)
     ids = structure.create(points)
     for i, pose in enumerate(walk(8)):
-        pixels = project(PINHOLE, pose, points) + noise * rng.normal(size=(POINTS, 2))
+        pixels = PINHOLE.project(transform(pose, points)) + noise * rng.normal(size=(POINTS, 2))
         descriptors = rng.integers(0, 256, (POINTS, 8), np.uint8)
         frame = Frame(
             index=i,
@@ -42,7 +43,7 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
             pose=pose.copy(),
             keypoints=pixels.astype(np.float32),
             landmarks=np.full(POINTS, -1, np.int64),
-            rays=rays(PINHOLE, pixels),
+            rays=PINHOLE.rays(pixels),
             descriptors=descriptors,
             encoded=descriptors,
         )
@@ -64,7 +65,7 @@ def test_visible_is_what_projects_into_the_image_from_where_it_was_seen() -> Non
     structure, _ = scene()
     pose = walk(8)[3]
     ids, pixels = structure.visible(pose, 1)
-    want = project(PINHOLE, pose, structure.positions[structure.ids])
+    want = PINHOLE.project(transform(pose, structure.positions[structure.ids]))
     inside = ((want > 0) & (want < [320, 240])).all(1)
     np.testing.assert_array_equal(ids, structure.ids[inside])
     np.testing.assert_allclose(pixels, want[inside], atol=1e-9)
@@ -126,7 +127,7 @@ def test_merging_joins_what_no_frame_tells_apart_and_one_position_fits() -> None
     far = structure.create(structure.positions[[30]] + [[0.3, 0, 0]])
     for frame in structure.frames[4:]:
         frame.landmarks[29] = -1
-        frame.rays[29] = rays(PINHOLE, project(PINHOLE, frame.pose, structure.positions[far]))[0]
+        frame.rays[29] = PINHOLE.rays(PINHOLE.project(transform(frame.pose, structure.positions[far])))[0]
         structure.observe(frame, np.array([29]), far)
     assert merging.merge(structure, memory, [(30, int(far[0]))], MAX_ERROR) == 0
 
@@ -164,17 +165,17 @@ def test_drift_is_spread_over_the_frames_since_the_place_was_seen() -> None:
         frame.landmarks[20:] = frame.landmarks[20:] if i >= 3 else -1
     for i, frame in enumerate(structure.frames[3:], 1):
         turn = cv2.Rodrigues(i / 5 * np.array([0.02, -0.1, 0.03]))[0]
-        moved = centre(frame.pose) + i / 5 * np.array([0.3, -0.1, 0.2])
+        moved = camera_centers(frame.pose) + i / 5 * np.array([0.3, -0.1, 0.2])
         frame.pose[:, :3] = frame.pose[:, :3] @ turn.T
         frame.pose[:, 3] = -frame.pose[:, :3] @ moved
     true = walk(8)
-    before = [np.linalg.norm(centre(f.pose) - centre(true[f.index])) for f in structure.frames]
+    before = [np.linalg.norm(camera_centers(f.pose) - camera_centers(true[f.index])) for f in structure.frames]
     loop._correct(structure, 7, true[7], np.arange(20), old)
     np.testing.assert_allclose(newest.pose, true[7], atol=1e-9)
     for frame in structure.frames[:3]:
         np.testing.assert_array_equal(frame.pose, true[frame.index])
     for frame in structure.frames[3:]:
-        off = np.linalg.norm(centre(frame.pose) - centre(true[frame.index]))
+        off = np.linalg.norm(camera_centers(frame.pose) - camera_centers(true[frame.index]))
         assert off < 0.2 * before[frame.index]
 
 
@@ -227,7 +228,7 @@ def test_landmarks_are_less_certain_the_further_from_their_rays_they_are_seen() 
     # depth's variance shows half as much as a keypoint's.
     np.testing.assert_allclose(structure.certainty(one, ids), 2 / 3, rtol=1e-3)
     middle = one.copy()
-    middle[:, 3] = -middle[:, :3] @ (centre(one) + centre(two)) / 2
+    middle[:, 3] = -middle[:, :3] @ (camera_centers(one) + camera_centers(two)) / 2
     assert (structure.certainty(middle, ids) > 0.999).all()
     far = walk(8)[7]
     assert (structure.certainty(far, ids) < 0.03).all()
@@ -238,7 +239,7 @@ def test_a_refined_pose_is_the_one_that_certain_landmarks_give(weighted: bool) -
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.6, -0.5, 2], [0.5, 0.5, 3], (POINTS, 3))
     pose = walk(8)[3]
-    pixels = project(PINHOLE, pose, points)
+    pixels = PINHOLE.project(transform(pose, points))
     weights = np.ones(POINTS)
     if weighted:
         # A third, on one side, has depths that all are wrong the same way.

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mutation import FILES, SEED, bounded, mutated
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 from protomark.tracks.database import _features, _read
 from small_tracks import small_tracks
 

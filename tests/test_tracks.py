@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 from protomark.tracks.extract import Settings, Source, extract, find_source, fingerprint, is_done
-from protomark.tracks.features import DESCRIPTORS, Extractor
+from protomark.features.descriptors import DESCRIPTORS
+from protomark.features.extractor import Extractor
 from protomark.tracks.summary import reprojection_errors, summarise
 from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
@@ -28,12 +29,11 @@ def orb(sequence: Path) -> Tracks:
 
 def spread_on_plane(tracks: Tracks) -> np.ndarray:
     """Distance of each observation from its landmark's mean, measured on the true plane z = 0."""
-    from protomark.tracks.colmap import rays
 
     rows = tracks.observations
     keyframe = tracks.keyframe_of_keypoint[rows]
     pose = poses(len(tracks.keyframe_names))[keyframe]
-    ray = rays(tracks.cameras[1], tracks.keypoints[rows])
+    ray = tracks.cameras[1].rays(tracks.keypoints[rows])
     direction = np.einsum("nji,nj->ni", pose[:, :, :3], np.column_stack([ray, np.ones(len(ray))]))
     center = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
     hit = (center - direction * (center[:, 2] / direction[:, 2])[:, None])[:, :2]

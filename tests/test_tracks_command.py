@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from protomark.cli import main
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 from tracks_scene import PINHOLE, poses, write_model, write_sequence
 
 FAST = ["--max-keypoints", "300", "--threads", "1"]
@@ -104,7 +104,7 @@ def test_other_layouts(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_binary_model_without_points(copy: Path, tmp_path: Path) -> None:
-    from protomark.tracks.colmap import read_reconstruction
+    from protomark.geometry.colmap import read_reconstruction
 
     model = read_reconstruction(copy / "sparse")
     shutil.rmtree(copy / "sparse")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protomark.tracks import Tracks
-from protomark.tracks.colmap import pycolmap, read_model
+from protomark.tracks.file import Tracks
+from protomark.geometry.colmap import pycolmap, read_model
 from protomark.tracks.database import digest_of, from_database, is_done
 from protomark.tracks.extract import Settings, extract, find_source
 from protomark.tracks.triangulation import _posed, _write_database

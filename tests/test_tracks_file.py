@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save
 
-from protomark.tracks import Camera, Tracks
-from protomark.tracks.file import CAMERA_MODELS
+from protomark.geometry.camera import Camera
+from protomark.tracks.file import Tracks
+from protomark.geometry.camera import CAMERA_MODELS
 from small_tracks import small_tracks
 
 Arrays = dict[str, NDArray[Any]]

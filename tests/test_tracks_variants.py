@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from protomark.cli import app
 from protomark.evaluation.protocol import split
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 from protomark.tracks.extract import Settings, extract, find_source
-from protomark.tracks.variants import add_variants, vary
+from protomark.tracks.augmentation import add_variants, vary
 from tracks_scene import PINHOLE, poses, render, texture, write_model
 
 

@@ -8,10 +8,11 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark import sample
-from protomark.build import build_map
+from protomark.maps.build import build_map
 from protomark.cli import app
 from protomark.evaluation.results import load_json
-from protomark.upright import BYTES, upright_descriptors, upright_tracks
+from protomark.features.upright import BYTES, upright_descriptors
+from protomark.tracks.file import upright_tracks
 
 
 def added(angle: float, size: float) -> tuple[list[int], list[int]]:
