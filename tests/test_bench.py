@@ -489,7 +489,7 @@ def test_figures_outlive_a_section_that_fails(
 def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
     arguments = ["bench", "--quick", "-o", tmp_path / "report", "--json", tmp_path / "bench.json"]
     done = subprocess.run(
-        [sys.executable, "-m", "protomark.cli", *map(str, arguments)],
+        [sys.executable, "-m", "protomark", *map(str, arguments)],
         capture_output=True,
         text=True,
     )

@@ -9,12 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation_scene import CAMERA, looking_inwards
-from protomark.localization import PosePrior
-from protomark.geometry.pose import transform
-from protomark.geometry.pose import camera_centers
-from protomark.localization.frustum import visible
-from protomark.geometry.pose import quaternion_from_rotation, rotation_from_quaternion
 from protomark.geometry.camera import Camera
+from protomark.geometry.pose import (
+    camera_centers,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+)
+from protomark.localization import PosePrior
+from protomark.localization.prior import visible
 from tracks_scene import DISTORTED, PINHOLE, quaternion
 
 FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0))
@@ -65,6 +68,8 @@ def test_priors_that_are_none(distance: float, degrees: float) -> None:
 @given(st.tuples(*[st.floats(-4, 4)] * 3))
 def test_rotations_round_trip(axis: tuple[float, ...]) -> None:
     rotation = cv2.Rodrigues(np.array(axis))[0]
-    assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-9)
+    assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(
+        rotation, abs=1e-9
+    )
     if np.trace(rotation) > 0:
         assert quaternion_from_rotation(rotation) == pytest.approx(quaternion(rotation), abs=1e-9)

@@ -6,7 +6,14 @@ import torch
 
 import protomark as pm
 from protomark import models
-from protomark.training.network import EncoderNetwork, MAX_WEIGHT_BYTES, default_hidden, embed, to_signs, weight_bytes
+from protomark.training.network import (
+    MAX_WEIGHT_BYTES,
+    EncoderNetwork,
+    default_hidden,
+    embed,
+    to_signs,
+    weight_bytes,
+)
 from protomark.training.quantization import Layer, QuantizedNetwork, integer_forward
 
 

@@ -29,11 +29,10 @@ _MAX_LANDMARKS = 20_000
 _MAX_OBSERVATIONS = 20
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """A figure of so many inches, independent of any window."""
-    figure: Figure = optional("matplotlib.figure").Figure(
-        figsize=(width, height), layout="constrained"
-    )
+def new_figure(width: float, height: float, **padding: float) -> Figure:
+    """A figure of so many inches, independent of any window; `padding` as constrained layout."""
+    engine = optional("matplotlib.layout_engine").ConstrainedLayoutEngine(**padding)
+    figure: Figure = optional("matplotlib.figure").Figure(figsize=(width, height), layout=engine)
     return figure
 
 
@@ -306,8 +305,10 @@ def _map_from_above(pictures: MapPictures) -> Figure:
     step = max(1, len(pictures.positions) // _MAX_LANDMARKS)
     points = pictures.positions[::step] @ plane.T
     if len(points):
+        x, y = points.T
         shown = axes.scatter(
-            *points.T,
+            x,
+            y,
             s=2,
             c=np.minimum(pictures.counts[::step], _MAX_OBSERVATIONS),
             cmap="viridis",

@@ -118,7 +118,6 @@ def tracks(
     sources = [TracksInput(folder, images, model, database) for folder in folders]
     _check(sources, output, augmentations)
     check_outputs(json_file)
-    output.mkdir(parents=True, exist_ok=True)
     threads = threads if threads > 0 else available_threads()
     facts = []
     for source in sources:

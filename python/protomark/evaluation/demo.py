@@ -257,8 +257,7 @@ def _write_maps(
 
 
 def _draw(rows: list[DemoRow], shown: DemoRow, scene: ScenePicture, path: Path) -> None:
-    figure = new_figure(13, 6.2)
-    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.08, wspace=0.04)
+    figure = new_figure(13, 6.2, w_pad=0.12, h_pad=0.08, wspace=0.04)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
     draw_scene(
         left,

@@ -217,9 +217,9 @@ class Initialiser:
             pixels = witness.keypoints[pairs[known, 1]].astype(np.float64)
             seen = points[pairs[known, 0]]
             total += len(seen)
-            found = estimate_pose(self.camera, pixels, seen, limit)
+            found = estimate_pose(pixels, seen, self.camera, limit)
             if found is not None:
-                error = reprojection_error(self.camera, pixels, seen, found[0])
+                error = reprojection_error(found.cam_from_world, pixels, seen, self.camera)
                 fit += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
                 fitting += int((error <= limit).sum())
         return fit, fitting / max(total, 1)

@@ -76,7 +76,7 @@ def make_tracks(
     Args:
         source: where to make them from.
         options: how to make them.
-        output: an existing folder for the file.
+        output: folder for the file; it is made if it does not exist.
         force: make the file anew even if it is up to date.
         threads: threads for detection and matching.
         progress: called with each stage.
@@ -102,6 +102,7 @@ def make_tracks(
     if current:
         return TracksFile(path, Tracks.load(path), skipped=True)
     tracks = _timed(make)
+    output.mkdir(parents=True, exist_ok=True)
     tracks.save(path)
     return TracksFile(path, tracks, skipped=False)
 

@@ -12,12 +12,19 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark import models, sample
-from protomark.match_calibration import KEY, MatchCalibration, parse, with_calibration
-from protomark.training.calibration import encoder_answers, measure
 from protomark.cli import app
-from protomark.match_calibration import fit, sigmoid
+from protomark.match_calibration import (
+    KEY,
+    SOURCE_KEY,
+    MatchCalibration,
+    fit_logistic,
+    parse,
+    sigmoid,
+    with_calibration,
+)
 from protomark.matching import MIN_PROBABILITY, accept
 from protomark.tracks.file import Tracks
+from protomark.training.match_calibration import matches_by_dim, measure_calibration
 
 LIMIT = 600_000
 
@@ -27,31 +34,33 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
     x = rng.normal((3, -200), (2, 50), (60_000, 2))
     true = np.array([2.5, -1.5, -0.01])
     right = rng.random(len(x)) < sigmoid(true[0] + x @ true[1:])
-    found = fit(x, right, np.ones(len(x)))
+    found = fit_logistic(x, right, np.ones(len(x)))
     assert found == pytest.approx(true, rel=0.1)
     # Counting a row twice is as good as having it twice.
-    twice = fit(np.vstack([x, x[:9000]]), np.append(right, right[:9000]), np.ones(69_000))
-    assert fit(x, right, 1.0 + (np.arange(60_000) < 9000)) == pytest.approx(twice, rel=1e-6)
+    twice = fit_logistic(np.vstack([x, x[:9000]]), np.append(right, right[:9000]), np.ones(69_000))
+    assert fit_logistic(x, right, 1.0 + (np.arange(60_000) < 9000)) == pytest.approx(
+        twice, rel=1e-6
+    )
 
 
 def test_what_is_told_apart_without_exception_has_finite_weights() -> None:
     x = np.linspace(-1, 1, 100)[:, None]
-    found = fit(x, x[:, 0] > 0, np.ones(100))
+    found = fit_logistic(x, x[:, 0] > 0, np.ones(100))
     assert np.isfinite(found).all()
     assert found[1] > 1
     for same in (np.zeros(100, bool), np.ones(100, bool)):
         with pytest.raises(ValueError, match="nothing to tell apart"):
-            fit(x, same, np.ones(100))
+            fit_logistic(x, same, np.ones(100))
 
 
 def test_probability() -> None:
-    acceptance = MatchCalibration((1.0, -0.05, 0.02))
+    calibration = MatchCalibration((1.0, -0.05, 0.02))
     away = np.array([[4, 8], [4, np.inf], [0, 0], [np.inf, np.inf]], np.float32)
-    p = acceptance.probability(away)
+    p = calibration.probability(away)
     logits = [1 - 0.8 + 0.96, 1 - 0.8 + 0.96, 1]
     assert p[:3] == pytest.approx(1 / (1 + np.exp(-np.array(logits))))
     assert p[3] == 0
-    assert len(acceptance.probability(np.zeros((0, 2)))) == 0
+    assert len(calibration.probability(np.zeros((0, 2)))) == 0
 
 
 @given(st.lists(st.tuples(st.integers(-1, 5), st.floats(0, 1)), max_size=30))
@@ -74,18 +83,18 @@ def test_the_note_changes_neither_identity_nor_codes(encoder: pm.Encoder, tmp_pa
     with_calibration(encoder, fitted, "here, there").save(tmp_path / "x.pme")
     read = pm.Encoder.load(tmp_path / "x.pme")
     assert read.identity == encoder.identity
-    assert read.acceptance(5) == fitted[5]
-    assert read.acceptance() == fitted[12]
-    assert read.notes["acceptance_data"] == "here, there"
+    assert MatchCalibration.of(read, 5) == fitted[5]
+    assert MatchCalibration.of(read) == fitted[12]
+    assert read.notes[SOURCE_KEY] == "here, there"
     # A map keeps it.
     pm.PrototypeMap(read, 5).save(tmp_path / "m.pmk")
     scene = pm.open(tmp_path / "m.pmk")
-    assert scene.encoder.acceptance(scene.dim) == fitted[5]
+    assert MatchCalibration.of(scene.encoder, scene.dim) == fitted[5]
 
 
 def test_without_a_note_the_error_says_what_to_do(encoder: pm.Encoder) -> None:
     with pytest.raises(ValueError, match="protomark calibrate"):
-        encoder.acceptance(5)
+        MatchCalibration.of(encoder, 5)
 
 
 @pytest.mark.parametrize("note", ["8 1 2", "8 1 2 3 4", "8 1 2 nan", "8 1 2 x", "\n"])
@@ -102,11 +111,11 @@ def test_what_ships_is_calibrated_and_as_its_card_says(name: str) -> None:
     assert size <= LIMIT
     card = path.with_suffix(".md").read_text()
     assert f"- file: {size:,} bytes" in card
-    assert f"fitted to {encoder.notes['acceptance_data']} " in card
+    assert f"fitted to {encoder.notes[SOURCE_KEY]} " in card
     for test_sequence in ("toy", "kitchen", "castle", "kitti07"):
-        assert test_sequence not in encoder.notes["acceptance_data"]
+        assert test_sequence not in encoder.notes[SOURCE_KEY]
     for dim in encoder.dims:
-        near, far = encoder.acceptance(dim).probability([[1.0, 100.0], [99.0, 100.0]])
+        near, far = MatchCalibration.of(encoder, dim).probability([[1.0, 100.0], [99.0, 100.0]])
         assert near > 0.8
         assert near - far > 0.3
 
@@ -115,15 +124,15 @@ def test_an_older_map_takes_over_what_the_encoder_that_ships_says() -> None:
     ships = pm.Encoder.load("orb")
     old = pm.Encoder(ships.layers, ships.dims, "orb", "orb", ships.scale)
     assert KEY not in old.notes
-    assert old.acceptance(16) == ships.acceptance(16)
+    assert MatchCalibration.of(old, 16) == MatchCalibration.of(ships, 16)
 
 
 def test_probabilities_hold_on_a_sequence_that_they_were_not_fitted_to() -> None:
     encoder = pm.Encoder.load("freak")
     tracks = Tracks.load(sample.path())
-    found = encoder_answers(encoder, tracks, frames=5)
+    found = matches_by_dim(encoder, tracks, frames=5)
     for dim in (16, 32, 64):
-        figures = measure("toy", dim, encoder.acceptance(dim), found[dim])
+        figures = measure_calibration("toy", dim, MatchCalibration.of(encoder, dim), found[dim])
         assert figures.precision == pytest.approx(figures.expected, abs=0.12)
         assert figures.recall > 0.6
 
@@ -148,7 +157,7 @@ def test_calibrate_command(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "new.pme")])
     assert done.exit_code == 0, done.output
     made = pm.Encoder.load(tmp_path / "new.pme")
-    assert made.notes["acceptance_data"] == "toy"
-    assert made.acceptance(8) != pm.Encoder.load("freak").acceptance(8)
+    assert made.notes[SOURCE_KEY] == "toy"
+    assert MatchCalibration.of(made, 8) != MatchCalibration.of(pm.Encoder.load("freak"), 8)
     twice = CliRunner().invoke(app, [*command, str(sample.path())])
     assert "two files are of the sequence toy" in str(twice.exception)

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from protomark.cli import app
 from protomark.evaluation.protocol import split
+from protomark.tracks.augmentation import add_augmentations, augment
+from protomark.tracks.extract import TracksOptions, extract, find_sequence
 from protomark.tracks.file import Tracks
-from protomark.tracks.extract import Settings, extract, find_source
-from protomark.tracks.augmentation import add_variants, vary
 from tracks_scene import PINHOLE, poses, render, texture, write_model
 
 
@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def plain(folder: Path) -> Tracks:
-    return extract(find_source(folder), Settings("orb", max_keypoints=600))
+    return extract(find_sequence(folder), TracksOptions("orb", max_keypoints=600))
 
 
 def test_homography_says_where_a_pixel_went() -> None:
@@ -38,7 +38,7 @@ def test_homography_says_where_a_pixel_went() -> None:
     image = np.full((200, 300), 60, np.uint8)
     cv2.circle(image, (170, 80), 4, 255, -1)
     for seed in range(10):
-        copy, homography, _, _ = vary(image, np.random.default_rng(seed))
+        copy, homography, _, _ = augment(image, np.random.default_rng(seed))
         assert copy.shape == image.shape
         assert copy.dtype == np.uint8
         x, y, w = homography @ [170, 80, 1]
@@ -50,7 +50,7 @@ def test_homography_says_where_a_pixel_went() -> None:
 def test_scale_and_rotation_are_the_homographys() -> None:
     image = np.zeros((200, 300), np.uint8)
     for seed in range(5):
-        _, homography, scale, angle = vary(image, np.random.default_rng(seed))
+        _, homography, scale, angle = augment(image, np.random.default_rng(seed))
         to = [(homography @ [150 + dx, 100, 1]) for dx in (0, 1)]
         step = to[1][:2] / to[1][2] - to[0][:2] / to[0][2]
         assert np.hypot(*step) == pytest.approx(scale, rel=0.1)
@@ -58,7 +58,7 @@ def test_scale_and_rotation_are_the_homographys() -> None:
 
 
 def test_copies_see_the_same_landmarks_at_the_same_places(folder: Path, plain: Tracks) -> None:
-    varied = add_variants(plain, folder / "images", 2)
+    varied = add_augmentations(plain, folder / "images", 2)
     varied.check()
     m, n = len(plain.keyframe_names), len(plain.observations)
     assert varied.keyframe_names[m : m + 2] == ["0.png#1", "0.png#2"]
@@ -86,19 +86,19 @@ def test_copies_see_the_same_landmarks_at_the_same_places(folder: Path, plain: T
 
 
 def test_threads_change_nothing(folder: Path, plain: Tracks) -> None:
-    one, two = (add_variants(plain, folder / "images", 1, threads=t) for t in (1, 2))
+    one, two = (add_augmentations(plain, folder / "images", 1, threads=t) for t in (1, 2))
     np.testing.assert_array_equal(one.descriptors, two.descriptors)
     np.testing.assert_array_equal(one.offsets, two.offsets)
 
 
 def test_not_for_measuring_and_not_twice(folder: Path, plain: Tracks) -> None:
-    varied = add_variants(plain, folder / "images", 1)
-    with pytest.raises(ValueError, match="to learn from only"):
+    varied = add_augmentations(plain, folder / "images", 1)
+    with pytest.raises(ValueError, match="for training only"):
         split(varied, 0)
-    with pytest.raises(ValueError, match="have variants already"):
-        add_variants(varied, folder / "images", 1)
+    with pytest.raises(ValueError, match="are augmented already"):
+        add_augmentations(varied, folder / "images", 1)
     with pytest.raises(ValueError, match="at least 1"):
-        add_variants(plain, folder / "images", 0)
+        add_augmentations(plain, folder / "images", 0)
 
 
 def test_command_writes_both_and_keeps_what_is_there(folder: Path, tmp_path: Path) -> None:
@@ -106,21 +106,21 @@ def test_command_writes_both_and_keeps_what_is_there(folder: Path, tmp_path: Pat
     tmp_path.mkdir()
     words = ["tracks", str(folder), "-d", "orb", "--max-keypoints", "300", "-o", str(tmp_path)]
     facts = tmp_path / "facts.json"
-    words += ["--json", str(facts), "--threads", "1", "--variants", "1"]
+    words += ["--json", str(facts), "--threads", "1", "--augmentations", "1"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    path = tmp_path / "plane.orb.varied.safetensors"
-    assert Tracks.load(path).info["variants"] == 1
+    path = tmp_path / "plane.orb.augmented.safetensors"
+    assert Tracks.load(path).info["augmentations"] == 1
     assert "more observations" in done.output
     assert done.output.count("/of[today]/plane.orb.") == 2
     plain, varied = json.loads(facts.read_text())
     assert (plain["file"], varied["file"]) == (str(tmp_path / "plane.orb.safetensors"), str(path))
-    assert "variants" not in plain
-    assert (varied["variants"], varied["skipped"]) == (1, False)
+    assert "augmentations" not in plain
+    assert (varied["augmentations"], varied["skipped"]) == (1, False)
     assert varied["observations"] == len(Tracks.load(path).observations) > plain["observations"]
     before = path.stat().st_mtime_ns
     assert CliRunner().invoke(app, words).exit_code == 0
     assert path.stat().st_mtime_ns == before
     assert json.loads(facts.read_text())[1] == {**varied, "skipped": True}
     assert CliRunner().invoke(app, [*words[:-1], "2"]).exit_code == 0
-    assert Tracks.load(path).info["variants"] == 2
+    assert Tracks.load(path).info["augmentations"] == 2
