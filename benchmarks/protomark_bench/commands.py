@@ -68,8 +68,10 @@ def bench(
     maps lie. docs/results/benchmarks.md
     holds a whole run.
     """
-    from protomark_bench import machine, report
-    from protomark_bench.options import command_line, numbers
+    from protomark.cli.terminal import comma_separated, comma_separated_numbers
+    from protomark.threads import available_threads
+    from protomark_bench import report
+    from protomark_bench.options import command_line
     from protomark_bench.speed import command
     from protomark_bench.speed.results import BenchResults
     from protomark_bench.speed.settings import settings_of
@@ -80,12 +82,14 @@ def bench(
     else:
         settings = settings_of(
             scale,
-            tuple(name.strip() for name in only.split(",") if name.strip()),
+            comma_separated(only),
             threads,
-            build_threads=machine.available_threads(),
+            build_threads=available_threads(),
             indexes=indexes,
         )
-        settings = settings.at(numbers("--landmarks", landmarks)).with_graphs(graphs)
+        settings = settings.at(comma_separated_numbers("--landmarks", landmarks)).with_graphs(
+            graphs
+        )
         again = command_line(
             "bench",
             tracks,
@@ -153,7 +157,8 @@ def reproduce(
     same command goes on. Sequences of other names than the project's own need --train,
     --validation and --test. docs/reproduction.md says more.
     """
-    from protomark_bench import machine, report
+    from protomark.threads import available_threads
+    from protomark_bench import report
     from protomark_bench.options import need, resumable
     from protomark_bench.paper.results import PaperResults
 
@@ -170,7 +175,7 @@ def reproduce(
         settings = command.PaperSettings(
             scale=find_scale(scale),
             descriptor=descriptor,
-            jobs=jobs or max(machine.available_threads() // threads, 1),
+            jobs=jobs or max(available_threads() // threads, 1),
             threads=threads,
             roles={"training": train or [], "validation": validation or [], "test": test or []},
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import os
 import platform
 import shutil
 import sys
@@ -12,6 +11,8 @@ import tempfile
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from protomark.threads import available_threads
 
 
 def describe(*distributions: str) -> dict[str, str]:
@@ -35,13 +36,6 @@ def describe(*distributions: str) -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return facts
-
-
-def available_threads() -> int:
-    """Processors that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def cpu_model() -> str:

@@ -10,18 +10,6 @@ from pathlib import Path
 import typer
 
 
-def numbers(option: str, text: str) -> tuple[int, ...]:
-    """The numbers of a list such as 10000,1000000.
-
-    Raises:
-        ValueError: it holds something else.
-    """
-    try:
-        return tuple(int(number) for number in text.split(",") if number.strip())
-    except ValueError:
-        raise ValueError(f"{option} {text}: not numbers with commas between them") from None
-
-
 def command_line(command: str, paths: Sequence[Path] | None, **options: object) -> str:
     """The command that does the same again, as a report tells it: files by name alone.
 
@@ -53,11 +41,7 @@ def resumable(output: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        from protomark.console import progress_console
+        from protomark.cli.terminal import note
 
-        progress_console.print(
-            f"stopped; what is finished is cached in {output}, and the same command goes on",
-            highlight=False,
-            soft_wrap=True,
-        )
+        note(f"stopped; what is finished is cached in {output}, and the same command goes on")
         raise typer.Exit(130) from None

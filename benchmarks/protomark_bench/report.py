@@ -93,7 +93,7 @@ class Report:
 
     def publish(self, folder: Path) -> None:
         """Write all files into `folder`, each whole or not at all, and print the summary."""
-        from protomark.console import console
+        from protomark.cli.terminal import console
         from protomark_bench.plot import save_svg
 
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,10 +12,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from protomark.evaluation.methods import choices
-from protomark.evaluation.plot import save_plot
-from protomark.evaluation.report import markdown
-from protomark.evaluation.results import SequenceResult, load_json, mean_rows
+from protomark.evaluation.methods import method_choices
+from protomark.evaluation.results import (
+    SequenceResult,
+    evaluation_markdown,
+    load_json,
+    mean_rows,
+    save_precision_plot,
+)
 from protomark.files import write_text
 from protomark_bench.report import ReportTable, number
 
@@ -36,14 +40,14 @@ COLUMNS = {
     **{f"pca-{dim}": f"PCA {dim}" for dim in (16, 32, 64)},
     **{f"protomark-{dim}": f"**{dim}**" for dim in DIMS},
     **{f"protomark-{dim}x4": f"**{dim} x 4 bits**" for dim in (16, 32, 64)},
-    **{f"looks-{size}": f"**appearances, {size} B**" for size in (17, 33, 65)},
+    **{f"appearances-{size}": f"**appearances, {size} B**" for size in (17, 33, 65)},
 }
 # Bytes per landmark -> what is kept in them: int8, 4 bits, 4 bits and several appearances.
 BUDGETS = {
     9: ("protomark-8", "protomark-16x4", None),
-    17: ("protomark-16", "protomark-32x4", "looks-17"),
-    33: ("protomark-32", "protomark-64x4", "looks-33"),
-    65: ("protomark-64", None, "looks-65"),
+    17: ("protomark-16", "protomark-32x4", "appearances-17"),
+    33: ("protomark-32", "protomark-64x4", "appearances-33"),
+    65: ("protomark-64", None, "appearances-65"),
 }
 PAPER = {65: 0.849}  # Komorowski and Trzcinski, 16 float32 numbers and the count: 0.676 of 0.796
 
@@ -70,8 +74,8 @@ def joined(results: Sequence[SequenceResult]) -> list[SequenceResult]:
     Raises:
         ValueError: two files measured a sequence on other queries.
     """
-    families = [choice.family for choice in choices()]
-    families += ["protomark", "protomark-4bit", "protomark-looks"]
+    families = [choice.family for choice in method_choices()]
+    families += ["protomark", "protomark-4bit", "protomark-appearances"]
     whole: dict[tuple[str, str], SequenceResult] = {}
     for result in results:
         first = whole.setdefault((result.descriptor, result.sequence), result)
@@ -137,7 +141,7 @@ def card_text(results: Sequence[SequenceResult]) -> str:
 
 def upright_table(plain: Sequence[SequenceResult], upright: Sequence[SequenceResult]) -> str:
     """Precision without and with angle and size of the keypoint, a row per sequence."""
-    names = ["protomark-32", "protomark-32x4", "looks-17", "looks-33", "looks-65"]
+    names = ["protomark-32", "protomark-32x4", "appearances-17", "appearances-33", "appearances-65"]
     others = {result.sequence: result for result in upright}
     rows = []
     for result in plain:
@@ -166,7 +170,9 @@ def main() -> None:
         tests = [result for result in same if split_of(result.sequence) == "test"]
         if tests:
             title = f"{descriptor.upper()}: mean of {', '.join(r.sequence for r in tests)}"
-            save_plot(mean_rows(tests), DOCUMENT.parent / f"precision.{descriptor}.png", title)
+            save_precision_plot(
+                mean_rows(tests), DOCUMENT.parent / f"precision.{descriptor}.png", title
+            )
             parts += [ratio_table(tests), f"![{title}](precision.{descriptor}.png)"]
             replace_tables(MODELS / f"{descriptor}.md", card_text(tests))
         upright = RESULTS / f"upright.{descriptor}.json"
@@ -179,7 +185,7 @@ def main() -> None:
     for split, members in SPLITS.items():
         chosen = [result for result in results if result.sequence in members]
         if chosen:
-            parts.append(f"**Split: {split}**\n\n{markdown(chosen).rstrip()}")
+            parts.append(f"**Split: {split}**\n\n{evaluation_markdown(chosen).rstrip()}")
     replace_tables(DOCUMENT, "\n\n".join(parts))
 
 

@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.build import build_map
-from protomark.console import track
-from protomark.evaluation.pose import Frame
+from protomark.cli.terminal import progress_bar
+from protomark.evaluation.frames import QueryFrame
 from protomark.evaluation.protocol import split
+from protomark.geometry.pose import pose_error
 from protomark.localization import Localization, Localizer
-from protomark.localization.absolute_pose import pose_error
 from protomark.localization.confidence import Evidence, confidence
-from protomark.logistic import fit
+from protomark.maps.build import build_map, tracks_for
+from protomark.match_calibration import fit_logistic
+from protomark.progress import Progress, tracked
 from protomark.tracks.file import Tracks, sequence_name
-from protomark.upright import SUFFIX, upright_tracks
 from protomark_bench.report import ReportTable
 
 DEPTH_SHARE, DEGREES = 0.05, 5.0
@@ -41,7 +41,7 @@ KINDS = ("other", "tenth", "half")
 
 
 @dataclass(frozen=True)
-class LocalizedFrame:
+class ConfidenceSample:
     """One frame in one map.
 
     Attributes:
@@ -69,7 +69,7 @@ def own_maps(tracks: Tracks) -> Iterator[tuple[str, NDArray[np.int64], NDArray[n
     yield "half", rows, np.arange(half, len(tracks.keyframe_names))
 
 
-def is_right(found: Localization, frame: Frame, positions: NDArray[np.float64]) -> bool:
+def is_right(found: Localization, frame: QueryFrame, positions: NDArray[np.float64]) -> bool:
     """Whether a pose is near the true one, for landmarks at these positions."""
     if found.cam_from_world is None or not len(positions):
         return False
@@ -80,39 +80,39 @@ def is_right(found: Localization, frame: Frame, positions: NDArray[np.float64]) 
 
 
 def collect(
-    loaded: dict[str, Tracks], encoder: pm.Encoder, dim: int, stride: int
-) -> list[LocalizedFrame]:
+    loaded: dict[str, Tracks], encoder: pm.Encoder, dim: int, stride: int, progress: Progress
+) -> list[ConfidenceSample]:
     """Every frame in every map."""
     found = []
-    for name, tracks in track(loaded.items(), f"maps of {dim} numbers", len(loaded)):
+    for name, tracks in tracked(loaded.items(), progress, f"maps of {dim} numbers", len(loaded)):
         for kind, rows, asked in own_maps(tracks):
             used = np.zeros(len(tracks.keypoints), bool)
             used[rows] = True
             localizer = Localizer(build_map(tracks.where(used), encoder, dim))
             for keyframe in asked[::stride]:
-                frame = Frame.of(tracks, int(keyframe))
+                frame = QueryFrame.of(tracks, int(keyframe))
                 pose = localizer.localize_features(frame.keypoints, frame.descriptors, frame.camera)
                 right = is_right(pose, frame, localizer.scene.positions(pose.landmarks))
-                found.append(LocalizedFrame(name, name, kind, right, pose.evidence))
+                found.append(ConfidenceSample(name, name, kind, right, pose.evidence))
         localizer = Localizer(build_map(tracks, encoder, dim))
         for other, theirs in loaded.items():
             for keyframe in range(0, len(theirs.keyframe_names) if other != name else 0, stride):
-                frame = Frame.of(theirs, keyframe)
+                frame = QueryFrame.of(theirs, keyframe)
                 pose = localizer.localize_features(frame.keypoints, frame.descriptors, frame.camera)
-                found.append(LocalizedFrame(name, other, "other", False, pose.evidence))
+                found.append(ConfidenceSample(name, other, "other", False, pose.evidence))
     return found
 
 
-def fit_weights(found: list[LocalizedFrame]) -> NDArray[np.float64]:
+def fit_weights(found: list[ConfidenceSample]) -> NDArray[np.float64]:
     """Weights that fit poses, each (map, kind) counting alike."""
     posed = [f for f in found if f.evidence.inliers]
     groups = [(f.scene, f.kind) for f in posed]
     weights = np.array([1 / groups.count(g) for g in groups])
     features = np.array([f.evidence.features() for f in posed])
-    return fit(features, np.array([f.right for f in posed]), weights)
+    return fit_logistic(features, np.array([f.right for f in posed]), weights)
 
 
-def table(found: list[LocalizedFrame]) -> ReportTable:
+def table(found: list[ConfidenceSample]) -> ReportTable:
     """Frames, right poses, and how many right and wrong ones are believed at each level."""
     rows = []
     for scene in [*dict.fromkeys(f.scene for f in found), "all"]:
@@ -141,10 +141,12 @@ def main() -> None:
     asked = parser.parse_args()
     loaded = {sequence_name(path): Tracks.load(path) for path in asked.tracks}
     encoder = pm.Encoder.load(asked.encoder or next(iter(loaded.values())).descriptor)
-    if encoder.descriptor.endswith(SUFFIX):
-        loaded = {name: upright_tracks(tracks) for name, tracks in loaded.items()}
+    loaded = {name: tracks_for(encoder, tracks) for name, tracks in loaded.items()}
     dims = [int(dim) for dim in asked.dims.split(",")]
-    found = [f for dim in dims for f in collect(loaded, encoder, dim, asked.stride)]
+    found = []
+    with progress_bar() as progress:
+        for dim in dims:
+            found += collect(loaded, encoder, dim, asked.stride, progress)
     print(table(found).markdown())
     if asked.fit:
         names = asked.fit.split(",")

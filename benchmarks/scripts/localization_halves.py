@@ -21,16 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.acceptance import Acceptance
-from protomark.calibration import Search, answers, fit_acceptance, held_out
-from protomark.console import track
-from protomark.evaluation import pose
-from protomark.evaluation.methods.medoid import medoid
-from protomark.evaluation.support import Support
-from protomark.localization.absolute_pose import pose_error
-from protomark.localization.results import THRESHOLDS
-from protomark.localization.solve import CANDIDATES, solve
+from protomark.baselines.binary import medoid
+from protomark.baselines.support import Support
+from protomark.cli.terminal import progress_bar
+from protomark.evaluation.frames import QueryFrame
+from protomark.geometry.pose import pose_error
+from protomark.localization.batch import THRESHOLDS
+from protomark.localization.solve import CANDIDATES, Candidates, solve_pose
+from protomark.match_calibration import MatchCalibration
+from protomark.matching import MIN_PROBABILITY
+from protomark.progress import tracked
 from protomark.tracks.file import Tracks
+from protomark.training.match_calibration import (
+    Search,
+    fit_calibration,
+    held_out_frames,
+    label_matches,
+)
 from protomark_bench.report import ReportTable
 
 MIN_OBSERVATIONS = 2
@@ -76,14 +83,14 @@ def hamming(descriptors: NDArray[np.uint8], landmarks: NDArray[np.int64]) -> Sea
     return search
 
 
-def calibrated(build: Builder, sequences: Sequence[Tracks], frames: int = 40) -> Acceptance:
-    """Which matches this kind of map accepts, fitted to frames of some sequences."""
+def calibrated(build: Builder, sequences: Sequence[Tracks], frames: int = 40) -> MatchCalibration:
+    """The calibration of this kind of map, fitted to frames of other sequences."""
     given = []
     for tracks in sequences:
-        rows, asked = held_out(tracks, frames)
+        rows, queries = held_out_frames(tracks, frames)
         support = Support(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
-        given.append(answers(tracks, asked, build(support)[0]))
-    return fit_acceptance(given)
+        given.append(label_matches(tracks, queries, build(support)[0]))
+    return fit_calibration(given)
 
 
 @dataclass(frozen=True)
@@ -112,14 +119,18 @@ class HalvesResult:
 
 
 def localize_halves(
-    tracks: Tracks, build: Builder, acceptance: Acceptance, share: float = 0.5, stride: int = 1
+    tracks: Tracks,
+    build: Builder,
+    calibration: MatchCalibration,
+    share: float = 0.5,
+    stride: int = 1,
 ) -> HalvesResult:
     """Localizes the frames after the first `share` of a sequence in a map of those before.
 
     Args:
         tracks: a sequence, its keyframes in order of time.
         build: the kind of map.
-        acceptance: which matches it accepts.
+        calibration: of its matches.
         share: of the keyframes that build the map.
         stride: every so many of the others is asked for.
 
@@ -137,16 +148,19 @@ def localize_halves(
         raise ValueError(f"{keyframes} keyframes cannot be cut in two: too few or too short tracks")
     support = Support(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
     search, size = build(support)
-    found, errors, seconds = [], [], []
+    found, errors, seconds, pose_seconds = [], [], [], []
     for keyframe in range(cut, keyframes, stride):
-        frame = pose.Frame.of(tracks, keyframe)
+        frame = QueryFrame.of(tracks, keyframe)
         begin = time.perf_counter()
         ids, distances = search(frame.descriptors)
         seconds.append(time.perf_counter() - begin)
         where = np.searchsorted(tracks.landmark_ids, np.maximum(ids, tracks.landmark_ids[0]))
         positions = np.where((ids >= 0)[..., None], tracks.landmark_positions[where], np.nan)
-        probabilities = acceptance.probability(distances)
-        result = solve(frame.keypoints, frame.camera, ids, positions, probabilities)
+        probabilities = calibration.probability(distances)
+        candidates = Candidates(frame.keypoints, ids, positions, probabilities)
+        begin = time.perf_counter()
+        result = solve_pose(candidates, frame.camera, MIN_PROBABILITY, "known")
+        pose_seconds.append(time.perf_counter() - begin)
         found.append(result)
         errors.append(
             (np.inf, np.inf)
@@ -162,7 +176,7 @@ def localize_halves(
         (float(np.median(off[:, 0])), float(np.median(off[:, 1]))),
         float(np.median([f.inliers for f in found])),
         1000 * float(np.median(seconds)),
-        1000 * float(np.median([f.seconds["pose"] for f in found])),
+        1000 * float(np.median(pose_seconds)),
     )
 
 
@@ -179,9 +193,12 @@ def main() -> None:
     others = [Tracks.load(path) for path in asked.calibrate]
     encoder = pm.Encoder.load(asked.encoder or tracks.descriptor)
     kinds = kinds_of_map(encoder, [int(dim) for dim in asked.dims.split(",")])
-    rows = []
-    for name, build in track(kinds.items(), "kinds of map", len(kinds)):
-        r = localize_halves(tracks, build, calibrated(build, others), stride=asked.stride)
+    rows, found = [], {}
+    with progress_bar() as progress:
+        for name, build in tracked(kinds.items(), progress, "localize", len(kinds)):
+            fitted = calibrated(build, others)
+            found[name] = localize_halves(tracks, build, fitted, stride=asked.stride)
+    for name, r in found.items():
         rows.append(
             [
                 name,

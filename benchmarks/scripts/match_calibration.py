@@ -20,18 +20,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark import calibration
-from protomark.acceptance import Acceptance
-from protomark.build import build_map
-from protomark.calibration import answers, encoder_answers, fit_acceptance, held_out
-from protomark.console import track
-from protomark.evaluation import pose
-from protomark.evaluation.methods import LOOK_BITS
+from protomark.cli.terminal import progress_bar
+from protomark.evaluation.frames import FrameMatches, QueryFrame, right_matches, scene_depth
+from protomark.evaluation.methods import APPEARANCE_BITS
 from protomark.evaluation.protocol import split
-from protomark.localization.absolute_pose import pose_error
-from protomark.localization.solve import CANDIDATES, solve
+from protomark.geometry.pose import pose_error
+from protomark.localization.solve import CANDIDATES, Candidates, solve_pose
+from protomark.maps.build import build_map
+from protomark.match_calibration import MatchCalibration
 from protomark.matching import accept
+from protomark.progress import tracked
 from protomark.tracks.file import Tracks, sequence_name
+from protomark.training.match_calibration import (
+    fit_calibration,
+    held_out_frames,
+    label_matches,
+    matches_by_dim,
+    measure_calibration,
+)
 from protomark_bench.report import ReportTable
 
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
@@ -49,11 +55,11 @@ def clearness(distances: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(distances[:, 1] > 0, 1 - distances[:, 0] / distances[:, 1], 0.0)
 
 
-def rules(acceptance: Acceptance) -> dict[str, Rule]:
+def rules(calibration: MatchCalibration) -> dict[str, Rule]:
     """All that are compared, by name."""
 
     def by_probability(least: float) -> Rule:
-        return lambda distances: (acceptance.probability(distances), least)
+        return lambda distances: (calibration.probability(distances), least)
 
     def by_ratio(limit: float) -> Rule:
         return lambda distances: (clearness(distances), 1 - limit)
@@ -71,7 +77,7 @@ def measure(
     tracks: Tracks, encoder: pm.Encoder, dim: int, compared: dict[str, Rule]
 ) -> NDArray[np.float64]:
     """(part, rule, 4): accepted matches per frame, precision, recall, share of poses found."""
-    depth = pose.scene_depth(tracks)
+    depth = scene_depth(tracks)
     half = len(tracks.keyframe_names) // 2
     part, rows = split(tracks, 0), tracks.observations
     cuts = {
@@ -89,15 +95,16 @@ def measure(
         scene = build_map(tracks.where(used), encoder, dim)
         sums = np.zeros((len(compared), 5))
         for keyframe in asked[:: max(1, len(asked) // FRAMES)]:
-            frame = pose.Frame.of(tracks, int(keyframe))
+            frame = QueryFrame.of(tracks, int(keyframe))
             ids, distances = scene.search(frame.descriptors, k=CANDIDATES)
             positions = tracks.landmark_positions[np.searchsorted(tracks.landmark_ids, ids)]
-            every = pose.Matches(np.arange(len(ids)), ids[:, 0])
-            right = pose.right(frame, every, positions[:, 0])
+            every = FrameMatches(np.arange(len(ids)), ids[:, 0])
+            right = right_matches(frame, every, positions[:, 0])
             for j, score in enumerate(compared.values()):
                 values, least = score(distances.astype(np.float64))
                 taken = accept(ids[:, 0], values, least)
-                found = solve(frame.keypoints, frame.camera, ids, positions, values, least)
+                candidates = Candidates(frame.keypoints, ids, positions, values)
+                found = solve_pose(candidates, frame.camera, least, "known")
                 good = False
                 if found.cam_from_world is not None:
                     off, angle = pose_error(found.cam_from_world, frame.cam_from_world)
@@ -110,19 +117,19 @@ def measure(
 
 
 def kinds(
-    tracks: Tracks, encoder: pm.Encoder, dim: int, acceptance: Acceptance
+    tracks: Tracks, encoder: pm.Encoder, dim: int, calibration: MatchCalibration
 ) -> NDArray[np.float64]:
     """(kind of map, 3): precision of accepted matches, the expected one, recall."""
-    rows, asked = held_out(tracks)
+    rows, queries = held_out_frames(tracks)
     result = []
     for kind in KINDS:
-        scene = pm.PrototypeMap(encoder, dim, LOOK_BITS if kind == "appearances" else 0)
+        scene = pm.PrototypeMap(encoder, dim, APPEARANCE_BITS if kind == "appearances" else 0)
         scene.add(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
         with tempfile.TemporaryDirectory() as folder:
             sealed = scene.seal(Path(folder) / "scene.pmk", bits=4 if kind == "4 bits" else 8)
-            given = answers(tracks, asked, sealed.search)
-        found = calibration.measure("", dim, acceptance, given).as_dict()
-        result.append([found["precision"], found["expected"], found["recall"]])
+            given = label_matches(tracks, queries, sealed.search)
+        found = measure_calibration("", dim, calibration, given)
+        result.append([found.precision, found.expected, found.recall])
     return np.array(result)
 
 
@@ -135,13 +142,15 @@ def main() -> None:
     asked = parser.parse_args()
     loaded = {sequence_name(path): Tracks.load(path) for path in asked.tracks}
     encoder = pm.Encoder.load(asked.encoder or next(iter(loaded.values())).descriptor)
-    given = {n: encoder_answers(encoder, t)[asked.dim] for n, t in track(loaded.items(), "asking")}
-    by_rule, by_kind = [], []
-    for name, tracks in track(loaded.items(), "localizing"):
-        fitted = fit_acceptance([a for other, a in given.items() if other != name])
-        by_rule.append(measure(tracks, encoder, asked.dim, rules(fitted)))
-        by_kind.append(kinds(tracks, encoder, asked.dim, fitted))
-    names = list(rules(Acceptance((0.0, 0.0, 0.0))))
+    by_rule, by_kind, given = [], [], {}
+    with progress_bar() as progress:
+        for name, tracks in tracked(loaded.items(), progress, "query maps"):
+            given[name] = matches_by_dim(encoder, tracks)[asked.dim]
+        for name, tracks in tracked(loaded.items(), progress, "localize"):
+            fitted = fit_calibration([m for other, m in given.items() if other != name])
+            by_rule.append(measure(tracks, encoder, asked.dim, rules(fitted)))
+            by_kind.append(kinds(tracks, encoder, asked.dim, fitted))
+    names = list(rules(MatchCalibration((0.0, 0.0, 0.0))))
     means = np.mean(by_rule, axis=0)
     rows = [
         [

@@ -21,15 +21,19 @@ import torch
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.console import progress_bar
+from protomark.cli.terminal import progress_bar
 from protomark.files import write_text
 from protomark.tracks.file import Tracks, sequence_name
-from protomark.training.command import unaggregated_precision
+from protomark.training.encoder import unaggregated_precision
 from protomark.training.network import embed
 from protomark.training.sampling import Views
-from protomark.training.train import Options, Trainer, has_fast_bfloat16, keep_freed_memory
+from protomark.training.train import (
+    Trainer,
+    TrainingOptions,
+    has_fast_bfloat16,
+    keep_freed_memory,
+)
 from protomark.training.validation import Trial, precision
-from protomark.upright import upright_tracks
 from protomark_bench import plot
 from protomark_bench.cache import ResultCache, key_of
 from protomark_bench.report import ReportTable, number
@@ -47,7 +51,7 @@ class RecipeChange:
 
     Attributes:
         name: for the table.
-        options: of `Options`; "steps" is a factor.
+        options: of `TrainingOptions`; "steps" is a factor.
         group: "capacity" and "data" are drawn.
         sequences: that it is trained on.
         augmented: whether their augmented tracks are used.
@@ -99,12 +103,12 @@ def train(change: RecipeChange, steps: int, tracks: dict[str, Tracks]) -> dict[s
     """Trains with a change and measures the integer encoder."""
     changes = dict(change.options)
     total = round(steps * changes.pop("steps", 1.0))
-    options = replace(Options(steps=total, validate_every=total, seed=0), **changes)
+    options = replace(TrainingOptions(steps=total, validate_every=total, seed=0), **changes)
     learned = [tracks[name + ".augmented" * change.augmented] for name in change.sequences]
     measured = [tracks[name] for name in MEASURED]
     plain = [Trial.from_tracks(t, n, 0, QUERIES) for n, t in zip(MEASURED, measured, strict=True)]
     if change.upright:
-        learned, measured = [[upright_tracks(t) for t in each] for each in (learned, measured)]
+        learned, measured = [[t.upright() for t in each] for each in (learned, measured)]
     views = [Views.from_tracks(t, n) for n, t in zip(change.sequences, learned, strict=True)]
     trials = [Trial.from_tracks(t, n, 0, QUERIES) for n, t in zip(MEASURED, measured, strict=True)]
     trainer = Trainer(views, trials[:1], options, half=has_fast_bfloat16("cpu"))
@@ -194,13 +198,12 @@ def main() -> None:
     tracks = {}
     for path in asked.tracks:
         loaded = Tracks.load(path)
-        tracks[sequence_name(path) + ".augmented" * bool(loaded.info.get("variants"))] = loaded
+        tracks[sequence_name(path) + ".augmented" * bool(loaded.info.get("augmentations"))] = loaded
     cache = ResultCache(asked.output)
     results: dict[str, dict[str, Any]] = {}
-    with progress_bar() as bar:
-        task = bar.add_task("changes", total=len(CHANGES))
-        for change in CHANGES:
-            bar.update(task, description=change.name)
+    with progress_bar() as progress:
+        for done, change in enumerate(CHANGES):
+            progress(f"train, {change.name}", done, len(CHANGES))
             key = key_of(name=change.name, steps=asked.steps, tracks=sorted(tracks))
             found = cache.load(key)
             if found is None and (not asked.only or change.name in asked.only):
@@ -208,7 +211,6 @@ def main() -> None:
                 cache.save(key, found)
             if found is not None:
                 results[change.name] = found
-            bar.advance(task)
     raw = {s: next(iter(results.values()))[s]["unaggregated"] for s in MEASURED}
     text = (
         "# What each part of the training recipe brings\n\n"

@@ -12,8 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from protomark.evaluation.trajectory import trajectory_error
-from protomark.tracks.colmap import find_model, model_of, read_model, read_reconstruction
+from protomark.geometry.colmap import (
+    find_model,
+    model_from_reconstruction,
+    read_model,
+    read_reconstruction,
+)
+from protomark.geometry.similarity import trajectory_error
 from protomark_bench.report import ReportTable
 
 HEADS = (
@@ -25,7 +30,7 @@ HEADS = (
 
 def row(scene: Path, model: Path) -> list[str]:
     """Frames registered, trajectory error, and the map's own figures."""
-    found = model_of(read_reconstruction(scene / "sparse"), scene)
+    found = model_from_reconstruction(read_reconstruction(scene / "sparse"), scene)
     true = read_model(find_model(model))
     centers = dict(zip(true.names, true.centers, strict=True))
     common = [i for i, name in enumerate(found.names) if name in centers]

@@ -140,9 +140,9 @@ def test_colmap_takes_a_known_camera_with_strong_distortion(tmp_path):
 
 def test_every_nth_image_and_at_most_so_many(room):
     sequence = open_sequence(room, every=3, frames=3)
-    assert sequence.source.names == ["img1.png", "img4.png", "img7.png"]
+    assert sequence.source.names() == ["img1.png", "img4.png", "img7.png"]
     assert sequence.available == FRAMES + 2
-    assert list(sequence.poses) == sequence.source.names
+    assert list(sequence.poses) == sequence.source.names()
 
 
 def test_the_error_is_after_a_similarity_and_of_common_images():
@@ -167,9 +167,9 @@ def test_the_record_holds_what_was_added_and_not_subtracted():
     ids = np.arange(60) % 12
     for part in np.array_split(np.arange(60), 7):
         memory.add(ids[part], codes[part])
-    memory.remove(ids[3:20], codes[3:20])
-    memory.merge(np.array([1, 2]), np.array([5, 6]))
-    memory.discard(np.array([4]))
+    memory.subtract(ids[3:20], codes[3:20])
+    memory.merge_landmarks(np.array([1, 2]), np.array([5, 6]))
+    memory.remove(np.array([4]))
     memory.add(np.array([5]), codes[:1])
     held, found = memory.observations()
     left = np.setdiff1d(np.arange(60), np.arange(3, 20))

@@ -381,7 +381,7 @@ def test_figures_outlive_a_section_that_fails(
 def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
     arguments = ["bench", "--scale", "quick", "--landmarks", "1000", "-o", tmp_path]
     done = subprocess.run(
-        [sys.executable, "-m", "protomark.cli", *map(str, arguments)],
+        [sys.executable, "-m", "protomark", *map(str, arguments)],
         capture_output=True,
         text=True,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.acceptance import Acceptance
+from protomark.match_calibration import MatchCalibration
 
 # Less likely matches are not accepted. Chosen on the training and validation sequences
 # (docs/localization.md).
@@ -53,7 +53,7 @@ def match(
     Raises:
         ValueError: the map's encoder was not calibrated, or the descriptors are not its own.
     """
-    acceptance = Acceptance.of(scene.encoder, scene.dim)
+    acceptance = MatchCalibration.of(scene.encoder, scene.dim)
     ids, distances = scene.search(descriptors, k=2, threads=threads, recall=recall)
     return accept(ids[:, 0], acceptance.probability(distances), min_probability)
 

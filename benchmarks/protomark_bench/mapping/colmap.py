@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protomark.tracks.colmap import pycolmap, quiet
+from protomark.geometry.colmap import pycolmap, quiet
 from protomark_bench.mapping.results import COLMAP, MappingRun
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def _extract(sequence: ImageSequence, database: Path, threads: int) -> None:
     pycolmap.extract_features(
         database,
         sequence.source.path,
-        image_names=sequence.source.names,
+        image_names=sequence.source.names(),
         camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=reader,
         extraction_options=extraction,

@@ -10,13 +10,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 import protomark as pm
-from protomark.console import progress_bar, progress_console
-from protomark.evaluation.scene_plot import view_from_above
-from protomark.mapping.settings import Settings
-from protomark.tracks.colmap import pycolmap
+from protomark.cli.terminal import comma_separated, note, progress_bar
+from protomark.geometry.colmap import pycolmap
+from protomark.mapping.options import MappingOptions
+from protomark.plot import ground_plane
+from protomark.threads import one_blas_thread
 from protomark_bench import machine
 from protomark_bench.cache import ResultCache, key_of
 from protomark_bench.mapping import colmap, pipeline
@@ -67,10 +67,10 @@ class MappingRequest:
     threads: int = 1
     command: str = "protomark evaluate-mapping"
 
-    def settings(self, memory: str) -> Settings:
+    def options(self, memory: str) -> MappingOptions:
         """How to make a map with a memory."""
         kind, dim = MEMORIES[memory]
-        return Settings(
+        return MappingOptions(
             descriptor=self.descriptor,
             encoder=self.encoder,
             max_keypoints=self.max_keypoints,
@@ -85,7 +85,7 @@ def choose_memories(text: str) -> list[str]:
     Raises:
         ValueError: there is no memory of some name.
     """
-    names = [name.strip() for name in text.split(",") if name.strip()]
+    names = comma_separated(text)
     for name in names:
         if name not in MEMORIES:
             raise ValueError(f"there is no memory {name!r}: choose from {', '.join(MEMORIES)}")
@@ -104,7 +104,7 @@ def evaluate_mapping(request: MappingRequest) -> MappingResults:
     order = [*request.memories, *([COLMAP] if request.colmap else [])]
     runs: dict[str, dict[str, MappingRun]] = {s.name: {} for s in sequences}
     interrupted = False
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         try:
             _make_runs(request, sequences, order, cache, runs)
         except KeyboardInterrupt:
@@ -130,7 +130,7 @@ def _mapped(s: ImageSequence, runs: dict[str, MappingRun]) -> MappedSequence:
             others = error(other.centers, true, run.centers)
             errors = None if own is None or others is None else (own, others)
         runs[memory] = replace(run, error=error(run.centers, true), common_errors=errors)
-    plane = view_from_above(np.array(list(s.poses.values()))).tolist()
+    plane = ground_plane(np.array(list(s.poses.values()))).tolist()
     return MappedSequence(s.name, len(s.source), s.available, s.truth, s.extent, runs, true, plane)
 
 
@@ -143,16 +143,14 @@ def _make_runs(
 ) -> None:
     """Fills in sequence -> memory -> its run, from the cache or made now."""
     wanted = [(sequence, memory) for sequence in sequences for memory in order]
-    with progress_bar() as bar:
-        task = bar.add_task("mapping", total=len(wanted))
+    with progress_bar() as progress:
         for sequence, memory in wanted:
-            title, done = f"{sequence.name}, {memory}", 0
-            bar.update(task, description=title)
+            title, done = f"{sequence.name} by {memory}", 0
 
             def one_more(title: str = title, frames: int = len(sequence.source)) -> None:
                 nonlocal done
                 done += 1
-                bar.update(task, description=f"{title}: frame {done} of {frames}")
+                progress(title, done, frames)
 
             key = _key(request, sequence, memory)
             run = _cached(cache, key)
@@ -160,27 +158,24 @@ def _make_runs(
                 if memory == COLMAP:
                     run = colmap.run(sequence, request.threads, one_more)
                 else:
-                    settings = request.settings(memory)
-                    run = pipeline.run(sequence, memory, settings, request.threads, one_more)
+                    options = request.options(memory)
+                    run = pipeline.run(sequence, memory, options, request.threads, one_more)
                 cache.save(key, asdict(run))
-                progress_console.print(
+                note(
                     f"{title}: {run.registered} of {len(sequence.source)} frames, "
-                    f"{run.wall_seconds:.0f} s",
-                    highlight=False,
-                    soft_wrap=True,
+                    f"{run.wall_seconds:.0f} s"
                 )
             runs[sequence.name][memory] = run
-            bar.advance(task)
 
 
 def _key(request: MappingRequest, sequence: ImageSequence, memory: str) -> str:
     """The key of a run in the cache: everything that decides it."""
-    files = [(n, (sequence.source.path / n).stat().st_size) for n in sequence.source.names]
+    files = [(n, (sequence.source.path / n).stat().st_size) for n in sequence.source.names()]
     made_of: dict[str, Any] = {"version": pycolmap.__version__, "exhaustive": colmap.EXHAUSTIVE}
     if memory != COLMAP:
-        settings = request.settings(memory)
-        encoder = pm.Encoder.load(settings.encoder or settings.descriptor)
-        made_of = {"code": pipeline.code_digest(), "settings": asdict(settings)}
+        options = request.options(memory)
+        encoder = pm.Encoder.load(options.encoder or options.descriptor)
+        made_of = {"code": pipeline.code_digest(), "options": asdict(options)}
         made_of["encoder"] = encoder.identity
     return key_of(
         memory=memory,
@@ -207,7 +202,7 @@ def _conditions(request: MappingRequest) -> dict[str, str]:
     return {
         "scale": f"{taken}, {limit}",
         "pipeline": f"{request.descriptor.upper()}, at most {request.max_keypoints} keypoints an "
-        f"image, window of {Settings().window} keyframes; poses unknown, camera known and fixed",
+        f"image, window of {MappingOptions().window} keyframes; poses unknown, camera known and fixed",
         "COLMAP": "SIFT on the CPU, its default options but with any distortion, camera known and "
         f"fixed; of more than {colmap.EXHAUSTIVE} images pairs are matched that lie up to ten "
         "apart or a power of two"

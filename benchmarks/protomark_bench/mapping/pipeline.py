@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark import mapping
-from protomark.localization.absolute_pose import centre
+from protomark.features.extractor import Extractor
+from protomark.geometry.pose import camera_centers
 from protomark.mapping.clock import Clock
-from protomark.mapping.mapper import Mapper, Picture
+from protomark.mapping.frame import InputImage
+from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
-from protomark.mapping.settings import Settings
-from protomark.mapping.source import Folder
+from protomark.mapping.options import MappingOptions
+from protomark.mapping.source import ImageFolder
 from protomark.mapping.summary import summarise
-from protomark.tracks.features import Extractor
 from protomark_bench.mapping.results import Drift, MappingRun
 from protomark_bench.mapping.sequences import ImageSequence
 
@@ -45,7 +46,7 @@ def code_digest() -> str:
 def run(
     sequence: ImageSequence,
     memory: str,
-    settings: Settings,
+    options: MappingOptions,
     threads: int,
     advance: Callable[[], None] = lambda: None,
 ) -> MappingRun:
@@ -53,27 +54,27 @@ def run(
 
     Args:
         sequence: the images.
-        memory: name of what the settings say.
-        settings: of the map.
+        memory: name of what the options say.
+        options: of the map.
         threads: threads to search and adjust on.
         advance: called after each frame.
     """
     begin = time.perf_counter()
-    mapper = Mapper(settings, sequence.camera, threads)
+    mapper = Mapper(options, sequence.camera, threads)
     # Time that other programs on the machine take does not count.
     mapper.clock = Clock(time.process_time)
-    for picture in sequence.source.pictures():
+    for image in sequence.source.images():
         _record(mapper)
-        mapper.add(picture)
+        mapper.add(image)
         advance()
 
-    def again(names: set[str], backward: bool) -> Iterable[Picture]:
-        return sequence.source.pictures(only=names, backward=backward)
+    def reread(names: set[str], backward: bool) -> Iterable[InputImage]:
+        return sequence.source.images(only=names, backward=backward)
 
-    mapper.finish(again)
+    mapper.finish(reread)
     wall = time.perf_counter() - begin
     facts = summarise(mapper)
-    entries = list(mapper.history.entries.values())
+    records = list(mapper.history.records.values())
     frames = mapper.structure.frames
     drift = None
     if isinstance(mapper.memory, RecordedPrototypes) and frames:
@@ -84,9 +85,9 @@ def run(
         landmarks=facts["landmarks"],
         observations=facts["observations"],
         memory_bytes=facts["memory_bytes"],
-        peak_bytes=max(e.memory_bytes for e in entries),
-        peak_window_bytes=max(e.memory_bytes + e.window_bytes for e in entries),
-        learning_bytes=facts["open_map_bytes"],
+        peak_bytes=max(r.memory_bytes for r in records),
+        peak_window_bytes=max(r.memory_bytes + r.window_bytes for r in records),
+        learning_bytes=facts["learning_map_bytes"],
         seconds=facts["seconds"],
         wall_seconds=wall,
         search_ms=_search_ms(mapper, sequence) if facts["landmarks"] > 1 else None,
@@ -94,8 +95,8 @@ def run(
         not_registered={why: len(names) for why, names in facts["not_registered"].items()},
         events=facts["events"],
         drift=drift,
-        centers={f.name: [float(f"{x:.6g}") for x in centre(f.pose)] for f in frames},
-        growth=[e.memory_bytes for e in entries],
+        centers={f.name: [float(f"{x:.6g}") for x in camera_centers(f.pose)] for f in frames},
+        growth=[r.memory_bytes for r in records],
     )
 
 
@@ -108,14 +109,14 @@ def _record(mapper: Mapper) -> None:
 
 def _search_ms(mapper: Mapper, sequence: ImageSequence) -> float:
     """Median over frames spread over the sequence."""
-    names = sequence.source.names
+    names = sequence.source.names()
     chosen = {names[i] for i in np.linspace(0, len(names) - 1, _TIMED_FRAMES).astype(int)}
-    extractor = Extractor(mapper.settings.descriptor, mapper.settings.max_keypoints)
+    extractor = Extractor(mapper.options.descriptor, mapper.options.max_keypoints)
     found = []
-    for picture in sequence.source.pictures(only=chosen):
-        if picture.image is None:
+    for image in sequence.source.images(only=chosen):
+        if image.image is None:
             continue
-        descriptors = extractor(picture.image).descriptors
+        descriptors = extractor(image.image).descriptors
         times = []
         for _ in range(_TIMES):
             begin = time.process_time()
@@ -140,19 +141,19 @@ class RecordedPrototypes(Prototypes):
         super().add(ids, encoded)
         self._record.append(("add", ids.copy(), encoded.copy()))
 
-    def remove(self, ids: Ids, encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`."""
-        super().remove(ids, encoded)
+    def subtract(self, ids: Ids, encoded: NDArray[Any]) -> None:
+        """See `Memory.subtract`."""
+        super().subtract(ids, encoded)
         self._record.append(("subtract", ids.copy(), encoded.copy()))
 
-    def merge(self, into: Ids, source: Ids) -> None:
-        """See `Memory.merge`."""
-        super().merge(into, source)
+    def merge_landmarks(self, into: Ids, source: Ids) -> None:
+        """See `Memory.merge_landmarks`."""
+        super().merge_landmarks(into, source)
         self._record.append(("merge", into.copy(), source.copy()))
 
-    def discard(self, ids: Ids) -> None:
-        """See `Memory.discard`."""
-        super().discard(ids)
+    def remove(self, ids: Ids) -> None:
+        """See `Memory.remove`."""
+        super().remove(ids)
         self._record.append(("remove", ids.copy(), ids[:0]))
 
     def observations(self) -> tuple[Ids, NDArray[np.int8]]:
@@ -176,7 +177,7 @@ class RecordedPrototypes(Prototypes):
         return ids, np.frombuffer(joined, np.int8).reshape(-1, self.dim)
 
 
-def measure_drift(mapper: Mapper, memory: RecordedPrototypes, source: Folder) -> Drift:
+def measure_drift(mapper: Mapper, memory: RecordedPrototypes, source: ImageFolder) -> Drift:
     """Makes the map of prototypes anew, at once, and compares.
 
     The pipeline added and subtracted observations frame by frame, merged and removed landmarks. One
@@ -208,16 +209,16 @@ def _different(one: pm.PrototypeMap, other: pm.PrototypeMap) -> int:
     return int(off.sum()) + len(one) + len(other) - 2 * len(both)
 
 
-def _final_observations(mapper: Mapper, source: Folder) -> tuple[Ids, NDArray[np.uint8]]:
+def _final_observations(mapper: Mapper, source: ImageFolder) -> tuple[Ids, NDArray[np.uint8]]:
     """Landmark and descriptor of everything that the frames see at the end."""
-    extractor = Extractor(mapper.settings.descriptor, mapper.settings.max_keypoints)
+    extractor = Extractor(mapper.options.descriptor, mapper.options.max_keypoints)
     frames = {frame.name: frame for frame in mapper.structure.frames}
-    ids, descriptors = [np.zeros(0, np.int64)], [np.zeros((0, mapper.width), np.uint8)]
-    for picture in source.pictures(only=set(frames)):
-        assert picture.image is not None
-        frame = frames[picture.name]
-        features = extractor(picture.image)
-        # No two keypoints of one image have the same coordinates (`features.MIN_DISTANCE`).
+    ids, descriptors = [np.zeros(0, np.int64)], [np.zeros((0, mapper.descriptor_bytes), np.uint8)]
+    for image in source.images(only=set(frames)):
+        assert image.image is not None
+        frame = frames[image.name]
+        features = extractor(image.image)
+        # No two keypoints of one image have the same coordinates (`extractor.MIN_DISTANCE`).
         at = {point.tobytes(): row for row, point in enumerate(features.keypoints)}
         rows = [at[point.tobytes()] for point in frame.keypoints[frame.observed]]
         ids.append(frame.seen)

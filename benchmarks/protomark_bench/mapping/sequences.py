@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.evaluation.trajectory import trajectory_error
-from protomark.localization.cameras import read_cameras
-from protomark.mapping.source import Folder, open_source
-from protomark.tracks.colmap import find_model, read_model
-from protomark.tracks.file import Camera
+from protomark.geometry.camera import Camera
+from protomark.geometry.camera_files import read_cameras
+from protomark.geometry.colmap import find_model, read_model
+from protomark.geometry.pose import camera_centers
+from protomark.geometry.similarity import trajectory_error
+from protomark.mapping.source import ImageFolder
 
 # Of the project's own sequences, those whose poses a device measured, in metres; the others' poses
 # come from an incremental reconstruction of the same images.
 _MEASURED = ("hololens", "desk_rpy", "kitchen")
 _RECONSTRUCTED = ("viking", "conch", "seneca", "caliterra", "toy", "castle", "kitti07")
+
+
+class FirstImages(ImageFolder):
+    """A folder of images of which only the first `frames` count, 0 for all."""
+
+    def __init__(self, path: Path, every: int, frames: int) -> None:
+        super().__init__(path, every)
+        self._names = self._names[: frames or None]
+        self._times = self._times[: frames or None]
 
 
 @dataclass(frozen=True)
@@ -34,7 +44,7 @@ class ImageSequence:
     """
 
     name: str
-    source: Folder
+    source: ImageFolder
     available: int
     camera: Camera
     poses: dict[str, NDArray[np.float64]]
@@ -49,7 +59,7 @@ class ImageSequence:
     @property
     def centers(self) -> dict[str, list[float]]:
         """Image name -> true camera centre, x, y, z."""
-        return {name: (-pose[:, :3].T @ pose[:, 3]).tolist() for name, pose in self.poses.items()}
+        return {name: camera_centers(pose).tolist() for name, pose in self.poses.items()}
 
     @property
     def extent(self) -> float:
@@ -71,15 +81,13 @@ def open_sequence(folder: Path, every: int = 1, frames: int = 0) -> ImageSequenc
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; a sequence holds images/ and sparse/")
-    source = open_source(folder, every)
-    assert isinstance(source, Folder)
-    available = len(open_source(folder))
-    if frames:
-        source = replace(source, names=source.names[:frames], times=source.times[:frames])
+    images = folder / "images" if (folder / "images").is_dir() else folder
+    source = FirstImages(images, every, frames)
+    available = len(ImageFolder(images))
     path = find_model(folder)
     model = read_model(path)
     true = dict(zip(model.names, model.cam_from_world, strict=True))
-    poses = {name: true[name] for name in source.names if name in true}
+    poses = {name: true[name] for name in source.names() if name in true}
     if len(poses) < 3:
         raise ValueError(
             f"{folder}: {len(poses)} of {len(source)} images have a pose in {path}, three are "

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from protomark.console import progress_bar, progress_console
+from protomark.cli.terminal import note, progress_bar
+from protomark.progress import tracked
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.data import load_training
 from protomark.training.sampling import Views
@@ -97,10 +98,9 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
     measured = _measure(tests, picks, outcomes, trainings)
     rows = _rows(tests, picks, measured, descriptor, training.bits, together)
     seconds = {trainings.key(t): o.seconds for t, o in outcomes.items()}
-    progress_console.print(
+    note(
         f"{trainings.made} trainings made, {len(seconds) - trainings.made} were there; "
-        f"{(time.perf_counter() - begin) / 60:.1f} minutes in all",
-        highlight=False,
+        f"{(time.perf_counter() - begin) / 60:.1f} minutes in all"
     )
     return PaperResults(
         scale=settings.scale.name,
@@ -166,13 +166,11 @@ def _measure(
     """Precision on test of every network that the curves and the table ask for."""
     wanted = [t for pick in picks for t in measured_trainings(pick)]
     found = {}
-    with progress_bar() as bar:
-        task = bar.add_task("measuring networks", total=len(wanted) * len(tests))
-        for training in wanted:
+    with progress_bar() as progress:
+        for training in tracked(wanted, progress, "measure networks"):
             for test in tests:
                 key = trainings.key(training)
                 found[training, test.name] = test.of_network(training, key, outcomes[training])
-                bar.advance(task)
     return found
 
 
@@ -187,11 +185,9 @@ def _rows(
     """The table, in the paper's order; what the paper does not have comes last."""
     methods, encoder = compared(descriptor, bits, threads)
     by_sequence = {}
-    with progress_bar() as bar:
-        task = bar.add_task("measuring other methods", total=len(tests))
-        for test in tests:
+    with progress_bar() as progress:
+        for test in tracked(tests, progress, "measure other methods"):
             by_sequence[test.name] = test.of_methods(methods, encoder, threads)
-            bar.advance(task)
 
     def baseline(name: str, label: str) -> MethodRow:
         size = float(np.mean([found[name][1] for found in by_sequence.values()]))

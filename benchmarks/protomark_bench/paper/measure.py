@@ -10,8 +10,8 @@ import numpy as np
 
 import protomark as pm
 from protomark import models
-from protomark.evaluation.methods import MethodChoice, choices
-from protomark.evaluation.run import Options, evaluate
+from protomark.evaluation.methods import MethodChoice, method_choices
+from protomark.evaluation.run import EvaluationOptions, evaluate
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.network import embed
 from protomark.training.validation import Trial, precision
@@ -64,7 +64,7 @@ class MeasuredSequence:
         key = key_of(methods=names, seeds=SEEDS, encoder=encoder, sequence=self.fingerprint)
 
         def measure() -> dict[str, tuple[list[float], float]]:
-            options = Options(seeds=SEEDS, pose_frames=0, threads=threads)
+            options = EvaluationOptions(seeds=SEEDS, pose_frames=0, threads=threads)
             found = evaluate(self.tracks, self.name, methods, options).methods
             return {m.name: (m.precision, float(np.mean(m.bytes_per_landmark))) for m in found}
 
@@ -79,6 +79,6 @@ def compared(descriptor: str, bits: int, threads: int) -> tuple[list[MethodChoic
     """
     encoders = [pm.Encoder.load(descriptor)] if descriptor in models.names() else []
     encoders = [encoder for encoder in encoders if encoder.bits == bits]
-    listed = {choice.name: choice for choice in choices(encoders, threads=threads)}
+    listed = {choice.name: choice for choice in method_choices(encoders, threads=threads)}
     methods = [listed[name] for name in (*BASELINES, *SHIPPED) if name in listed]
     return methods, "".join(str(encoder.identity) for encoder in encoders)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from protomark.console import progress_console
+from protomark.cli.terminal import note
 from protomark.tracks.file import sequence_name
 from protomark_bench.paper.scale import Scale
 
@@ -86,9 +86,5 @@ def assign(
             )
     unused = sorted(set(found) - {name for names in chosen.values() for name in names})
     if unused:
-        progress_console.print(
-            f"left out, as they have no role at this scale: {', '.join(unused)}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        note(f"left out, as they have no role at this scale: {', '.join(unused)}")
     return chosen

@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from protomark.console import progress_bar
+from protomark.cli.terminal import progress_bar
+from protomark.progress import tracked
 from protomark.training.train import keep_freed_memory
 from protomark_bench.cache import ResultCache, key_of
 from protomark_bench.paper.scale import Scale, Training
@@ -68,14 +69,13 @@ class Trainings:
         keys = {training: self.key(training) for training in trainings}
         found = {key: self._load(key) for key in keys.values()}
         missing = {key: t for t, key in keys.items() if found[key] is None}
-        with progress_bar() as bar:
-            task = bar.add_task("trainings", total=len(missing))
-            for key, outcome in (self._here if self.jobs == 1 else self._apart)(missing):
+        made = (self._here if self.jobs == 1 else self._apart)(missing)
+        with progress_bar() as progress:
+            for key, outcome in tracked(made, progress, "train", len(missing)):
                 values = {name: value for name, value in vars(outcome).items() if name != "weights"}
                 self.cache.save_arrays(key, values, outcome.weights)
                 found[key] = outcome
                 self.made += 1
-                bar.advance(task)
         results = {training: found[key] for training, key in keys.items()}
         return {training: outcome for training, outcome in results.items() if outcome is not None}
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import protomark as pm
-from protomark.console import progress_bar, progress_console
+from protomark.cli.terminal import note, progress_bar
 from protomark_bench import machine
 from protomark_bench.report import save_json
 from protomark_bench.speed import peers, sections
@@ -77,23 +77,22 @@ def measure(
         "it; observations from their real observations, queries from held-out ones",
         "encoder": f"{encoder.name}, {workload.dim} dimensions",
     }
-    for note in results.skipped:
-        progress_console.print(f"note: {note}", highlight=False, soft_wrap=True, markup=False)
-    with progress_bar() as bar, peers.threads(settings.threads):
-        task = bar.add_task("ceilings", total=len(settings.sections) + 1)
+    for reason in results.skipped:
+        note(f"note: {reason}")
+    total = len(settings.sections)
+    with progress_bar() as progress, peers.threads(settings.threads):
+        progress("ceilings", 0, total)
         try:
             results.ceilings = machine.ceilings(settings.pace.shortest * 4)
             if {"approximate", "real"} & set(settings.sections):
-                bar.update(task, description="resemblance of the data")
+                progress("resemblance of the data", 0, total)
                 results.resemblance = sections.measure_resemblance(workload)
-            bar.advance(task)
-            for name in settings.sections:
+            for done, name in enumerate(settings.sections):
 
-                def advance(label: str, name: str = name) -> None:
-                    bar.update(task, description=f"{name}: {label}")
+                def advance(label: str, name: str = name, done: int = done) -> None:
+                    progress(f"{name}, {label}", done, total)
 
                 SECTION_FUNCTIONS[name](Bench(workload, settings, results, advance))
-                bar.advance(task)
                 results.interrupted = name != settings.sections[-1]  # if the process ends now
                 after(results)
         except KeyboardInterrupt:

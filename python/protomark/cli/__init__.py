@@ -1,7 +1,8 @@
-"""The `protomark` command: one file a command, in the order in which `--help` lists them here."""
+"""The `protomark` command: one file per command, listed by `--help` in the order given here."""
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -12,34 +13,35 @@ from protomark.cli.calibrate import calibrate
 from protomark.cli.demo import demo
 from protomark.cli.evaluate import evaluate
 from protomark.cli.info import info
-from protomark.cli.join import join
 from protomark.cli.localize import localize
 from protomark.cli.map import map_
+from protomark.cli.merge import merge
 from protomark.cli.plugins import CommandGroup
 from protomark.cli.split import split
 from protomark.cli.tracks import tracks
 from protomark.cli.train import train
 
+_SUMMARY = "Visual maps that keep a few small integer prototypes per landmark."
+
 app = typer.Typer(
     cls=CommandGroup,
-    help="One small integer prototype per landmark instead of all its binary descriptors.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _COMMANDS: dict[str, Callable[..., Any]] = {
-    "tracks": tracks,
-    "train": train,
-    "build": build,
     "map": map_,
     "localize": localize,
-    "calibrate": calibrate,
-    "join": join,
+    "tracks": tracks,
+    "build": build,
+    "merge": merge,
     "split": split,
     "info": info,
     "demo": demo,
     "evaluate": evaluate,
+    "train": train,
+    "calibrate": calibrate,
 }
 for name, command in _COMMANDS.items():
     app.command(name)(command)
@@ -53,7 +55,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(help=_SUMMARY)
 def options(
     version: Annotated[
         bool,
@@ -62,19 +64,30 @@ def options(
         ),
     ] = False,
 ) -> None:
-    """One small integer prototype per landmark instead of all its binary descriptors."""
+    """Take the options that stand before a command."""
 
 
 def main() -> None:
-    """Run the command; an expected error becomes one sentence on stderr and exit code 1."""
-    from rich.markup import escape
+    """Run the command.
 
-    from protomark.console import printable, progress_console
-
+    An expected error becomes one sentence on stderr and exit code 1; Ctrl-C and SIGTERM exit with
+    130.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        app()
+        app(standalone_mode=True)
+    except KeyboardInterrupt:
+        _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        message = f"[bold red]error:[/] {escape(printable(str(text)))}"
-        progress_console.print(message, highlight=False, soft_wrap=True)
-        raise SystemExit(1) from None
+        _fail(str(text), 1)
+
+
+def _fail(text: str, code: int) -> None:
+    from rich.markup import escape
+
+    from protomark.cli.terminal import error_console, printable
+
+    message = f"[bold red]error:[/] {escape(printable(text))}"
+    error_console.print(message, highlight=False, soft_wrap=True)
+    raise SystemExit(code) from None

@@ -1,4 +1,4 @@
-"""What a map remembers of its landmarks' descriptors; the one place where this is chosen."""
+"""What a map keeps of its landmarks' descriptors, and how frames are matched with it."""
 
 from __future__ import annotations
 
@@ -10,23 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.acceptance import Acceptance
+from protomark.baselines.binary import medoid
+from protomark.baselines.support import Support
+from protomark.features.descriptors import descriptor_kind
+from protomark.match_calibration import MatchCalibration
 
 if TYPE_CHECKING:
-    from protomark.mapping.settings import Settings
+    from protomark.mapping.options import MappingOptions
 
-# Rows that are no longer anyone's are dropped when they are this share of all.
-_DEAD_SHARE = 0.25
+# Rows of removed landmarks are dropped when they are this share of all.
+_MAX_REMOVED_SHARE = 0.25
 _CHUNK = 256
 _PAIRS = 4096
 _SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
 class Memory(ABC):
-    """What is kept of descriptors, and how a new frame is matched with it.
+    """What a map keeps of descriptors, and how a frame is matched with it.
 
-    A descriptor is encoded once for each frame; all other calls take the encoded form, which for
-    binary memories is the descriptor itself.
+    Descriptors are encoded once per frame; all other calls take the encoded form, which for binary
+    memories is the descriptor itself.
 
     Attributes:
         euclidean: whether distances are Euclidean, of codes, and not Hamming.
@@ -36,29 +39,29 @@ class Memory(ABC):
 
     @abstractmethod
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
-        """(n, bytes) uint8 -> (n, width), what is compared."""
+        """Encode descriptors (n, bytes) uint8 as (n, width), the form that is compared."""
 
     @abstractmethod
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """Add observations: unknown ids are new landmarks."""
 
     @abstractmethod
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Take observations back that were added before, exactly."""
+    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """Take back observations that were added before, exactly."""
 
     @abstractmethod
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """Join each source landmark to the one in `into`."""
+    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """Merge each source landmark into the one in `into`."""
 
     @abstractmethod
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """Forget landmarks."""
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """Remove landmarks."""
 
     @abstractmethod
     def search(
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The two nearest landmarks of each, exactly: ids (q, 2), -1 for none, and distances.
+        """The two nearest landmarks of each descriptor, exactly: ids (q, 2), -1 for none, and distances.
 
         Args:
             encoded: (q, width).
@@ -70,11 +73,11 @@ class Memory(ABC):
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """(p,) distances between row `rows[i]` of `encoded` and landmark `ids[i]`."""
+        """Distances (p,) between row `rows[i]` of `encoded` and landmark `ids[i]`."""
 
     @abstractmethod
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of these landmarks it remembers."""
+    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of these landmarks the memory holds."""
 
     @property
     @abstractmethod
@@ -83,15 +86,15 @@ class Memory(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What beside a map file must be kept to go on later; empty for prototypes."""
+        """What must be saved beside the map file to resume later; nothing for prototypes."""
 
     @abstractmethod
     def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
-        """Take up what `arrays` gave and, for prototypes, the saved map."""
+        """Restore the arrays that `arrays` returned and, for prototypes, the saved map."""
 
 
 class Prototypes(Memory):
-    """One prototype a landmark; descriptors are thrown away (the paper's method)."""
+    """One prototype per landmark, and no descriptors (the paper's method)."""
 
     euclidean = True
 
@@ -103,9 +106,9 @@ class Prototypes(Memory):
             )
         self.encoder, self.dim = encoder, dim
         self.map = pm.PrototypeMap(encoder, dim)
-        self.acceptance: Acceptance | None = None
+        self.calibration: MatchCalibration | None = None
         with contextlib.suppress(ValueError):
-            self.acceptance = encoder.acceptance(dim)
+            self.calibration = MatchCalibration.of(encoder, dim)
 
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
         """See `Memory.encode`."""
@@ -115,8 +118,8 @@ class Prototypes(Memory):
         """Eq. 1 and Eq. 2 of the paper."""
         self.map.add_codes(ids, encoded)
 
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`; a landmark halved at 255 observations may keep its share."""
+    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.subtract`; a landmark halved at 255 observations may keep its share."""
         try:
             self.map.remove_codes(ids, encoded)
         except ValueError:
@@ -124,12 +127,12 @@ class Prototypes(Memory):
                 with contextlib.suppress(ValueError):
                     self.map.remove_codes(ids[i : i + 1], encoded[i : i + 1])
 
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """See `Memory.merge`."""
+    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge_landmarks`."""
         self.map.merge(into, source)
 
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """See `Memory.discard`."""
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.remove`."""
         self.map.discard(ids)
 
     def search(
@@ -168,15 +171,15 @@ class Prototypes(Memory):
         at[known] = np.arange(len(known))
         codes, places = encoded.astype(np.float32), self._rounded(known)
         squares = np.empty(len(rows), np.float32)
-        # What stays in the processor's cache is several times faster.
+        # Pieces that fit into the cache are several times faster.
         for a in range(0, len(rows), _PAIRS):
             b = a + _PAIRS
             difference = places[at[ids[a:b]]] - codes[rows[a:b]]
             squares[a:b] = np.einsum("pd,pd->p", difference, difference)
         return np.sqrt(squares)
 
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """See `Memory.known`."""
+    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See `Memory.contains`."""
         return np.isin(ids, self.map.ids)
 
     def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -186,7 +189,7 @@ class Prototypes(Memory):
 
     @property
     def bytes(self) -> int:
-        """A sealed map's: one byte a dimension and one for the count."""
+        """As in a sealed map: one byte per dimension and one for the count."""
         return len(self.map) * (self.dim + 1)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -203,7 +206,7 @@ class Prototypes(Memory):
 
 
 class Descriptors(Memory):
-    """Every descriptor of every landmark, kept and searched: the traditional way."""
+    """Every descriptor of every landmark: the traditional way."""
 
     euclidean = False
 
@@ -223,8 +226,8 @@ class Descriptors(Memory):
         self._descriptors = np.concatenate([self._descriptors, encoded])
         self._owners = np.concatenate([self._owners, ids])
 
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`."""
+    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.subtract`."""
         self._sorted = None
         order = np.argsort(self._owners, kind="stable")
         sorted_owners = self._owners[order]
@@ -237,8 +240,8 @@ class Descriptors(Memory):
             self._owners[rows[np.argmax(same)]] = -1
         self._compact()
 
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """See `Memory.merge`."""
+    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge_landmarks`."""
         self._sorted = None
         order = np.argsort(source)
         at = np.minimum(np.searchsorted(source[order], self._owners), max(len(source) - 1, 0))
@@ -246,16 +249,16 @@ class Descriptors(Memory):
             hit = source[order][at] == self._owners
             self._owners[hit] = into[order][at[hit]]
 
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """See `Memory.discard`."""
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.remove`."""
         self._sorted = None
         self._owners[np.isin(self._owners, ids)] = -1
         self._compact()
 
     def _compact(self) -> None:
-        alive = self._owners >= 0
-        if len(alive) and 1 - alive.mean() > _DEAD_SHARE:
-            self._owners, self._descriptors = self._owners[alive], self._descriptors[alive]
+        existing = self._owners >= 0
+        if len(existing) and 1 - existing.mean() > _MAX_REMOVED_SHARE:
+            self._owners, self._descriptors = self._owners[existing], self._descriptors[existing]
 
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Owners (n,), ascending, and descriptors (n, bytes) that matching compares with."""
@@ -303,13 +306,13 @@ class Descriptors(Memory):
             self._padded = descriptors, _words(descriptors)
         return self._padded[1]
 
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """See `Memory.known`."""
+    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See `Memory.contains`."""
         return np.isin(ids, self._owners)
 
     @property
     def bytes(self) -> int:
-        """Each descriptor, with nothing for the landmark it is of."""
+        """Bytes of all descriptors, without what assigns them to landmarks."""
         return int((self._owners >= 0).sum()) * int(self._descriptors.shape[1])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -326,60 +329,57 @@ class Descriptors(Memory):
 class Medoids(Descriptors):
     """Of each landmark the descriptor that is closest to its others, as ORB-SLAM matches.
 
-    The medoid follows new observations only if all descriptors stay, so they do; `bytes` counts
-    the medoids, which matching needs.
+    To update a medoid takes all descriptors, so they are kept; `bytes` counts the medoids, which
+    matching needs.
     """
 
     def __init__(self, width: int) -> None:
         super().__init__(width)
         self._medoids: dict[int, NDArray[np.uint8]] = {}
         self._changed: set[int] = set()
-        self._chosen: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
+        self._table: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
 
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """See `Memory.add`."""
         super().add(ids, encoded)
         self._changed.update(ids.tolist())
 
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`."""
-        super().remove(ids, encoded)
+    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.subtract`."""
+        super().subtract(ids, encoded)
         self._changed.update(ids.tolist())
 
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """See `Memory.merge`."""
-        super().merge(into, source)
+    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge_landmarks`."""
+        super().merge_landmarks(into, source)
         self._changed.update(into.tolist(), source.tolist())
 
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """See `Memory.discard`."""
-        super().discard(ids)
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.remove`."""
+        super().remove(ids)
         self._changed.update(ids.tolist())
 
     def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
         """See `Memory.restore`."""
         super().restore(arrays, scene)
         self._medoids.clear()
-        self._chosen = None
+        self._table = None
         self._changed = set(self._owners[self._owners >= 0].tolist())
 
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """See `Descriptors.table`."""
-        self._follow()
-        if self._chosen is None:
+        self._update()
+        if self._table is None:
             ids = np.array(sorted(self._medoids), np.int64)
             rows = [self._medoids[i] for i in ids.tolist()]
             width = self._descriptors.shape[1]
-            self._chosen = ids, np.array(rows, np.uint8).reshape(-1, width)
-        return self._chosen
+            self._table = ids, np.array(rows, np.uint8).reshape(-1, width)
+        return self._table
 
-    def _follow(self) -> None:
-        from protomark.evaluation.methods.medoid import medoid
-        from protomark.evaluation.support import Support
-
+    def _update(self) -> None:
         if not self._changed:
             return
-        self._chosen = None
+        self._table = None
         changed = np.array(sorted(self._changed), np.int64)
         self._changed.clear()
         for i in changed.tolist():
@@ -391,21 +391,21 @@ class Medoids(Descriptors):
 
     @property
     def bytes(self) -> int:
-        """Medoids only."""
-        self._follow()
+        """Bytes of the medoids only."""
+        self._update()
         return len(self._medoids) * int(self._descriptors.shape[1])
 
 
 def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """(n, bytes) uint8 -> (n, ceil(bytes / 8)), the same bits and zeros."""
-    many, width = descriptors.shape
-    padded = np.zeros((many, -(-width // 8) * 8), np.uint8)
+    """Pad (n, bytes) uint8 with zeros to (n, ceil(bytes / 8)) uint64."""
+    count, width = descriptors.shape
+    padded = np.zeros((count, -(-width // 8) * 8), np.uint8)
     padded[:, :width] = descriptors
     return padded.view(np.uint64)
 
 
 def _set_bits(words: NDArray[np.uint64]) -> NDArray[np.int32]:
-    """(n, words) -> (n,) how many bits are set."""
+    """Number of set bits (n,) in each row of (n, words)."""
     if hasattr(np, "bitwise_count"):
         return np.asarray(np.bitwise_count(words).sum(1, dtype=np.int32))
     return np.asarray(_SET_BITS[words.view(np.uint8)].sum(1, dtype=np.int32))
@@ -414,23 +414,21 @@ def _set_bits(words: NDArray[np.uint64]) -> NDArray[np.int32]:
 MEMORIES = ("prototypes", "medoids", "descriptors")
 
 
-def make_memory(settings: Settings) -> Memory:
-    """The memory that the settings ask for.
+def make_memory(options: MappingOptions) -> Memory:
+    """The memory that the options ask for.
 
     Raises:
         ValueError: the encoder is for another descriptor, or lacks that number of dimensions.
     """
-    from protomark.tracks.features import descriptor_kind
-
-    kind = descriptor_kind(settings.descriptor)
-    if settings.memory == "descriptors":
+    kind = descriptor_kind(options.descriptor)
+    if options.memory == "descriptors":
         return Descriptors(kind.bytes)
-    if settings.memory == "medoids":
+    if options.memory == "medoids":
         return Medoids(kind.bytes)
-    encoder = pm.Encoder.load(settings.encoder or kind.name)
+    encoder = pm.Encoder.load(options.encoder or kind.name)
     if encoder.descriptor != kind.name or encoder.bits != kind.bits:
         raise ValueError(
             f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, "
             f"not for {kind.name}"
         )
-    return Prototypes(encoder, settings.dim)
+    return Prototypes(encoder, options.dim)

@@ -1,4 +1,4 @@
-"""When a match between a keypoint and a landmark is accepted."""
+"""Decides which matches between keypoints and landmarks are accepted."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.mapping.memory import Medoids, Memory, Prototypes
-
-# As `protomark localize` accepts.
-_MIN_PROBABILITY = 0.2
+from protomark.matching import MIN_PROBABILITY
 
 
 @dataclass(frozen=True)
@@ -18,11 +16,11 @@ class Thresholds:
     """Bounds on the distance of a match.
 
     Attributes:
-        ratio: nearest to second nearest landmark, where the whole map is searched by a memory that
-            was not calibrated.
+        ratio: largest ratio of the distances to the nearest and second nearest landmark, where the
+            whole map is searched by a memory without calibration.
         guided_ratio: the same among landmarks that project near the keypoint.
-        max_distance: of a guided match, as a share of the distance that the frame's keypoints
-            typically (median) have to landmarks elsewhere.
+        max_distance: largest distance among landmarks that project near the keypoint, as a share of
+            the median distance between keypoints and landmarks elsewhere.
     """
 
     ratio: float
@@ -33,8 +31,8 @@ class Thresholds:
 # A Hamming distance is a squared Euclidean one, so its ratios are squares.
 _EUCLIDEAN = Thresholds(ratio=0.85, guided_ratio=0.9, max_distance=0.75)
 _HAMMING = Thresholds(ratio=0.8, guided_ratio=0.85, max_distance=0.6)
-# One descriptor is further from a new view than the nearest of all: with the bounds above, medoids
-# lose `hololens` in its middle.
+# A medoid is further from a new view than the nearest of all descriptors: with the bounds above,
+# mapping with medoids loses `hololens` in the middle.
 _MEDOID = Thresholds(ratio=0.9, guided_ratio=0.92, max_distance=0.75)
 
 
@@ -45,10 +43,10 @@ def thresholds(memory: Memory) -> Thresholds:
     return _MEDOID if isinstance(memory, Medoids) else _HAMMING
 
 
-def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Which nearest landmarks of the whole map are accepted, the clearest first.
+def accepted_rows(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Rows whose nearest landmark in the whole map is accepted, the clearest first.
 
-    Where the encoder was calibrated its probability decides, else the ratio of the two distances.
+    If the encoder was calibrated the probability decides, else the ratio of the two distances.
 
     Args:
         memory: what was searched.
@@ -58,9 +56,9 @@ def accepted(memory: Memory, distances: NDArray[np.float32]) -> NDArray[np.int64
         (k,) int64, rows of `distances`.
     """
     nearest, second = distances.T
-    if isinstance(memory, Prototypes) and memory.acceptance is not None:
-        doubt = 1 - memory.acceptance.probability(distances)
-        limit = 1 - _MIN_PROBABILITY
+    if isinstance(memory, Prototypes) and memory.calibration is not None:
+        doubt = 1 - memory.calibration.probability(distances)
+        limit = 1 - MIN_PROBABILITY
     else:
         with np.errstate(invalid="ignore", divide="ignore"):
             doubt = np.where(second > 0, nearest / second, 1.0)
