@@ -3,8 +3,9 @@
 PYTHON ?= python3
 SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_*.pyi') \
            CMakeLists.txt pyproject.toml constraints.txt
-BENCH := $(shell find benchmarks -type f -not -path '*/__pycache__/*' -not -path 'benchmarks/results/*')
-CPP := $(shell find core bindings benchmarks -name '*.cpp' -o -name '*.h')
+BENCH := $(shell find benchmarks -type f -not -path '*/__pycache__/*' \
+  -not -path 'benchmarks/build/*' -not -path 'benchmarks/results/*')
+CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h') benchmarks/ceilings.cpp
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
@@ -13,7 +14,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
   sanitize-python-memory sanitize-python-threads coverage fuzz torture check format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
-	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick'); adds the commands of benchmarks/"
+	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick')"
 	@echo "make test      run the tests (C++ and Python)"
 	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
 	@echo "make sanitize  run the tests of the core under sanitizers (memory, undefined behaviour, threads)"

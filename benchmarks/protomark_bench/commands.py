@@ -157,9 +157,10 @@ def reproduce(
     same command goes on. Sequences of other names than the project's own need --train,
     --validation and --test. docs/reproduction.md says more.
     """
+    from protomark.extras import optional
     from protomark.threads import available_threads
     from protomark_bench import report
-    from protomark_bench.options import need, resumable
+    from protomark_bench.options import resumable
     from protomark_bench.paper.results import PaperResults
 
     report.check_folder(output)
@@ -168,7 +169,7 @@ def reproduce(
     else:
         if not data:
             raise ValueError("name tracks files, or the JSON of a run with --from")
-        need("torch", "reproduce trains networks with PyTorch")
+        optional("torch")
         from protomark_bench.paper import command
         from protomark_bench.paper.scale import find_scale
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 
 import typer
@@ -27,12 +26,6 @@ def command_line(command: str, paths: Sequence[Path] | None, **options: object) 
         option = name.replace("_", "-")
         words.append(f"--no-{option}" if value is False else f"--{option} {text}")
     return " ".join(words)
-
-
-def need(module: str, why: str) -> None:
-    """Raise ModuleNotFoundError that says what to install if a module is missing."""
-    if find_spec(module) is None:
-        raise ModuleNotFoundError(f"{why}, which is not installed: pip install {module}")
 
 
 @contextmanager

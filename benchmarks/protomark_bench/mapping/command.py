@@ -202,7 +202,8 @@ def _conditions(request: MappingRequest) -> dict[str, str]:
     return {
         "scale": f"{taken}, {limit}",
         "pipeline": f"{request.descriptor.upper()}, at most {request.max_keypoints} keypoints an "
-        f"image, window of {MappingOptions().window} keyframes; poses unknown, camera known and fixed",
+        f"image, window of {MappingOptions().window} keyframes; poses unknown, camera known and "
+        "fixed",
         "COLMAP": "SIFT on the CPU, its default options but with any distortion, camera known and "
         f"fixed; of more than {colmap.EXHAUSTIVE} images pairs are matched that lie up to ten "
         "apart or a power of two"
