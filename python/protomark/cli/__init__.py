@@ -25,6 +25,7 @@ _SUMMARY = "Visual maps that keep a few small integer prototypes per landmark."
 
 app = typer.Typer(
     cls=CommandGroup,
+    rich_markup_mode=None,  # drawing help with Rich takes as long as all else together
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -75,7 +76,7 @@ def main() -> None:
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        app(standalone_mode=True)
+        app(prog_name="protomark")
     except KeyboardInterrupt:
         _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:

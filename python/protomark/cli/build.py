@@ -77,8 +77,9 @@ def build(
         Path | None, typer.Option("--json", help="Write the facts to this file.")
     ] = None,
 ) -> None:
-    """Build a map from a tracks file: prototypes of each landmark, and its position.
+    """Build a map from a tracks file.
 
+    The map has the prototypes and the position of each landmark.
     Encoders for upright descriptors (freak-upright) take angles and sizes from the tracks.
     """
     from protomark import Encoder

@@ -22,8 +22,9 @@ def calibrate(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Fit how likely a match is right, from frames whose landmarks are known.
+    """Fit how likely matches are right, for an encoder.
 
+    From frames whose landmarks are known.
     `protomark train` does this by itself. The probability that a match is right, given the
     distances to the two nearest landmarks, is fitted for each code length and written into the
     model file; the network stays the same, and so do maps made with it. docs/localization.md says

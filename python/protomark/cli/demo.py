@@ -26,7 +26,7 @@ def demo(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Build a map of the bundled sample, localize new keyframes in it, and compare."""
+    """Map the bundled sample, localize frames in it, and compare."""
     from protomark.cli.terminal import check_outputs, progress_bar, write_json
     from protomark.evaluation.demo import run_demo
 

@@ -57,8 +57,9 @@ def evaluate(
         typer.Option("--plot", help="Draw precision over bytes to this file (.png, .svg, .pdf)."),
     ] = None,
 ) -> None:
-    """Compare precision, poses, bytes and search time of prototypes and of other methods.
+    """Compare Protomark with other ways to keep descriptors.
 
+    By precision, poses found, bytes per landmark and search time.
     The protocol is the paper's: a random 90 % of the keyframes build the map, and descriptors of
     the others query it. docs/evaluation.md describes it, and every method.
     """

@@ -76,7 +76,7 @@ def localize(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Find where images were taken in a map, with a confidence for each pose.
+    """Find where images were taken in a map, and how sure that is.
 
     The map may be a learning map or a sealed one. An image that cannot be read or was taken
     elsewhere does not end the run. docs/localization.md says more.

@@ -85,9 +85,9 @@ def map_(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    r"""Map a scene from images or a video, frame by frame: structure from motion.
+    r"""Map a scene from images or a video: structure from motion.
 
-    Each frame is matched with the prototypes of the map and updates those it sees; only the last
+    Frame by frame, each image is matched with the prototypes of the map and updates those it sees; only the last
     few keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP model),
     trajectory.txt (TUM format), report.html and report.json.
 

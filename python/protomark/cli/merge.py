@@ -28,8 +28,9 @@ def merge(
         Path | None, typer.Option("--json", help="Write the facts to this file.")
     ] = None,
 ) -> None:
-    """Merge maps that were built apart, exactly as if they had been one from the start.
+    """Merge maps that were built apart, exactly.
 
+    The result is the map that would have been built from all observations together.
     Landmarks with the same id are one landmark, and their observations are summed. The command
     prints how many there are, as ids may be equal by accident. docs/sharing.md says more.
     """

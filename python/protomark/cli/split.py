@@ -30,7 +30,7 @@ def split(
         Path | None, typer.Option("--json", help="Write the facts to this file.")
     ] = None,
 ) -> None:
-    """Split a map by id or by space into maps that can be served apart.
+    """Split a map by id or by space.
 
     The parts have no index. `protomark merge` makes the same map of them again.
     """

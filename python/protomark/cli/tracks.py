@@ -92,8 +92,9 @@ def tracks(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Make tracks from images with known poses: keypoints, descriptors and their landmarks.
+    """Make tracks from images with known poses.
 
+    Tracks are keypoints, their descriptors, and the landmarks that they see.
     A tracks file that was made with these options from this input is kept.
     """
     from protomark.cli.terminal import check_outputs, note, progress_bar, write_json

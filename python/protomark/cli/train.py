@@ -65,7 +65,7 @@ def train(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Train an encoder on tracks, and write it with its card (needs PyTorch).
+    """Train an encoder on tracks (needs PyTorch).
 
     Works for any binary descriptor of 64 to 1024 bits: `protomark train my-tracks/*`. Beside the
     model come its card (.md) and a picture of the training (.png) that is drawn anew at each
