@@ -61,7 +61,7 @@ def test_models_have_the_parameters_that_pycolmap_gives_them() -> None:
     ],
 )
 def test_a_map_with_such_a_camera_is_not_continued(camera: Any, tmp_path: Path) -> None:
-    options = asdict(MappingOptions("orb", memory="descriptors", calibrate=True))
+    options = asdict(MappingOptions("orb", calibrate=True))
     for cameras in ({"1": camera}, [camera]):
         told = {"options": options, "cameras": cameras, "camera_id": 1}
         header = {"format": "protomark-mapping", "version": "1", "state": json.dumps(told)}

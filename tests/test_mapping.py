@@ -135,16 +135,6 @@ def test_only_the_window_keeps_descriptors() -> None:
     assert all((f.landmarks >= 0).all() for f in mapper.structure.frames)
 
 
-@pytest.mark.parametrize("memory", ["medoids", "descriptors"])
-def test_other_memories_run_in_the_same_code(memory: str, images: Path, tmp_path: Path) -> None:
-    settings = MappingOptions(descriptor="orb", max_keypoints=500, window=5, memory=memory)
-    figures = make_map(MapRequest(images, tmp_path / "scene", settings, camera=CAMERA, every=2))
-    assert figures["registered"] == figures["frames"] == COUNT // 2
-    assert not (tmp_path / "scene" / "scene.pmk").exists()
-    share = figures["memory_bytes"] / figures["descriptor_bytes"]
-    assert 1 <= share < 1.3 if memory == "descriptors" else share < 0.6
-
-
 @pytest.mark.parametrize("after", [3, 10])
 def test_resumed_is_as_if_never_stopped(
     after: int, images: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -6,7 +6,7 @@ from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
-from protomark.mapping.memory import Descriptors, Medoids, Prototypes
+from protomark.mapping.memory import Prototypes
 from protomark.mapping.source import ImageFolder, Video, open_source
 from tracks_scene import PINHOLE
 
@@ -14,10 +14,6 @@ from tracks_scene import PINHOLE
 @pytest.fixture(scope="module")
 def encoder():
     return pm.Encoder.load("orb")
-
-
-def memories(encoder):
-    return [Prototypes(encoder, 16), Descriptors(32), Medoids(32)]
 
 
 @pytest.mark.parametrize("radius", [0.5, 3.0, 40.0])
@@ -44,9 +40,8 @@ def observations(seed=0, landmarks=12, each=5):
     return ids, descriptors
 
 
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_each_memory_finds_its_landmarks(encoder, which):
-    memory = memories(encoder)[which]
+def test_prototypes_find_their_landmarks(encoder):
+    memory = Prototypes(encoder, 16)
     ids, descriptors = observations()
     encoded = memory.encode(descriptors)
     memory.add(ids[::2], encoded[::2])
@@ -59,9 +54,8 @@ def test_each_memory_finds_its_landmarks(encoder, which):
     )
 
 
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(encoder, which):
-    memory, rest = memories(encoder)[which], memories(encoder)[which]
+def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(encoder):
+    memory, rest = Prototypes(encoder, 16), Prototypes(encoder, 16)
     ids, descriptors = observations()
     encoded = memory.encode(descriptors)
     memory.add(ids, encoded)
@@ -81,11 +75,9 @@ def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(enc
 
 def test_bytes_that_matching_needs(encoder):
     ids, descriptors = observations(landmarks=12, each=5)
-    sizes = []
-    for memory in memories(encoder):
-        memory.add(ids, memory.encode(descriptors))
-        sizes.append(memory.bytes)
-    assert sizes == [12 * 17, 12 * 5 * 32, 12 * 32]
+    memory = Prototypes(encoder, 16)
+    memory.add(ids, memory.encode(descriptors))
+    assert memory.bytes == 12 * 17
 
 
 def test_prototypes_of_other_dimensions(encoder):

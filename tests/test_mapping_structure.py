@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+import protomark as pm
+from conftest import random_layers
 from mapping_scene import walk
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.pose import camera_centers, transform
@@ -13,23 +15,26 @@ from protomark.mapping import loop, merging
 from protomark.mapping.adjustment import adjust, adjust_global
 from protomark.mapping.culling import cull
 from protomark.mapping.frame import Frame
-from protomark.mapping.memory import Descriptors
+from protomark.mapping.memory import Prototypes
 from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Structure
 from protomark.mapping.triangulation import remember
 from tracks_scene import PINHOLE
 
+ENCODER = pm.Encoder(
+    random_layers([64, 24, 12]), dims=[12], name="tiny", descriptor="test", scale=0.02
+)
 MAX_ERROR, MIN_ANGLE = 0.01, 1.0
 POINTS = 60
 
 
-def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
+def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Prototypes]:
     """Eight frames that see the same points, each with descriptors of its own."""
     rng = np.random.default_rng(seed)
     points = np.column_stack(
         [rng.uniform(-0.6, 0.5, POINTS), rng.uniform(-0.5, 0.5, POINTS), rng.uniform(2, 3, POINTS)]
     )
-    structure, memory = Structure({1: PINHOLE}), Descriptors(8)
+    structure, memory = Structure({1: PINHOLE}), Prototypes(ENCODER, 12)
     ids = structure.create(points)
     for i, pose in enumerate(walk(8)):
         pixels = PINHOLE.project(transform(pose, points)) + noise * rng.normal(size=(POINTS, 2))
@@ -44,12 +49,23 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
             landmarks=np.full(POINTS, -1, np.int64),
             rays=PINHOLE.rays(pixels),
             descriptors=descriptors,
-            encoded=descriptors,
+            encoded=memory.encode(descriptors),
         )
         structure.frames.append(frame)
         structure.observe(frame, np.arange(POINTS), ids)
         remember(memory, frame, np.arange(POINTS))
     return structure, memory
+
+
+def check_memory(structure: Structure, memory: Prototypes) -> None:
+    """The memory holds exactly the observations of the frames."""
+    expected = pm.PrototypeMap(ENCODER, 12)
+    for frame in structure.frames:
+        expected.add_codes(frame.seen, frame.codes[frame.observed])
+    ids = expected.ids
+    np.testing.assert_array_equal(memory.map.ids, ids)
+    np.testing.assert_array_equal(memory.map.counts(ids), expected.counts(ids))
+    np.testing.assert_array_equal(memory.map.prototype(ids), expected.prototype(ids))
 
 
 def test_ids_count_up_from_one_and_are_never_used_again() -> None:
@@ -84,14 +100,7 @@ def test_culling_takes_observations_back_exactly_and_weak_landmarks_out() -> Non
     assert gone == 1
     assert off.landmarks[4] == -1
     assert 8 not in structure.ids
-    owners, descriptors = memory.table()
-    want = {
-        (int(landmark), bytes(frame.descriptors[row]))
-        for frame in structure.frames
-        for row, landmark in enumerate(frame.landmarks)
-        if landmark >= 0
-    }
-    assert {(int(o), bytes(d)) for o, d in zip(owners, descriptors, strict=True)} == want
+    check_memory(structure, memory)
 
 
 def test_landmarks_seen_twice_go_when_the_window_has_left_them_behind() -> None:
@@ -120,8 +129,8 @@ def test_merging_joins_what_no_frame_tells_apart_and_one_position_fits() -> None
     pairs = [(3, a), (b, 5), (10, 11), (20, 20)]
     assert merging.merge_duplicates(structure, memory, pairs, MAX_ERROR) == 2
     assert all(frame.landmarks.tolist() == list(range(1, POINTS + 1)) for frame in structure.frames)
-    counts = np.bincount(memory.table()[0], minlength=POINTS + 1)
-    assert (counts[1:] == 8).all()
+    check_memory(structure, memory)
+    assert (memory.map.counts(memory.map.ids) == 8).all()
     # Two places that no frame shows together are still two.
     far = structure.create(structure.positions[[30]] + [[0.3, 0, 0]])
     for frame in structure.frames[4:]:

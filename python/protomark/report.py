@@ -96,7 +96,7 @@ def _map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         ),
         (
             "memory for matching",
-            f"{facts['memory']}: {facts['memory_bytes']:,} bytes, "
+            f"{facts['memory_bytes']:,} bytes, "
             f"{facts['bytes_per_landmark']:.0f} per landmark; all {facts['descriptor']} "
             f"descriptors of these observations: {facts['descriptor_bytes']:,} bytes, "
             f"{ratio:.1f} times that",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ import numpy as np
 import protomark as pm
 from protomark.cli.terminal import comma_separated, note, progress_bar
 from protomark.geometry.colmap import pycolmap
+from protomark.mapping.memory import Memory
 from protomark.mapping.options import MappingOptions
 from protomark.plot import ground_plane
 from protomark.threads import one_blas_thread
 from protomark_bench import machine
 from protomark_bench.cache import ResultCache, key_of
 from protomark_bench.mapping import colmap, pipeline
+from protomark_bench.mapping.memories import Descriptors, Medoids
 from protomark_bench.mapping.results import (
     COLMAP,
     PROTOTYPES,
@@ -30,12 +32,12 @@ from protomark_bench.mapping.results import (
 )
 from protomark_bench.mapping.sequences import ImageSequence, error, open_sequences
 
-# Name -> memory and dimensions, as `protomark map` takes them.
-MEMORIES = {
-    TRADITIONAL: ("descriptors", 32),
-    "medoid": ("medoids", 32),
-    PROTOTYPES: ("prototypes", 32),
-    "prototypes-16": ("prototypes", 16),
+# Name -> what makes the memory, and dimensions of its prototypes.
+MEMORIES: dict[str, tuple[Callable[[MappingOptions], Memory], int]] = {
+    TRADITIONAL: (Descriptors.of, 32),
+    "medoid": (Medoids.of, 32),
+    PROTOTYPES: (pipeline.RecordedPrototypes.of, 32),
+    "prototypes-16": (pipeline.RecordedPrototypes.of, 16),
 }
 
 
@@ -69,13 +71,11 @@ class MappingRequest:
 
     def options(self, memory: str) -> MappingOptions:
         """How to make a map with a memory."""
-        kind, dim = MEMORIES[memory]
         return MappingOptions(
             descriptor=self.descriptor,
             encoder=self.encoder,
             max_keypoints=self.max_keypoints,
-            memory=kind,
-            dim=dim,
+            dim=MEMORIES[memory][1],
         )
 
 
@@ -159,7 +159,9 @@ def _make_runs(
                     run = colmap.run(sequence, request.threads, one_more)
                 else:
                     options = request.options(memory)
-                    run = pipeline.run(sequence, memory, options, request.threads, one_more)
+                    run = pipeline.run(
+                        sequence, memory, MEMORIES[memory][0], options, request.threads, one_more
+                    )
                 cache.save(key, asdict(run))
                 note(
                     f"{title}: {run.registered} of {len(sequence.source)} frames, "

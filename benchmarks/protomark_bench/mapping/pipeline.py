@@ -22,7 +22,7 @@ from protomark.geometry.pose import camera_centers
 from protomark.mapping.clock import Clock
 from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
-from protomark.mapping.memory import Prototypes
+from protomark.mapping.memory import Memory, Prototypes, prototypes_for
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.source import ImageFolder
 from protomark.mapping.summary import summarise
@@ -46,6 +46,7 @@ def code_digest() -> str:
 def run(
     sequence: ImageSequence,
     memory: str,
+    new_memory: Callable[[MappingOptions], Memory],
     options: MappingOptions,
     threads: int,
     advance: Callable[[], None] = lambda: None,
@@ -54,17 +55,17 @@ def run(
 
     Args:
         sequence: the images.
-        memory: name of what the options say.
+        memory: name of the memory.
+        new_memory: makes it.
         options: of the map.
         threads: threads to search and adjust on.
         advance: called after each frame.
     """
     begin = time.perf_counter()
-    mapper = Mapper(options, sequence.camera, threads)
+    mapper = Mapper(options, sequence.camera, threads, new_memory)
     # Time that other programs on the machine take does not count.
     mapper.clock = Clock(time.process_time)
     for image in sequence.source.images():
-        _record(mapper)
         mapper.add(image)
         advance()
 
@@ -87,7 +88,7 @@ def run(
         memory_bytes=facts["memory_bytes"],
         peak_bytes=max(r.memory_bytes for r in records),
         peak_window_bytes=max(r.memory_bytes + r.window_bytes for r in records),
-        learning_bytes=facts["learning_map_bytes"],
+        learning_bytes=facts["landmarks"] * (2 * options.dim + 1) if drift else None,
         seconds=facts["seconds"],
         wall_seconds=wall,
         search_ms=_search_ms(mapper, sequence) if facts["landmarks"] > 1 else None,
@@ -98,13 +99,6 @@ def run(
         centers={f.name: [float(f"{x:.6g}") for x in camera_centers(f.pose)] for f in frames},
         growth=[r.memory_bytes for r in records],
     )
-
-
-def _record(mapper: Mapper) -> None:
-    """Replaces a memory of prototypes that is still empty by one that records its input."""
-    memory = mapper.memory
-    if type(memory) is Prototypes and not len(memory.map):
-        mapper.memory = RecordedPrototypes(memory.encoder, memory.dim)
 
 
 def _search_ms(mapper: Mapper, sequence: ImageSequence) -> float:
@@ -135,6 +129,12 @@ class RecordedPrototypes(Prototypes):
     def __init__(self, encoder: pm.Encoder, dim: int) -> None:
         super().__init__(encoder, dim)
         self._record: list[tuple[str, Ids, NDArray[Any]]] = []
+
+    @classmethod
+    def of(cls, options: MappingOptions) -> RecordedPrototypes:
+        """The memory of a map."""
+        prototypes = prototypes_for(options)
+        return cls(prototypes.encoder, prototypes.dim)
 
     def add(self, ids: Ids, encoded: NDArray[Any]) -> None:
         """See `Memory.add`."""

@@ -60,13 +60,6 @@ def map_(
     encoder: Annotated[
         str, typer.Option(help="Name or file of the encoder; by default the descriptor's own.")
     ] = "",
-    memory: Annotated[
-        str,
-        typer.Option(
-            help="What the map keeps: prototypes; or, to compare, medoids (one descriptor per "
-            "landmark) or descriptors (all of them)."
-        ),
-    ] = "prototypes",
     max_keypoints: Annotated[
         int, typer.Option(help="Keypoints kept in a frame, strongest first, spread over it.")
     ] = 2000,
@@ -119,7 +112,6 @@ def map_(
         options=MappingOptions(
             descriptor=descriptor,
             max_keypoints=max_keypoints,
-            memory=memory,
             encoder=encoder,
             dim=dim,
             window=window,
@@ -161,7 +153,7 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
         f"median {figures['reprojection_error_median']:.2f}"
     )
     say(
-        f"  memory for matching ({figures['memory']}): {figures['memory_bytes'] / 1e6:.2f} MB, "
+        f"  memory for matching: {figures['memory_bytes'] / 1e6:.2f} MB, "
         f"{figures['bytes_per_landmark']:.0f} bytes per landmark; all descriptors: "
         f"{figures['descriptor_bytes'] / 1e6:.2f} MB, {ratio:.1f} times as much"
     )

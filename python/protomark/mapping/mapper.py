@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+import protomark as pm
 from protomark.features.extractor import Extractor
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
@@ -15,7 +16,7 @@ from protomark.mapping.frame import Array, Frame, InputImage
 from protomark.mapping.history import REGISTERED, FrameRecord, History
 from protomark.mapping.initialisation import Initialiser, TwoViewPose
 from protomark.mapping.keyframes import is_keyframe
-from protomark.mapping.memory import Memory, make_memory
+from protomark.mapping.memory import Memory, Prototypes, prototypes_for
 from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
@@ -57,12 +58,20 @@ class Mapper:
         options: how to make it.
         camera: camera of the frames to come.
         threads: threads to search and adjust on.
+        new_memory: makes an empty memory; prototypes by default.
     """
 
-    def __init__(self, options: MappingOptions, camera: Camera, threads: int = 1) -> None:
+    def __init__(
+        self,
+        options: MappingOptions,
+        camera: Camera,
+        threads: int = 1,
+        new_memory: Callable[[MappingOptions], Memory] = prototypes_for,
+    ) -> None:
         self.options, self.threads = options, threads
+        self._new_memory = new_memory
         self.structure = Structure({1: camera})
-        self.memory: Memory = make_memory(options)
+        self.memory = new_memory(options)
         self.history = History()
         self.clock = Clock()
         self.camera_id = 1
@@ -79,6 +88,13 @@ class Mapper:
     def camera(self) -> Camera:
         """Camera of the frames to come."""
         return self.structure.cameras[self.camera_id]
+
+    @property
+    def scene(self) -> pm.PrototypeMap:
+        """The map of prototypes."""
+        if not isinstance(self.memory, Prototypes):
+            raise TypeError("only a memory of prototypes is a map that can be saved")
+        return self.memory.map
 
     @property
     def tracker(self) -> Tracker:
@@ -370,7 +386,7 @@ class Mapper:
         record.outcome = reason
         waiting = self.initialiser.waiting[-1:]
         self.structure = Structure({self.camera_id: self.camera})
-        self.memory = make_memory(self.options)
+        self.memory = self._new_memory(self.options)
         self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
         self._reset_initialiser()
         self.initialiser.waiting = waiting
@@ -400,7 +416,7 @@ class Mapper:
 
     def restart(self) -> Mapper:
         """An empty map that begins with the camera that this one found."""
-        new = Mapper(self.options, self.camera, self.threads)
+        new = Mapper(self.options, self.camera, self.threads, self._new_memory)
         new.restarted = True
         new.history.events.append(
             f"the map restarts: focal length {new.guessed_focal:.0f}, not "

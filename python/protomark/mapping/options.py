@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protomark.features.descriptors import descriptor_kind
-from protomark.mapping.memory import MEMORIES
 
 
 @dataclass(frozen=True)
@@ -15,7 +14,6 @@ class MappingOptions:
     Attributes:
         descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
         max_keypoints: the most keypoints to keep in a frame.
-        memory: what the map keeps of descriptors: prototypes, medoids or descriptors (all of them).
         encoder: name or file of the encoder; empty: the one that ships for the descriptor.
         dim: dimensions of a prototype.
         window: number of latest keyframes that keep their descriptors, to triangulate landmarks.
@@ -28,7 +26,6 @@ class MappingOptions:
 
     descriptor: str = "akaze"
     max_keypoints: int = 2000
-    memory: str = "prototypes"
     encoder: str = ""
     dim: int = 32
     window: int = 8
@@ -42,7 +39,6 @@ class MappingOptions:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)
         checks = (
             ("max_keypoints", self.max_keypoints >= 50, "at least 50"),
-            ("memory", self.memory in MEMORIES, f"one of {', '.join(MEMORIES)}"),
             ("window", self.window >= 2, "at least 2"),
             ("max_error", 0 < self.max_error <= 0.05, "in (0, 0.05]"),
             ("min_angle", 0 < self.min_angle < 45, "in (0, 45)"),

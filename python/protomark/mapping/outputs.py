@@ -12,7 +12,6 @@ from protomark.files import replacing_folder, write_text
 from protomark.geometry.colmap import pycolmap, quiet
 from protomark.geometry.pose_files import tum_trajectory
 from protomark.mapping.mapper import Mapper
-from protomark.mapping.memory import Prototypes
 from protomark.mapping.structure import Structure
 from protomark.mapping.summary import map_pictures, summarise
 from protomark.maps.open import SCENE_MAP
@@ -30,12 +29,11 @@ def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> d
         source: name of the input.
         finished: whether all frames of the input were added.
     """
-    structure, memory = mapper.structure, mapper.memory
+    structure = mapper.structure
     figures = {"input": source, "finished": finished, **summarise(mapper)}
-    if isinstance(memory, Prototypes):
-        ids = memory.map.ids
-        memory.map.set_positions(ids, structure.positions[ids])
-        memory.map.save(scene / SCENE_MAP)
+    ids = mapper.scene.ids
+    mapper.scene.set_positions(ids, structure.positions[ids])
+    mapper.scene.save(scene / SCENE_MAP)
     write_model(structure, scene / MODEL)
     frames = sorted(structure.frames, key=lambda f: (f.time, f.name))
     times = np.array([frame.time for frame in frames])

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import protomark as pm
 from protomark.errors import FileError
 from protomark.extras import optional
 from protomark.files import replacing, replacing_folder
@@ -23,6 +22,7 @@ from protomark.mapping.history import History
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.options import MappingOptions
+from protomark.maps.merge import open_learning_map
 from protomark.maps.open import SCENE_MAP
 
 STATE, CHECKPOINT = "state.safetensors", "checkpoint"
@@ -33,8 +33,7 @@ def save_checkpoint(mapper: Mapper, scene: Path, facts: dict[str, Any]) -> None:
     """Save all that is needed to continue after the last frame, in place of the last checkpoint."""
     with replacing_folder(scene / CHECKPOINT) as folder:
         save_state(mapper, folder / STATE, facts)
-        if isinstance(mapper.memory, Prototypes):
-            mapper.memory.map.save(folder / SCENE_MAP)
+        mapper.scene.save(folder / SCENE_MAP)
 
 
 def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
@@ -62,7 +61,6 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         "keypoints": np.concatenate([np.zeros((0, 2), np.float32), *(f.keypoints for f in every)]),
         "landmarks": np.concatenate([np.zeros(0, np.int64), *(f.landmarks for f in frames)]),
         "descriptors": np.concatenate([no_descriptors, *descriptors]),
-        **mapper.memory.arrays(),
     }
     state = {
         "options": asdict(mapper.options),
@@ -104,14 +102,9 @@ def load_state(
         arrays, state = _read(path)
         options = MappingOptions(**state["options"])
         cameras = cameras_from_json(state["cameras"])
-        scene = None
-        if options.memory == "prototypes":
-            opened = pm.open(folder / SCENE_MAP)
-            if not isinstance(opened, pm.PrototypeMap):
-                raise ValueError(f"{folder / SCENE_MAP} is sealed")
-            scene = opened
         mapper = Mapper(options, cameras[state["camera_id"]], threads)
-        mapper.memory.restore(arrays, scene)
+        assert isinstance(mapper.memory, Prototypes)
+        mapper.memory.use(open_learning_map(folder / SCENE_MAP))
         mapper.structure.cameras = cameras
         mapper.camera_id = state["camera_id"]
         _restore_structure(mapper, arrays, state)

@@ -9,7 +9,6 @@ import numpy as np
 from protomark.mapping.clock import STAGES
 from protomark.mapping.history import REGISTERED
 from protomark.mapping.mapper import Mapper
-from protomark.mapping.memory import Prototypes
 from protomark.plot import MapPictures
 from protomark.tracks.summary import length_histogram
 
@@ -44,14 +43,10 @@ def summarise(mapper: Mapper) -> dict[str, Any]:
         "track_length_histogram": length_histogram(lengths),
         "reprojection_error_mean": float(errors.mean()) if len(errors) else 0.0,
         "reprojection_error_median": float(np.median(errors)) if len(errors) else 0.0,
-        "memory": mapper.options.memory,
         "descriptor": mapper.options.descriptor,
         "bytes_per_landmark": mapper.memory.bytes / max(len(ids), 1),
         "memory_bytes": mapper.memory.bytes,
         "descriptor_bytes": mapper.descriptor_bytes * len(seen.landmarks),
-        "learning_map_bytes": (2 * mapper.memory.dim + 1) * len(ids)
-        if isinstance(mapper.memory, Prototypes)
-        else None,
         "camera": camera.as_dict(),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "seconds_total": round(total, 3),

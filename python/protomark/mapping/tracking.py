@@ -12,7 +12,6 @@ from protomark.geometry.neighbours import near_pairs, runs
 from protomark.mapping.frame import Array, Frame, Ids
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
-from protomark.mapping.thresholds import accepted_rows, thresholds
 
 # Radii of the search around projected landmarks, as shares of the image's longer side: under a
 # predicted pose, and under a pose found by RANSAC.
@@ -84,7 +83,6 @@ class Tracker:
     ) -> None:
         self.structure, self.memory = structure, memory
         self.max_error, self.min_inliers, self.threads = max_error, min_inliers, threads
-        self.bounds = thresholds(memory)
 
     def track(self, frame: Frame, predicted: Array) -> TrackedPose | None:
         """The pose of a frame that should be near a predicted one (ORB-SLAM's motion model)."""
@@ -138,7 +136,7 @@ class Tracker:
     def search(self, frame: Frame, among: Ids | None = None) -> LandmarkMatches:
         """Nearest landmark of each keypoint in the whole map, where the match is accepted."""
         ids, distances = self.memory.search(frame.codes, self.threads, among)
-        rows = accepted_rows(self.memory, distances)
+        rows = self.memory.accepted(distances)
         return _unique_landmarks(rows, ids[rows, 0])
 
     def match_projected(
@@ -167,8 +165,8 @@ class Tracker:
         other = np.where(off > _SAME_PLACE**2, distance.astype(np.float64), np.inf)
         second = np.minimum.reduceat(other, starts)
         with np.errstate(invalid="ignore"):
-            fits = first < self.bounds.guided_ratio * second
-        fits &= first < self.bounds.max_distance * self._typical_distance(frame, ids)
+            fits = first < self.memory.guided_ratio * second
+        fits &= first < self.memory.max_distance * self._typical_distance(frame, ids)
         rows, best, first = rows[starts[fits]], best[fits], first[fits]
         order = np.lexsort((rows, first))
         return _unique_landmarks(rows[order], ids[best[order]])
