@@ -3,15 +3,18 @@
 PYTHON ?= python3
 SOURCES := $(shell find core bindings python -type f -not -path '*/__pycache__/*' -not -name '_*.pyi') \
            CMakeLists.txt pyproject.toml constraints.txt
-CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h')
+BENCH := $(shell find benchmarks -type f -not -path '*/__pycache__/*' \
+  -not -path 'benchmarks/build/*' -not -path 'benchmarks/results/*')
+CPP := $(shell find core bindings -name '*.cpp' -o -name '*.h') benchmarks/ceilings.cpp
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads \
+.PHONY: help demo bench test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads \
   sanitize-python-memory sanitize-python-threads coverage fuzz torture check format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
+	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick')"
 	@echo "make test      run the tests (C++ and Python)"
 	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
 	@echo "make sanitize  run the tests of the core under sanitizers (memory, undefined behaviour, threads)"
@@ -24,9 +27,14 @@ help:
 demo: .venv/installed
 	.venv/bin/protomark demo
 
+# The peers are large: they have an environment of their own.
+BENCH_OPTIONS ?=
+bench: .venv-bench/installed
+	.venv-bench/bin/protomark bench $(BENCH_OPTIONS)
+
 test: test-cpp test-python
 
-test-python: .venv-test/installed
+test-python: .venv-test/installed .venv-test/bench
 	.venv-test/bin/python -m pytest
 
 test-cpp: .venv-test/installed
@@ -55,11 +63,10 @@ comma := ,
 sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$(1)
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
-CORE_TESTS := $(addprefix tests/test_,bench_shelf.py cli.py encoder.py evaluation_protocol.py \
-  example_reader.py features.py files.py four_bit_maps.py hamming.py index.py journal.py limits.py \
-  looks.py map_file.py metadata.py mutated_maps.py mutated_tracks.py prototypes.py \
-  reproduce_sequences.py sealed_sections.py sharing.py subset.py tracks_file.py \
-  training_sampling.py)
+CORE_TESTS := $(addprefix tests/test_,cli.py encoder.py evaluation_protocol.py example_reader.py \
+  features.py files.py four_bit_maps.py hamming.py index.py journal.py limits.py looks.py map_file.py \
+  metadata.py mutated_maps.py mutated_tracks.py prototypes.py sealed_sections.py sharing.py \
+  subset.py tracks_file.py training_sampling.py)
 sanitize: sanitize-memory sanitize-threads sanitize-python-memory sanitize-python-threads
 
 # Python itself was built without them, so the sanitizer's library has to come first.
@@ -129,17 +136,27 @@ format: .venv-check/installed
 	.venv-check/bin/clang-format -i $(CPP)
 
 clean:
-	rm -rf build .venv .venv-test .venv-sanitize .venv-check
+	rm -rf build .venv .venv-bench .venv-test .venv-sanitize .venv-check
 
 .venv/installed: $(SOURCES)
 	test -x .venv/bin/python || $(PYTHON) -m venv .venv
 	.venv/bin/pip install --quiet .
 	touch $@
 
+.venv-bench/installed: $(SOURCES) $(BENCH)
+	test -x .venv-bench/bin/python || $(PYTHON) -m venv .venv-bench
+	.venv-bench/bin/pip install --quiet -c constraints.txt . ./benchmarks
+	touch $@
+
 .venv-test/installed: $(SOURCES)
 	test -x .venv-test/bin/python || $(PYTHON) -m venv .venv-test
 	.venv-test/bin/pip install --quiet -c constraints.txt cmake ninja
 	.venv-test/bin/pip install --quiet -c constraints.txt '.[test,train]'
+	touch $@
+
+# Without the peers: the tests that need one are skipped.
+.venv-test/bench: .venv-test/installed $(BENCH)
+	.venv-test/bin/pip install --quiet --no-deps ./benchmarks
 	touch $@
 
 .venv-sanitize/tools:

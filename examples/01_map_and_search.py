@@ -7,7 +7,7 @@ import numpy as np
 
 import protomark as pm
 from protomark import sample
-from protomark.info import matching_bytes
+from protomark.maps.info import matching_bytes
 
 tracks = sample.load()
 encoder = pm.Encoder.load("freak")

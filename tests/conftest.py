@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import subprocess
 import sys
 from itertools import pairwise
@@ -24,7 +26,7 @@ settings.load_profile("protomark")
 def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
     """The command as users run it."""
     return subprocess.run(
-        [sys.executable, "-m", "protomark.cli", *map(str, arguments)],
+        [sys.executable, "-m", "protomark", *map(str, arguments)],
         capture_output=True,
         text=True,
     )
@@ -90,3 +92,33 @@ def balanced_encoder() -> pm.Encoder:
     layers = random_layers([64, 12])
     layers[0]["bias"] = (-layers[0]["weights"].sum(axis=1, dtype=np.int64) // 2).astype(np.int32)
     return pm.Encoder(layers, [5, 12], name="balanced", descriptor="test", scale=0.02)
+
+
+class _MallocInfo(ctypes.Structure):
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in [
+            "arena",
+            "ordblks",
+            "smblks",
+            "hblks",
+            "hblkhd",
+            "usmblks",
+            "fsmblks",
+            "uordblks",
+            "fordblks",
+            "keepcost",
+        ]
+    ]
+
+
+def allocated_bytes() -> int | None:
+    """Memory that this process has allocated and not freed; None without glibc 2.33 or newer."""
+    gc.collect()
+    try:
+        mallinfo = ctypes.CDLL(None).mallinfo2
+    except (AttributeError, OSError, TypeError):
+        return None
+    mallinfo.restype = _MallocInfo
+    info = mallinfo()
+    return int(info.uordblks + info.hblkhd)

@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from protomark.tracks import Camera, Tracks
+from protomark.geometry.camera import Camera
+from protomark.tracks.file import Tracks
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.05))
 

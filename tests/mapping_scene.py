@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import rays
-from protomark.tracks.file import Camera
+from protomark.geometry.camera import Camera
 from tracks_scene import PINHOLE
 
 # Depth of each wall (it stands parallel to the x axis and y axis), its extent in x, and its seed.
@@ -43,7 +42,7 @@ def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
 def show(pose: NDArray[np.float64], camera: Camera = PINHOLE, seed: int = 0) -> NDArray[np.uint8]:
     """What a camera sees; another seed is another room."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    ray = rays(camera, np.column_stack([x.ravel(), y.ravel()]))
+    ray = camera.rays(np.column_stack([x.ravel(), y.ravel()]))
     direction = np.column_stack([ray, np.ones(len(ray))]) @ pose[:, :3]
     center = -pose[:, :3].T @ pose[:, 3]
     picture = np.zeros((camera.height, camera.width), np.uint8)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from protomark.tracks import Camera, Tracks
+from protomark.geometry.camera import Camera
+from protomark.tracks.file import Tracks
 
 
 def small_tracks() -> Tracks:

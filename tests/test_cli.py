@@ -13,8 +13,9 @@ import pytest
 
 import protomark as pm
 from conftest import balanced_encoder, protomark, random_descriptors, random_layers
-from protomark.build import build_map
-from protomark.tracks import Camera, Tracks
+from protomark.geometry.camera import Camera
+from protomark.maps.build import build_map
+from protomark.tracks.file import Tracks
 
 
 @pytest.fixture
@@ -50,12 +51,42 @@ def test_help_lists_the_commands() -> None:
     done = protomark("--help")
     assert done.returncode == 0
     for command in (
-        *("demo", "tracks", "build", "join", "split", "info", "localize", "train"),
-        *("calibrate", "evaluate", "reproduce", "bench"),
+        *("demo", "tracks", "map", "build", "merge", "split", "info", "localize", "train"),
+        *("calibrate", "evaluate"),
     ):
         assert command in done.stdout
         assert protomark(command, "--help").returncode == 0
     assert protomark("--version").stdout.strip() == f"protomark {pm.__version__}"
+
+
+def test_other_distributions_add_commands(tmp_path: Path) -> None:
+    info = tmp_path / "extra-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: extra\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[protomark.commands]\ngreet = extra:greet\nbroken = no_such_module:f\ninfo = extra:greet\n"
+    )
+    (tmp_path / "extra.py").write_text(
+        "def greet(name: str) -> None:\n"
+        "    'Says hello.'\n"
+        "    if name == 'nobody': raise ValueError('nobody is there')\n"
+        "    print('hello', name)\n"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(tmp_path))
+        assert protomark("greet", "you").stdout == "hello you\n"
+        assert protomark("greet", "nobody").stderr == "error: nobody is there\n"
+        assert "Says hello." in protomark("greet", "--help").stdout
+        # The package's own command of the same name goes first.
+        assert "Describe what a file holds" in protomark("info", "--help").stdout
+        listed = protomark("--help")
+        assert "Says hello." in listed.stdout
+        broken = protomark("broken")
+    assert (broken.returncode, broken.stderr) == (
+        1,
+        "error: the command broken of another distribution cannot be loaded: No module named "
+        "'no_such_module'\n",
+    )
 
 
 def test_starting_imports_nothing_heavy() -> None:
@@ -86,9 +117,9 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     done = protomark("info", scene, "--verify", "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
-    assert (facts["kind"], facts["landmarks"], facts["observations"]) == ("open map", 4, 16)
+    assert (facts["kind"], facts["landmarks"], facts["observations"]) == ("learning map", 4, 16)
     assert facts["count_histogram"] == [0, 0, 0, 0, 4]
-    assert "open map" in done.stdout
+    assert "learning map" in done.stdout
     assert protomark("info", model).returncode == 0
     assert protomark("info", tmp_path / "t.safetensors").returncode == 0
 
@@ -100,39 +131,38 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "19.00"
 
     build = ["build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model]
-    done = protomark(*build, "--sealed", "--code-bits", 4, "--json", tmp_path / "facts.json")
+    done = protomark(*build, "--sealed", "--bytes", 9, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
     # 12 dimensions in two words of 8, a count, and ids, which are 0, 1, 2 and 7: a block of 16
     # bytes and a word of 8 for all four.
     assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 24 / 4)
     assert row(done.stdout, "code bits").split()[-1] == "4"
-    done = protomark(*build, "--code-bits", 4)
+    done = protomark(*build, "--bytes", 9)
     assert (done.returncode, done.stderr.strip()) == (
         1,
-        "error: --code-bits 4 is for sealed maps: add --sealed",
+        "error: --bytes is for sealed maps: add --sealed",
     )
 
     balanced_encoder().save(model)
-    done = protomark(*build, "--look-bits", 12, "--json", tmp_path / "facts.json")
+    done = protomark(*build, "--appearance-bits", 12, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     opened = pm.open(scene)
     facts = json.loads((tmp_path / "facts.json").read_text())
-    assert (facts["look_bits"], facts["prototypes"]) == (12, opened.prototype_count)
+    assert (facts["appearance_bits"], facts["prototypes"]) == (12, opened.prototype_count)
     assert opened.prototype_count == 16
-    looks = ["--look-bits", 12, "--sealed", "--prototypes", 1.5]
-    done = protomark(*build, *looks, "--json", tmp_path / "facts.json")
+    appearances = ["--appearance-bits", 12, "--sealed", "--bytes", 14]
+    done = protomark(*build, *appearances, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert (facts["prototypes"], facts["prototypes_per_landmark"]) == (6, 1.5)
-    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 12 + 2 + 6
+    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 8 + 2 + 6
     assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
     for options, message in (
-        (["--prototypes", 2], "is for sealed maps: add --sealed"),
-        (["--prototypes", 2, "--sealed"], "is for landmarks with looks: add --look-bits 10"),
-        (["--prototypes", 0.5, *looks[:3]], "--prototypes 0.5: a landmark has at least 1"),
-        (["--look-bits", 13], "look_bits must be 0 to 12, not 13"),
-        (["--look-bits", -1], "Invalid value for '--look-bits'"),
+        (["--bytes", 2], "is for sealed maps: add --sealed"),
+        (["--bytes", 5, *appearances[:3]], "10"),
+        (["--appearance-bits", 13], "appearance_bits must be 0 to 12, not 13"),
+        (["--appearance-bits", -1], "Invalid value for '--appearance-bits'"),
     ):
         done = protomark(*build, *options)
         assert done.returncode in (1, 2)
@@ -146,7 +176,7 @@ def row(output: str, name: str) -> str:
 
 def test_notes_of_an_encoder_cannot_pass_for_facts(tmp_path: Path) -> None:
     notes = dict.fromkeys(["kind", "bits", "bytes", "checksums", "notes"], "tracks")
-    notes |= {"identity": "0" * 64, "acceptance_data": "a\nkind  tracks"}
+    notes |= {"identity": "0" * 64, "match_calibration_data": "a\nkind  tracks"}
     layers = random_layers([64, 12])
     encoder = pm.Encoder(layers, [12], name="tiny", descriptor="test", scale=0.02, notes=notes)
     scene = pm.PrototypeMap(encoder)
@@ -223,7 +253,7 @@ def test_errors_show_no_control_characters(tmp_path: Path) -> None:
         assert result.stderr.rstrip("\n").isprintable()
 
 
-def test_split_and_join(encoder: pm.Encoder, tmp_path: Path) -> None:
+def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene = pm.PrototypeMap(encoder)
     scene.add(np.arange(30) % 10, random_descriptors(30))
     scene.set_positions(np.arange(8), np.repeat(np.arange(8.0)[:, None], 3, axis=1))
@@ -239,7 +269,7 @@ def test_split_and_join(encoder: pm.Encoder, tmp_path: Path) -> None:
     assert sorted(file.name for file in (tmp_path / "parts").iterdir()) == names
     assert "scene.1.pmk" in done.stdout
     parts = [tmp_path / "parts" / name for name in names]
-    done = protomark("join", *parts, "-o", tmp_path / "joined.pmk", "--json", facts_file)
+    done = protomark("merge", *parts, "-o", tmp_path / "joined.pmk", "--json", facts_file)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "joined.pmk").read_bytes() == whole.read_bytes()
     facts = json.loads(facts_file.read_text())
@@ -258,17 +288,17 @@ def test_split_and_join(encoder: pm.Encoder, tmp_path: Path) -> None:
     # The same landmarks under the same ids by accident, and otherwise.
     copy = tmp_path / "copy.pmk"
     copy.write_bytes(whole.read_bytes())
-    done = protomark("join", whole, copy, "-o", tmp_path / "joined.pmk")
+    done = protomark("merge", whole, copy, "-o", tmp_path / "joined.pmk")
     assert "10 of them known before" in done.stdout
     np.testing.assert_array_equal(pm.open(tmp_path / "joined.pmk").counts(0), [6])
-    done = protomark("join", whole, copy, "-o", tmp_path / "joined.pmk", "--renumber")
+    done = protomark("merge", whole, copy, "-o", tmp_path / "joined.pmk", "--renumber")
     assert done.returncode == 0, done.stderr
     joined = pm.open(tmp_path / "joined.pmk")
     np.testing.assert_array_equal(joined.ids, np.arange(20))
     np.testing.assert_array_equal(joined.prototype(np.arange(10, 20)), scene.prototype(scene.ids))
 
 
-def test_what_cannot_be_joined_or_split_is_refused(encoder: pm.Encoder, tmp_path: Path) -> None:
+def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path: Path) -> None:
     one, short, sealed = (tmp_path / name for name in ("one.pmk", "short.pmk", "sealed.pmk"))
     scene = pm.PrototypeMap(encoder)
     scene.add([1, 2], random_descriptors(2))
@@ -279,13 +309,13 @@ def test_what_cannot_be_joined_or_split_is_refused(encoder: pm.Encoder, tmp_path
     before = one.read_bytes()
     output = tmp_path / "out.pmk"
     calls = [
-        (["join", one, "-o", output], "name at least two maps"),
-        (["join", one, tmp_path / "." / "one.pmk", "-o", output], "is named twice"),
-        (["join", one, tmp_path / "two.pmk", "-o", one], "is one of the maps to join"),
-        (["join", one, short, "-o", output], f"{short}: maps of different encoders or dimensions"),
-        (["join", one, sealed, "-o", output], "is a sealed map, which keeps no sums"),
-        (["join", one, tmp_path / "none.pmk", "-o", output], "No such file"),
-        (["join", one, short, "-o", tmp_path / "none" / "out.pmk"], "no such folder"),
+        (["merge", one, "-o", output], "name at least two maps"),
+        (["merge", one, tmp_path / "." / "one.pmk", "-o", output], "is named twice"),
+        (["merge", one, tmp_path / "two.pmk", "-o", one], "is one of the maps to merge"),
+        (["merge", one, short, "-o", output], f"{short}: maps of different encoders or dimensions"),
+        (["merge", one, sealed, "-o", output], "is a sealed map, which keeps no sums"),
+        (["merge", one, tmp_path / "none.pmk", "-o", output], "No such file"),
+        (["merge", one, short, "-o", tmp_path / "none" / "out.pmk"], "no such folder"),
         (["split", one, "-o", tmp_path], "one of --ids, --parts and --cell-size"),
         (["split", one, "--parts", 2, "--ids", "1", "-o", tmp_path], "one of --ids"),
         (["split", one, "--parts", 3, "-o", tmp_path], "a map of 2 landmarks has 1 to 2"),

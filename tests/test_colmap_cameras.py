@@ -13,16 +13,15 @@ import pytest
 from safetensors.numpy import save
 
 import protomark as pm
-from protomark.mapping.settings import Settings
+from protomark.geometry.camera import CAMERA_MODELS, Camera
+from protomark.geometry.colmap import pycolmap
+from protomark.mapping.options import MappingOptions
 from protomark.mapping.state import STATE, load_state
-from protomark.tracks import Camera
-from protomark.tracks.colmap import focal_length, project, pycolmap, rays
-from protomark.tracks.file import CAMERA_MODELS
 
 USES: list[Callable[[Camera], Any]] = [
-    lambda camera: rays(camera, np.ones((2, 2))),
-    lambda camera: project(camera, np.ones((2, 3))),
-    focal_length,
+    lambda camera: camera.rays(np.ones((2, 2))),
+    lambda camera: camera.project(np.ones((2, 3))),
+    lambda camera: camera.focal_length,
 ]
 
 
@@ -34,7 +33,7 @@ USES: list[Callable[[Camera], Any]] = [
         ("SIMPLE_RADIAL", (500.0, 320.0, 240.0), "has 4 parameters, not 3"),
         ("PINHOLE", (500.0, 500.0, np.nan, 240.0), "not all finite"),
         ("PINHOLE", "1234", "not all finite"),
-        ("NOPE", (500.0,), "none of COLMAP's"),
+        ("NOPE", (500.0,), "COLMAP has no camera model"),
     ],
 )
 def test_only_whole_cameras_reach_pycolmap(
@@ -61,11 +60,11 @@ def test_models_have_the_parameters_that_pycolmap_gives_them() -> None:
         ["SIMPLE_RADIAL", 10, 10, []],
     ],
 )
-def test_a_map_with_such_a_camera_is_not_gone_on_with(camera: Any, tmp_path: Path) -> None:
-    settings = asdict(Settings("orb", memory="descriptors", calibrate=True))
+def test_a_map_with_such_a_camera_is_not_continued(camera: Any, tmp_path: Path) -> None:
+    options = asdict(MappingOptions("orb", calibrate=True))
     for cameras in ({"1": camera}, [camera]):
-        told = {"settings": settings, "cameras": cameras, "camera_id": 1}
-        header = {"format": "protomark-mapping", "version": "3", "state": json.dumps(told)}
+        told = {"options": options, "cameras": cameras, "camera_id": 1}
+        header = {"format": "protomark-mapping", "version": "1", "state": json.dumps(told)}
         (tmp_path / STATE).write_bytes(save({"positions": np.zeros((1, 3))}, header))
         with pytest.raises(pm.FileError, match=r"state\.safetensors: .*broken one \(cameras"):
             load_state(tmp_path)

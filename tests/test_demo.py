@@ -14,15 +14,16 @@ import pytest
 import protomark as pm
 from evaluation_scene import looking_inwards, ring_scene
 from protomark import sample
-from protomark.demo import OPEN_MAP, PICTURE, SEALED_MAP, run_demo, size
+from protomark.cli.terminal import readable_size
+from protomark.evaluation.demo import LEARNING_MAP, PICTURE, SEALED_MAP, run_demo
 from protomark.evaluation.protocol import split
-from protomark.evaluation.scene_plot import view_from_above
-from protomark.tracks import Tracks
+from protomark.plot import ground_plane
+from protomark.tracks.file import Tracks
 
 
 def demo(*arguments: Any, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "protomark.cli", "demo", *map(str, arguments)],
+        [sys.executable, "-m", "protomark", "demo", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd,
@@ -41,15 +42,18 @@ def test_on_the_sample(tmp_path: Path) -> None:
     # Tracks of a good reconstruction: every query is found.
     assert ours["found"] == ours["frames"] == whole["found"] >= 5
     assert ours["median_error"] < 0.01
-    for name in (PICTURE, OPEN_MAP, SEALED_MAP):
+    for name in (PICTURE, LEARNING_MAP, SEALED_MAP):
         assert facts["files"][name] == (tmp_path / "demo" / name).stat().st_size
-    assert done.stdout.splitlines()[-2].startswith("What it means: 33 bytes a landmark")
-    assert done.stdout.splitlines()[-1].startswith("What next: `protomark tracks")
+    assert done.stdout.splitlines()[-2].startswith("What it means: 33 bytes per landmark")
+    assert done.stdout.splitlines()[-1].startswith("What next: `protomark map")
 
     # The maps that were written hold the support and nothing else.
     tracks = Tracks.load(sample.path())
     rows_of_map = split(tracks, 0).support_rows
-    for scene in (pm.open(tmp_path / "demo" / OPEN_MAP), pm.open(tmp_path / "demo" / SEALED_MAP)):
+    for scene in (
+        pm.open(tmp_path / "demo" / LEARNING_MAP),
+        pm.open(tmp_path / "demo" / SEALED_MAP),
+    ):
         assert np.array_equal(scene.ids, np.unique(tracks.landmark_of_keypoint[rows_of_map]))
         assert scene.counts(scene.ids).sum() == len(rows_of_map)
 
@@ -81,10 +85,10 @@ def test_again_replaces_its_own_files_and_no_others(ring: Path, model: str, tmp_
     assert [row.precision for row in first.rows] == [row.precision for row in second.rows]
     assert (output / "notes.txt").read_text() == "mine"
     names = {path.name for path in output.iterdir()}
-    assert names == {PICTURE, OPEN_MAP, SEALED_MAP, "notes.txt"}
+    assert names == {PICTURE, LEARNING_MAP, SEALED_MAP, "notes.txt"}
 
 
-@pytest.mark.parametrize("name", [PICTURE, OPEN_MAP, SEALED_MAP])
+@pytest.mark.parametrize("name", [PICTURE, LEARNING_MAP, SEALED_MAP])
 def test_what_it_did_not_write_stays(ring: Path, model: str, tmp_path: Path, name: str) -> None:
     output = tmp_path / "demo"
     output.mkdir()
@@ -96,7 +100,7 @@ def test_what_it_did_not_write_stays(ring: Path, model: str, tmp_path: Path, nam
     assert [path.name for path in output.iterdir()] == [name]
 
 
-@pytest.mark.parametrize("name", [OPEN_MAP, SEALED_MAP])
+@pytest.mark.parametrize("name", [LEARNING_MAP, SEALED_MAP])
 def test_a_map_of_the_users_stays(
     ring: Path, model: str, encoder: pm.Encoder, tmp_path: Path, name: str
 ) -> None:
@@ -115,7 +119,7 @@ def test_a_run_cut_short_leaves_nothing_in_the_way(
 
     output = tmp_path / "demo"
     with monkeypatch.context() as patch:
-        patch.setattr("protomark.demo._draw", interrupt)
+        patch.setattr("protomark.evaluation.demo._draw", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run_demo(output, tracks_path=ring, encoder=model)
     assert list(output.iterdir()) == []
@@ -155,7 +159,7 @@ def test_above_is_above(down: bool) -> None:
         looks_down = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
         poses[:, :, :3] = looks_down
         poses[:, :, 3] = -centres @ looks_down.T
-    plane = view_from_above(poses)
+    plane = ground_plane(poses)
     assert plane @ plane.T == pytest.approx(np.eye(2), abs=1e-12)
     assert plane[:, 1] == pytest.approx(np.zeros(2), abs=1e-12)
     # Right-handed about up, which is -y: the picture is not mirrored.
@@ -163,9 +167,9 @@ def test_above_is_above(down: bool) -> None:
 
 
 def test_view_without_any_spread() -> None:
-    plane = view_from_above(np.array([looking_inwards(0.3)]))
+    plane = ground_plane(np.array([looking_inwards(0.3)]))
     assert plane @ plane.T == pytest.approx(np.eye(2), abs=1e-9)
 
 
 def test_sizes() -> None:
-    assert [size(n) for n in (900, 262_400, 2_550_000)] == ["1 KB", "262 KB", "2.55 MB"]
+    assert [readable_size(n) for n in (900, 262_400, 2_550_000)] == ["1 KB", "262 KB", "2.55 MB"]

@@ -13,14 +13,14 @@ import pytest
 
 import protomark as pm
 from evaluation_scene import ring_scene
-from protomark.evaluation.command import encoders_for, learn
 from protomark.evaluation.results import load_json
+from protomark.evaluation.run import encoders_for, learn_moments
 from protomark.tracks.file import sequence_name
 
 
 def evaluate(*arguments: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "protomark.cli", "evaluate", *map(str, arguments)],
+        [sys.executable, "-m", "protomark", "evaluate", *map(str, arguments)],
         capture_output=True,
         text=True,
     )
@@ -67,7 +67,7 @@ def test_everything_at_once(tracks: Path, model: Path, tmp_path: Path) -> None:
 def test_without_an_encoder_the_others_are_compared(tracks: Path) -> None:
     done = evaluate(tracks, "--seeds", 1, "--pose-frames", 0, "--methods", "medoid, pca")
     assert done.returncode == 0
-    assert "no encoder ships for test with 64 bits" in done.stderr
+    assert "no encoder for test" in done.stderr
     assert "Medoid" in done.stdout
     assert "Random" not in done.stdout
 
@@ -120,11 +120,11 @@ def test_discriminants_can_be_learned_from_other_tracks(tracks: Path, tmp_path: 
     assert done.returncode == 0, done.stderr
     assert load_json(path)[0].discriminant == "other.safetensors"
 
-    together = learn([tracks, other], ring_scene())
-    one = learn([tracks], ring_scene())
+    together = learn_moments([tracks, other], ring_scene())
+    one = learn_moments([tracks], ring_scene())
     assert not np.array_equal(together.within, one.within)
     with pytest.raises(ValueError, match="give tracks of the same descriptor"):
-        learn([other], ring_scene(bits=128))
+        learn_moments([other], ring_scene(bits=128))
 
 
 def test_encoders_fit_by_descriptor_and_bits(encoder: pm.Encoder) -> None:

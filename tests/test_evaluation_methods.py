@@ -15,21 +15,24 @@ from numpy.typing import NDArray
 import protomark as pm
 from conftest import random_descriptors, random_layers
 from evaluation_scene import observations
-from protomark.evaluation.methods import choices, choose
-from protomark.evaluation.methods.bitwise import bitwise_and, majority
-from protomark.evaluation.methods.hamming_map import HammingMap
-from protomark.evaluation.methods.medoid import medoid
-from protomark.evaluation.methods.projection import (
+from protomark.baselines.binary import (
+    HammingMap,
+    bitwise_and,
+    first_seen,
+    majority,
+    medoid,
+    random_sample,
+    unaggregated,
+)
+from protomark.baselines.linear import (
     RIDGE,
     linear_discriminants,
     mean_of_bits,
     principal_components,
     projected_mean,
 )
-from protomark.evaluation.methods.prototypes import prototypes
-from protomark.evaluation.methods.single import first_seen, random_sample
-from protomark.evaluation.methods.unaggregated import unaggregated
-from protomark.evaluation.support import Moments, Support, unpack
+from protomark.baselines.support import Moments, Support, unpack
+from protomark.evaluation.methods import choose_methods, method_choices, prototype_map
 
 Observations = tuple[NDArray[np.int64], NDArray[np.uint8]]
 
@@ -171,7 +174,7 @@ def test_equal_vectors_give_the_smaller_id_across_blocks() -> None:
 def test_bytes_per_landmark(encoder: pm.Encoder) -> None:
     counts = [2, 3, 7]
     support = Support(np.repeat([4, 5, 9], counts), random_descriptors(12))
-    built = {c.name: c.build(support).bytes_per_landmark for c in choices([encoder])}
+    built = {c.name: c.build(support).bytes_per_landmark for c in method_choices([encoder])}
     assert built["unaggregated"] == 12 / 3 * 8 + 1
     assert {built[n] for n in ("random", "first", "majority", "and", "medoid")} == {8}
     assert built["mean"] == 64 * 4 + 1
@@ -263,7 +266,7 @@ def test_prototypes_are_the_cores_map(encoder: pm.Encoder) -> None:
     scene = pm.PrototypeMap(encoder, dim=5)
     scene.add(landmarks, descriptors)
     queries = random_descriptors(30)
-    built = prototypes(Support(landmarks, descriptors), encoder, 5)
+    built = prototype_map(Support(landmarks, descriptors), encoder, 5)
     assert_same_matches(built, scene, queries)
 
 
@@ -273,10 +276,10 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
     )
     landmarks, descriptors = structured()
     support = Support(landmarks, descriptors)
-    listed = choices([coder])
-    chosen = choose(listed, ["protomark-4bit"])
+    listed = method_choices([coder])
+    chosen = choose_methods(listed, ["protomark-4bit"])
     assert [c.name for c in chosen] == ["protomark-16x4", "protomark-32x4"]
-    names = [c.name for c in choose(listed, None)]
+    names = [c.name for c in choose_methods(listed, None)]
     assert names[-2:] == [c.name for c in chosen]
     assert chosen[1].label == "Protomark, 32 x 4 bits"
     queries = random_descriptors(30)
@@ -289,7 +292,7 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
         assert_same_matches(built, sealed, queries)
         # Rounding to 16 levels shows.
         assert not np.array_equal(sealed.search(queries)[1], scene.search(queries)[1])
-    several = [c.name for c in choices([coder, coder]) if c.family == "protomark-4bit@w"]
+    several = [c.name for c in method_choices([coder, coder]) if c.family == "protomark-4bit@w"]
     assert several[0] == "protomark-16x4@w"
 
 
@@ -299,40 +302,40 @@ def test_looks_are_a_sealed_map_of_looks_in_the_bytes_of_one_prototype(tmp_path:
     )
     landmarks, descriptors = structured()
     support = Support(landmarks, descriptors)
-    chosen = choose(choices([coder]), ["protomark-looks"])
+    chosen = choose_methods(method_choices([coder]), ["protomark-looks"])
     assert [c.name for c in chosen] == ["looks-17", "looks-33"]
     assert chosen[1].label == "Looks, 48 x 4 bits"
     queries = random_descriptors(30)
     for choice, dim, size in zip(chosen, (24, 48), (17, 33), strict=True):
         scene = pm.PrototypeMap(coder, dim=dim, look_bits=10)
         scene.add(landmarks, descriptors)
-        sealed = scene.seal(tmp_path / "s.pmk", bits=4, prototypes=(size - 2) / (dim / 2))
+        sealed = scene.seal(tmp_path / "s.pmk", bits=4, prototype_map=(size - 2) / (dim / 2))
         built = choice.build(support)
-        # What the file really holds; 300 landmarks and their prototypes fill no block of 16.
+        # What the file really holds; 300 landmarks and their prototype_map fill no block of 16.
         held = sealed.prototype_count * dim / 2 + 2 * 300
         assert built.bytes_per_landmark == pytest.approx(held / 300)
         assert size - 1 < built.bytes_per_landmark <= size
         sizes = dict(pm.file_sections(tmp_path / "s.pmk"))
         assert 0 <= sum(sizes[n] for n in ("counts", "rows", "protos")) - held < 16 * dim / 2
         assert_same_matches(built, sealed, queries)
-    assert "looks-17@w" in [c.name for c in choices([coder, coder])]
+    assert "looks-17@w" in [c.name for c in method_choices([coder, coder])]
 
 
 def test_choosing_methods(encoder: pm.Encoder) -> None:
-    listed = choices([encoder])
-    names = [c.name for c in choose(listed, None)]
+    listed = method_choices([encoder])
+    names = [c.name for c in choose_methods(listed, None)]
     assert names[0] == "unaggregated"
     assert names[-2:] == ["protomark-5", "protomark-12"]
     assert not any(name.endswith("float") for name in names)
     # In the order of the table, whatever the order they are asked for.
-    some = [c.name for c in choose(listed, ["pca", "medoid", "pca-8-float"])]
+    some = [c.name for c in choose_methods(listed, ["pca", "medoid", "pca-8-float"])]
     assert some == ["medoid", "pca-8", "pca-16", "pca-32", "pca-64", "pca-8-float"]
     with pytest.raises(ValueError, match=r"no method 'median'.*medoid"):
-        choose(listed, ["median"])
+        choose_methods(listed, ["median"])
 
 
 def test_several_encoders_are_told_apart(encoder: pm.Encoder) -> None:
-    names = [c.name for c in choices([encoder, encoder])]
+    names = [c.name for c in method_choices([encoder, encoder])]
     assert "protomark-12@tiny" in names
     assert "protomark-12" not in names
 

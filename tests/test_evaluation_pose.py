@@ -10,22 +10,31 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation_scene import CAMERA, looking_inwards, radial_pixels, ring_scene
-from protomark.evaluation import pose
-from protomark.evaluation.methods import choices, choose
-from protomark.evaluation.methods.unaggregated import unaggregated
+from protomark.baselines.binary import unaggregated
+from protomark.baselines.support import Support
+from protomark.evaluation.frames import (
+    FrameMatches,
+    LocalizedFrame,
+    QueryFrame,
+    localize_frame,
+    right_matches,
+    scene_depth,
+    select_matches,
+)
+from protomark.evaluation.methods import choose_methods, method_choices
 from protomark.evaluation.protocol import split
-from protomark.evaluation.run import Options, draw_frames, evaluate, positions_of
-from protomark.evaluation.support import Support
+from protomark.evaluation.run import EvaluationOptions, draw_frames, evaluate
+from protomark.geometry.pose import pose_error, transform
 
 
 def test_projection_is_colmaps() -> None:
     camera_points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 5), (50, 3))
     world = np.eye(3, 4)
-    assert pose.project(CAMERA, world, camera_points) == pytest.approx(
+    assert CAMERA.project(transform(world, camera_points)) == pytest.approx(
         radial_pixels(camera_points), abs=1e-6
     )
     behind = camera_points * (1, 1, -1)
-    assert np.isinf(pose.project(CAMERA, world, behind)).all()
+    assert np.isinf(CAMERA.project(transform(world, behind))).all()
 
 
 @given(
@@ -44,7 +53,7 @@ def test_pose_error(
     turned = rotation @ true[:, :3]
     centre = -true[:, :3].T @ true[:, 3] + shift
     estimate = np.concatenate([turned, (-turned @ centre)[:, None]], axis=1)
-    distance, degrees = pose.pose_error(estimate, true)
+    distance, degrees = pose_error(estimate, true)
     assert distance == pytest.approx(np.linalg.norm(shift), abs=1e-6)
     assert degrees == pytest.approx(angle, abs=1e-5)
 
@@ -52,10 +61,10 @@ def test_pose_error(
 def test_found_needs_both_place_and_direction() -> None:
     inliers = np.ones(4, bool)
     near, straight = 0.01 * 5, 2.0
-    assert pose.Localization(np.eye(3, 4), near, straight, inliers).found(5)
-    assert not pose.Localization(np.eye(3, 4), near + 1e-6, straight, inliers).found(5)
-    assert not pose.Localization(np.eye(3, 4), near, straight + 1e-6, inliers).found(5)
-    assert not pose.Localization(None, np.inf, np.inf, inliers).found(5)
+    assert LocalizedFrame(np.eye(3, 4), near, straight, inliers).found(5)
+    assert not LocalizedFrame(np.eye(3, 4), near + 1e-6, straight, inliers).found(5)
+    assert not LocalizedFrame(np.eye(3, 4), near, straight + 1e-6, inliers).found(5)
+    assert not LocalizedFrame(None, np.inf, np.inf, inliers).found(5)
 
 
 def test_acceptance_ranks_by_ratio_and_keeps_each_landmark_once() -> None:
@@ -64,46 +73,46 @@ def test_acceptance_ranks_by_ratio_and_keeps_each_landmark_once() -> None:
         [[4, 8], [1, 8], [3, 10], [np.inf, np.inf], [5, 5], [9, np.inf], [0, 0], [0, 7]],
         dtype=np.float32,
     )
-    every = pose.accept(landmarks, distances, share=1)
+    every = select_matches(landmarks, distances, share=1)
     # Ratios: 0.5 (loses landmark 7), 0.125, 0.3, none, 1, 0 at distance 9, 1 (0 / 0), 0 at 0.
     assert every.keypoints.tolist() == [7, 5, 1, 2, 6, 4]
     assert every.landmarks.tolist() == [8, 5, 7, 3, 6, 4]
-    quarter = pose.accept(landmarks, distances)
+    quarter = select_matches(landmarks, distances)
     assert quarter.keypoints.tolist() == [7, 5]
-    nothing = pose.accept(landmarks[:0], distances[:0])
+    nothing = select_matches(landmarks[:0], distances[:0])
     assert len(nothing.keypoints) == 0
 
 
 def test_right_matches() -> None:
     tracks = ring_scene()
-    frame = pose.Frame.of(tracks, 3)
+    frame = QueryFrame.of(tracks, 3)
     own = np.flatnonzero(frame.landmarks >= 0)[:6]
     landmarks = frame.landmarks[own].copy()
     landmarks[3:] = np.roll(frame.landmarks[own], 1)[3:]
-    matches = pose.Matches(own, landmarks)
-    positions = positions_of(tracks, landmarks)
-    assert pose.right(frame, matches, positions).tolist() == [True] * 3 + [False] * 3
+    matches = FrameMatches(own, landmarks)
+    positions = tracks.positions_of(landmarks)
+    assert right_matches(frame, matches, positions).tolist() == [True] * 3 + [False] * 3
     # The track is not known to the keypoint, but the landmark projects onto it.
     unknown = replace(frame, landmarks=np.full_like(frame.landmarks, -1))
-    assert pose.right(unknown, matches, positions).tolist() == [True] * 3 + [False] * 3
+    assert right_matches(unknown, matches, positions).tolist() == [True] * 3 + [False] * 3
     # The tolerance is half a percent of 640 pixels.
     off = replace(unknown, keypoints=frame.keypoints + np.array([0, 3.2 + 2.5]))
-    assert not pose.right(off, matches, positions).any()
+    assert not right_matches(off, matches, positions).any()
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.6])
 def test_a_pose_is_found_among_wrong_matches(wrong: float) -> None:
     tracks = ring_scene()
-    depth = pose.scene_depth(tracks)
+    depth = scene_depth(tracks)
     rng = np.random.default_rng(0)
     for keyframe in range(5):
-        frame = pose.Frame.of(tracks, keyframe)
+        frame = QueryFrame.of(tracks, keyframe)
         keypoints = np.flatnonzero(frame.landmarks >= 0)
         landmarks = frame.landmarks[keypoints].copy()
         spoilt = rng.random(len(landmarks)) < wrong
         landmarks[spoilt] = rng.permutation(landmarks[spoilt])
-        matches = pose.Matches(keypoints, landmarks)
-        found = pose.localize(frame, matches, positions_of(tracks, landmarks))
+        matches = FrameMatches(keypoints, landmarks)
+        found = localize_frame(frame, matches, tracks.positions_of(landmarks))
         assert found.found(depth)
         # Half a pixel of noise at 500 pixels focal length: a thousandth of the depth.
         assert found.position_error < 0.005 * depth
@@ -112,10 +121,10 @@ def test_a_pose_is_found_among_wrong_matches(wrong: float) -> None:
 
 def test_no_pose_without_enough_matches() -> None:
     tracks = ring_scene()
-    frame = pose.Frame.of(tracks, 0)
+    frame = QueryFrame.of(tracks, 0)
     three = np.flatnonzero(frame.landmarks >= 0)[:3]
-    matches = pose.Matches(three, frame.landmarks[three])
-    found = pose.localize(frame, matches, positions_of(tracks, matches.landmarks))
+    matches = FrameMatches(three, frame.landmarks[three])
+    found = localize_frame(frame, matches, tracks.positions_of(matches.landmarks))
     assert found.cam_from_world is None
     assert not found.found(1e9)
 
@@ -123,13 +132,13 @@ def test_no_pose_without_enough_matches() -> None:
 def test_no_pose_from_random_matches() -> None:
     tracks = ring_scene()
     rng = np.random.default_rng(0)
-    frame = pose.Frame.of(tracks, 0)
+    frame = QueryFrame.of(tracks, 0)
     keypoints = np.arange(100)
     landmarks = rng.permutation(400)[:100]
-    found = pose.localize(
-        frame, pose.Matches(keypoints, landmarks), positions_of(tracks, landmarks)
+    found = localize_frame(
+        frame, FrameMatches(keypoints, landmarks), tracks.positions_of(landmarks)
     )
-    assert not found.found(pose.scene_depth(tracks))
+    assert not found.found(scene_depth(tracks))
 
 
 def test_scene_depth_against_every_observation() -> None:
@@ -140,15 +149,15 @@ def test_scene_depth_against_every_observation() -> None:
         for i, j in zip(tracks.keyframe_of_keypoint, tracks.landmark_of_keypoint, strict=True)
         if j >= 0
     ]
-    assert pose.scene_depth(tracks) == pytest.approx(np.median(depths))
+    assert scene_depth(tracks) == pytest.approx(np.median(depths))
 
 
 def test_camera_models_that_no_pose_can_be_found_for_are_named() -> None:
     tracks = ring_scene(keyframes=3)
     tracks.cameras[1] = replace(CAMERA, model="FOV", params=(500.0, 500.0, 320.0, 240.0, 0.1))
-    chosen = choose(choices(), ["first"])
+    chosen = choose_methods(method_choices(), ["first"])
     with pytest.raises(ValueError, match=r"camera model FOV.*undistort"):
-        evaluate(tracks, "ring", chosen, Options(seeds=[0]))
+        evaluate(tracks, "ring", chosen, EvaluationOptions(seeds=[0]))
 
 
 def test_frames_are_whole_query_keyframes() -> None:
@@ -169,8 +178,8 @@ def test_frames_are_whole_query_keyframes() -> None:
 
 def test_figures_of_a_method_against_one_query_at_a_time() -> None:
     tracks = ring_scene(noise=0.25)
-    chosen = choose(choices(), ["unaggregated", "pca-8"])
-    result = evaluate(tracks, "ring", chosen, Options(seeds=[0], threads=2))
+    chosen = choose_methods(method_choices(), ["unaggregated", "pca-8"])
+    result = evaluate(tracks, "ring", chosen, EvaluationOptions(seeds=[0], threads=2))
     part = split(tracks, 0)
     support = Support(
         tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
@@ -187,12 +196,12 @@ def test_figures_of_a_method_against_one_query_at_a_time() -> None:
 
     accepted = good = found = 0
     for keyframe in part.query_keyframes:
-        frame = pose.Frame.of(tracks, int(keyframe))
-        matches = pose.accept(*method.match(frame.descriptors))
-        positions = positions_of(tracks, matches.landmarks)
+        frame = QueryFrame.of(tracks, int(keyframe))
+        matches = select_matches(*method.match(frame.descriptors))
+        positions = tracks.positions_of(matches.landmarks)
         accepted += len(matches.keypoints)
-        good += int(pose.right(frame, matches, positions).sum())
-        found += pose.localize(frame, matches, positions).found(result.scene_depth)
+        good += int(right_matches(frame, matches, positions).sum())
+        found += localize_frame(frame, matches, positions).found(result.scene_depth)
     assert (whole.frames, whole.found) == (2, found)
-    assert (whole.accepted, whole.right) == (accepted, good)
+    assert (whole.selected, whole.right) == (accepted, good)
     assert found == 2

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from evaluation_scene import ring_scene
 from protomark.evaluation.protocol import split
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 
 
 @st.composite

@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protomark.evaluation.plot import save_plot
-from protomark.evaluation.report import markdown, markdown_table, rich_table
+from protomark.cli.evaluate import _table
 from protomark.evaluation.results import (
     MethodResult,
     SequenceResult,
+    evaluation_markdown,
     load_json,
     mean_rows,
     save_json,
+    save_precision_plot,
+    summary_markdown,
 )
 
 
@@ -23,7 +25,7 @@ def result(sequence: str = "ring", lift: float = 0.0, descriptor: str = "freak")
     def method(name: str, family: str, size: float, precision: list[float]) -> MethodResult:
         return MethodResult(
             name, name.title(), family, [size] * 2, [p + lift for p in precision], [3.0, 5.0],
-            [0.1, 0.1], frames=8, found=6, accepted=40, right=30,
+            [0.1, 0.1], frames=8, found=6, selected=40, right=30,
         )  # fmt: skip
 
     return SequenceResult(
@@ -59,10 +61,10 @@ def test_rows_without_what_was_not_measured() -> None:
     one = result()
     one.methods = one.methods[1:2]
     one.methods[0].precision = [0.6]
-    one.methods[0].frames = one.methods[0].accepted = 0
+    one.methods[0].frames = one.methods[0].selected = 0
     row = one.rows()[0]
     assert row.spread is row.ratio is row.pose_recall is row.right_share is None
-    assert "–" in markdown_table([row])
+    assert "–" in summary_markdown([row])
 
 
 def test_means_over_sequences() -> None:
@@ -100,7 +102,7 @@ def test_broken_results_are_refused(tmp_path: Path) -> None:
 
 
 def test_markdown_has_a_table_a_sequence_and_a_mean_a_descriptor() -> None:
-    text = markdown([result(), result("other"), result(descriptor="orb")])
+    text = evaluation_markdown([result(), result("other"), result(descriptor="orb")])
     assert text.count("|---|") == 4
     assert "FREAK: mean of ring, other" in text
     assert "ORB: mean" not in text
@@ -116,7 +118,7 @@ def test_the_table_fits_a_terminal() -> None:
     rows = result().rows()
     rows[0].bytes_per_landmark = 12_345
     rows[0].search_ms = 1234
-    console.print(rich_table("title", rows))
+    console.print(_table("title", rows))
     text = console.export_text()
     assert "…" not in text
     for shown in ("12,345", "0.800 ±0.141", "1,234"):
@@ -126,8 +128,8 @@ def test_the_table_fits_a_terminal() -> None:
 @pytest.mark.parametrize("ending", [".png", ".svg"])
 def test_plots(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"plot{ending}"
-    save_plot(result().rows(), path, "title")
-    save_plot(result().rows(), path, "title")
+    save_precision_plot(result().rows(), path, "title")
+    save_precision_plot(result().rows(), path, "title")
     head = path.read_bytes()[:2000]
     assert head.startswith(b"\x89PNG") if ending == ".png" else b"<svg" in head
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
@@ -135,4 +137,4 @@ def test_plots(tmp_path: Path, ending: str) -> None:
 
 def test_a_plot_needs_the_ending_of_a_picture(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"must end in \.png, \.svg or \.pdf"):
-        save_plot(result().rows(), tmp_path / "plot.txt")
+        save_precision_plot(result().rows(), tmp_path / "plot.txt")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protomark.tracks.features import MIN_DISTANCE, _apart
+from protomark.features.extractor import MIN_DISTANCE, _apart
 
 
 @pytest.mark.parametrize("extent", [10.0, 60.0, 400.0])

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 import protomark as pm
 from conftest import NO_DISTANCE, random_descriptors, random_layers, rounded
 from map_container import container, sections
-from protomark.build import build_file
 
 
 @pytest.fixture(scope="module")
@@ -275,12 +274,3 @@ def test_plain_code_gives_the_same_file_and_answers(coder: pm.Encoder, tmp_path:
     ids, distances = sealed.search(descriptors, k=5)
     np.testing.assert_array_equal(answers["ids"], ids)
     np.testing.assert_array_equal(answers["distances"], distances)
-
-
-@pytest.mark.parametrize(
-    ("seal", "bits", "message"),
-    [(False, 4, "is for sealed maps: add --sealed"), (True, 6, "has 8 or 4 bits a number")],
-)
-def test_build_says_what_is_wrong(seal: bool, bits: int, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        build_file(tmp_path / "t", tmp_path / "s.pmk", None, None, 2, seal, 1, bits)

@@ -9,11 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation_scene import CAMERA, looking_inwards
+from protomark.geometry.camera import Camera
+from protomark.geometry.pose import (
+    camera_centers,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+)
 from protomark.localization import PosePrior
-from protomark.localization.absolute_pose import centre, project
-from protomark.localization.frustum import visible
-from protomark.localization.poses import quaternion_of, rotation_of
-from protomark.tracks import Camera
+from protomark.localization.prior import visible
 from tracks_scene import DISTORTED, PINHOLE, quaternion
 
 FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0))
@@ -34,9 +38,9 @@ def test_what_an_allowed_pose_sees_is_visible(
     axis, shift = rng.normal(size=(2, 3))
     turn = cv2.Rodrigues(np.radians(degrees) * 0.999 * axis / np.linalg.norm(axis))[0]
     rotation = turn @ prior[:, :3]
-    where = centre(prior) + distance * 0.999 * shift / np.linalg.norm(shift)
+    where = camera_centers(prior) + distance * 0.999 * shift / np.linalg.norm(shift)
     true = np.column_stack([rotation, -rotation @ where])
-    pixels = project(camera, true, positions)
+    pixels = camera.project(transform(true, positions))
     # COLMAP's distortions are not one to one: points far outside may fall into the image again.
     local = positions @ true[:, :3].T + true[:, 3]
     inside = (pixels >= 0).all(1) & (pixels <= (camera.width, camera.height)).all(1)
@@ -64,6 +68,8 @@ def test_priors_that_are_none(distance: float, degrees: float) -> None:
 @given(st.tuples(*[st.floats(-4, 4)] * 3))
 def test_rotations_round_trip(axis: tuple[float, ...]) -> None:
     rotation = cv2.Rodrigues(np.array(axis))[0]
-    assert rotation_of(quaternion_of(rotation)) == pytest.approx(rotation, abs=1e-9)
+    assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(
+        rotation, abs=1e-9
+    )
     if np.trace(rotation) > 0:
-        assert quaternion_of(rotation) == pytest.approx(quaternion(rotation), abs=1e-9)
+        assert quaternion_from_rotation(rotation) == pytest.approx(quaternion(rotation), abs=1e-9)

@@ -17,13 +17,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import balanced_encoder
+from conftest import allocated_bytes, balanced_encoder
 from map_container import SEALED_MAP, Section, container, sections
 from protomark import sample
-from protomark.bench.machine import allocated_bytes
-from protomark.build import build_file, build_map
 from protomark.evaluation.protocol import split
-from protomark.info import describe
+from protomark.maps.build import build_map
+from protomark.maps.info import describe
 
 DIM = 12
 
@@ -380,14 +379,15 @@ def test_all_instruction_sets_learn_the_same_cells(coder: pm.Encoder, tmp_path: 
 
 
 @pytest.mark.parametrize("bits", [8, 4])
-def test_build_and_info_show_the_index(tmp_path: Path, bits: int) -> None:
+def test_info_shows_the_index(tmp_path: Path, bits: int) -> None:
     path = tmp_path / "s.pmk"
-    build_file(sample.path(), path, None, 32, 2, True, 1, bits, index=True)
+    scene = build_map(sample.load(), pm.Encoder.load("freak"), 32)
+    scene.seal(path, bits=bits)
+    assert describe(path)["index_cells"] is None
+    scene.build_index()
+    scene.seal(path, bits=bits)
     facts = describe(path)
     assert facts["index_cells"] == pm.open(path).index_cells > 1
     assert 1 < facts["index_bytes_per_landmark"] <= 4
-    build_file(sample.path(), path, None, 32, 2, False, 1, index=True)
+    scene.save(path)
     assert describe(path)["index_cells"] == facts["index_cells"]
-    scene = build_map(sample.load(), pm.Encoder.load("freak"), 32)
-    scene.seal(path)
-    assert describe(path)["index_cells"] is None

@@ -18,18 +18,16 @@ from typer.testing import CliRunner, Result
 
 import protomark as pm
 from protomark import sample
-from protomark.build import build_map
 from protomark.cli import app
-from protomark.evaluation.pose import Frame, scene_depth
+from protomark.evaluation.frames import QueryFrame, scene_depth
 from protomark.evaluation.protocol import split
+from protomark.geometry.camera_files import camera_from_exif
+from protomark.geometry.pose import camera_centers, pose_error
 from protomark.localization import Localization, Localizer, PosePrior
-from protomark.localization.absolute_pose import centre, pose_error
-from protomark.localization.cameras import camera_of_exif
-from protomark.localization.halves import calibrated, localize_halves, medoids, prototypes
-from protomark.tracks import Tracks
-from protomark.tracks.command import make_tracks
-from protomark.tracks.extract import Settings
-from protomark.upright import upright_tracks
+from protomark.maps.build import build_map
+from protomark.tracks.extract import TracksOptions
+from protomark.tracks.file import Tracks
+from protomark.tracks.make import TracksInput, make_tracks
 from tracks_scene import PINHOLE, poses, quaternion, render, texture, write_model, write_sequence
 
 KEYPOINTS = 600
@@ -42,8 +40,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Tracks and maps of a plane, in both descriptors that the tests use."""
     folder = tmp_path_factory.mktemp("localization")
     sequence = write_sequence(folder / "plane", count=8)
-    settings = [Settings(descriptor=name, max_keypoints=KEYPOINTS) for name in ("freak", "orb")]
-    make_tracks([sequence], settings, folder, threads=1)
+    for name in ("freak", "orb"):
+        options = TracksOptions(descriptor=name, max_keypoints=KEYPOINTS)
+        make_tracks(TracksInput(sequence), options, folder)
     return folder
 
 
@@ -91,7 +90,7 @@ def test_every_kind_of_map(folder: Path, images: list[Any], kind: str, tmp_path:
     tracks = tracks_of(folder, "orb" if kind == "orb" else "freak")
     encoder = pm.Encoder.load("freak-upright" if kind == "upright" else tracks.descriptor)
     if kind == "upright":
-        tracks = upright_tracks(tracks)
+        tracks = tracks.upright()
     look_bits = 8 if kind == "looks" else 0
     dim = 64 if kind == "64" else 32
     made: pm.PrototypeMap | pm.SealedMap = build_map(tracks, encoder, dim, look_bits=look_bits)
@@ -172,25 +171,10 @@ def test_real_frames_of_the_sample() -> None:
     kept[part.support_rows] = True
     localizer = Localizer(build_map(tracks.where(kept), pm.Encoder.load("freak"), 32))
     for keyframe in part.query_keyframes[:4]:
-        frame = Frame.of(tracks, int(keyframe))
+        frame = QueryFrame.of(tracks, int(keyframe))
         found = localizer.localize_features(frame.keypoints, frame.descriptors, frame.camera)
         assert close(found, frame.cam_from_world, 0.01 * scene_depth(tracks))
         assert found.confidence > 0.9
-
-
-def test_halves_of_the_sample() -> None:
-    tracks = Tracks.load(sample.path())
-    variants = [medoids(), prototypes(pm.Encoder.load("freak"), 32)]
-    results = []
-    for variant in variants:
-        acceptance = calibrated(variant, [tracks], frames=3)
-        result, found = localize_halves(tracks, variant, acceptance, share=0.8, stride=6)
-        assert result.frames == len(found) == 3
-        results.append(result)
-    one, ours = results
-    assert (one.bytes_per_landmark, ours.bytes_per_landmark) == (64, 33)
-    assert one.landmarks == ours.landmarks
-    assert ours.recall[-1] >= one.recall[-1] > 0
 
 
 @pytest.fixture
@@ -232,9 +216,9 @@ def test_command(query: Path) -> None:
     assert "0 keypoints" in rows["black.png"]["note"]
     assert "32 x 24 pixels" in rows["small.png"]["note"]
     position = [float(rows["2.png"][axis]) for axis in "xyz"]
-    assert position == pytest.approx(centre(NEW_POSES[1]), abs=0.02)
+    assert position == pytest.approx(camera_centers(NEW_POSES[1]), abs=0.02)
 
-    from protomark.tracks.colmap import pycolmap
+    from protomark.geometry.colmap import pycolmap
 
     model = pycolmap.Reconstruction(str(out))
     assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
@@ -255,7 +239,7 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
     stamps = []
     for i, pose in enumerate(NEW_POSES):
         w, *v = quaternion(pose[:, :3].T)
-        stamps.append(" ".join(map(str, [f"{i + 1}.0", *centre(pose), *v, w])))
+        stamps.append(" ".join(map(str, [f"{i + 1}.0", *camera_centers(pose), *v, w])))
     (query / "tum.txt").write_text("# time x y z q\n" + "\n".join(stamps) + "\n")
     for camera in (
         "PINHOLE:300,300,160,120",
@@ -288,10 +272,10 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
     exif[0x8769] = {0xA405: 34}  # focal length of 35 mm film, by the image's diagonal 43.3 mm
     with Image.open(query / "images" / "1.png") as image:
         image.save(query / "exif.jpg", quality=98, exif=exif)
-    camera = camera_of_exif(query / "exif.jpg")
+    camera = camera_from_exif(query / "exif.jpg")
     assert camera is not None
     assert camera.params[0] == pytest.approx(34 / 43.27 * 400, rel=0.01)
-    assert camera_of_exif(query / "images" / "1.png") is None
+    assert camera_from_exif(query / "images" / "1.png") is None
     done = run(
         query / "scene.pmk", query / "exif.jpg", "-o", query / "o", "--json", query / "f.json"
     )
@@ -307,14 +291,17 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
         (["{q}/scene.pmk", "{q}/true"], "no image in this folder"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "{q}/gone.txt"], "no cameras.txt"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 300"], "has 4 parameters"),
-        (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 a"], "number that is none"),
+        (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 a"], "is not a number"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 32 24 30 30 16 12"], "32 x 24"),
         (
             ["{q}/scene.pmk", "{q}/images", "--poses", "{q}/gone.txt"],
             "folder of poses",
         ),
-        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/true/cameras.txt"], "a word is no number"),
-        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/else.txt"], "is of one of the images"),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/true/cameras.txt"], "is not a number"),
+        (
+            ["{q}/scene.pmk", "{q}/images", "--poses", "{q}/else.txt"],
+            "belongs to one of the images",
+        ),
         (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/long.txt"], "is not of length 1"),
         (["{q}/images/1.png", "{q}/images"], "1.png"),
     ],

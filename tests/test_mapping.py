@@ -14,30 +14,33 @@ import pytest
 
 import protomark as pm
 from mapping_scene import show, walk, write_images
-from protomark.evaluation.trajectory import trajectory_error
-from protomark.localization.absolute_pose import centre
-from protomark.localization.poses import quaternion_of, read_poses
-from protomark.mapping.command import Interrupted, Request, make_map
-from protomark.mapping.mapper import Mapper, Picture
+from protomark.geometry.colmap import pycolmap
+from protomark.geometry.pose import camera_centers, quaternion_from_rotation
+from protomark.geometry.pose_files import read_poses
+from protomark.geometry.similarity import trajectory_error
+from protomark.mapping.frame import InputImage
+from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
-from protomark.mapping.settings import Settings
+from protomark.mapping.options import MappingOptions
+from protomark.mapping.session import MappingInterrupted, MapRequest, make_map
 from protomark.mapping.state import load_state
-from protomark.tracks.colmap import pycolmap
 from test_tracks_command import fails
 from test_tracks_command import run as run_tracks
 from tracks_scene import PINHOLE
 
 CAMERA = "PINHOLE:300,300,160,120"
 COUNT = 16
-SETTINGS = Settings(descriptor="orb", max_keypoints=500, window=5)
+SETTINGS = MappingOptions(descriptor="orb", max_keypoints=500, window=5)
 
 
 def run(*arguments: object):  # type: ignore[no-untyped-def]
     return run_tracks(*arguments, command="map")
 
 
-def pictures(poses, seed: int = 0) -> list[Picture]:  # type: ignore[no-untyped-def]
-    return [Picture(i, f"{i}.png", float(i), show(pose, seed=seed)) for i, pose in enumerate(poses)]
+def pictures(poses, seed: int = 0) -> list[InputImage]:  # type: ignore[no-untyped-def]
+    return [
+        InputImage(i, f"{i}.png", float(i), show(pose, seed=seed)) for i, pose in enumerate(poses)
+    ]
 
 
 def error_of(scene: Path, poses) -> float:  # type: ignore[no-untyped-def]
@@ -46,7 +49,7 @@ def error_of(scene: Path, poses) -> float:  # type: ignore[no-untyped-def]
     images = sorted(found.images.values(), key=lambda i: int(i.name[3:-4]))
     true = np.array([poses[int(i.name[3:-4]) - 1] for i in images])
     centers = np.array([i.projection_center() for i in images])
-    return trajectory_error(centers, centre(true)).rmse
+    return trajectory_error(centers, camera_centers(true)).rmse
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +60,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = tmp_path_factory.mktemp("map") / "scene"
-    figures = make_map(Request(images, scene, SETTINGS, camera=CAMERA))
+    figures = make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA))
     assert figures["registered"] == figures["frames"] == COUNT
     return scene
 
@@ -76,7 +79,7 @@ def test_what_is_written_agrees(finished: Path) -> None:
     assert model.compute_mean_reprojection_error() < 1
     trajectory = read_poses(finished / "trajectory.txt")
     for image in model.images.values():
-        pose = trajectory.of(image.name, float(int(image.name[3:-4]) - 1))
+        pose = trajectory.find(image.name, float(int(image.name[3:-4]) - 1))
         np.testing.assert_allclose(pose, image.cam_from_world().matrix(), atol=1e-6)
     figures = json.loads((finished / "report.json").read_text())
     assert figures["landmarks"] == len(ids)
@@ -89,7 +92,7 @@ def test_prototypes_are_what_building_at_once_gives() -> None:
     """Added, taken back and merged as the map grew, they are sums of the codes that are left."""
     mapper = Mapper(SETTINGS, PINHOLE)
     # A window that never moves on: every observation that is left keeps its code.
-    mapper.settings = Settings(descriptor="orb", max_keypoints=500, window=100)
+    mapper.options = MappingOptions(descriptor="orb", max_keypoints=500, window=100)
     for picture in pictures(walk(9)):
         mapper.add(picture)
     memory, structure = mapper.memory, mapper.structure
@@ -132,16 +135,6 @@ def test_only_the_window_keeps_descriptors() -> None:
     assert all((f.landmarks >= 0).all() for f in mapper.structure.frames)
 
 
-@pytest.mark.parametrize("memory", ["medoids", "descriptors"])
-def test_other_memories_run_in_the_same_code(memory: str, images: Path, tmp_path: Path) -> None:
-    settings = Settings(descriptor="orb", max_keypoints=500, window=5, memory=memory)
-    figures = make_map(Request(images, tmp_path / "scene", settings, camera=CAMERA, every=2))
-    assert figures["registered"] == figures["frames"] == COUNT // 2
-    assert not (tmp_path / "scene" / "scene.pmk").exists()
-    share = figures["memory_bytes"] / figures["descriptor_bytes"]
-    assert 1 <= share < 1.3 if memory == "descriptors" else share < 0.6
-
-
 @pytest.mark.parametrize("after", [3, 10])
 def test_resumed_is_as_if_never_stopped(
     after: int, images: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -149,19 +142,19 @@ def test_resumed_is_as_if_never_stopped(
     scene = tmp_path / "scene"
     add = Mapper.add
 
-    def stop_after(self: Mapper, picture: Picture) -> object:
+    def stop_after(self: Mapper, picture: InputImage) -> object:
         if picture.index == after:
             os.kill(os.getpid(), signal.SIGINT)
         return add(self, picture)
 
     monkeypatch.setattr(Mapper, "add", stop_after)
-    with pytest.raises(Interrupted):
-        make_map(Request(images, scene, SETTINGS, camera=CAMERA))
+    with pytest.raises(MappingInterrupted):
+        make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA))
     monkeypatch.setattr(Mapper, "add", add)
     assert (scene / "scene.pmk").exists()
-    with pytest.raises(FileExistsError, match="--resume goes on"):
-        make_map(Request(images, scene, SETTINGS, camera=CAMERA))
-    make_map(Request(images, scene, SETTINGS, camera=CAMERA, resume=True))
+    with pytest.raises(FileExistsError, match="--resume continues it"):
+        make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA))
+    make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA, resume=True))
     for name in ("scene.pmk", "trajectory.txt"):
         assert (scene / name).read_bytes() == (finished / name).read_bytes()
     assert not (scene / "checkpoint").exists()
@@ -192,11 +185,13 @@ def test_given_poses_stay_and_structure_is_built(images: Path, tmp_path: Path) -
     poses = walk(COUNT)
     lines = []
     for i, pose in enumerate(poses, 1):
-        numbers = " ".join(repr(float(v)) for v in (*quaternion_of(pose[:, :3]), *pose[:, 3]))
+        numbers = " ".join(
+            repr(float(v)) for v in (*quaternion_from_rotation(pose[:, :3]), *pose[:, 3])
+        )
         lines.append(f"{i} {numbers} 1 img{i}.png\n\n" if i != 4 else "")
     (tmp_path / "images.txt").write_text("".join(lines))
     scene = tmp_path / "scene"
-    request = Request(images, scene, SETTINGS, camera=CAMERA, poses=tmp_path / "images.txt")
+    request = MapRequest(images, scene, SETTINGS, camera=CAMERA, poses=tmp_path / "images.txt")
     figures = make_map(request)
     assert figures["not_registered"] == {"no pose is given for it": ["img4.png"]}
     model = pycolmap.Reconstruction(str(scene / "sparse"))
@@ -210,7 +205,7 @@ def test_given_poses_stay_and_structure_is_built(images: Path, tmp_path: Path) -
 
 
 def test_an_unknown_camera_is_calibrated_along_the_way(images: Path, tmp_path: Path) -> None:
-    figures = make_map(Request(images, tmp_path / "scene", SETTINGS))
+    figures = make_map(MapRequest(images, tmp_path / "scene", SETTINGS))
     assert figures["registered"] == COUNT
     assert figures["camera"]["model"] == "SIMPLE_RADIAL"
     # Begun with 1.2 times 320, that is 384.
@@ -228,19 +223,19 @@ def test_resumed_with_an_unknown_camera(
     add = Mapper.add
     begun = 0
 
-    def stop_after(self: Mapper, picture: Picture) -> object:
+    def stop_after(self: Mapper, picture: InputImage) -> object:
         nonlocal begun
         begun += picture.index == 0
         if picture.index == 10 and begun == beginning:
             os.kill(os.getpid(), signal.SIGINT)
         return add(self, picture)
 
-    make_map(Request(images, tmp_path / "whole", SETTINGS))
+    make_map(MapRequest(images, tmp_path / "whole", SETTINGS))
     monkeypatch.setattr(Mapper, "add", stop_after)
-    with pytest.raises(Interrupted):
-        make_map(Request(images, tmp_path / "scene", SETTINGS))
+    with pytest.raises(MappingInterrupted):
+        make_map(MapRequest(images, tmp_path / "scene", SETTINGS))
     monkeypatch.setattr(Mapper, "add", add)
-    make_map(Request(images, tmp_path / "scene", SETTINGS, resume=True))
+    make_map(MapRequest(images, tmp_path / "scene", SETTINGS, resume=True))
     for name in ("scene.pmk", "trajectory.txt"):
         whole = (tmp_path / "whole" / name).read_bytes()
         assert (tmp_path / "scene" / name).read_bytes() == whole
@@ -254,7 +249,7 @@ def test_black_blurred_and_broken_frames_are_named_and_cost_nothing_else(
     cv2.imwrite(str(bad / "img8.png"), cv2.GaussianBlur(show(walk(8)[7]), (0, 0), 12))
     (bad / "img11.png").write_bytes(b"no image")
     cv2.imwrite(str(bad / "img13.png"), np.zeros((100, 100), np.uint8))
-    figures = make_map(Request(bad, tmp_path / "scene", SETTINGS, camera=CAMERA))
+    figures = make_map(MapRequest(bad, tmp_path / "scene", SETTINGS, camera=CAMERA))
     assert figures["registered"] == COUNT - 4
     reasons = {name: why for why, names in figures["not_registered"].items() for name in names}
     assert set(reasons) == {"img5.png", "img8.png", "img11.png", "img13.png"}
@@ -275,15 +270,15 @@ def test_gaps_do_not_bend_the_map(missing: tuple[int, ...]) -> None:
     mapper.finish()
     frames = mapper.structure.frames
     assert len(frames) == COUNT - len(missing)
-    found = centre(np.array([frame.pose for frame in frames]))
-    true = centre(poses[[frame.index for frame in frames]])
+    found = camera_centers(np.array([frame.pose for frame in frames]))
+    true = camera_centers(poses[[frame.index for frame in frames]])
     assert trajectory_error(found, true).rmse < 0.01
 
 
 def test_a_second_scene_stays_out_and_is_named(images: Path, tmp_path: Path) -> None:
     two = Path(shutil.copytree(images, tmp_path / "two"))
     write_images(two, walk(5), seed=100, first=COUNT + 1)
-    figures = make_map(Request(two, tmp_path / "scene", SETTINGS, camera=CAMERA))
+    figures = make_map(MapRequest(two, tmp_path / "scene", SETTINGS, camera=CAMERA))
     assert figures["registered"] == COUNT
     (reason,) = figures["not_registered"]
     assert "not found in the map" in reason
@@ -302,10 +297,10 @@ def test_a_turn_on_the_spot_makes_no_map_but_a_sentence(tmp_path: Path) -> None:
 
 
 def test_refusals(images: Path, finished: Path, tmp_path: Path) -> None:
-    fails(run(images, "-o", finished), "a map is there already", "--into", "--force")
+    fails(run(images, "-o", finished), "holds a map already", "--into", "--force")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("important")
-    fails(run(images, "-o", tmp_path / "mine"), "not empty, and no map")
+    fails(run(images, "-o", tmp_path / "mine"), "not empty, and not a map")
     fails(run(images), "-o", "--into")
     fails(run(tmp_path / "nothing", "-o", tmp_path / "x"), "no such folder of images or video")
     fails(run(images, "--into", tmp_path / "mine"), "is this the folder of a map?")
@@ -337,7 +332,7 @@ def test_a_video_is_mapped_as_its_frames_are(tmp_path: Path) -> None:
     for pose in walk(8):
         writer.write(cv2.cvtColor(show(pose), cv2.COLOR_GRAY2BGR))
     writer.release()
-    figures = make_map(Request(path, tmp_path / "scene", SETTINGS, camera=CAMERA))
+    figures = make_map(MapRequest(path, tmp_path / "scene", SETTINGS, camera=CAMERA))
     assert figures["registered"] == figures["frames"] == 8
     lines = (tmp_path / "scene" / "trajectory.txt").read_text().splitlines()[1:]
     times = [float(line.split()[0]) for line in lines]

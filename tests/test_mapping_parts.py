@@ -2,21 +2,18 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from protomark.localization.cameras import read_cameras
-from protomark.localization.poses import quaternion_of, read_poses
-from protomark.mapping.memory import Descriptors, Medoids, Prototypes
-from protomark.mapping.source import Folder, Video, open_source
-from protomark.tracks.nearby import near_pairs
+from protomark.geometry.camera_files import read_cameras
+from protomark.geometry.neighbours import near_pairs
+from protomark.geometry.pose import quaternion_from_rotation
+from protomark.geometry.pose_files import read_poses
+from protomark.mapping.memory import Prototypes
+from protomark.mapping.source import ImageFolder, Video, open_source
 from tracks_scene import PINHOLE
 
 
 @pytest.fixture(scope="module")
 def encoder():
     return pm.Encoder.load("orb")
-
-
-def memories(encoder):
-    return [Prototypes(encoder, 16), Descriptors(32), Medoids(32)]
 
 
 @pytest.mark.parametrize("radius", [0.5, 3.0, 40.0])
@@ -43,9 +40,8 @@ def observations(seed=0, landmarks=12, each=5):
     return ids, descriptors
 
 
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_each_memory_finds_its_landmarks(encoder, which):
-    memory = memories(encoder)[which]
+def test_prototypes_find_their_landmarks(encoder):
+    memory = Prototypes(encoder, 16)
     ids, descriptors = observations()
     encoded = memory.encode(descriptors)
     memory.add(ids[::2], encoded[::2])
@@ -54,23 +50,22 @@ def test_each_memory_finds_its_landmarks(encoder, which):
     assert (distances[:, 0] <= distances[:, 1]).all()
     rows = np.arange(len(found))
     again = memory.distances(encoded[1::2], rows, found[:, 0])
-    np.testing.assert_allclose(again ** (2 if memory.euclidean else 1), distances[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(again**2, distances[:, 0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(encoder, which):
-    memory, rest = memories(encoder)[which], memories(encoder)[which]
+def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(encoder):
+    memory, rest = Prototypes(encoder, 16), Prototypes(encoder, 16)
     ids, descriptors = observations()
     encoded = memory.encode(descriptors)
     memory.add(ids, encoded)
-    gone = np.zeros(len(ids), bool)
-    gone[[0, 7, 8, 21, 40]] = True
-    memory.remove(ids[gone], encoded[gone])
-    memory.merge(np.array([3, 5]), np.array([4, 6]))
-    memory.discard(np.array([1, 9]))
-    np.testing.assert_array_equal(memory.known(np.array([1, 2, 3, 4, 9])), [0, 1, 1, 0, 0])
+    removed = np.zeros(len(ids), bool)
+    removed[[0, 7, 8, 21, 40]] = True
+    memory.subtract(ids[removed], encoded[removed])
+    memory.merge_landmarks(np.array([3, 5]), np.array([4, 6]))
+    memory.remove(np.array([1, 9]))
+    np.testing.assert_array_equal(memory.contains(np.array([1, 2, 3, 4, 9])), [0, 1, 1, 0, 0])
     ids = np.where(ids == 4, 3, np.where(ids == 6, 5, ids))
-    stays = ~gone & (ids != 1) & (ids != 9)
+    stays = ~removed & (ids != 1) & (ids != 9)
     rest.add(ids[stays], encoded[stays])
     for a, b in zip(memory.search(encoded), rest.search(encoded), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -79,11 +74,9 @@ def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(enc
 
 def test_bytes_that_matching_needs(encoder):
     ids, descriptors = observations(landmarks=12, each=5)
-    sizes = []
-    for memory in memories(encoder):
-        memory.add(ids, memory.encode(descriptors))
-        sizes.append(memory.bytes)
-    assert sizes == [12 * 17, 12 * 5 * 32, 12 * 32]
+    memory = Prototypes(encoder, 16)
+    memory.add(ids, memory.encode(descriptors))
+    assert memory.bytes == 12 * 17
 
 
 def test_prototypes_of_other_dimensions(encoder):
@@ -135,18 +128,18 @@ def test_camera_parameters_that_do_not_fit():
 def test_poses_as_tum_and_as_colmap_agree(tmp_path):
     rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     pose = np.column_stack([rotation, [1.0, 2, 3]])
-    w, x, y, z = quaternion_of(rotation)
+    w, x, y, z = quaternion_from_rotation(rotation)
     colmap = tmp_path / "images.txt"
     colmap.write_text(f"# images\n1 {w} {x} {y} {z} 1 2 3 1 a b.png\n\n")
-    np.testing.assert_allclose(read_poses(colmap).of("a b.png", 0.0), pose, atol=1e-12)
-    assert read_poses(colmap).of("c.png", 0.0) is None
+    np.testing.assert_allclose(read_poses(colmap).find("a b.png", 0.0), pose, atol=1e-12)
+    assert read_poses(colmap).find("c.png", 0.0) is None
     place = -rotation.T @ pose[:, 3]
     tum = tmp_path / "trajectory.txt"
     lines = [f"{t} {place[0]} {place[1]} {place[2]} {-x} {-y} {-z} {w}" for t in (1.0, 2.0)]
     tum.write_text("# time and pose\n" + "\n".join(lines) + "\n")
     found = read_poses(tum)
-    np.testing.assert_allclose(found.of("any", 1.1), pose, atol=1e-12)
-    assert found.of("any", 3.0) is None
+    np.testing.assert_allclose(found.find("any", 1.1), pose, atol=1e-12)
+    assert found.find("any", 3.0) is None
 
 
 @pytest.mark.parametrize(
@@ -154,7 +147,7 @@ def test_poses_as_tum_and_as_colmap_agree(tmp_path):
     [
         ("1 2 3\n", "neither a line"),
         ("1 0 0 0 0 0 0 0\n", "quaternion"),
-        ("1 a 0 0 0 0 0 1\n", "no number"),
+        ("1 a 0 0 0 0 0 1\n", "not a number"),
         ("1 inf 0 0 0 0 0 1\n", "not finite"),
         ("# nothing\n", "no poses"),
     ],
@@ -175,16 +168,16 @@ def test_images_come_in_natural_order_and_know_their_times(tmp_path):
         else:
             (tmp_path / name).write_text("no image")
     folder = open_source(tmp_path)
-    assert isinstance(folder, Folder)
-    assert folder.names == ["img2.png", "img10.png"]
+    assert isinstance(folder, ImageFolder)
+    assert folder.names() == ["img2.png", "img10.png"]
     assert folder.size() == (6, 4)
-    assert [p.name for p in folder.pictures(backward=True)] == ["img10.png", "img2.png"]
-    assert [p.name for p in folder.pictures(only={"img10.png"})] == ["img10.png"]
+    assert [p.name for p in folder.images(backward=True)] == ["img10.png", "img2.png"]
+    assert [p.name for p in folder.images(only={"img10.png"})] == ["img10.png"]
     timed = tmp_path / "timed"
     timed.mkdir()
     for name in ("1305.25.png", "1305.75.png"):
         cv2.imwrite(str(timed / name), np.zeros((4, 6), np.uint8))
-    assert [p.time for p in open_source(timed).pictures()] == [1305.25, 1305.75]
+    assert [p.time for p in open_source(timed).images()] == [1305.25, 1305.75]
 
 
 def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
@@ -192,10 +185,10 @@ def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
 
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 6), np.uint8))
     (tmp_path / "b.png").write_bytes(b"no image")
-    pictures = list(open_source(tmp_path).pictures())
+    pictures = list(open_source(tmp_path).images())
     assert pictures[0].image is not None
     assert pictures[1].image is None
-    assert "not a readable image" in pictures[1].trouble
+    assert "not a readable image" in pictures[1].problem
 
 
 def video_of(path, frames):
@@ -212,15 +205,15 @@ def test_a_video_frame_by_frame(tmp_path):
     video_of(path, range(0, 200, 10))
     video = open_source(path, every=2)
     assert isinstance(video, Video)
-    pictures = list(video.pictures())
+    pictures = list(video.images())
     assert len(pictures) == len(video) == 10
     np.testing.assert_allclose([p.time for p in pictures], np.arange(10) * 0.2)
     assert [int(np.median(p.image)) for p in pictures] == pytest.approx(range(0, 200, 20), abs=3)
-    backward = list(video.pictures(backward=True))
+    backward = list(video.images(backward=True))
     assert [p.name for p in backward] == [p.name for p in pictures][::-1]
     for a, b in zip(backward[::-1], pictures, strict=True):
         np.testing.assert_array_equal(a.image, b.image)
-    assert [p.index for p in video.pictures(7)] == [7, 8, 9]
+    assert [p.index for p in video.images(7)] == [7, 8, 9]
 
 
 def test_a_file_that_is_no_video(tmp_path):

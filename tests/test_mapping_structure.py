@@ -6,33 +6,38 @@ import cv2
 import numpy as np
 import pytest
 
+import protomark as pm
+from conftest import random_layers
 from mapping_scene import walk
-from protomark.localization.absolute_pose import centre, project
+from protomark.geometry.absolute_pose import refine_pose
+from protomark.geometry.pose import camera_centers, transform
 from protomark.mapping import loop, merging
 from protomark.mapping.adjustment import adjust, adjust_global
 from protomark.mapping.culling import cull
-from protomark.mapping.memory import Descriptors
-from protomark.mapping.pose import refine_pose
+from protomark.mapping.frame import Frame
+from protomark.mapping.memory import Prototypes
 from protomark.mapping.prediction import predict
-from protomark.mapping.structure import Frame, Structure
+from protomark.mapping.structure import Structure
 from protomark.mapping.triangulation import remember
-from protomark.tracks.colmap import rays
 from tracks_scene import PINHOLE
 
+ENCODER = pm.Encoder(
+    random_layers([64, 24, 12]), dims=[12], name="tiny", descriptor="test", scale=0.02
+)
 MAX_ERROR, MIN_ANGLE = 0.01, 1.0
 POINTS = 60
 
 
-def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
+def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Prototypes]:
     """Eight frames that see the same points, each with descriptors of its own."""
     rng = np.random.default_rng(seed)
     points = np.column_stack(
         [rng.uniform(-0.6, 0.5, POINTS), rng.uniform(-0.5, 0.5, POINTS), rng.uniform(2, 3, POINTS)]
     )
-    structure, memory = Structure({1: PINHOLE}), Descriptors(8)
+    structure, memory = Structure({1: PINHOLE}), Prototypes(ENCODER, 12)
     ids = structure.create(points)
     for i, pose in enumerate(walk(8)):
-        pixels = project(PINHOLE, pose, points) + noise * rng.normal(size=(POINTS, 2))
+        pixels = PINHOLE.project(transform(pose, points)) + noise * rng.normal(size=(POINTS, 2))
         descriptors = rng.integers(0, 256, (POINTS, 8), np.uint8)
         frame = Frame(
             index=i,
@@ -42,9 +47,9 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
             pose=pose.copy(),
             keypoints=pixels.astype(np.float32),
             landmarks=np.full(POINTS, -1, np.int64),
-            rays=rays(PINHOLE, pixels),
+            rays=PINHOLE.rays(pixels),
             descriptors=descriptors,
-            encoded=descriptors,
+            encoded=memory.encode(descriptors),
         )
         structure.frames.append(frame)
         structure.observe(frame, np.arange(POINTS), ids)
@@ -52,10 +57,21 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Descriptors]:
     return structure, memory
 
 
+def check_memory(structure: Structure, memory: Prototypes) -> None:
+    """The memory holds exactly the observations of the frames."""
+    expected = pm.PrototypeMap(ENCODER, 12)
+    for frame in structure.frames:
+        expected.add_codes(frame.seen, frame.codes[frame.observed])
+    ids = expected.ids
+    np.testing.assert_array_equal(memory.map.ids, ids)
+    np.testing.assert_array_equal(memory.map.counts(ids), expected.counts(ids))
+    np.testing.assert_array_equal(memory.map.prototype(ids), expected.prototype(ids))
+
+
 def test_ids_count_up_from_one_and_are_never_used_again() -> None:
     structure, _ = scene()
     assert structure.ids.tolist() == list(range(1, POINTS + 1))
-    structure.discard(np.array([2, POINTS]))
+    structure.remove(np.array([2, POINTS]))
     assert structure.create(np.zeros((1, 3))).tolist() == [POINTS + 1]
     assert all(2 not in frame.landmarks for frame in structure.frames)
 
@@ -64,7 +80,7 @@ def test_visible_is_what_projects_into_the_image_from_where_it_was_seen() -> Non
     structure, _ = scene()
     pose = walk(8)[3]
     ids, pixels = structure.visible(pose, 1)
-    want = project(PINHOLE, pose, structure.positions[structure.ids])
+    want = PINHOLE.project(transform(pose, structure.positions[structure.ids]))
     inside = ((want > 0) & (want < [320, 240])).all(1)
     np.testing.assert_array_equal(ids, structure.ids[inside])
     np.testing.assert_allclose(pixels, want[inside], atol=1e-9)
@@ -78,27 +94,20 @@ def test_culling_takes_observations_back_exactly_and_weak_landmarks_out() -> Non
     off = structure.frames[2]
     off.rays[4] += 0.1
     for frame in structure.frames[1:]:
-        memory.remove(frame.landmarks[7:8], frame.encoded[7:8])
+        memory.subtract(frame.landmarks[7:8], frame.encoded[7:8])
         frame.landmarks[7] = -1
     gone = cull(structure, memory, list(range(8)), MAX_ERROR, MIN_ANGLE)
     assert gone == 1
     assert off.landmarks[4] == -1
     assert 8 not in structure.ids
-    owners, descriptors = memory.table()
-    want = {
-        (int(landmark), bytes(frame.descriptors[row]))
-        for frame in structure.frames
-        for row, landmark in enumerate(frame.landmarks)
-        if landmark >= 0
-    }
-    assert {(int(o), bytes(d)) for o, d in zip(owners, descriptors, strict=True)} == want
+    check_memory(structure, memory)
 
 
 def test_landmarks_seen_twice_go_when_the_window_has_left_them_behind() -> None:
     structure, memory = scene()
     structure.born[:] = 1
     for frame in structure.frames[2:]:
-        memory.remove(frame.landmarks[:5], frame.encoded[:5])
+        memory.subtract(frame.landmarks[:5], frame.encoded[:5])
         frame.landmarks[:5] = -1
     assert cull(structure, memory, list(range(8)), MAX_ERROR, MIN_ANGLE) == 0
     for frame in structure.frames[:2]:
@@ -112,23 +121,25 @@ def test_merging_joins_what_no_frame_tells_apart_and_one_position_fits() -> None
     double = structure.create(structure.positions[[3, 5]] + 1e-4)
     for frame in structure.frames[4:]:
         for row, new in zip((2, 4), double, strict=True):
-            memory.remove(frame.landmarks[[row]], frame.encoded[[row]])
+            memory.subtract(frame.landmarks[[row]], frame.encoded[[row]])
             frame.landmarks[row] = -1
             structure.observe(frame, np.array([row]), np.array([new]))
             remember(memory, frame, np.array([row]))
     a, b = double.tolist()
     pairs = [(3, a), (b, 5), (10, 11), (20, 20)]
-    assert merging.merge(structure, memory, pairs, MAX_ERROR) == 2
+    assert merging.merge_duplicates(structure, memory, pairs, MAX_ERROR) == 2
     assert all(frame.landmarks.tolist() == list(range(1, POINTS + 1)) for frame in structure.frames)
-    counts = np.bincount(memory.table()[0], minlength=POINTS + 1)
-    assert (counts[1:] == 8).all()
+    check_memory(structure, memory)
+    assert (memory.map.counts(memory.map.ids) == 8).all()
     # Two places that no frame shows together are still two.
     far = structure.create(structure.positions[[30]] + [[0.3, 0, 0]])
     for frame in structure.frames[4:]:
         frame.landmarks[29] = -1
-        frame.rays[29] = rays(PINHOLE, project(PINHOLE, frame.pose, structure.positions[far]))[0]
+        frame.rays[29] = PINHOLE.rays(
+            PINHOLE.project(transform(frame.pose, structure.positions[far]))
+        )[0]
         structure.observe(frame, np.array([29]), far)
-    assert merging.merge(structure, memory, [(30, int(far[0]))], MAX_ERROR) == 0
+    assert merging.merge_duplicates(structure, memory, [(30, int(far[0]))], MAX_ERROR) == 0
 
 
 def test_adjustment_finds_back_to_what_was_seen() -> None:
@@ -164,17 +175,20 @@ def test_drift_is_spread_over_the_frames_since_the_place_was_seen() -> None:
         frame.landmarks[20:] = frame.landmarks[20:] if i >= 3 else -1
     for i, frame in enumerate(structure.frames[3:], 1):
         turn = cv2.Rodrigues(i / 5 * np.array([0.02, -0.1, 0.03]))[0]
-        moved = centre(frame.pose) + i / 5 * np.array([0.3, -0.1, 0.2])
+        moved = camera_centers(frame.pose) + i / 5 * np.array([0.3, -0.1, 0.2])
         frame.pose[:, :3] = frame.pose[:, :3] @ turn.T
         frame.pose[:, 3] = -frame.pose[:, :3] @ moved
     true = walk(8)
-    before = [np.linalg.norm(centre(f.pose) - centre(true[f.index])) for f in structure.frames]
-    loop._correct(structure, 7, true[7], np.arange(20), old)
+    before = [
+        np.linalg.norm(camera_centers(f.pose) - camera_centers(true[f.index]))
+        for f in structure.frames
+    ]
+    loop._distribute_drift(structure, 7, true[7], np.arange(20), old)
     np.testing.assert_allclose(newest.pose, true[7], atol=1e-9)
     for frame in structure.frames[:3]:
         np.testing.assert_array_equal(frame.pose, true[frame.index])
     for frame in structure.frames[3:]:
-        off = np.linalg.norm(centre(frame.pose) - centre(true[frame.index]))
+        off = np.linalg.norm(camera_centers(frame.pose) - camera_centers(true[frame.index]))
         assert off < 0.2 * before[frame.index]
 
 
@@ -220,17 +234,17 @@ def test_prediction_goes_on_as_the_camera_moved_on_either_side() -> None:
 def test_landmarks_are_less_certain_the_further_from_their_rays_they_are_seen() -> None:
     structure, _ = scene()
     structure.frames = structure.frames[:2]
-    structure.look_again()
+    structure.recompute_views()
     ids = structure.ids
     one, two = (frame.pose for frame in structure.frames)
     # Along one of two rays that are an angle apart, it is half of that off their middle, and the
     # depth's variance shows half as much as a keypoint's.
-    np.testing.assert_allclose(structure.certainty(one, ids), 2 / 3, rtol=1e-3)
+    np.testing.assert_allclose(structure.weights(one, ids), 2 / 3, rtol=1e-3)
     middle = one.copy()
-    middle[:, 3] = -middle[:, :3] @ (centre(one) + centre(two)) / 2
-    assert (structure.certainty(middle, ids) > 0.999).all()
+    middle[:, 3] = -middle[:, :3] @ (camera_centers(one) + camera_centers(two)) / 2
+    assert (structure.weights(middle, ids) > 0.999).all()
     far = walk(8)[7]
-    assert (structure.certainty(far, ids) < 0.03).all()
+    assert (structure.weights(far, ids) < 0.03).all()
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -238,7 +252,7 @@ def test_a_refined_pose_is_the_one_that_certain_landmarks_give(weighted: bool) -
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.6, -0.5, 2], [0.5, 0.5, 3], (POINTS, 3))
     pose = walk(8)[3]
-    pixels = project(PINHOLE, pose, points)
+    pixels = PINHOLE.project(transform(pose, points))
     weights = np.ones(POINTS)
     if weighted:
         # A third, on one side, has depths that all are wrong the same way.
@@ -247,6 +261,6 @@ def test_a_refined_pose_is_the_one_that_certain_landmarks_give(weighted: bool) -
         weights[wrong] = 1e-6
     start = pose.copy()
     start[:, 3] += [0.02, -0.03, 0.05]
-    found, inliers = refine_pose(PINHOLE, pixels, points, start, 2.5, weights)
+    found, inliers = refine_pose(start, pixels, points, PINHOLE, 2.5, weights)
     np.testing.assert_allclose(found, pose, atol=1e-4)
     assert inliers.all()

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mutation import FILES, SEED, bounded, mutated
-from protomark.tracks import Tracks
 from protomark.tracks.database import _features, _read
+from protomark.tracks.file import Tracks
 from small_tracks import small_tracks
 
 _JUNK: list[Any] = [

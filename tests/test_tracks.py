@@ -9,9 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from protomark.tracks import Tracks
-from protomark.tracks.extract import Settings, Source, extract, find_source, fingerprint, is_done
-from protomark.tracks.features import DESCRIPTORS, Extractor
+from protomark.features.descriptors import DESCRIPTORS
+from protomark.features.extractor import Extractor
+from protomark.tracks.extract import (
+    SequenceFolder,
+    TracksOptions,
+    extract,
+    find_sequence,
+    is_up_to_date,
+)
+from protomark.tracks.file import Tracks
 from protomark.tracks.summary import reprojection_errors, summarise
 from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
@@ -23,17 +30,16 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def orb(sequence: Path) -> Tracks:
-    return extract(find_source(sequence), Settings("orb", max_keypoints=600))
+    return extract(find_sequence(sequence), TracksOptions("orb", max_keypoints=600))
 
 
 def spread_on_plane(tracks: Tracks) -> np.ndarray:
     """Distance of each observation from its landmark's mean, measured on the true plane z = 0."""
-    from protomark.tracks.colmap import rays
 
     rows = tracks.observations
     keyframe = tracks.keyframe_of_keypoint[rows]
     pose = poses(len(tracks.keyframe_names))[keyframe]
-    ray = rays(tracks.cameras[1], tracks.keypoints[rows])
+    ray = tracks.cameras[1].rays(tracks.keypoints[rows])
     direction = np.einsum("nji,nj->ni", pose[:, :, :3], np.column_stack([ray, np.ones(len(ray))]))
     center = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
     hit = (center - direction * (center[:, 2] / direction[:, 2])[:, None])[:, :2]
@@ -56,7 +62,7 @@ def check_labels(tracks: Tracks) -> None:
 
 @pytest.mark.parametrize("name", DESCRIPTORS)
 def test_every_descriptor_gives_landmarks_on_the_plane(sequence: Path, name: str) -> None:
-    tracks = extract(find_source(sequence), Settings(name, max_keypoints=400))
+    tracks = extract(find_sequence(sequence), TracksOptions(name, max_keypoints=400))
     check_labels(tracks)
     assert tracks.bits == DESCRIPTORS[name].bits
     assert len(tracks.landmark_ids) > 50
@@ -69,7 +75,7 @@ def test_every_descriptor_gives_landmarks_on_the_plane(sequence: Path, name: str
 
 def test_strong_distortion(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "bent", DISTORTED, count=6)
-    tracks = extract(find_source(folder), Settings("orb", max_keypoints=500))
+    tracks = extract(find_sequence(folder), TracksOptions("orb", max_keypoints=500))
     check_labels(tracks)
     assert len(tracks.landmark_ids) > 50
     assert np.median(np.abs(tracks.landmark_positions[:, 2])) < 0.01
@@ -77,7 +83,7 @@ def test_strong_distortion(tmp_path: Path) -> None:
 
 
 def test_same_tracks_on_any_number_of_threads(sequence: Path, orb: Tracks) -> None:
-    again = extract(find_source(sequence), Settings("orb", max_keypoints=600), threads=2)
+    again = extract(find_sequence(sequence), TracksOptions("orb", max_keypoints=600), threads=2)
     for name, value in vars(orb).items():
         if isinstance(value, np.ndarray):
             assert np.array_equal(value, getattr(again, name)), name
@@ -87,19 +93,19 @@ def test_same_tracks_on_any_number_of_threads(sequence: Path, orb: Tracks) -> No
 def test_akaze_at_once_finds_what_threshold_after_threshold_finds() -> None:
     rich, poor = texture(480), cv2.convertScaleAbs(texture(480, 5), alpha=0.15, beta=100)
     at_once, plain = Extractor("akaze", 500), Extractor("akaze", 500)
-    plain._at_once = None
+    plain._akaze = None
     before = []
     for image in (rich, poor, poor, rich, rich, np.zeros((480, 480), np.uint8)):
         found, expected = at_once(image), plain(image)
         for name, value in vars(expected).items():
             np.testing.assert_array_equal(getattr(found, name), value)
-        before.append(at_once._rich)
+        before.append(at_once._high_contrast)
     assert before == [True, False, False, True, True, False], "both ways were to be taken"
 
 
 def test_keyframes_are_in_order_of_capture(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "long", count=11)
-    tracks = extract(find_source(folder), Settings("orb", max_keypoints=200))
+    tracks = extract(find_sequence(folder), TracksOptions("orb", max_keypoints=200))
     assert tracks.keyframe_names == [f"img{i}.png" for i in range(1, 12)]
 
 
@@ -111,9 +117,9 @@ def test_rough_poses_are_noticed_and_refined(sequence: Path, tmp_path: Path) -> 
         turn = cv2.Rodrigues(rng.normal(0, 0.008, 3))[0]
         pose[:] = turn @ pose
     write_model(tmp_path / "sparse", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
-    source = find_source(tmp_path)
-    kept = extract(source, Settings("orb", max_keypoints=500, refine_poses="no"))
-    refined = extract(source, Settings("orb", max_keypoints=500))
+    source = find_sequence(tmp_path)
+    kept = extract(source, TracksOptions("orb", max_keypoints=500, refine_poses="no"))
+    refined = extract(source, TracksOptions("orb", max_keypoints=500))
     assert not kept.info["poses_refined"]
     assert refined.info["poses_refined"]
     assert np.allclose(kept.cam_from_world, rough, atol=1e-12)
@@ -135,7 +141,7 @@ def test_exact_poses_are_kept(orb: Tracks) -> None:
 def test_completion_adds_observations_that_are_right(sequence: Path, orb: Tracks) -> None:
     assert orb.info["observations_completed"] > 0
     # Against a stricter matcher that leaves more to completion, the same points come out.
-    strict = extract(find_source(sequence), Settings("orb", max_keypoints=600, ratio=0.6))
+    strict = extract(find_sequence(sequence), TracksOptions("orb", max_keypoints=600, ratio=0.6))
     assert strict.info["observations_completed"] > orb.info["observations_completed"]
     assert np.percentile(spread_on_plane(strict), 99) < 3 / 150
 
@@ -170,8 +176,8 @@ def test_keypoints_keep_what_the_detector_says(orb: Tracks) -> None:
 
 
 def test_max_unlabelled_drops_only_keypoints_without_landmark(sequence: Path, orb: Tracks) -> None:
-    settings = Settings("orb", max_keypoints=600, max_unlabelled=7)
-    few = extract(find_source(sequence), settings)
+    settings = TracksOptions("orb", max_keypoints=600, max_unlabelled=7)
+    few = extract(find_sequence(sequence), settings)
     assert np.array_equal(few.descriptors[few.observations], orb.descriptors[orb.observations])
     for i in range(len(few.keyframe_names)):
         rows, all_rows = few.keypoints_of(i), orb.keypoints_of(i)
@@ -192,16 +198,15 @@ def test_done_only_with_same_settings_and_input(
     sequence: Path, orb: Tracks, tmp_path: Path
 ) -> None:
     path = tmp_path / "t.safetensors"
-    source, settings = find_source(sequence), Settings("orb", max_keypoints=600)
-    digest = fingerprint(source)
-    assert not is_done(path, settings, digest)
+    source, options = find_sequence(sequence), TracksOptions("orb", max_keypoints=600)
+    assert not is_up_to_date(path, options, source)
     orb.save(path)
-    assert is_done(path, settings, digest)
-    assert not is_done(path, Settings("orb", max_keypoints=601), digest)
+    assert is_up_to_date(path, options, source)
+    assert not is_up_to_date(path, TracksOptions("orb", max_keypoints=601), source)
     rough = poses(8)
     rough[3, 0, 3] += 1e-6
     write_model(tmp_path / "moved", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
-    moved = Source("plane", source.images, tmp_path / "moved")
-    assert not is_done(path, settings, fingerprint(moved))
+    moved = SequenceFolder("plane", source.images, tmp_path / "moved")
+    assert not is_up_to_date(path, options, moved)
     path.write_bytes(path.read_bytes()[:-100])
-    assert not is_done(path, settings, digest)
+    assert not is_up_to_date(path, options, source)

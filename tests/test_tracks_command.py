@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from protomark.cli import main
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 from tracks_scene import PINHOLE, poses, write_model, write_sequence
 
 FAST = ["--max-keypoints", "300", "--threads", "1"]
@@ -60,7 +60,7 @@ def test_writes_summary_json_and_skips_on_rerun(sequence: Path, tmp_path: Path) 
     assert first.returncode == 0, first.stderr
     names = sorted(p.name for p in out.iterdir())
     assert names == ["plane.freak.safetensors", "plane.orb.safetensors"]
-    assert "observations of a landmark" in first.stdout
+    assert "observations per landmark" in first.stdout
     figures = json.loads(report.read_text())
     assert [f["descriptor"] for f in figures] == ["orb", "freak"]
     tracks = Tracks.load(out / "plane.orb.safetensors")
@@ -77,14 +77,14 @@ def test_writes_summary_json_and_skips_on_rerun(sequence: Path, tmp_path: Path) 
     other = run(sequence, "-d", "orb", "-o", out, *FAST, "--ratio", "0.7")
     assert other.returncode == 0
     assert "skipped" not in other.stderr
-    assert Tracks.load(out / "plane.orb.safetensors").info["settings"]["ratio"] == 0.7
+    assert Tracks.load(out / "plane.orb.safetensors").info["options"]["ratio"] == 0.7
     forced = run(sequence, "-d", "orb", "-o", out, *FAST, "--ratio", "0.7", "--force")
     assert "skipped" not in forced.stderr
 
 
 def test_as_a_program(copy: Path, tmp_path: Path) -> None:
     (copy / "images" / "img2.png").unlink()
-    command = [sys.executable, "-m", "protomark.cli", "tracks", copy, "-o", tmp_path / "out"]
+    command = [sys.executable, "-m", "protomark", "tracks", copy, "-o", tmp_path / "out"]
     fails(subprocess.run(command, capture_output=True, text=True, check=False), "img2.png")
 
 
@@ -104,7 +104,7 @@ def test_other_layouts(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_binary_model_without_points(copy: Path, tmp_path: Path) -> None:
-    from protomark.tracks.colmap import read_reconstruction
+    from protomark.geometry.colmap import read_reconstruction
 
     model = read_reconstruction(copy / "sparse")
     shutil.rmtree(copy / "sparse")

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protomark.tracks import Tracks
-from protomark.tracks.colmap import pycolmap, read_model
-from protomark.tracks.database import digest_of, from_database, is_done
-from protomark.tracks.extract import Settings, extract, find_source
+from protomark.geometry.colmap import pycolmap, read_model
+from protomark.tracks.database import is_up_to_date, tracks_from_database
+from protomark.tracks.extract import TracksOptions, extract, find_sequence
+from protomark.tracks.file import Tracks
 from protomark.tracks.triangulation import _posed, _write_database
 from tracks_scene import write_sequence
 
@@ -20,7 +20,7 @@ from tracks_scene import write_sequence
 def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tracks]:
     """A database and a model with points in COLMAP's own files, and the tracks they came from."""
     folder = write_sequence(tmp_path_factory.mktemp("database") / "plane", count=5)
-    tracks = extract(find_source(folder), Settings("orb", max_keypoints=300))
+    tracks = extract(find_sequence(folder), TracksOptions("orb", max_keypoints=300))
     model = read_model(folder / "sparse")
     keypoints = [tracks.keypoints[tracks.keypoints_of(i)] for i in range(5)]
     reconstruction = _posed(model, keypoints)
@@ -58,7 +58,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tracks]:
 
 def test_same_tracks_as_went_in(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
     folder, tracks = scene
-    found = from_database(folder / "database.db", folder / "points", "orb", "plane")
+    found = tracks_from_database(folder / "database.db", folder / "points", "orb", "plane")
     for name in ("descriptors", "keypoints", "landmark_of_keypoint", "offsets", "landmark_ids"):
         assert np.array_equal(getattr(found, name), getattr(tracks, name)), name
     assert np.allclose(found.landmark_positions, tracks.landmark_positions)
@@ -66,9 +66,9 @@ def test_same_tracks_as_went_in(scene: tuple[Path, Tracks], tmp_path: Path) -> N
     assert np.allclose(found.angles, tracks.angles, atol=1e-3)
     assert found.keyframe_names == tracks.keyframe_names
     found.save(tmp_path / "t.safetensors")
-    digest = digest_of(folder / "database.db", folder / "points")
-    assert is_done(tmp_path / "t.safetensors", "orb", digest)
-    assert not is_done(tmp_path / "t.safetensors", "latch", digest)
+    inputs = (tmp_path / "t.safetensors", folder / "database.db", folder / "points")
+    assert is_up_to_date(*inputs, "orb")
+    assert not is_up_to_date(*inputs, "latch")
 
 
 def change(scene: tuple[Path, Tracks], tmp_path: Path, sql: str) -> Path:
@@ -83,31 +83,31 @@ def change(scene: tuple[Path, Tracks], tmp_path: Path, sql: str) -> Path:
 
 def test_other_descriptor(scene: tuple[Path, Tracks]) -> None:
     with pytest.raises(ValueError, match=r"32 bytes, freak has 64.*orb or latch or teblid"):
-        from_database(scene[0] / "database.db", scene[0] / "points", "freak")
+        tracks_from_database(scene[0] / "database.db", scene[0] / "points", "freak")
 
 
 def test_model_without_points(scene: tuple[Path, Tracks]) -> None:
     with pytest.raises(ValueError, match=r"no points.*without --database"):
-        from_database(scene[0] / "database.db", scene[0] / "sparse", "orb")
+        tracks_from_database(scene[0] / "database.db", scene[0] / "sparse", "orb")
 
 
 def test_image_that_the_database_lacks(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
     path = change(scene, tmp_path, "DELETE FROM images WHERE name = 'img2.png'")
     with pytest.raises(ValueError, match=r"img2.png"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")
 
 
 def test_database_of_another_model(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
     sql = "DELETE FROM {} WHERE image_id = 1"
     path = change(scene, tmp_path, sql.format("keypoints"))
     with pytest.raises(ValueError, match=r"do not fit together"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")
     connection = sqlite3.connect(path)
     connection.execute(sql.format("descriptors"))
     connection.commit()
     connection.close()
     with pytest.raises(ValueError, match=r"img1.png has 0 keypoints.*the model's database"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")
 
 
 def test_cut_off_blob(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
@@ -115,16 +115,16 @@ def test_cut_off_blob(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
         scene, tmp_path, "UPDATE descriptors SET data = substr(data, 1, 99) WHERE image_id = 3"
     )
     with pytest.raises(ValueError, match=r"img3.png.*do not fit together"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")
 
 
 def test_not_a_database(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
     path = tmp_path / "x.db"
     with pytest.raises(FileNotFoundError, match=r"x.db"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")
     path.write_bytes(b"nonsense" * 100)
     with pytest.raises(ValueError, match=r"not a COLMAP database"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")
     path.write_bytes((scene[0] / "database.db").read_bytes()[:20000])
     with pytest.raises(ValueError, match=r"not a COLMAP database|do not fit|not in the database"):
-        from_database(path, scene[0] / "points", "orb")
+        tracks_from_database(path, scene[0] / "points", "orb")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save
 
-from protomark.tracks import Camera, Tracks
-from protomark.tracks.file import CAMERA_MODELS
+from protomark.geometry.camera import CAMERA_MODELS, Camera
+from protomark.tracks.file import Tracks
 from small_tracks import small_tracks
 
 Arrays = dict[str, NDArray[Any]]
@@ -60,9 +60,9 @@ def refused(path: Path, *words: str) -> None:
         ("params", [500.0, float("inf"), 3.0, 4.0], "parameters"),
         ("params", [500.0, 10**400, 3.0, 4.0], "too large"),
         ("params", None, "params"),
-        ("model", "NOPE", "'NOPE' is none of COLMAP's"),
-        ("model", "\ud800", "none of COLMAP's"),
-        ("model", ["PINHOLE"], "none of COLMAP's"),
+        ("model", "NOPE", "COLMAP has no camera model 'NOPE'"),
+        ("model", "\ud800", "COLMAP has no camera model"),
+        ("model", ["PINHOLE"], "COLMAP has no camera model"),
         ("model", "FULL_OPENCV", "12 parameters, not 4"),
         ("width", 0, "pixels"),
         ("width", "640", "pixels"),
@@ -136,5 +136,5 @@ def test_every_number_is_finite(name: str, value: float, path: Path) -> None:
 def test_half_a_character_is_not_saved(tmp_path: Path) -> None:
     tracks = small_tracks()
     tracks.descriptor = "orb\ud800"
-    with pytest.raises(ValueError, match="descriptor is no text"):
+    with pytest.raises(ValueError, match="descriptor is not a text"):
         tracks.save(tmp_path / "t.safetensors")

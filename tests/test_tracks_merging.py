@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import Model
-from protomark.tracks.geometry import residuals
+from protomark.geometry.colmap import ColmapModel
+from protomark.geometry.triangulation import reprojection_residuals
 from protomark.tracks.merging import merge
 from protomark.tracks.scene import Scene
 from tracks_scene import PINHOLE, poses
@@ -21,11 +21,11 @@ def scene(*landmarks: tuple[NDArray[np.float64], list[int]]) -> Scene:
     keyframe = np.array([k for k, _ in rows])
     labels = np.array([label for _, label in rows])
     positions = np.array([place for place, _ in landmarks])
-    rays, _ = residuals(positions[labels], world[keyframe], np.zeros((len(rows), 2)))
+    rays, _ = reprojection_residuals(positions[labels], world[keyframe], np.zeros((len(rows), 2)))
     counts = np.bincount(keyframe, minlength=8)
     names = [str(i) for i in range(8)]
     return Scene(
-        model=Model({1: PINHOLE}, names, np.arange(8), np.ones(8, np.int32), world, []),
+        model=ColmapModel({1: PINHOLE}, names, np.arange(8), np.ones(8, np.int32), world, []),
         offsets=np.concatenate([[0], np.cumsum(counts)]),
         keyframe=keyframe,
         keypoints=(rays * 300 + (160, 120)).astype(np.float32),

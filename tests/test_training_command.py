@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark.cli import app
+from protomark.match_calibration import MatchCalibration
 from protomark.tracks.file import Tracks
 from protomark.training.data import load_training
 from training_scene import scene
@@ -62,7 +63,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
     assert codes.std() > 15
 
     # Which matches to accept is fitted at the end, and the card says to what.
-    near, far = encoder.acceptance(8).probability([[20.0, 60.0], [20.0, 21.0]])
+    near, far = MatchCalibration.of(encoder, 8).probability([[400, 3600], [400, 441]])
     assert near > far
 
     figures = json.loads((tmp_path / "mine.json").read_text())
@@ -110,15 +111,17 @@ def test_data_that_cannot_be_trained_on(files, training, validation, message):
         load_training([files[n] for n in training], [files[n] for n in validation])
 
 
-def test_varied_copies_of_the_validation_sequence_are_not_trained_on(tmp_path):
+def test_augmented_copies_of_the_validation_sequence_are_not_trained_on(tmp_path):
     tracks = scene(seed=1)
     tracks.info["input"] = "digest of the images"
-    plain, varied = tmp_path / "yard.x.safetensors", tmp_path / "yard.x.varied.safetensors"
+    plain, augmented = tmp_path / "yard.x.safetensors", tmp_path / "yard.x.augmented.safetensors"
     tracks.save(plain)
-    tracks.info["variants"] = 1
-    tracks.save(varied)
-    with pytest.raises(ValueError, match=r"yard\.x\.safetensors and yard\.x\.varied.*same images"):
-        load_training([varied], [plain])
+    tracks.info["augmentations"] = 1
+    tracks.save(augmented)
+    with pytest.raises(
+        ValueError, match=r"yard\.x\.safetensors and yard\.x\.augmented.*same images"
+    ):
+        load_training([augmented], [plain])
 
 
 def test_a_missing_file_is_named(files, tmp_path):
@@ -135,7 +138,7 @@ def test_a_missing_file_is_named(files, tmp_path):
         (["--device", "abacus"], "cpu or cuda"),
         (["--resume"], "without --resume"),
         (["--data-licence", "MIT"], "NAME=LICENCE"),
-        (["--data-licence", "z=MIT"], "none of the sequences"),
+        (["--data-licence", "z=MIT"], "not one of the sequences"),
         (["-o", "no/such/folder/x.pme"], "does not exist"),
         (["--report", "nowhere.safetensors"], "nowhere"),
         (["--report", "{longer}"], "report on tracks of the same descriptor"),
@@ -157,7 +160,7 @@ def test_bad_options_stop_before_the_first_step(files, tmp_path, words, message)
 def test_without_torch_it_says_what_to_install(files, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     result = run(files["a"], "--validation", files["unseen"], "-o", tmp_path / "x.pme")
-    assert "pip install protomark[train]" in str(result.exception)
+    assert "PyTorch, which is not installed: pip install '" in str(result.exception)
 
 
 def test_without_options_the_last_file_picks_and_the_descriptor_names_the_model(
@@ -183,4 +186,4 @@ def test_without_options_the_last_file_picks_and_the_descriptor_names_the_model(
 def test_one_file_cannot_do_both(files):
     result = run(files["a"])
     assert isinstance(result.exception, ValueError)
-    assert "cannot both train and pick" in str(result.exception)
+    assert "cannot serve for training and validation" in str(result.exception)

@@ -11,11 +11,11 @@ import torch
 from protomark.training.network import embed
 from protomark.training.quantization import integer_forward
 from protomark.training.sampling import Views
-from protomark.training.train import Interrupted, Options, Trainer
+from protomark.training.train import Trainer, TrainingInterrupted, TrainingOptions
 from protomark.training.validation import Trial, precision
 from training_scene import scene
 
-SMALL = Options(
+SMALL = TrainingOptions(
     dims=(4, 8), hidden=(64, 32), steps=120, landmarks=200, views=6, validate_every=30, seed=3
 )
 
@@ -103,7 +103,7 @@ def test_resumed_training_equals_uninterrupted(views, trial, tmp_path, stop):
 
     path = tmp_path / "x.checkpoint"
     first = Trainer(views, [trial], SMALL, path)
-    with pytest.raises(Interrupted) as caught:
+    with pytest.raises(TrainingInterrupted) as caught:
         first.run(press_ctrl_c)
     assert caught.value.step == stop
     assert [p.name for p in tmp_path.iterdir()] == ["x.checkpoint"]

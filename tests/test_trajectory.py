@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from protomark.evaluation.trajectory import align, trajectory_error
+from protomark.geometry.similarity import align, trajectory_error
 
 
 def random_similarity(rng):

@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 import protomark as pm
 from protomark import sample
-from protomark.build import build_map
 from protomark.cli import app
 from protomark.evaluation.results import load_json
-from protomark.upright import BYTES, upright_descriptors, upright_tracks
+from protomark.features.upright import BYTES, upright_descriptors
+from protomark.maps.build import build_map
 
 
 def added(angle: float, size: float) -> tuple[list[int], list[int]]:
@@ -59,11 +59,11 @@ def test_descriptors_stay_and_shapes_must_fit():
 
 def test_tracks_without_angles_are_refused():
     tracks = sample.load()
-    assert upright_tracks(tracks).descriptor == "freak-upright"
-    assert upright_tracks(tracks).bits == tracks.bits + 8 * BYTES
+    assert tracks.upright().descriptor == "freak-upright"
+    assert tracks.upright().bits == tracks.bits + 8 * BYTES
     tracks.angles = np.full_like(tracks.angles, -1)
     with pytest.raises(ValueError, match="no keypoint of these freak tracks has an angle"):
-        upright_tracks(tracks)
+        tracks.upright()
 
 
 def test_evaluate_gives_only_our_methods_the_longer_descriptors(tmp_path):
@@ -75,7 +75,7 @@ def test_evaluate_gives_only_our_methods_the_longer_descriptors(tmp_path):
     )
     encoder.save(tmp_path / "u.pme")
     words = ["evaluate", str(sample.path()), "--encoder", str(tmp_path / "u.pme"), "--seeds", "1"]
-    words += ["--methods", "medoid,protomark-16", "--pose-frames", "2", "--upright"]
+    words += ["--methods", "medoid,protomark-16", "--pose-frames", "2"]
     done = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "u.json")])
     assert done.exit_code == 0, done.output
     (result,) = load_json(tmp_path / "u.json")
@@ -84,9 +84,5 @@ def test_evaluate_gives_only_our_methods_the_longer_descriptors(tmp_path):
     assert medoid.bytes_per_landmark == [64]
     assert ours.precision[0] > 0.05
 
-    # Without the flag the encoder does not fit, and it is said what is missing.
-    words = ["evaluate", str(sample.path()), "--encoder", str(tmp_path / "u.pme"), "--seeds", "1"]
-    done = CliRunner().invoke(app, [*words, "--methods", "first", "--pose-frames", "0"])
-    assert "give --upright" in " ".join(done.output.split())
-    with pytest.raises(ValueError, match="choose an encoder for freak, or build with --upright"):
-        build_map(tracks, encoder)
+    # `build` finds by itself that the encoder needs angles and sizes.
+    assert build_map(tracks, encoder).encoder.descriptor == "freak-upright"

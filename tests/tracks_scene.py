@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import rays
-from protomark.tracks.file import Camera
+from protomark.geometry.camera import Camera
 
 PINHOLE = Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
 # Wide and strongly bent, with a coefficient above 1, which COLMAP by default takes for nonsense.
@@ -51,7 +50,7 @@ def render(
 ) -> NDArray[np.uint8]:
     """What the camera sees of the plane z = 0, on which the texture covers [-1.5, 1.5]²."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    ray = rays(camera, np.column_stack([x.ravel(), y.ravel()]))
+    ray = camera.rays(np.column_stack([x.ravel(), y.ravel()]))
     direction = np.column_stack([ray, np.ones(len(ray))]) @ pose[:, :3]
     center = -pose[:, :3].T @ pose[:, 3]
     hit = center - direction * (center[2] / direction[:, 2])[:, None]

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from protomark.tracks.file import Camera, Tracks
+from protomark.geometry.camera import Camera
+from protomark.tracks.file import Tracks
 
 IDENTITY, NUISANCE = 10, 4
 

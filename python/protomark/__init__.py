@@ -1,4 +1,4 @@
-"""Protomark: one small integer prototype per landmark instead of all its binary descriptors.
+"""Protomark: visual maps that keep a few small integer prototypes per landmark.
 
 import protomark as pm
 
@@ -8,6 +8,7 @@ scene.add(landmark_ids, descriptors)
 ids, distances = scene.search(new_descriptors, k=2)
 """
 
+from importlib import import_module as _import_module
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
@@ -23,19 +24,31 @@ from protomark._core import (
 )
 from protomark.encoders import Encoder
 from protomark.errors import FileError
-from protomark.sized import sized_descriptors
-from protomark.upright import upright_descriptors
 
 if TYPE_CHECKING:
+    from protomark.features.upright import upright_descriptors as upright_descriptors
+    from protomark.geometry.camera import Camera as Camera
     from protomark.localization import Localizer as Localizer
+    from protomark.localization import PosePrior as PosePrior
     from protomark.matching import match as match
 
 __version__ = _version("protomark")
 
+# Imported when they are first used, so that search alone starts fast and needs NumPy only.
+_LAZY = {
+    "Camera": "protomark.geometry.camera",
+    "Localizer": "protomark.localization",
+    "PosePrior": "protomark.localization",
+    "match": "protomark.matching",
+    "upright_descriptors": "protomark.features.upright",
+}
+
 __all__ = [
+    "Camera",
     "Encoder",
     "FileError",
     "Localizer",
+    "PosePrior",
     "PrototypeMap",
     "SealedMap",
     "__version__",
@@ -45,18 +58,12 @@ __all__ = [
     "instruction_set",
     "match",
     "open",
-    "sized_descriptors",
     "upright_descriptors",
     "verify_file",
 ]
 
-# What search alone does not need is imported when it is first asked for.
-_LATER = {"Localizer": "protomark.localization", "match": "protomark.matching"}
-
 
 def __getattr__(name: str) -> object:
-    if name in _LATER:
-        from importlib import import_module
-
-        return getattr(import_module(_LATER[name]), name)
+    if name in _LAZY:
+        return getattr(_import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'protomark' has no attribute {name!r}")

@@ -9,7 +9,7 @@ from protomark._core import Encoder as Encoder
 from protomark.models import resolve
 
 if TYPE_CHECKING:
-    from protomark.acceptance import Acceptance
+    from protomark.match_calibration import MatchCalibration
 
 _load_file = Encoder.load
 
@@ -24,7 +24,7 @@ def load(source: str | os.PathLike[str]) -> Encoder:
     return _load_file(resolve(source))
 
 
-def match_calibration(self: Encoder, dim: int | None = None) -> Acceptance:
+def match_calibration(self: Encoder, dim: int | None = None) -> MatchCalibration:
     """How likely a match is right, by the distances to the two nearest landmarks.
 
     Args:
@@ -34,9 +34,9 @@ def match_calibration(self: Encoder, dim: int | None = None) -> Acceptance:
     Raises:
         ValueError: the encoder was not calibrated for codes of this length.
     """
-    from protomark.acceptance import Acceptance
+    from protomark.match_calibration import MatchCalibration
 
-    return Acceptance.of(self, dim)
+    return MatchCalibration.of(self, dim)
 
 
 # The stub of the core declares them (bindings/stub_patterns.txt).

@@ -1,10 +1,13 @@
-"""Files that are written whole or not at all."""
+"""Writes files whole or not at all, and sorts their names."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,9 +18,9 @@ from typing import BinaryIO
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file beside `path` to write into; it takes the place of `path` when the block ends well.
 
-    On an error, Ctrl-C included, what was there before stays and nothing is left behind. When the
-    block has ended, the new file outlasts a power cut. A process that is killed may leave
-    `.<name>.<random>` behind, which nobody reads. A file that was there keeps its permission bits.
+    On an error, Ctrl-C included, what was there before stays and nothing else is left. After the
+    block the new file survives a power cut. A process that is killed may leave `.<name>.<random>`,
+    which nobody reads. The permission bits of a replaced file are kept.
     """
     target = Path(path).absolute()
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
@@ -39,6 +42,26 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         os.unlink(temporary)
         raise
     _sync_folder(target.parent)
+
+
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """A new folder beside `folder` to fill; it takes the place of `folder` when the block ends well.
+
+    On an error, Ctrl-C included, what was there before stays.
+    """
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    temporary.chmod(0o755)
+    old = folder.with_name(f".{folder.name}.old")
+    try:
+        yield temporary
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            folder.rename(old)
+        temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _permissions(path: Path) -> int | None:
@@ -68,3 +91,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a UTF-8 text file, whole or not at all."""
     with replacing(path) as file:
         file.write(text.encode())
+
+
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Sort key under which frame2 comes before frame10."""
+    return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", name)]

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.acceptance import Acceptance
 
 # Less likely matches are not accepted. Chosen on the training and validation sequences
 # (docs/localization.md).
@@ -44,7 +43,7 @@ def match(
     """The landmarks that the keypoints of a frame see.
 
     Args:
-        scene: a map, whose encoder says how likely a match is (`protomark.acceptance`).
+        scene: a map, whose encoder says how likely a match is (`Encoder.match_calibration`).
         descriptors: (n, bits / 8) uint8.
         min_probability: of an accepted match.
         threads: threads to encode and search on.
@@ -53,9 +52,9 @@ def match(
     Raises:
         ValueError: the map's encoder was not calibrated, or the descriptors are not its own.
     """
-    acceptance = Acceptance.of(scene.encoder, scene.dim)
+    calibration = scene.encoder.match_calibration(scene.dim)
     ids, distances = scene.search(descriptors, k=2, threads=threads, recall=recall)
-    return accept(ids[:, 0], acceptance.probability(distances), min_probability)
+    return accept(ids[:, 0], calibration.probability(distances), min_probability)
 
 
 def accept(

@@ -1,4 +1,4 @@
-"""Search among some of a map's landmarks only, as if the map held no others."""
+"""Searches among some of a map's landmarks only, as if the map held no others."""
 
 from __future__ import annotations
 

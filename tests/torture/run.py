@@ -34,7 +34,7 @@ import numpy as np
 
 import protomark as pm
 from protomark import sample
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 
 Save = Callable[[Path], object]
 LEFT_BEHIND = re.compile(r"target\.\d+|\.target\.[0-9a-f]{8}")

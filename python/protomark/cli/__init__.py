@@ -1,49 +1,48 @@
-"""The `protomark` command: one file a command, in the order in which `--help` lists them here."""
+"""The `protomark` command: one file per command, listed by `--help` in the order given here."""
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.bench import bench
 from protomark.cli.build import build
 from protomark.cli.calibrate import calibrate
 from protomark.cli.demo import demo
 from protomark.cli.evaluate import evaluate
-from protomark.cli.evaluate_mapping import evaluate_mapping
 from protomark.cli.info import info
-from protomark.cli.join import join
 from protomark.cli.localize import localize
 from protomark.cli.map import map_
-from protomark.cli.reproduce import reproduce
+from protomark.cli.merge import merge
+from protomark.cli.plugins import CommandGroup
 from protomark.cli.split import split
 from protomark.cli.tracks import tracks
 from protomark.cli.train import train
 
+_SUMMARY = "Visual maps that keep a few small integer prototypes per landmark."
+
 app = typer.Typer(
-    help="One small integer prototype per landmark instead of all its binary descriptors.",
+    cls=CommandGroup,
+    rich_markup_mode=None,  # drawing help with Rich takes as long as all else together
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _COMMANDS: dict[str, Callable[..., Any]] = {
-    "tracks": tracks,
-    "train": train,
-    "build": build,
     "map": map_,
     "localize": localize,
-    "calibrate": calibrate,
-    "join": join,
+    "tracks": tracks,
+    "build": build,
+    "merge": merge,
     "split": split,
     "info": info,
     "demo": demo,
     "evaluate": evaluate,
-    "evaluate-mapping": evaluate_mapping,
-    "reproduce": reproduce,
-    "bench": bench,
+    "train": train,
+    "calibrate": calibrate,
 }
 for name, command in _COMMANDS.items():
     app.command(name)(command)
@@ -57,7 +56,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(help=_SUMMARY)
 def options(
     version: Annotated[
         bool,
@@ -66,19 +65,30 @@ def options(
         ),
     ] = False,
 ) -> None:
-    """One small integer prototype per landmark instead of all its binary descriptors."""
+    """Take the options that stand before a command."""
 
 
 def main() -> None:
-    """Run the command; an expected error becomes one sentence on stderr and exit code 1."""
-    from rich.markup import escape
+    """Run the command.
 
-    from protomark.console import printable, progress_console
-
+    An expected error becomes one sentence on stderr and exit code 1; Ctrl-C and SIGTERM exit with
+    130.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        app()
+        app(prog_name="protomark")
+    except KeyboardInterrupt:
+        _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        message = f"[bold red]error:[/] {escape(printable(str(text)))}"
-        progress_console.print(message, highlight=False, soft_wrap=True)
-        raise SystemExit(1) from None
+        _fail(str(text), 1)
+
+
+def _fail(text: str, code: int) -> None:
+    from rich.markup import escape
+
+    from protomark.cli.terminal import error_console, printable
+
+    message = f"[bold red]error:[/] {escape(printable(text))}"
+    error_console.print(message, highlight=False, soft_wrap=True)
+    raise SystemExit(code) from None

@@ -1,4 +1,4 @@
-"""`protomark build`."""
+"""The command `protomark build`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from protomark.cli.options import write_json
 
 
 def build(
@@ -24,47 +22,32 @@ def build(
         int, typer.Option(help="Leave out landmarks with fewer observations.")
     ] = 2,
     sealed: Annotated[
-        bool, typer.Option("--sealed", help="Write a sealed map: smaller, and only answers.")
+        bool,
+        typer.Option("--sealed", help="Write a sealed map, which is smaller and only answers."),
     ] = False,
-    code_bits: Annotated[
-        int, typer.Option(help="Bits of a sealed prototype's number: 8, or 4 for half the bytes.")
-    ] = 8,
+    bytes_per_landmark: Annotated[
+        float | None,
+        typer.Option(
+            "--bytes",
+            help="Most bytes that a sealed map spends on a landmark's prototypes on average, for "
+            "example 33. By default nothing is lost.",
+        ),
+    ] = None,
     look_bits: Annotated[
         int,
         typer.Option(
             min=0,
-            help="Signs of a code that tell several looks of a landmark apart, each with a "
-            "prototype of its own: more precise, more bytes. 0 to 16, 0 for one prototype a "
+            help="Signs of a code that tell the appearances of a landmark apart, each with a "
+            "prototype of its own: more precise, more bytes. 0 to 16, 0 for one prototype per "
             "landmark.",
         ),
     ] = 0,
-    prototypes: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest number of prototypes that a landmark of a sealed map has on average: "
-            "looks are joined until it fits. By default all are kept."
-        ),
-    ] = None,
     index: Annotated[
         bool,
         typer.Option(
             "--index",
-            help="Learn coarse cells, for approximate search in large maps: at most 4 bytes a "
-            "landmark more.",
-        ),
-    ] = False,
-    upright: Annotated[
-        bool,
-        typer.Option(
-            "--upright",
-            help="For cameras that do not roll: encode the keypoints' angles and sizes, too.",
-        ),
-    ] = False,
-    sized: Annotated[
-        bool,
-        typer.Option(
-            "--sized",
-            help="For places seen from like distances again: encode the keypoints' sizes, too.",
+            help="Learn inverted lists for approximate search in large maps: at most 4 more bytes "
+            "per landmark.",
         ),
     ] = False,
     position_bits: Annotated[
@@ -85,8 +68,8 @@ def build(
         list[str] | None,
         typer.Option(
             metavar="NAME=TEXT",
-            help="What else the map shall say of itself; may be repeated. 'created' is now, or "
-            "SOURCE_DATE_EPOCH where that is set.",
+            help="Further metadata of the map; may be repeated. 'created' is now, or "
+            "SOURCE_DATE_EPOCH if that is set.",
         ),
     ] = None,
     threads: Annotated[int, typer.Option(help="CPU threads.")] = 1,
@@ -94,31 +77,43 @@ def build(
         Path | None, typer.Option("--json", help="Write the facts to this file.")
     ] = None,
 ) -> None:
-    """Build a map from a tracks file: prototypes of each landmark, and its position."""
-    from protomark.build import build_file
-    from protomark.evaluation.command import check_outputs
-    from protomark.info import describe, show
-    from protomark.inputs import chosen
-    from protomark.metadata import command_metadata
+    """Build a map from a tracks file.
+
+    The map has the prototypes and the position of each landmark.
+    Encoders for upright descriptors (freak-upright) take angles and sizes from the tracks.
+    """
+    from protomark import Encoder
+    from protomark.cli.info import show
+    from protomark.cli.terminal import check_outputs, write_json
+    from protomark.maps.build import build_map
+    from protomark.maps.info import describe
+    from protomark.maps.metadata import command_metadata
+    from protomark.tracks.file import Tracks
 
     check_outputs(output, json_file)
+    for option, given in (
+        ("--bytes", bytes_per_landmark is not None),
+        ("--position-bits", position_bits != 32),
+    ):
+        if given and not sealed:
+            raise ValueError(f"{option} is for sealed maps: add --sealed")
     texts = command_metadata(frame, metadata or [])
-    build_file(
-        tracks,
-        output,
-        encoder,
+    observed = Tracks.load(tracks)
+    scene = build_map(
+        observed,
+        Encoder.load(encoder or observed.descriptor),
         dim,
-        min_observations,
-        sealed,
-        threads,
-        code_bits=code_bits,
-        inputs=chosen(upright, sized),
+        min_observations=min_observations,
         look_bits=look_bits,
-        prototypes=prototypes,
-        index=index,
-        metadata=texts,
-        position_bits=position_bits,
+        threads=threads,
     )
+    scene.metadata = texts
+    if index:
+        scene.build_index(threads=threads, in_place=True)  # nobody searches the map yet
+    if sealed:
+        scene.seal(output, bytes_per_landmark=bytes_per_landmark, position_bits=position_bits)
+    else:
+        scene.save(output)
     facts = describe(output)
     write_json(json_file, facts)
     show(facts)

@@ -1,4 +1,4 @@
-"""`protomark calibrate`."""
+"""The command `protomark calibrate`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from protomark.cli.options import write_json
 
 
 def calibrate(
@@ -24,16 +22,37 @@ def calibrate(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Say in a model file which matches to accept, from frames whose landmarks are known.
+    """Fit how likely matches are right, for an encoder.
 
+    From frames whose landmarks are known.
     `protomark train` does this by itself. The probability that a match is right, given the
-    distances to the two nearest landmarks, is fitted for each length of a code; the network stays
-    the same, and so do maps made with it. docs/localization.md says more.
+    distances to the two nearest landmarks, is fitted for each code length and written into the
+    model file; the network stays the same, and so do maps made with it. docs/localization.md says
+    more.
     """
-    from protomark.calibration import calibrate_file, show
-    from protomark.evaluation.command import check_outputs
+    from protomark import Encoder
+    from protomark.cli.terminal import (
+        check_outputs,
+        console,
+        progress_bar,
+        say,
+        table_of,
+        write_json,
+    )
+    from protomark.matching import MIN_PROBABILITY
+    from protomark.training.match_calibration import calibrate as fit
 
     check_outputs(output or model, json_file)
-    figures = calibrate_file(model, tracks, output or model, threads)
-    write_json(json_file, {"figures": [f.as_dict() for f in figures]})
-    show(figures)
+    with progress_bar() as progress:
+        encoder, quality = fit(Encoder.load(model), tracks, threads, progress)
+    encoder.save(output or model)
+    write_json(json_file, {"figures": [one.as_dict() for one in quality]})
+    table = table_of("sequence", "dim", "right of all", "precision", "expected", "recall")
+    for one in quality:
+        shares = (one.right, one.precision, one.expected, one.recall)
+        table.add_row(one.sequence, str(one.dim), *(f"{share:.3f}" for share in shares))
+    console.print(table)
+    say(
+        f"Matches with a probability of {MIN_PROBABILITY:g} or more; each sequence by a fit to the "
+        "others."
+    )

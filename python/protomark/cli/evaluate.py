@@ -1,13 +1,17 @@
-"""`protomark evaluate`."""
+"""The command `protomark evaluate`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import listed
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from protomark.evaluation.results import MethodSummary, SequenceResult
 
 
 def evaluate(
@@ -17,29 +21,15 @@ def evaluate(
     encoder: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name or file of an encoder; may be repeated. By default the descriptor's own."
+            help="Name or file of an encoder; may be repeated. By default the one that ships for the "
+            "descriptor. An upright encoder gets the keypoints' angles and sizes, too."
         ),
     ] = None,
-    upright: Annotated[
-        bool,
-        typer.Option(
-            "--upright",
-            help="Give Protomark the keypoints' angles and sizes, too (encoders such as "
-            "freak-upright); all other methods get the plain descriptors.",
-        ),
-    ] = False,
-    sized: Annotated[
-        bool,
-        typer.Option(
-            "--sized",
-            help="Give Protomark the keypoints' sizes, too (encoders such as freak-sized).",
-        ),
-    ] = False,
     methods: Annotated[
         str,
         typer.Option(
             help="Methods to compare, for example unaggregated,medoid,pca,protomark; "
-            "by default all but the -float variants."
+            "by default all except those in -float."
         ),
     ] = "",
     seeds: Annotated[int, typer.Option(min=1, help="Random splits, with seeds 0, 1, ...")] = 3,
@@ -67,26 +57,86 @@ def evaluate(
         typer.Option("--plot", help="Draw precision over bytes to this file (.png, .svg, .pdf)."),
     ] = None,
 ) -> None:
-    """Compare precision, poses, bytes and search time of prototypes and of other methods.
+    """Compare Protomark with other ways to keep descriptors.
 
-    The protocol is the paper's: a random 90 % of the keyframes build the map, descriptors of the
-    others ask it. docs/evaluation.md describes it, and every method.
+    By precision, poses found, bytes per landmark and search time.
+    The protocol is the paper's: a random 90 % of the keyframes build the map, and descriptors of
+    the others query it. docs/evaluation.md describes it, and every method.
     """
-    from protomark.evaluation import command
-    from protomark.evaluation.run import Options
-    from protomark.evaluation.threads import available_threads
-    from protomark.inputs import chosen
-
-    command.check_plot(plot_file)
-    command.check_outputs(json_file, markdown_file, plot_file)
-    results = command.evaluate_files(
-        tracks,
-        Options(
-            seeds=range(seeds), pose_frames=pose_frames, threads=threads or available_threads()
-        ),
-        encoders=encoder or [],
-        methods=list(listed(methods)),
-        discriminant_from=discriminant_from or [],
-        inputs=chosen(upright, sized),
+    from protomark.cli.terminal import (
+        check_outputs,
+        comma_separated,
+        console,
+        note,
+        progress_bar,
     )
-    command.write(results, json_file, markdown_file, plot_file)
+    from protomark.evaluation.results import (
+        caption,
+        evaluation_markdown,
+        mean_rows,
+        save_json,
+        save_precision_plot,
+    )
+    from protomark.evaluation.run import EvaluationOptions, evaluate_files
+    from protomark.files import write_text
+    from protomark.plot import check_suffix
+    from protomark.threads import available_threads
+
+    check_outputs(json_file, markdown_file, plot_file)
+    if plot_file:
+        check_suffix(plot_file)
+    options = EvaluationOptions(
+        seeds=range(seeds),
+        pose_frames=pose_frames,
+        threads=threads or available_threads(),
+        encoders=encoder or [],
+        methods=comma_separated(methods),
+        discriminant_from=discriminant_from or [],
+    )
+    results: list[SequenceResult] = []
+    with progress_bar() as progress:
+        for result in evaluate_files(tracks, options, progress):
+            results.append(result)
+            console.print(_table(caption(result), result.rows()))
+            if not any(method.family.startswith("protomark") for method in result.methods):
+                note(f"note: no encoder for {result.descriptor}: train one with `protomark train`")
+    by_descriptor: dict[str, list[SequenceResult]] = {}
+    for result in results:
+        by_descriptor.setdefault(result.descriptor, []).append(result)
+    for descriptor, same in by_descriptor.items():
+        if len(same) > 1:
+            title = f"{descriptor.upper()}: mean of {len(same)} sequences"
+            console.print(_table(title, mean_rows(same)))
+    if json_file:
+        save_json(results, json_file)
+    if markdown_file:
+        write_text(markdown_file, evaluation_markdown(results))
+    if plot_file:
+        for descriptor, same in by_descriptor.items():
+            path = plot_file
+            if len(by_descriptor) > 1:
+                path = path.with_name(f"{path.stem}.{descriptor}{path.suffix}")
+            rows = mean_rows(same) if len(same) > 1 else same[0].rows()
+            names = ", ".join(result.sequence for result in same)
+            save_precision_plot(rows, path, f"{descriptor.upper()}: {names}")
+
+
+def _table(title: str, rows: Sequence[MethodSummary]) -> Table:
+    """A table for a terminal of 80 columns, in which Protomark's rows stand out."""
+    from protomark.cli.terminal import table_of
+    from protomark.evaluation.results import table_row
+
+    table = table_of(
+        "method",
+        "bytes per\nlandmark",
+        "precision",
+        "of un-\naggreg.",
+        "poses\nfound",
+        "right\nmatches",
+        "ms per\n1,000",
+        title=title,
+    )
+    for row in rows:
+        ours = row.family.startswith("protomark")
+        table.add_row(*table_row(row), style="bold green" if ours else "")
+    return table

@@ -1,13 +1,14 @@
-"""`protomark info`."""
+"""The command `protomark info`."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import write_json
+_BARS = "▁▂▃▄▅▆▇█"
 
 
 def info(
@@ -22,12 +23,13 @@ def info(
         Path | None, typer.Option("--json", help="Write the facts to this file.")
     ] = None,
 ) -> None:
-    """Say what a file holds."""
+    """Describe what a file holds."""
     from protomark import verify_file
-    from protomark.console import progress_console
-    from protomark.info import describe, is_tracks, show
+    from protomark.cli.terminal import check_outputs, error_console, write_json
+    from protomark.maps.info import describe, is_tracks
 
-    with progress_console.status(f"Reading {file.name}"):
+    check_outputs(json_file)
+    with error_console.status(f"Reading {file.name}"):
         facts = describe(file)
         if verify and is_tracks(file):
             facts["checksums"] = "none in a tracks file, which is checked whole whenever it is read"
@@ -36,3 +38,71 @@ def info(
             facts["checksums"] = "all right"
     write_json(json_file, facts)
     show(facts)
+
+
+def show(facts: dict[str, Any]) -> None:
+    """Print what `protomark.maps.info.describe` returned."""
+    from rich.table import Table
+
+    from protomark.cli.terminal import console
+
+    table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")
+    for name, text in _rows(facts):
+        table.add_row(name, text)
+    console.print(table)
+
+
+def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    from rich.markup import escape
+
+    for key, value in facts.items():
+        name = key.replace("_", " ")
+        if value is None or key == "bytes_per_landmark_by_section":
+            continue
+        if key == "count_histogram":
+            yield "observations per landmark", f"1 {_bars(value)} 16 and more"
+        elif key == "extent":
+            yield name, " to ".join(_vector(corner) for corner in value)
+        elif key == "position_error":
+            yield name, _vector(value)
+        elif key == "bytes_by_section":
+            for section, size in value.items():
+                each = facts["bytes_per_landmark_by_section"][section]
+                yield escape(_text(f"bytes: {section}")), f"{size:,}  {each:,.2f} per landmark"
+        elif isinstance(value, dict):
+            for label, text in _nested_rows(name, value):
+                yield escape(label), escape(text)
+        else:
+            yield name, escape(_text(value))
+
+
+def _nested_rows(name: str, values: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for key, value in values.items():
+        label = f"{name}: {key.replace('_', ' ')}"
+        if key == "notes" and isinstance(value, dict):
+            for note, text in value.items():
+                yield _text(f"{label}: {note.replace('_', ' ')}"), _text(text)
+        else:
+            yield _text(label), _text(value)
+
+
+def _bars(histogram: list[int]) -> str:
+    """A histogram of counts 1, 2, ... as one line of bars, with 16 and more in the last one."""
+    bins = [*histogram[1:16], sum(histogram[16:])]
+    top = max(max(bins), 1)
+    return "".join(_BARS[int(v / top * (len(_BARS) - 1))] if v else " " for v in bins)
+
+
+def _vector(values: list[float]) -> str:
+    return f"({', '.join(f'{v:,.6g}' for v in values)})"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str) and not value.isprintable():
+        # A stranger's file must not control the terminal.
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return str(value)
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}"

@@ -1,17 +1,24 @@
-"""`protomark localize`."""
+"""The command `protomark localize`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import write_json
+if TYPE_CHECKING:
+    from protomark.localization.batch import LocalizationBatch
 
 
 def localize(
-    scene: Annotated[Path, typer.Argument(help="Map file (.pmk) whose landmarks have positions.")],
+    scene: Annotated[
+        Path,
+        typer.Argument(
+            help="Map file (.pmk) whose landmarks have positions, or the folder that `protomark "
+            "map` wrote."
+        ),
+    ],
     images: Annotated[list[Path], typer.Argument(help="Images, or folders of images.")],
     output: Annotated[
         Path,
@@ -28,7 +35,10 @@ def localize(
         ),
     ] = None,
     refine_focal_length: Annotated[
-        bool, typer.Option("--refine-focal-length", help="Refine it for each image.")
+        bool,
+        typer.Option(
+            "--refine-focal-length", help="Refine the camera's focal length for each image."
+        ),
     ] = False,
     poses: Annotated[
         Path | None,
@@ -40,20 +50,22 @@ def localize(
     priors: Annotated[
         Path | None,
         typer.Option(
-            help="Rough poses, in the same formats: only landmarks that they make visible are "
+            help="Rough poses, in the same formats: only landmarks that are visible from them are "
             "searched."
         ),
     ] = None,
     prior_distance: Annotated[
-        float, typer.Option(help="How far off a rough pose may be, in the map's units.")
+        float, typer.Option(help="Largest error of a rough pose, in the map's units.")
     ] = 1.0,
     prior_degrees: Annotated[
-        float, typer.Option(help="How far off its orientation may be, degrees.")
+        float, typer.Option(help="Largest error of its orientation, degrees.")
     ] = 15.0,
     min_confidence: Annotated[
         float,
         typer.Option(
-            min=0, max=1, help="Poses that are less likely to be right are only in poses.csv."
+            min=0,
+            max=1,
+            help="Poses that are less likely to be right are listed in poses.csv only.",
         ),
     ] = 0.9,
     max_keypoints: Annotated[
@@ -64,32 +76,69 @@ def localize(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Say where images were taken, in a map, with a confidence for each pose.
+    """Find where images were taken in a map, and how sure that is.
 
-    A map may be open or sealed; `protomark build` makes one from tracks. An image that cannot be
-    read or was taken elsewhere does not end the run. docs/localization.md says more.
+    The map may be a learning map or a sealed one. An image that cannot be read or was taken
+    elsewhere does not end the run. docs/localization.md says more.
+
+    protomark localize kitchen new-photos/
     """
-    from protomark.evaluation.command import check_outputs
-    from protomark.localization.command import Settings, localize_files, show
+    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.localization.batch import LocalizationRequest, localize_files
 
     check_outputs(json_file)
-    results, interrupted = localize_files(
+    request = LocalizationRequest(
         scene,
         images,
-        output,
-        Settings(
-            camera=camera,
-            refine_focal_length=refine_focal_length,
-            true_poses=poses,
-            priors=priors,
-            prior_distance=prior_distance,
-            prior_degrees=prior_degrees,
-            min_confidence=min_confidence,
-            max_keypoints=max_keypoints,
-            threads=threads,
-        ),
+        camera=camera,
+        refine_focal_length=refine_focal_length,
+        true_poses=poses,
+        priors=priors,
+        prior_distance=prior_distance,
+        prior_degrees=prior_degrees,
+        min_confidence=min_confidence,
+        max_keypoints=max_keypoints,
+        threads=threads,
     )
-    write_json(json_file, results.as_dict())
-    show(results, output)
-    if interrupted:
+    with progress_bar() as progress:
+        batch = localize_files(request, output, progress)
+    write_json(json_file, batch.as_dict())
+    _show(batch, output)
+    if batch.interrupted:
         raise typer.Exit(130)
+
+
+def _show(batch: LocalizationBatch, output: Path) -> None:
+    """Print the summary."""
+    from protomark.cli.terminal import console, facts_table, printable
+    from protomark.localization.batch import CAMERAS, POSES, TABLE
+
+    facts = batch.summary()
+    rows = [
+        ("images", f"{facts['images']:,}"),
+        ("localized", f"{facts['localized']:,} (confidence {batch.min_confidence:g} or more)"),
+        ("not found", f"{facts['images'] - facts['localized'] - facts['unreadable']:,}"),
+    ]
+    if facts["unreadable"]:
+        rows.append(("not usable", f"{facts['unreadable']:,}"))
+    if facts["median_inliers"] is not None:
+        rows.append(("median inliers", f"{facts['median_inliers']:,.0f}"))
+    times = facts["median_seconds"]
+    if times:
+        text = ", ".join(f"{stage} {1000 * times[stage]:.1f}" for stage in times)
+        rows.append(("median milliseconds", text))
+    for row in facts["recall"]:
+        label = f"recall at {row['distance']:g}, {row['degrees']:g} degrees"
+        rows.append((label, f"{row['recall']:.3f} of {facts['with_true_pose']:,}"))
+    if facts["median_position_error"] is not None:
+        text = f"{facts['median_position_error']:.4g}, {facts['median_angle_error']:.3g} degrees"
+        rows.append(("median error of localized", text))
+    console.print(facts_table(rows))
+    failed = [image for image in batch.images if image.error]
+    for image in failed[:5]:
+        line = printable(f"{image.name}: {image.error}")
+        console.print(line, markup=False, highlight=False)
+    if len(failed) > 5:
+        console.print(f"... and {len(failed) - 5} more, in {output / TABLE}", highlight=False)
+    files = f"{output / POSES}, {CAMERAS} and {TABLE}"
+    console.print(files, markup=False, highlight=False, soft_wrap=True)

@@ -1,13 +1,13 @@
-"""`protomark map`."""
+"""The command `protomark map`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import write_json
+_NAMES_SHOWN = 3
 
 
 def map_(
@@ -32,7 +32,7 @@ def map_(
         typer.Option(
             help="A COLMAP cameras.txt, a folder with a COLMAP model, or a camera written out: "
             "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'. By default it is "
-            "calibrated along the way."
+            "calibrated while mapping."
         ),
     ] = None,
     focal: Annotated[
@@ -45,34 +45,29 @@ def map_(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="Given poses, then only landmarks are made: COLMAP model folder or images.txt, or "
-            "a TUM trajectory."
+            help="Given poses, for which only landmarks are made: COLMAP model folder or images.txt, "
+            "or a TUM trajectory."
         ),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
     window: Annotated[
         int,
-        typer.Option(help="Last keyframes that keep their descriptors, to make new landmarks."),
+        typer.Option(
+            help="Number of latest keyframes that keep their descriptors, to make landmarks."
+        ),
     ] = 8,
     dim: Annotated[int, typer.Option(help="Dimensions of a prototype.")] = 32,
     encoder: Annotated[
         str, typer.Option(help="Name or file of the encoder; by default the descriptor's own.")
     ] = "",
-    memory: Annotated[
-        str,
-        typer.Option(
-            help="What the map keeps: prototypes; or, to compare, medoids (one descriptor a "
-            "landmark) or descriptors (all of them)."
-        ),
-    ] = "prototypes",
     max_keypoints: Annotated[
         int, typer.Option(help="Keypoints kept in a frame, strongest first, spread over it.")
     ] = 2000,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a map that Ctrl-C or a crash ended.")
+        bool, typer.Option("--resume", help="Continue a map that Ctrl-C or a crash ended.")
     ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Make the map anew, though OUTPUT holds one.")
+        bool, typer.Option("--force", help="Make the map anew even if OUTPUT holds one.")
     ] = False,
     view: Annotated[
         bool,
@@ -83,34 +78,40 @@ def map_(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    r"""Make a map of a scene from images or a video, as they come: structure from motion.
+    r"""Map a scene from images or a video: structure from motion.
 
-    Each frame is matched with the prototypes of the map, updates those it sees, and is forgotten;
-    only the last few keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP
-    model), trajectory.txt (TUM format), report.html and report.json.
+    Frame by frame, each image is matched with the prototypes of the map and updates those it sees; only the last
+    few keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP model),
+    trajectory.txt (TUM format), report.html and report.json.
 
     protomark map walk.mp4 -o kitchen
 
     protomark map more-images/ --into kitchen
 
-    Ctrl-C ends with what there is, and the same command with --resume goes on. --view needs
-    `pip install protomark\[view]`. docs/mapping.md explains the pipeline.
-    """
-    from protomark.evaluation.command import check_outputs
-    from protomark.mapping import command
-    from protomark.mapping.settings import Settings
+    protomark localize kitchen new-images/
 
-    if (output is None) == (into is None):
-        raise ValueError("name a folder for the new map with -o, or a map to extend with --into")
+    Ctrl-C writes the map so far, and the same command with --resume continues it. docs/mapping.md
+    explains the pipeline.
+    """
+    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.extras import optional
+    from protomark.mapping.options import MappingOptions
+    from protomark.mapping.session import MappingInterrupted, MapRequest, make_map
+
+    scene = output or into
+    if scene is None or (output is not None and into is not None):
+        raise ValueError(
+            "name either a folder for the new map with -o, or a map to extend with --into"
+        )
     check_outputs(json_file)
-    scene = output or into or Path()
-    request = command.Request(
+    if view:
+        optional("rerun")
+    request = MapRequest(
         images=images,
         output=scene,
-        settings=Settings(
+        options=MappingOptions(
             descriptor=descriptor,
             max_keypoints=max_keypoints,
-            memory=memory,
             encoder=encoder,
             dim=dim,
             window=window,
@@ -122,13 +123,46 @@ def map_(
         resume=resume,
         extend=into is not None,
         force=force,
-        view=view,
+        record=view,
         threads=threads,
     )
     try:
-        figures = command.make_map(request)
-    except (command.Interrupted, KeyboardInterrupt):
-        command.explain_interruption(scene)
+        with progress_bar() as progress:
+            figures = make_map(request, progress, note)
+    except MappingInterrupted:
+        note(f"stopped: the map so far is in {scene}; the same command with --resume continues it")
         raise typer.Exit(130) from None
     write_json(json_file, figures)
-    command.show(figures, scene)
+    _show(figures, scene)
+
+
+def _show(figures: dict[str, Any], scene: Path) -> None:
+    from rich.markup import escape
+
+    from protomark.cli.terminal import say
+
+    ratio = figures["descriptor_bytes"] / max(figures["memory_bytes"], 1)
+    say(f"[bold]{escape(str(scene))}[/]")
+    say(
+        f"  {figures['registered']} of {figures['frames']} frames registered, "
+        f"{figures['keyframes']} keyframes, {figures['landmarks']} landmarks, "
+        f"{figures['observations']} observations ({figures['track_length_mean']:.1f} per landmark)"
+    )
+    say(
+        f"  reprojection error: mean {figures['reprojection_error_mean']:.2f} pixels, "
+        f"median {figures['reprojection_error_median']:.2f}"
+    )
+    say(
+        f"  memory for matching: {figures['memory_bytes'] / 1e6:.2f} MB, "
+        f"{figures['bytes_per_landmark']:.0f} bytes per landmark; all descriptors: "
+        f"{figures['descriptor_bytes'] / 1e6:.2f} MB, {ratio:.1f} times as much"
+    )
+    say(
+        f"  {figures['seconds_total']:.1f} s, {figures['frames_per_second']:.1f} frames per second; "
+        f"see {scene / 'report.html'}"
+    )
+    for reason, names in figures["not_registered"].items():
+        shown = ", ".join(names[:_NAMES_SHOWN])
+        more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+        say(f"  [yellow]without a pose[/]: {escape(shown)}{more}: {escape(reason)}")
+    say(f"  next: protomark localize {escape(str(scene))} IMAGES")

@@ -1,11 +1,16 @@
-"""`protomark tracks`."""
+"""The command `protomark tracks`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from protomark.tracks.make import TracksInput
+
+_BAR = 30  # characters
 
 
 def tracks(
@@ -70,34 +75,35 @@ def tracks(
             help="Keypoints without a landmark kept in a keyframe, the strongest (smaller files)."
         ),
     ] = None,
-    variants: Annotated[
+    augmentations: Annotated[
         int,
         typer.Option(
-            help="Also write FOLDER.DESCRIPTOR.varied.safetensors, to train on: with this many "
+            help="Also write FOLDER.DESCRIPTOR.augmented.safetensors to train on, with this many "
             "copies of each image, warped and with other light, blur and noise."
         ),
     ] = 0,
     threads: Annotated[
-        int, typer.Option(help="CPU threads, 0 for one a core; the result is the same.")
+        int, typer.Option(help="CPU threads, 0 for one per core; the result is the same.")
     ] = 0,
     force: Annotated[
-        bool, typer.Option("--force", help="Make files anew that are there and up to date.")
+        bool, typer.Option("--force", help="Make files anew even if they are up to date.")
     ] = False,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Make tracks from images with known poses: keypoints, descriptors and their landmarks.
+    """Make tracks from images with known poses.
 
-    A file that is there already is kept if it was made with these options from this input.
+    Tracks are keypoints, their descriptors, and the landmarks that they see.
+    A tracks file that was made with these options from this input is kept.
     """
-    import os
+    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.threads import available_threads
+    from protomark.tracks.extract import TracksOptions, find_sequence
+    from protomark.tracks.make import TracksInput, make_augmented_tracks, make_tracks
 
-    from protomark.tracks.command import make_tracks
-    from protomark.tracks.extract import Settings
-
-    settings = [
-        Settings(
+    options = [
+        TracksOptions(
             descriptor=name,
             max_keypoints=max_keypoints,
             partners=partners,
@@ -110,15 +116,94 @@ def tracks(
         )
         for name in dict.fromkeys(descriptors or ["freak"])
     ]
-    make_tracks(
-        folders,
-        settings,
-        output,
-        images=images,
-        model=model,
-        database=database,
-        variants=variants,
-        force=force,
-        threads=threads if threads > 0 else os.cpu_count() or 1,
-        json_path=json_file,
+    sources = [TracksInput(folder, images, model, database) for folder in folders]
+    _check(sources, output, augmentations)
+    check_outputs(json_file)
+    threads = threads if threads > 0 else available_threads()
+    facts = []
+    for source in sources:
+        for one in options:
+            with progress_bar(f"{source.name}: ") as progress:
+                made = make_tracks(
+                    source, one, output, force=force, threads=threads, progress=progress
+                )
+            if made.skipped:
+                note(f"{made.path}: up to date with these options, skipped (--force makes it anew)")
+            facts.append(made.as_dict())
+            _show(facts[-1], made.tracks.info)
+            if not augmentations:
+                continue
+            folder = find_sequence(source.folder, images, model).images
+            with progress_bar(f"{source.name}: ") as progress:
+                more = make_augmented_tracks(
+                    made, folder, augmentations, force=force, threads=threads, progress=progress
+                )
+            facts.append(more.as_dict())
+            _show_augmented(facts[-1], facts[-2])
+    write_json(json_file, facts)
+
+
+def _check(sources: list[TracksInput], output: Path, augmentations: int) -> None:
+    """Raise before any work if options do not fit together."""
+    first = sources[0]
+    if augmentations < 0:
+        raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
+    if augmentations and first.database:
+        raise ValueError("--augmentations needs the images, and --database does not read them")
+    if len(sources) > 1 and (first.images or first.model or first.database):
+        raise ValueError("--images, --model and --database go with one FOLDER, give one at a time")
+    names = [source.name for source in sources]
+    double = sorted({n for n in names if names.count(n) > 1})
+    if double:
+        raise ValueError(
+            f"two folders are named {double[0]} and would write the same file; run them apart, "
+            "each with its own -o"
+        )
+    if output.exists() and not output.is_dir():
+        raise NotADirectoryError(f"{output}: not a folder, name one for the tracks with -o")
+
+
+def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
+    """Print counts, errors and the histogram of track lengths."""
+    from rich.markup import escape
+
+    from protomark.cli.terminal import note, say
+
+    say(f"[bold]{escape(facts['file'])}[/]")
+    say(
+        f"  {facts['keyframes']} keyframes, {facts['keypoints']} keypoints, "
+        f"{facts['landmarks']} landmarks, {facts['observations']} observations "
+        f"({facts['track_length_mean']:.1f} per landmark)"
     )
+    say(
+        f"  reprojection error: mean {facts['reprojection_error_mean']:.2f} pixels, "
+        f"median {facts['reprojection_error_median']:.2f}"
+    )
+    if "epipolar_error" in info:
+        error, refined = info["epipolar_error"], facts["poses_refined"]
+        say(
+            f"  given poses: epipolar error {error:.2f} pixels, "
+            + ("refined by bundle adjustment" if refined else "kept as they are")
+        )
+        if error > 1 and not refined:
+            note("  hint: these poses are only roughly right, --refine-poses auto refines them")
+    without = info.get("images_without_pose") or []
+    if without:
+        more = f" and {len(without) - 3} more" if len(without) > 3 else ""
+        say(f"  left out, as they have no pose: {escape(', '.join(without[:3]))}{more}")
+    say("  observations per landmark:")
+    most = max(facts["track_length_histogram"].values(), default=0) or 1
+    for label, count in facts["track_length_histogram"].items():
+        if count:
+            bar = "█" * max(1, round(_BAR * count / most))
+            say(f"  {label:>7} {bar:<{_BAR}} {count}")
+
+
+def _show_augmented(facts: dict[str, Any], plain: dict[str, Any]) -> None:
+    from rich.markup import escape
+
+    from protomark.cli.terminal import say
+
+    added = facts["observations"] - plain["observations"]
+    say(f"[bold]{escape(facts['file'])}[/]")
+    say(f"  {facts['augmentations']} copies of each keyframe, {added} more observations")

@@ -1,16 +1,21 @@
-"""`protomark train`."""
+"""The command `protomark train`."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from protomark.training.card import EncoderCard
+    from protomark.training.encoder import TrainingRequest
 
 
 def train(
     tracks: Annotated[
-        list[Path], typer.Argument(help="Tracks files to learn from, one a sequence.")
+        list[Path], typer.Argument(help="Tracks files to train on, one per sequence.")
     ],
     validation: Annotated[
         list[Path] | None,
@@ -39,19 +44,13 @@ def train(
     upright: Annotated[
         bool,
         typer.Option(
-            "--upright", help="For cameras that do not roll: learn from angles and sizes, too."
-        ),
-    ] = False,
-    sized: Annotated[
-        bool,
-        typer.Option(
-            "--sized",
-            help="For places seen from like distances again: learn from the keypoints' sizes, too.",
+            "--upright",
+            help="For cameras that do not roll: train on angles and sizes of keypoints, too.",
         ),
     ] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     threads: Annotated[
-        int, typer.Option(help="CPU threads, 0 for one a core; take 1 on a busy machine.")
+        int, typer.Option(help="CPU threads, 0 for one per core; take 1 on a busy machine.")
     ] = 0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint beside the output.")
@@ -66,27 +65,20 @@ def train(
         Path | None, typer.Option("--json", help="Write the figures to this file.")
     ] = None,
 ) -> None:
-    """Train an encoder on tracks, and write it with its card (needs PyTorch).
+    """Train an encoder on tracks (needs PyTorch).
 
     Works for any binary descriptor of 64 to 1024 bits: `protomark train my-tracks/*`. Beside the
     model come its card (.md) and a picture of the training (.png) that is drawn anew at each
     validation. Ctrl-C leaves a checkpoint, and the same command with --resume continues.
     """
-    try:
-        import torch  # noqa: F401
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "training needs PyTorch, which is not installed: pip install protomark[train]"
-        ) from None
-    from protomark.inputs import chosen
-    from protomark.training.command import (
-        default_output,
-        explain_interruption,
-        print_summary,
-        train_encoder,
-    )
+    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.extras import optional
+
+    check_outputs(json_file)
+    optional("torch")
     from protomark.training.data import hold_out
-    from protomark.training.train import Interrupted, Options
+    from protomark.training.encoder import TrainingRequest, default_output, train_encoder
+    from protomark.training.train import TrainingInterrupted, TrainingOptions
 
     try:
         parsed = tuple(int(d) for d in dims.split(","))
@@ -95,28 +87,45 @@ def train(
     for entry in data_licence or []:
         if "=" not in entry:
             raise ValueError(f"--data-licence {entry!r} is not of the form NAME=LICENCE")
-    data_licences = dict(entry.split("=", 1) for entry in data_licence or [])
-    options = Options(dims=parsed, steps=steps, landmarks=batch, seed=seed)
-    learned, picking = hold_out(tracks, validation or [])
-    inputs = chosen(upright, sized)
-    output = output or default_output(learned[0], resume, inputs)
+    training, selecting = hold_out(tracks, validation or [])
+    request = TrainingRequest(
+        training,
+        selecting,
+        output or default_output(training[0], resume, upright),
+        TrainingOptions(dims=parsed, steps=steps, landmarks=batch, seed=seed),
+        report=report or [],
+        resume=resume,
+        upright=upright,
+        name=name,
+        licence=licence,
+        data_licences=dict(entry.split("=", 1) for entry in data_licence or []),
+        device=device,
+        threads=threads,
+    )
     try:
-        card = train_encoder(
-            learned,
-            picking,
-            output,
-            options,
-            report=report or [],
-            resume=resume,
-            inputs=inputs,
-            name=name,
-            licence=licence,
-            data_licences=data_licences,
-            device=device,
-            threads=threads,
-            json_path=json_file,
-        )
-    except Interrupted as stop:
-        explain_interruption(stop, output)
+        with progress_bar() as progress:
+            card = train_encoder(request, progress, note)
+    except TrainingInterrupted as stop:
+        note(f"{stop}; the same command with --resume continues ({request.output}.checkpoint)")
         raise typer.Exit(130) from None
-    print_summary(card, output)
+    write_json(json_file, asdict(card))
+    _show(card, request)
+
+
+def _show(card: EncoderCard, request: TrainingRequest) -> None:
+    from protomark.cli.terminal import console, say, table_of
+
+    table = table_of("sequence", "unaggregated", "dim", "bytes", "float", "integer", "ratio")
+    for f in card.figures:
+        for d in card.dims:
+            table.add_row(
+                f"{f.sequence} ({f.role})",
+                f"{f.unaggregated:.4f}",
+                str(d),
+                str(d + 1),
+                f"{f.float_precision[d]:.4f}",
+                f"{f.integer_precision[d]:.4f}",
+                f"{f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f}",
+            )
+    console.print(table)
+    say(f"{request.output} ({card.bytes:,} bytes), {request.card_path} and {request.plot_path}")

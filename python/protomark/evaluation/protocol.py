@@ -1,4 +1,4 @@
-"""The paper's protocol: which keyframes build the map, and which descriptors ask it."""
+"""The paper's protocol: which keyframes build the map, and which descriptors query it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_QUERIES = 10_000
 
 
 @dataclass(frozen=True)
-class Split:
+class SupportQuerySplit:
     """Support and queries of one sequence at one seed.
 
     Attributes:
@@ -23,7 +23,7 @@ class Split:
         support_keyframes: (s,) int64, ascending indices of the keyframes that build the map.
         query_keyframes: (m - s,) int64, ascending indices of the others.
         support_rows: (o,) int64, ascending keypoint rows whose landmark is in the map.
-        query_rows: (q,) int64, ascending keypoint rows to ask for; each one's landmark is in
+        query_rows: (q,) int64, ascending keypoint rows of the queries; the landmark of each is in
             the map.
     """
 
@@ -41,7 +41,7 @@ def split(
     support_share: float = SUPPORT_SHARE,
     min_observations: int = MIN_OBSERVATIONS,
     max_queries: int = MAX_QUERIES,
-) -> Split:
+) -> SupportQuerySplit:
     """Draw support and queries as in Komorowski and Trzcinski, section "Performance metric".
 
     A random `support_share` of the keyframes is the support, rounded to the nearest number that
@@ -52,12 +52,12 @@ def split(
     The same tracks and seed give the same split on every platform.
 
     Raises:
-        ValueError: the tracks hold variants (`tracks.variants`), there are fewer than two
-            keyframes, or no landmark that both sides see.
+        ValueError: the tracks are augmented, there are fewer than two keyframes, or no landmark
+            that both sides see.
     """
-    if tracks.info.get("variants"):
+    if tracks.info.get("augmentations"):
         raise ValueError(
-            "these tracks hold varied copies of each keyframe, which are to learn from only; "
+            "these tracks hold augmented copies of each keyframe, which are for training only; "
             "give the plain tracks"
         )
     keyframes = len(tracks.keyframe_names)
@@ -68,7 +68,7 @@ def split(
         )
     rng = np.random.default_rng(seed)
     order = rng.permutation(keyframes)
-    # Not round(): it takes halves to the even neighbour, which is hard to explain in a protocol.
+    # round() would take halves to the even neighbour, which is hard to explain in a protocol.
     size = min(max(int(keyframes * support_share + 0.5), 1), keyframes - 1)
     in_support = np.zeros(keyframes, dtype=bool)
     in_support[order[:size]] = True
@@ -87,7 +87,7 @@ def split(
         )
     if len(query_rows) > max_queries:
         query_rows = np.sort(rng.choice(query_rows, size=max_queries, replace=False))
-    return Split(
+    return SupportQuerySplit(
         seed=seed,
         support_keyframes=np.flatnonzero(in_support),
         query_keyframes=np.flatnonzero(~in_support),

@@ -1,4 +1,4 @@
-"""Figures of an evaluation, and their JSON."""
+"""Results of an evaluation, as JSON, tables and curves."""
 
 from __future__ import annotations
 
@@ -12,14 +12,43 @@ from typing import Any
 import numpy as np
 
 from protomark.files import write_text
+from protomark.plot import AMBER, MUTED, OURS, Curve, draw_curves, new_figure, save_figure
+from protomark.report import markdown_table, percent
 
 FORMAT = "protomark-evaluation"
 VERSION = 1
 
+_TABLE_HEAD = (
+    "method",
+    "bytes per landmark",
+    "precision",
+    "of unaggregated",
+    "poses found",
+    "right matches",
+    "ms per 1,000 queries",
+)
+# Families of several sizes get a colour of their own, single methods are grey.
+_COLOURS = {"pca": AMBER, "discriminant": "#7c3aed"}
+_OUR_COLOURS = (OURS, "#0369a1", "#4d7c0f", "#be123c")
+_CURVE_LABELS = {
+    "unaggregated": "all descriptors",
+    "random": "random",
+    "first": "first seen",
+    "majority": "quantised mean",
+    "and": "bitwise AND",
+    "medoid": "medoid",
+    "mean": "mean of bits",
+    "pca": "PCA",
+    "discriminant": "discriminant",
+    "protomark": "Protomark",
+    "protomark-4bit": "Protomark x4",
+    "protomark-appearances": "Protomark appearances",
+}
+
 
 @dataclass
 class MethodResult:
-    """Figures of one method on one sequence, one entry a seed where there are several.
+    """Results of one method on one sequence, with one entry per seed in the lists.
 
     Attributes:
         name, label, family: as in `methods.MethodChoice`.
@@ -29,7 +58,7 @@ class MethodResult:
         build_s: seconds to build the map.
         frames: query keyframes that were localized.
         found: those whose pose is within 1 % of the median scene depth and 2 degrees.
-        accepted: matches that were given to RANSAC, over all frames.
+        selected: matches that were given to RANSAC, over all frames.
         right: those of them that are right.
     """
 
@@ -42,13 +71,13 @@ class MethodResult:
     build_s: list[float] = field(default_factory=list)
     frames: int = 0
     found: int = 0
-    accepted: int = 0
+    selected: int = 0
     right: int = 0
 
-    def summary(self) -> Summary:
+    def summary(self) -> MethodSummary:
         """Means over seeds; of the search times the least."""
         spread = float(np.std(self.precision, ddof=1)) if len(self.precision) > 1 else None
-        return Summary(
+        return MethodSummary(
             name=self.name,
             label=self.label,
             family=self.family,
@@ -57,14 +86,14 @@ class MethodResult:
             spread=spread,
             ratio=None,
             pose_recall=self.found / self.frames if self.frames else None,
-            right_share=self.right / self.accepted if self.accepted else None,
+            right_share=self.right / self.selected if self.selected else None,
             # Other work on the machine only ever adds.
             search_ms=min(self.search_ms),
         )
 
 
 @dataclass
-class Summary:
+class MethodSummary:
     """One row of a table.
 
     Attributes:
@@ -97,7 +126,7 @@ class SequenceResult:
         map_landmarks, support_observations, queries: means over seeds.
         scene_depth: median depth of the observations, in world units.
         seeds: seeds of the splits.
-        methods: one result a method, in the order of the table.
+        methods: one result per method, in the order of the table.
         discriminant: what the linear discriminants were learned from.
     """
 
@@ -114,7 +143,7 @@ class SequenceResult:
     discriminant: str
     methods: list[MethodResult]
 
-    def rows(self) -> list[Summary]:
+    def rows(self) -> list[MethodSummary]:
         """The rows of the table, with the ratio to the unaggregated map."""
         rows = [method.summary() for method in self.methods]
         whole = next((row.precision for row in rows if row.name == "unaggregated"), None)
@@ -123,7 +152,7 @@ class SequenceResult:
         return rows
 
 
-def mean_rows(results: Sequence[SequenceResult]) -> list[Summary]:
+def mean_rows(results: Sequence[SequenceResult]) -> list[MethodSummary]:
     """Means over sequences, of the methods that all of them have, in the first one's order."""
     tables = [{row.name: row for row in result.rows()} for result in results]
     rows = []
@@ -136,7 +165,7 @@ def mean_rows(results: Sequence[SequenceResult]) -> list[Summary]:
             for key in ("ratio", "pose_recall", "right_share")
         }
         rows.append(
-            Summary(
+            MethodSummary(
                 name=name,
                 label=first.label,
                 family=first.family,
@@ -171,17 +200,103 @@ def load_json(path: str | os.PathLike[str]) -> list[SequenceResult]:
         document = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise ValueError(f"{path}: not results of `protomark evaluate --json`")
-        return [_sequence(entry) for entry in document["sequences"]]
+        return [_sequence_result(entry) for entry in document["sequences"]]
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such results file") from None
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: broken results file ({error!r})") from None
 
 
-def _sequence(entry: dict[str, Any]) -> SequenceResult:
-    known = {f.name for f in fields(SequenceResult)} - {"methods"}
+def _sequence_result(entry: dict[str, Any]) -> SequenceResult:
+    names = {f.name for f in fields(SequenceResult)} - {"methods"}
     methods = [MethodResult(**method) for method in entry["methods"]]
-    return SequenceResult(**{key: entry[key] for key in known}, methods=methods)
+    return SequenceResult(**{key: entry[key] for key in names}, methods=methods)
+
+
+def caption(result: SequenceResult) -> str:
+    """What was evaluated, in one line."""
+    return (
+        f"{result.sequence}, {result.descriptor.upper()}: {result.keyframes} keyframes, "
+        f"{result.map_landmarks:,.0f} landmarks in the map from "
+        f"{result.support_observations:,.0f} observations, {result.queries:,.0f} queries, "
+        f"{len(result.seeds)} seed{'s' if len(result.seeds) != 1 else ''}"
+    )
+
+
+def table_row(row: MethodSummary) -> list[str]:
+    """One row of a table as text, in the order of its head."""
+    spread = f" ±{row.spread:.3f}" if row.spread is not None else ""
+    return [
+        row.label,
+        f"{row.bytes_per_landmark:,.0f}",
+        f"{row.precision:.3f}{spread}",
+        percent(row.ratio),
+        percent(row.pose_recall),
+        percent(row.right_share),
+        f"{row.search_ms:,.0f}" if row.search_ms >= 10 else f"{row.search_ms:.1f}",
+    ]
+
+
+def evaluation_markdown(results: Sequence[SequenceResult]) -> str:
+    """All tables, and their mean where there are several, one descriptor after the other."""
+    parts = []
+    for descriptor in dict.fromkeys(result.descriptor for result in results):
+        same = [result for result in results if result.descriptor == descriptor]
+        if len(same) > 1:
+            names = ", ".join(result.sequence for result in same)
+            parts.append(f"#### {descriptor.upper()}: mean of {names}\n")
+            parts.append(summary_markdown(mean_rows(same)))
+        for result in same:
+            parts.append(f"#### {caption(result)}\n")
+            parts.append(summary_markdown(result.rows()))
+    return "\n".join(parts)
+
+
+def summary_markdown(rows: Sequence[MethodSummary]) -> str:
+    """One table in Markdown; Protomark's rows are bold."""
+    ours = [row.family.startswith("protomark") for row in rows]
+    return markdown_table(_TABLE_HEAD, [table_row(row) for row in rows], ours)
+
+
+def precision_curves(rows: Sequence[MethodSummary]) -> list[Curve]:
+    """Precision over bytes per landmark; methods of one family are one curve."""
+    families: dict[str, list[MethodSummary]] = {}
+    for row in rows:
+        families.setdefault(row.family, []).append(row)
+    our_families = [family for family in families if family.startswith("protomark")]
+    curves = []
+    for family, members in families.items():
+        members = sorted(members, key=lambda row: row.bytes_per_landmark)
+        ours = family in our_families
+        kind, _, encoder = family.partition("@")
+        colour = (
+            _OUR_COLOURS[our_families.index(family) % len(_OUR_COLOURS)]
+            if ours
+            else _COLOURS.get(family.removesuffix("-float"), MUTED)
+        )
+        curves.append(
+            Curve(
+                f"{_CURVE_LABELS.get(kind, kind)} {encoder}".rstrip(),
+                [row.bytes_per_landmark for row in members],
+                [row.precision for row in members],
+                [row.spread or 0.0 for row in members],
+                colour,
+                ours,
+            )
+        )
+    return curves
+
+
+def save_precision_plot(rows: Sequence[MethodSummary], path: Path, title: str = "") -> None:
+    """Write precision over bytes per landmark as PNG, SVG or PDF.
+
+    Raises:
+        ValueError: the suffix is another one.
+    """
+    figure = new_figure(8, 5)
+    axes = figure.add_subplot()
+    draw_curves(axes, precision_curves(rows), "bytes per landmark (log)", "precision", title)
+    save_figure(figure, path, made_by="protomark evaluate")
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

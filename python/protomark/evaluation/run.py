@@ -1,51 +1,136 @@
-"""All methods on the same queries of one sequence."""
+"""Runs all methods on the same queries of each sequence."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from protomark.evaluation import pose
-from protomark.evaluation.methods import MethodChoice
-from protomark.evaluation.methods.method import Method
-from protomark.evaluation.protocol import Split, split
+import protomark as pm
+from protomark import models
+from protomark.baselines.method import Method
+from protomark.baselines.support import Moments, Support
+from protomark.evaluation.frames import (
+    QueryFrame,
+    localize_frame,
+    right_matches,
+    scene_depth,
+    select_matches,
+)
+from protomark.evaluation.methods import MethodChoice, choose_methods, method_choices
+from protomark.evaluation.protocol import SupportQuerySplit, split
 from protomark.evaluation.results import MethodResult, SequenceResult
-from protomark.evaluation.support import Support
-from protomark.evaluation.threads import one_blas_thread
-from protomark.tracks.file import Tracks
+from protomark.features.upright import SUFFIX
+from protomark.progress import Progress, silent
+from protomark.threads import one_blas_thread
+from protomark.tracks.file import Tracks, sequence_name
 
 TIMED_QUERIES = 1000
 POSE_FRAMES = 20
 
 
 @dataclass(frozen=True)
-class Options:
+class EvaluationOptions:
     """How an evaluation runs.
 
     Attributes:
         seeds: seeds of the splits.
         pose_frames: query keyframes to localize at each seed, at most.
         threads: threads for all that is not timed.
+        encoders: names or files of encoders; a file is evaluated with those of its descriptor, or
+            of its upright form. None given: the one that ships for the descriptor.
+        methods: names of methods, or of families of methods; none given: the default ones.
+        discriminant_from: tracks files to learn the linear discriminants from; none given: they are
+            learned from each sequence's own support.
     """
 
     seeds: Sequence[int] = (0, 1, 2)
     pose_frames: int = POSE_FRAMES
     threads: int = 1
+    encoders: Sequence[str] = ()
+    methods: Sequence[str] = ()
+    discriminant_from: Sequence[Path] = ()
+
+
+def evaluate_files(
+    paths: Sequence[Path], options: EvaluationOptions, progress: Progress = silent
+) -> Iterator[SequenceResult]:
+    """Evaluate tracks files one after the other.
+
+    Args:
+        paths: tracks files.
+        options: what to compare, and how.
+        progress: called with each method at each seed.
+
+    Raises:
+        FileNotFoundError, ValueError: a file is missing, broken, or does not fit the others.
+    """
+    encoders = [pm.Encoder.load(source) for source in options.encoders or models.names()]
+    for path in [*paths, *options.discriminant_from]:
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such tracks file")
+    learned: dict[tuple[str, int], Moments | None] = {}
+    for path in paths:
+        tracks = Tracks.load(path)
+        kind = (tracks.descriptor, tracks.bits)
+        if kind not in learned:
+            sources = options.discriminant_from
+            learned[kind] = learn_moments(sources, tracks) if sources else None
+        fitting = encoders_for(tracks, encoders, given=bool(options.encoders))
+        choices = method_choices(fitting, learned[kind], options.threads)
+        chosen = choose_methods(choices, options.methods)
+        yield evaluate(tracks, sequence_name(path), chosen, options, progress)
+
+
+def encoders_for(
+    tracks: Tracks, encoders: Sequence[pm.Encoder], *, given: bool
+) -> list[pm.Encoder]:
+    """The encoders that take the descriptors of the tracks, or their upright form.
+
+    Args:
+        tracks: the tracks.
+        encoders: what to choose from.
+        given: whether the user named them; if not, only the one with the descriptor's name counts.
+    """
+    descriptor, bits = tracks.descriptor, tracks.bits
+    if not given:
+        encoders = [encoder for encoder in encoders if encoder.name == descriptor]
+    fitting = [e for e in encoders if (e.descriptor, e.bits) == (descriptor, bits)]
+    return fitting + [e for e in encoders if e.descriptor == descriptor + SUFFIX]
+
+
+def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
+    """Moments over several tracks files together, of landmarks with at least two observations.
+
+    Raises:
+        ValueError: a file holds other descriptors than `like`.
+    """
+    landmarks, descriptors, at = [], [], 0
+    for path in paths:
+        tracks = Tracks.load(path)
+        if (tracks.descriptor, tracks.bits) != (like.descriptor, like.bits):
+            raise ValueError(
+                f"{path}: holds {tracks.descriptor} with {tracks.bits} bits, the tracks to "
+                f"evaluate {like.descriptor} with {like.bits}: give tracks of the same descriptor"
+            )
+        rows = tracks.observations
+        index = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
+        repeated = np.bincount(index, minlength=len(tracks.landmark_ids))[index] >= 2
+        landmarks.append(index[repeated] + at)
+        descriptors.append(tracks.descriptors[rows[repeated]])
+        at += len(tracks.landmark_ids)
+    return Support(np.concatenate(landmarks), np.concatenate(descriptors)).moments
 
 
 def evaluate(
     tracks: Tracks,
     sequence: str,
     methods: Sequence[MethodChoice],
-    options: Options,
-    *,
-    own: Tracks | None = None,
-    discriminant: str = "support",
-    advance: Callable[[str], None] = lambda _: None,
+    options: EvaluationOptions,
+    progress: Progress = silent,
 ) -> SequenceResult:
     """Precision, pose recall and search time of each method at each seed.
 
@@ -54,74 +139,73 @@ def evaluate(
         sequence: its name, for the tables.
         methods: what to compare.
         options: seeds, frames and threads.
-        own: the same sequence with the descriptors that Protomark's own methods take, if others
-            than those of `tracks`.
-        discriminant: what the linear discriminants are learned from, for the record.
-        advance: called with the method's label before each method at each seed.
+        progress: called with the method's label at each seed.
     """
-    own = own or tracks
     results = [MethodResult(choice.name, choice.label, choice.family) for choice in methods]
-    sizes = []
-    depth = pose.scene_depth(tracks)
+    # The same keypoints either way; only the bytes of their descriptors differ.
+    sources = {False: tracks}
+    if any(choice.upright for choice in methods):
+        sources[True] = tracks.upright()
+    depth = scene_depth(tracks)
+    sizes, done = [], 0
     for seed in options.seeds:
         part = split(tracks, seed)
-        sources = [tracks] if own is tracks else [tracks, own]
-        # The same keypoints either way; only the bytes of their descriptors may differ.
+        landmarks = tracks.landmark_of_keypoint[part.support_rows]
         supports = {
-            id(source): Support(
-                tracks.landmark_of_keypoint[part.support_rows],
-                source.descriptors[part.support_rows],
-                seed,
-            )
-            for source in sources
+            upright: Support(landmarks, source.descriptors[part.support_rows], seed)
+            for upright, source in sources.items()
         }
-        frames = {id(t): draw_frames(t, part, options.pose_frames) for t in sources}
-        support = supports[id(tracks)]
-        sizes.append((len(support.ids), len(part.support_rows), len(part.query_rows)))
+        frames = {
+            upright: draw_frames(source, part, options.pose_frames)
+            for upright, source in sources.items()
+        }
+        sizes.append((len(supports[False].ids), len(part.support_rows), len(part.query_rows)))
         for choice, result in zip(methods, results, strict=True):
-            advance(choice.label)
-            source = own if choice.is_own else tracks
+            stage = f"{sequence}, {choice.label}"
+            progress(stage, done, len(methods) * len(options.seeds))
+            done += 1
             began = time.perf_counter()
-            # Small matrices: more BLAS threads cost more in waiting than they bring.
+            # On small matrices more BLAS threads spend more time waiting than they save.
             with one_blas_thread():
-                method = choice.build(supports[id(source)])
+                method = choice.build(supports[choice.upright])
             result.build_s.append(time.perf_counter() - began)
             result.bytes_per_landmark.append(method.bytes_per_landmark)
+            source = sources[choice.upright]
             measure_precision(source, part, method, options.threads, result)
-            measure_poses(source, frames[id(source)], depth, method, options.threads, result)
-    landmarks, observations, queries = np.mean(sizes, axis=0)
+            measure_poses(source, frames[choice.upright], depth, method, options.threads, result)
+    mean_landmarks, observations, queries = np.mean(sizes, axis=0)
     return SequenceResult(
         sequence=sequence,
         descriptor=tracks.descriptor,
         keyframes=len(tracks.keyframe_names),
         landmarks=len(tracks.landmark_ids),
         observations=len(tracks.observations),
-        map_landmarks=float(landmarks),
+        map_landmarks=float(mean_landmarks),
         support_observations=float(observations),
         queries=float(queries),
         scene_depth=depth,
         seeds=list(options.seeds),
-        discriminant=discriminant,
+        discriminant=", ".join(p.name for p in options.discriminant_from) or "support",
         methods=results,
     )
 
 
-def draw_frames(tracks: Tracks, part: Split, at_most: int) -> list[pose.Frame]:
+def draw_frames(tracks: Tracks, part: SupportQuerySplit, at_most: int) -> list[QueryFrame]:
     """Up to `at_most` of the query keyframes, drawn at random, in order."""
     chosen = part.query_keyframes
     if len(chosen) > at_most:
         rng = np.random.default_rng(part.seed)
         chosen = np.sort(rng.choice(chosen, size=at_most, replace=False))
-    return [pose.Frame.of(tracks, int(keyframe)) for keyframe in chosen]
+    return [QueryFrame.of(tracks, int(keyframe)) for keyframe in chosen]
 
 
 def measure_precision(
-    tracks: Tracks, part: Split, method: Method, threads: int, result: MethodResult
+    tracks: Tracks, part: SupportQuerySplit, method: Method, threads: int, result: MethodResult
 ) -> None:
-    """Add the share of right answers, and the time of the first queries on one thread."""
+    """Add the share of right answers, and the time of some queries on one thread, to a result."""
     queries = tracks.descriptors[part.query_rows]
     true = tracks.landmark_of_keypoint[part.query_rows]
-    # Queries are sorted by keyframe; an even draw is as hard as the whole.
+    # Queries are sorted by keyframe, so an even draw is as hard as the whole.
     timed = np.unique(np.linspace(0, len(queries) - 1, TIMED_QUERIES).astype(np.int64))
     began = time.perf_counter()
     answers, _ = method.match(queries[timed], threads=1)
@@ -138,13 +222,13 @@ def measure_precision(
 
 def measure_poses(
     tracks: Tracks,
-    frames: Sequence[pose.Frame],
+    frames: Sequence[QueryFrame],
     depth: float,
     method: Method,
     threads: int,
     result: MethodResult,
 ) -> None:
-    """Add how many frames were localized, and how many accepted matches were right."""
+    """Add how many frames were localized, and how many selected matches were right, to a result."""
     if not frames:
         return
     ends = np.cumsum([len(frame.keypoints) for frame in frames])
@@ -153,14 +237,9 @@ def measure_poses(
     )
     for frame, end in zip(frames, ends, strict=True):
         rows = slice(int(end) - len(frame.keypoints), int(end))
-        matches = pose.accept(landmarks[rows], distances[rows])
-        positions = positions_of(tracks, matches.landmarks)
+        matches = select_matches(landmarks[rows], distances[rows])
+        positions = tracks.positions_of(matches.landmarks)
         result.frames += 1
-        result.accepted += len(matches.landmarks)
-        result.right += int(pose.right(frame, matches, positions).sum())
-        result.found += pose.localize(frame, matches, positions).found(depth)
-
-
-def positions_of(tracks: Tracks, landmarks: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(n,) landmark ids that the tracks hold -> (n, 3) positions."""
-    return tracks.landmark_positions[np.searchsorted(tracks.landmark_ids, landmarks)]
+        result.selected += len(matches.landmarks)
+        result.right += int(right_matches(frame, matches, positions).sum())
+        result.found += localize_frame(frame, matches, positions).found(depth)

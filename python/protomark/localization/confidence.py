@@ -1,4 +1,4 @@
-"""How likely a pose is right, by the matches that agree with it."""
+"""How likely a pose is right, given the matches that agree with it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.logistic import sigmoid
-from protomark.tracks.file import Camera
+from protomark.geometry.camera import Camera
+from protomark.match_calibration import sigmoid
 
-# Inliers are counted once for each cell of a grid of so many cells a side: many inliers on one
+# Cells per side of a grid over the image, in which occupied cells are counted: many inliers on one
 # spot of the image say little.
 CELLS = 10
-# Fitted by benchmarks/localization_confidence.py to the training and validation sequences, with
-# codes of 16 and 32 numbers: the constant, and what `Evidence.features` counts.
+# Fitted by benchmarks/scripts/localization_confidence.py to the training and validation sequences,
+# with codes of 16 and 32 numbers: the constant, then the weights of `Evidence.features`.
 WEIGHTS = (-14.94, 3.716, 4.628, 3.015)
 
 
@@ -34,14 +34,14 @@ class Evidence:
 
     @classmethod
     def of(cls, camera: Camera, inliers: NDArray[np.float64], matches: int) -> Evidence:
-        """By the pixels (i, 2) of the inliers, and the number of accepted matches."""
+        """Evidence from the pixels (i, 2) of the inliers, and the number of accepted matches."""
         size = np.array([camera.width, camera.height])
         cell = np.clip(inliers * CELLS / size, 0, CELLS - 1).astype(np.int64)
         occupied = len(np.unique(cell[:, 0] * CELLS + cell[:, 1]))
         return cls(len(inliers), matches, occupied)
 
     def features(self) -> NDArray[np.float64]:
-        """(3,) float64, what the probability depends on."""
+        """The (3,) float64 that the probability depends on."""
         share = self.inliers / max(self.matches, 1)
         return np.array([np.log(max(self.inliers, 1)), share, np.log(max(self.cells, 1))])
 

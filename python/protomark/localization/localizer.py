@@ -1,75 +1,78 @@
-"""Poses of images in a map of prototypes."""
+"""The localizer: an image in, its pose in a map out."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.acceptance import Acceptance
-from protomark.localization.absolute_pose import FocalLength, check_camera
-from protomark.localization.frustum import PosePrior, visible
-from protomark.localization.solve import CANDIDATES, Localization, solve
+from protomark.features.descriptors import DESCRIPTORS
+from protomark.features.extractor import Extractor, Features
+from protomark.features.images import read_gray, to_gray
+from protomark.features.upright import SUFFIX, upright_descriptors
+from protomark.geometry.absolute_pose import FocalLength, check_pose_model
+from protomark.geometry.camera import Camera
+from protomark.localization.prior import PosePrior, visible
+from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
+from protomark.maps.open import open_map
+from protomark.match_calibration import MatchCalibration
 from protomark.matching import MIN_PROBABILITY
 from protomark.subset import Subset
-from protomark.tracks.features import DESCRIPTORS, Extractor, Features, read_gray
-from protomark.tracks.file import Camera
-from protomark.upright import SUFFIX, upright_descriptors
-
-# COLMAP's guess where nothing is known of a camera, times the longer side.
-_FOCAL_LENGTH = 1.2
 
 
 class Localizer:
     """Finds where images were taken.
 
-        localizer = pm.Localizer(pm.open("scene.pmk"))
-        result = localizer.localize("frame.jpg", camera)
+        localizer = pm.Localizer("scene.pmk")
+        result = localizer.localize("frame.jpg", "PINHOLE:525,525,320,240")
         result.cam_from_world, result.inliers, result.confidence, result.seconds
 
-    Each thread needs one of its own (OpenCV's detectors are not to be shared).
+    Each thread needs a localizer of its own, as OpenCV's detectors are not safe to share.
 
     Args:
-        scene: an open or a sealed map whose landmarks have positions.
-        max_keypoints: how many keypoints an image keeps.
+        scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
+            that `protomark map` wrote.
+        max_keypoints: the most keypoints to keep in an image.
         min_probability: a match is accepted if it is at least so likely to be right.
         threads: threads to encode and search on.
 
     Raises:
+        FileError: the file is not a map.
         ValueError: no landmark of the map has a position, or its encoder was not calibrated.
     """
 
     def __init__(
         self,
-        scene: pm.PrototypeMap | pm.SealedMap,
+        scene: pm.PrototypeMap | pm.SealedMap | str | Path,
         *,
         max_keypoints: int = 2000,
         min_probability: float = MIN_PROBABILITY,
         threads: int = 1,
     ) -> None:
-        self.scene = scene
+        self.scene = open_map(scene) if isinstance(scene, (str, Path)) else scene
         self.max_keypoints = max_keypoints
         self.min_probability = min_probability
         self.threads = threads
-        self._ids = scene.ids
-        self._positions = scene.positions(self._ids)
+        self._ids = self.scene.ids
+        self._positions = self.scene.positions(self._ids)
         if not np.isfinite(self._positions).all(axis=1).any():
             raise ValueError(
                 f"none of the map's {len(self._ids)} landmarks has a position, so no pose can be "
                 "found in it: set them with `set_positions`, or build the map from tracks"
             )
-        self.acceptance = Acceptance.of(scene.encoder, scene.dim)
+        self.calibration = MatchCalibration.of(self.scene.encoder, self.scene.dim)
         self._extractor: Extractor | None = None
 
     def localize(
         self,
         image: str | Path | NDArray[np.uint8],
-        camera: Camera | None = None,
+        camera: Camera | str | None = None,
         prior: PosePrior | None = None,
         *,
         focal_length: FocalLength = "known",
@@ -78,31 +81,37 @@ class Localizer:
 
         Args:
             image: a file, or (height, width) grey or (height, width, 3) BGR uint8.
-            camera: its camera; None: a pinhole whose focal length is estimated.
-            prior: roughly where it was taken: only landmarks that it makes visible are searched.
+            camera: its camera, or the camera written out as "MODEL:PARAMETERS"; None: a pinhole
+                whose focal length is estimated.
+            prior: a rough pose: only landmarks that it makes visible are searched.
             focal_length: "rough" to have the camera's refined, "unknown" to have it estimated.
 
         Raises:
             FileNotFoundError, ValueError: the image cannot be read, is not of the camera's size,
-                or the map's descriptor is none that this package computes.
+                or OpenCV does not compute the map's descriptor.
         """
-        seconds: dict[str, float] = {}
-        with _timed(seconds, "features"):
-            pixels = read_gray(Path(image)) if isinstance(image, (str, Path)) else _gray(image)
-            height, width = pixels.shape
-            if camera is not None and (camera.width, camera.height) != (width, height):
-                raise ValueError(
-                    f"the image has {width} x {height} pixels, its camera {camera.width} x "
-                    f"{camera.height}: scale one of them"
-                )
-            found = self._extract(pixels)
+        began = time.perf_counter()
+        gray = read_gray(Path(image)) if isinstance(image, (str, Path)) else to_gray(image)
+        height, width = gray.shape
+        if isinstance(camera, str):
+            camera = Camera.parse(camera)
+        if camera is None:
+            camera, focal_length = Camera.guess(width, height), "unknown"
+        elif not camera.width:
+            camera = replace(camera, width=width, height=height)
+        elif (camera.width, camera.height) != (width, height):
+            raise ValueError(
+                f"the image has {width} x {height} pixels, its camera {camera.width} x "
+                f"{camera.height}: scale one of them"
+            )
+        features = self._extract(gray)
         return self.localize_features(
-            found.keypoints,
-            found.descriptors,
-            camera or guessed_camera(width, height),
+            features.keypoints,
+            features.descriptors,
+            camera,
             prior,
-            focal_length=focal_length if camera is not None else "unknown",
-            seconds=seconds,
+            focal_length=focal_length,
+            seconds={"features": time.perf_counter() - began},
         )
 
     def localize_features(
@@ -118,78 +127,58 @@ class Localizer:
         """The pose of a frame whose keypoints are described already.
 
         Args:
-            keypoints: (n, 2), pixels, the centre of the upper left one at (0.5, 0.5).
+            keypoints: (n, 2), pixels; the centre of the upper left pixel is (0.5, 0.5).
             descriptors: (n, bits / 8) uint8, those that the map's encoder takes.
             camera: the frame's camera.
             prior: see `localize`.
             focal_length: see `localize`.
-            seconds: what earlier stages took, by name.
+            seconds: time of earlier stages, by name.
 
         Raises:
-            ValueError: lengths differ, descriptors are not the encoder's, or no pose can be found
-                for cameras of this model.
+            ValueError: lengths differ, descriptors are not the encoder's, or poses cannot be
+                estimated for cameras of this model.
         """
-        check_camera(camera)
+        check_pose_model(camera)
         if len(keypoints) != len(descriptors):
             raise ValueError(f"{len(keypoints)} keypoints, but {len(descriptors)} descriptors")
-        seconds = dict(seconds or {})
-        with _timed(seconds, "encode"):
+        stages = dict(seconds or {})
+        with _timed(stages, "encode"):
             codes = self.scene.encoder.encode(descriptors, self.scene.dim, self.threads)
-        with _timed(seconds, "search"):
+        with _timed(stages, "search"):
             searched: pm.PrototypeMap | pm.SealedMap | Subset = self.scene
             if prior is not None:
                 searched = Subset(self.scene, self._ids[visible(prior, camera, self._positions)])
             ids, distances = searched.search_codes(codes, k=CANDIDATES, threads=self.threads)
-        return solve(
-            np.asarray(keypoints, np.float64).reshape(-1, 2),
-            camera,
-            ids,
-            self._positions_of(ids),
-            self.acceptance.probability(distances),
-            self.min_probability,
-            focal_length,
-            seconds,
-        )
+        with _timed(stages, "pose"):
+            candidates = Candidates(
+                np.asarray(keypoints, np.float64).reshape(-1, 2),
+                ids,
+                self._positions_of(ids),
+                self.calibration.probability(distances),
+            )
+            result = solve_pose(candidates, camera, self.min_probability, focal_length)
+        return replace(result, seconds={**stages, "total": sum(stages.values())})
 
     def _positions_of(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(...) ids, -1 for none -> (..., 3), NaN where there is no position."""
+        """Positions (..., 3) of ids (...), NaN where the id is -1 or has no position."""
         where = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
         return np.where((ids >= 0)[..., None], self._positions[where], np.nan)
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:
-        takes = self.scene.encoder.descriptor
+        descriptor = self.scene.encoder.descriptor
         if self._extractor is None:
-            if takes.removesuffix(SUFFIX) not in DESCRIPTORS:
+            if descriptor.removesuffix(SUFFIX) not in DESCRIPTORS:
                 raise ValueError(
-                    f"the map's encoder takes {takes} descriptors, which OpenCV does not compute: "
-                    "describe the keypoints yourself and call localize_features"
+                    f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
+                    "compute: describe the keypoints yourself and call localize_features"
                 )
-            self._extractor = Extractor(takes.removesuffix(SUFFIX), self.max_keypoints)
-        found = self._extractor(image)
-        if takes.endswith(SUFFIX):
-            found.descriptors = upright_descriptors(found.descriptors, found.angles, found.sizes)
-        return found
-
-
-def guessed_camera(width: int, height: int) -> Camera:
-    """A pinhole camera as COLMAP guesses it."""
-    focal = _FOCAL_LENGTH * max(width, height)
-    return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
-
-
-def _gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or 0 in image.shape:
-        raise ValueError(
-            f"an image is (height, width) or (height, width, 3) uint8, not {image.shape} "
-            f"{image.dtype}"
-        )
-    if image.ndim == 2:
-        return image
-    import cv2
-
-    if image.shape[2] != 3:
-        raise ValueError(f"an image has 3 colours, not {image.shape[2]}")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+            self._extractor = Extractor(descriptor.removesuffix(SUFFIX), self.max_keypoints)
+        features = self._extractor(image)
+        if descriptor.endswith(SUFFIX):
+            features.descriptors = upright_descriptors(
+                features.descriptors, features.angles, features.sizes
+            )
+        return features
 
 
 @contextmanager

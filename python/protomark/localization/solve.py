@@ -1,47 +1,40 @@
-"""From the nearest landmarks of a frame's keypoints to its pose."""
+"""Solves the pose of a frame from the nearest landmarks of its keypoints."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.localization.absolute_pose import (
-    AbsolutePose,
-    FocalLength,
-    estimate,
-    project,
-    refine,
-)
+from protomark.geometry.absolute_pose import AbsolutePose, FocalLength, estimate_pose, refine_pose
+from protomark.geometry.camera import Camera
+from protomark.geometry.pose import transform
 from protomark.localization.confidence import Evidence, confidence
-from protomark.matching import MIN_PROBABILITY, accept
-from protomark.tracks.file import Camera
+from protomark.matching import accept
 
 # Reprojection error of an inlier, as a share of the image's longer side.
-TOLERANCE = 0.005
-# So many nearest landmarks of a keypoint are tried once there is a pose.
+MAX_ERROR = 0.005
+# So many nearest landmarks of a keypoint are considered once there is a pose.
 CANDIDATES = 3
 MIN_MATCHES = 4
-_NOTHING = Evidence(0, 0, 0)
+_NO_EVIDENCE = Evidence(0, 0, 0)
 
 
 @dataclass(frozen=True)
 class Localization:
-    """What came of localizing one frame.
+    """The result of localizing one frame.
 
     Attributes:
         camera: the frame's camera, with another focal length where that was estimated.
         cam_from_world: (3, 4) float64, or None where no pose was found.
         keypoints: (i,) int64, rows of the keypoints that agree with the pose.
         pixels: (i, 2) float64, where they are in the image.
-        landmarks: (i,) int64, which landmarks they see.
+        landmarks: (i,) int64, ids of the landmarks that they see.
         evidence: what speaks for the pose.
         confidence: probability that the pose is right, 0 without one.
         reason: why there is no pose, else "".
-        seconds: what each stage took: features, encode, search, pose, and total.
+        seconds: time of each stage: features, encode, search, pose, and total.
     """
 
     camera: Camera
@@ -49,7 +42,7 @@ class Localization:
     keypoints: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     landmarks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    evidence: Evidence = _NOTHING
+    evidence: Evidence = _NO_EVIDENCE
     confidence: float = 0.0
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -59,59 +52,59 @@ class Localization:
         """Number of keypoints that agree with the pose."""
         return len(self.keypoints)
 
+    def __repr__(self) -> str:
+        """One line, without the arrays."""
+        if self.cam_from_world is None:
+            return f"<protomark.Localization: no pose, {self.reason}>"
+        return (
+            f"<protomark.Localization: {self.inliers} inliers of {self.evidence.matches} matches, "
+            f"confidence {self.confidence:.3f}>"
+        )
 
-def solve(
-    keypoints: NDArray[np.float64],
-    camera: Camera,
-    ids: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
-    min_probability: float = MIN_PROBABILITY,
-    focal_length: FocalLength = "known",
-    seconds: Mapping[str, float] | None = None,
+
+@dataclass(frozen=True)
+class Candidates:
+    """The nearest landmarks of the keypoints of a frame.
+
+    Attributes:
+        keypoints: (n, 2) float64, pixels.
+        landmarks: (n, c) int64, ids of the nearest landmarks, -1 where there is none.
+        positions: (n, c, 3) float64, their positions, NaN where there is none.
+        probabilities: (n,) float64, that the nearest landmark is the right one.
+    """
+
+    keypoints: NDArray[np.float64]
+    landmarks: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    probabilities: NDArray[np.float64]
+
+
+def solve_pose(
+    candidates: Candidates, camera: Camera, min_probability: float, focal_length: FocalLength
 ) -> Localization:
     """RANSAC over the likely matches; then keypoints may see any of their nearest landmarks.
 
     Args:
-        keypoints: (n, 2) float64, pixels.
+        candidates: the nearest landmarks of each keypoint.
         camera: the frame's camera.
-        ids: (n, c) int64, the nearest landmarks of each keypoint, -1 where there is none.
-        positions: (n, c, 3) float64, theirs, NaN where there is none.
-        probabilities: (n,) float64, that the nearest landmark is the right one.
         min_probability: of a match that RANSAC gets.
         focal_length: what is known of the camera's focal length.
-        seconds: what earlier stages took, by name.
     """
-    began = time.perf_counter()
-    result = _solve(keypoints, camera, ids, positions, probabilities, min_probability, focal_length)
-    stages = {**(seconds or {}), "pose": time.perf_counter() - began}
-    return replace(result, seconds={**stages, "total": sum(stages.values())})
-
-
-def _solve(
-    keypoints: NDArray[np.float64],
-    camera: Camera,
-    ids: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    probabilities: NDArray[np.float64],
-    min_probability: float,
-    focal_length: FocalLength,
-) -> Localization:
-    placed = np.isfinite(positions).all(axis=2)
-    ids = np.where(placed, ids, -1)
+    keypoints, positions = candidates.keypoints, candidates.positions
+    landmarks = np.where(np.isfinite(positions).all(axis=2), candidates.landmarks, -1)
     if len(keypoints) < MIN_MATCHES:
         return Localization(camera, reason=f"{len(keypoints)} keypoints: blurred, dark or empty")
-    matches = accept(ids[:, 0], probabilities, min_probability)
+    matches = accept(landmarks[:, 0], candidates.probabilities, min_probability)
     evidence = Evidence(0, len(matches), 0)
     if len(matches) < MIN_MATCHES:
         reason = f"{len(matches)} likely matches of {len(keypoints)} keypoints: another place?"
         return Localization(camera, evidence=evidence, reason=reason)
-    tolerance = TOLERANCE * max(camera.width, camera.height)
-    found = estimate(
+    max_error = MAX_ERROR * max(camera.width, camera.height)
+    found = estimate_pose(
         keypoints[matches.keypoints],
         positions[matches.keypoints, 0],
         camera,
-        tolerance,
+        max_error,
         focal_length,
     )
     if found is None:
@@ -119,13 +112,13 @@ def _solve(
         return Localization(camera, evidence=evidence, reason=reason)
     agreeing = matches.keypoints[found.inliers]
     evidence = Evidence.of(found.camera, keypoints[agreeing], len(matches))
-    pose, rows, columns = _complete(found, keypoints, ids, positions, tolerance)
+    pose, rows, columns = _complete(found, keypoints, landmarks, positions, max_error)
     return Localization(
         found.camera,
         pose,
         rows,
         keypoints[rows],
-        ids[rows, columns],
+        landmarks[rows, columns],
         evidence,
         confidence(evidence),
     )
@@ -134,42 +127,41 @@ def _solve(
 def _complete(
     found: AbsolutePose,
     keypoints: NDArray[np.float64],
-    ids: NDArray[np.int64],
+    landmarks: NDArray[np.int64],
     positions: NDArray[np.float64],
-    tolerance: float,
+    max_error: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """The pose refined on all keypoints one of whose nearest landmarks projects to them.
+    """Refine the pose on all keypoints to which one of their nearest landmarks projects.
 
     Returns:
         The pose, and the inliers: rows of keypoints and columns of their landmarks.
     """
-    pose = found.cam_from_world
-    rows, columns = _agreeing(pose, found, keypoints, ids, positions, tolerance)
+    pose, camera = found.cam_from_world, found.camera
+    rows, columns = _agreeing(pose, camera, keypoints, landmarks, positions, max_error)
     if len(rows) >= MIN_MATCHES:
-        pose = refine(pose, keypoints[rows], positions[rows, columns], found.camera, tolerance)
-        rows, columns = _agreeing(pose, found, keypoints, ids, positions, tolerance)
+        pose, _ = refine_pose(pose, keypoints[rows], positions[rows, columns], camera, max_error)
+        rows, columns = _agreeing(pose, camera, keypoints, landmarks, positions, max_error)
     return pose, rows, columns
 
 
 def _agreeing(
     pose: NDArray[np.float64],
-    found: AbsolutePose,
+    camera: Camera,
     keypoints: NDArray[np.float64],
-    ids: NDArray[np.int64],
+    landmarks: NDArray[np.int64],
     positions: NDArray[np.float64],
-    tolerance: float,
+    max_error: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the candidates within the tolerance; a landmark and a keypoint once."""
-    shape = ids.shape
-    there = ids >= 0
-    pixels = np.full((*shape, 2), np.inf)
-    pixels[there] = project(found.camera, pose, positions[there])
+    """Rows and columns of the candidates within the error; each landmark and keypoint once."""
+    present = landmarks >= 0
+    pixels = np.full((*landmarks.shape, 2), np.inf)
+    pixels[present] = camera.project(transform(pose, positions[present]))
     error = np.linalg.norm(pixels - keypoints[:, None], axis=2)
-    inside = error <= tolerance
+    inside = error <= max_error
     rows = np.flatnonzero(inside.any(axis=1))
     columns = inside[rows].argmax(axis=1)
-    # Of the keypoints that see one landmark the nearest to its projection keeps it.
-    order = np.lexsort((error[rows, columns], ids[rows, columns]))
-    _, first = np.unique(ids[rows, columns][order], return_index=True)
-    kept = np.sort(order[first])
-    return rows[kept], columns[kept]
+    # Of several keypoints that see one landmark, the nearest to its projection keeps it.
+    order = np.lexsort((error[rows, columns], landmarks[rows, columns]))
+    _, first = np.unique(landmarks[rows, columns][order], return_index=True)
+    unique = np.sort(order[first])
+    return rows[unique], columns[unique]

@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from protomark.mapping.structure import Array, Ids, Observations, Structure
-from protomark.tracks.colmap import pycolmap, quiet
-from protomark.tracks.file import Camera
-from protomark.tracks.geometry import refine_points
+from protomark.geometry.camera import Camera
+from protomark.geometry.colmap import pycolmap, quiet
+from protomark.geometry.triangulation import refine_points
+from protomark.mapping.frame import Array, Ids
+from protomark.mapping.structure import Observations, Structure
 
-# Points of a frame that take part, those seen most often: more cost time, not error. The others
-# follow with poses as they are.
+# The most-seen points of a frame take part in the adjustment; more cost time and do not lower the
+# error. The others are refined afterwards, with the poses fixed.
 _POINTS_PER_POSE = 250
-# Keyframes outside of the neighbourhood that hold it in place, those that share most with it.
+# Keyframes outside of the neighbourhood that are held fixed, those that share most with it.
 _MAX_FIXED = 15
 
 
@@ -23,12 +24,12 @@ def adjust_local(structure: Structure, newest: int, size: int, iterations: int) 
 
     Args:
         structure: frames and landmarks; changed.
-        newest: a keyframe, a place in `structure.frames`.
-        size: keyframes that move.
+        newest: a keyframe, an index into `structure.frames`.
+        size: number of keyframes that move.
         iterations: most steps of the solver.
 
     Returns:
-        Places of the frames that were moved.
+        Indices of the frames that were moved.
     """
     shared = _shared(structure, np.unique(structure.frames[newest].seen))
     shared.pop(newest, None)
@@ -53,11 +54,11 @@ def adjust_global(
     keyframes = structure.keyframes()
     moving, fixed = (keyframes, []) if poses else ([], keyframes)
     adjust(structure, moving, fixed, iterations, loss_scale, intrinsics, threads)
-    structure.look_again()
+    structure.recompute_views()
 
 
 def _shared(structure: Structure, ids: Ids) -> dict[int, int]:
-    """For each keyframe that sees some of the landmarks, how many."""
+    """Number of the given landmarks that each keyframe sees, where it sees any."""
     wanted = np.zeros(len(structure.positions), bool)
     wanted[ids] = True
     frames, landmarks = structure.pairs(structure.keyframes())
@@ -78,38 +79,38 @@ def adjust(
 
     Args:
         structure: changed.
-        moving: places of keyframes that move.
-        fixed: places of keyframes that see the same and stay.
+        moving: indices of keyframes that move.
+        fixed: indices of keyframes that see the same landmarks and are held fixed.
         iterations: most steps of the solver.
-        loss_scale: pixels from where an error counts less.
+        loss_scale: errors beyond so counts pixels count less.
         intrinsics: whether focal length and distortion move, too.
-        threads: threads of the solver; more than one change the last digits.
+        threads: threads of the solver; their number changes the last digits.
     """
     seen = structure.observations(sorted({*moving, *fixed}))
-    many = np.bincount(seen.landmarks, minlength=len(structure.positions))
-    seen = seen.where(many[seen.landmarks] >= 2)
+    counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
+    seen = seen.where(counts[seen.landmarks] >= 2)
     if moving:
-        used = seen.where(np.isin(seen.landmarks, _chosen(seen, many, set(moving))))
+        used = seen.where(np.isin(seen.landmarks, _most_seen(seen, counts, set(moving))))
         before = {i: structure.frames[i].pose for i in moving}
         reconstruction = _problem(structure, used)
         _solve(reconstruction, used, moving, fixed, iterations, loss_scale, intrinsics, threads)
-        _take_over(structure, reconstruction, used, moving, intrinsics)
-        _carry(structure, np.setdiff1d(seen.landmarks, used.landmarks), before)
+        _read_back(structure, reconstruction, used, moving, intrinsics)
+        _move_with_frames(structure, np.setdiff1d(seen.landmarks, used.landmarks), before)
     seen = structure.observations(sorted({*moving, *fixed}))
-    seen = seen.where(many[seen.landmarks] >= 2)
+    seen = seen.where(counts[seen.landmarks] >= 2)
     structure.positions = refine_points(
         structure.positions, seen.landmarks, seen.poses, seen.rays, seen.focal
     )
 
 
-def _chosen(seen: Observations, many: Ids, moving: set[int]) -> Ids:
+def _most_seen(seen: Observations, counts: Ids, moving: set[int]) -> Ids:
     """The landmarks seen most often, enough for each frame."""
     order = np.argsort(seen.landmarks, kind="stable")
     ids, starts = np.unique(seen.landmarks[order], return_index=True)
     viewers = np.split(seen.frames[order], starts[1:])
     have: dict[int, int] = dict.fromkeys(np.unique(seen.frames).tolist(), 0)
     out = []
-    for k in np.argsort(-many[ids], kind="stable").tolist():
+    for k in np.argsort(-counts[ids], kind="stable").tolist():
         frames = viewers[k].tolist()
         if any(have[i] < _POINTS_PER_POSE for i in frames if i in moving):
             out.append(ids[k])
@@ -119,7 +120,7 @@ def _chosen(seen: Observations, many: Ids, moving: set[int]) -> Ids:
 
 
 def _problem(structure: Structure, seen: Observations) -> Any:
-    """A pycolmap.Reconstruction of these observations; image and camera ids as ours plus one."""
+    """A pycolmap.Reconstruction of these observations; image ids are frame indices plus one."""
     reconstruction = pycolmap.Reconstruction()
     places = np.unique(seen.frames).tolist()
     for camera_id in sorted({structure.frames[i].camera_id for i in places}):
@@ -137,7 +138,7 @@ def _problem(structure: Structure, seen: Observations) -> Any:
             keypoints=frame.keypoints[seen.rows[mine]].astype(np.float64),
         )
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.pose))
-    # Each look-up in the reconstruction takes longer than all else that an observation needs.
+    # Access through the reconstruction takes longer than all else that an observation needs.
     images = {i + 1: reconstruction.images[i + 1] for i in places}
     order = np.argsort(seen.landmarks, kind="stable")
     ids, starts = np.unique(seen.landmarks[order], return_index=True)
@@ -181,19 +182,19 @@ def _solve(
         config.set_constant_rig_from_world_pose(i + 1)
     if len(held) < 2:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not pycolmap.bundle_adjustment, which writes to the terminal.
+    # pycolmap.bundle_adjustment would write to the terminal.
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
     with quiet():
         adjuster.solve()
 
 
-def _take_over(
+def _read_back(
     structure: Structure, reconstruction: Any, seen: Observations, moving: list[int], cameras: bool
 ) -> None:
     present = set(np.unique(seen.frames).tolist())
     for i in moving:
         if i in present:
-            # In C order as after loading: the layout decides the last digits of what is made of it.
+            # In C order, as after loading: the memory layout decides the last digits of products.
             pose = np.ascontiguousarray(reconstruction.images[i + 1].cam_from_world().matrix())
             if np.isfinite(pose).all():
                 structure.frames[i].pose = pose
@@ -209,8 +210,8 @@ def _take_over(
                 structure.set_camera(camera_id, Camera(ours.model, ours.width, ours.height, params))
 
 
-def _carry(structure: Structure, ids: Ids, before: dict[int, Array]) -> None:
-    """Move landmarks along with the first frame that moved and sees them."""
+def _move_with_frames(structure: Structure, ids: Ids, before: dict[int, Array]) -> None:
+    """Move landmarks that took no part along with the first moved frame that sees them."""
     left = np.zeros(len(structure.positions), bool)
     left[ids] = True
     for i, old in before.items():

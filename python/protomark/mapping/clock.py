@@ -1,4 +1,4 @@
-"""Where the time goes."""
+"""Measures how long each stage takes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ STAGES = ("detect", "encode", "initialise", "match", "triangulate", "adjust", "o
 
 
 class Clock:
-    """Seconds by stage; stages may be nested, and then count for the inner one.
+    """Seconds by stage; time in a nested stage counts for the inner one only.
 
     Args:
-        now: what time it is; `time.process_time` leaves out what other programs take.
+        now: the clock; `time.process_time` leaves out what other programs take.
     """
 
     def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:

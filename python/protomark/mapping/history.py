@@ -1,4 +1,4 @@
-"""What became of each frame, and how the map grew."""
+"""Records what became of each frame, and how the map grew."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ REGISTERED = "registered"
 
 
 @dataclass
-class Entry:
+class FrameRecord:
     """One frame of the input.
 
     Attributes:
@@ -43,28 +43,30 @@ class Entry:
 
 @dataclass
 class History:
-    """Entries by frame, in the order in which frames came, and what happened beside.
+    """Records of all frames, in the order in which they came, and events.
 
     Attributes:
-        entries: name of the frame -> its entry.
+        records: name of the frame -> its record.
         events: sentences such as "frame 31: a place seen before, 45 landmarks merged".
-        later: seconds by stage that belong to no frame (second looks, last adjustment).
+        closing_seconds: seconds by stage that belong to no frame (retries, last adjustment).
     """
 
-    entries: dict[str, Entry] = field(default_factory=dict)
+    records: dict[str, FrameRecord] = field(default_factory=dict)
     events: list[str] = field(default_factory=list)
-    later: dict[str, float] = field(default_factory=dict)
+    closing_seconds: dict[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
-            "entries": [vars(entry) for entry in self.entries.values()],
+            "records": [vars(record) for record in self.records.values()],
             "events": self.events,
-            "later": self.later,
+            "closing_seconds": self.closing_seconds,
         }
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> History:
         """Back from `as_dict`."""
-        entries = [Entry(**entry) for entry in values["entries"]]
-        return cls({e.name: e for e in entries}, list(values["events"]), dict(values["later"]))
+        records = [FrameRecord(**record) for record in values["records"]]
+        return cls(
+            {e.name: e for e in records}, list(values["events"]), dict(values["closing_seconds"])
+        )

@@ -1,49 +1,53 @@
-"""The first two frames: their relative pose, once there is enough parallax to trust it."""
+"""Finds the first two frames of a map: a pair with enough parallax to trust its relative pose."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-import protomark as pm
-from protomark.localization.absolute_pose import MAX_ITERATIONS, MIN_ITERATIONS
-from protomark.mapping.pose import absolute_pose, reprojection_error
-from protomark.mapping.sighting import Sighting
-from protomark.mapping.structure import Array, Ids
-from protomark.tracks.colmap import focal_length
-from protomark.tracks.file import Camera
-from protomark.tracks.geometry import depth_of_first, epipolar_error
+from protomark._core import hamming_search
+from protomark.extras import optional
+from protomark.geometry.absolute_pose import (
+    MAX_ITERATIONS,
+    MIN_ITERATIONS,
+    estimate_pose,
+    reprojection_error,
+)
+from protomark.geometry.camera import Camera
+from protomark.geometry.triangulation import depth_of_first, epipolar_error
+from protomark.mapping.frame import Array, Frame, Ids
 
 RATIO = 0.8
 # Fewest matches that must agree with the relative pose.
 _MIN_MATCHES = 60
 # Median angle between the two rays of a match, degrees.
-_MIN_PARALLAX = 2.0
-# Where this share of matches is explained by a turn on the spot, there is no parallax.
-_MAX_TURNED = 0.7
-# Share of the landmarks that other frames see which must agree with a pose of that frame, within
-# three quarters of the largest error; and the lead over any other relative pose, which is larger
-# where there are few such frames.
+MIN_PARALLAX = 2.0
+# If a rotation alone explains this share of the matches, there is no parallax.
+_MAX_ROTATED = 0.7
+# Share of the landmarks that a third frame sees which must agree with a pose of that frame, within
+# three quarters of the largest error; and the lead over any other relative pose, which must be
+# larger where there are few such frames.
 _MIN_SUPPORT = 0.7
-_LEAD = 1.05
-_LEAD_OF_FEW = 1.2
-_FEW = 2
-_WITNESSES = 4
+_MIN_LEAD = 1.05
+_MIN_LEAD_OF_FEW = 1.2
+_FEW_WITNESSES = 2
+_MAX_WITNESSES = 4
 _MIN_COMMON = 40
-# When more wait, every second one goes; it is looked for at the end.
+# When more frames wait, every second one is dropped until the end, when lost frames are retried.
 _MAX_WAITING = 40
-# A new frame is tried with so many of them at most, from the oldest to the newest.
-_PARTNERS = 10
+# A new frame is tried with at most so many of them, from the oldest to the newest.
+_MAX_PARTNERS = 10
 
 
 @dataclass
-class TwoView:
+class TwoViewPose:
     """The relative pose of two frames, the first one at the origin.
 
     Attributes:
-        first: place in `Initialiser.waiting`.
-        second: place in `Initialiser.waiting`.
+        first: index into `Initialiser.waiting`.
+        second: index into `Initialiser.waiting`.
         pose: (3, 4) float64, of the second; the translation has length 1.
     """
 
@@ -55,8 +59,8 @@ class TwoView:
 class Initialiser:
     """Collects frames until two of them show the scene from places far enough apart.
 
-    Two views of a plane fit two relative poses, and of little depth nearly so. Other frames that
-    wait tell which is right: landmarks of a wrong one do not fit where these saw them.
+    Two views of a plane fit two relative poses, and views of little depth nearly do. Other waiting
+    frames, the witnesses, decide: landmarks of a wrong pose do not project where these saw them.
 
     Args:
         camera: camera of all frames.
@@ -65,27 +69,27 @@ class Initialiser:
 
     def __init__(self, camera: Camera, max_error: float) -> None:
         self.camera, self.max_error = camera, max_error
-        self.waiting: list[Sighting] = []
+        self.waiting: list[Frame] = []
         self.best_parallax = 0.0
-        self._focal = focal_length(camera)
+        self._focal = camera.focal_length
         self._matches: dict[tuple[str, str], Ids] = {}
 
-    def push(self, sighting: Sighting) -> TwoView | None:
-        """Try the new frame with those that wait, the oldest first; it then waits, too.
+    def push(self, frame: Frame) -> TwoViewPose | None:
+        """Try a new frame with the waiting ones, the oldest first, and let it wait, too.
 
-        With many that wait, some spread evenly over them are tried.
+        If many wait, some of them, spread evenly, are tried.
         """
-        self.waiting.append(sighting)
+        self.waiting.append(frame)
         if len(self.waiting) > _MAX_WAITING:
-            # Not the oldest: a slow video needs a long way back.
+            # The oldest stays, as a slow video needs a long baseline.
             del self.waiting[1:-1:2]
             self._matches.clear()
         last = len(self.waiting) - 1
-        partners = np.linspace(0, last - 1, min(last, _PARTNERS)).round().astype(int)
+        partners = np.linspace(0, last - 1, min(last, _MAX_PARTNERS)).round().astype(int)
         for first in partners.tolist():
             pose = self._relative_pose(first, last)
             if pose is not None:
-                return TwoView(first, last, pose)
+                return TwoViewPose(first, last, pose)
         return None
 
     def _relative_pose(self, first: int, second: int) -> Array | None:
@@ -94,14 +98,14 @@ class Initialiser:
         if len(rows) < _MIN_MATCHES:
             return None
         rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
-        # Most pairs of a video end here, for little time.
-        if _turned(np.eye(3), *rays, self.max_error / self._focal) > _MAX_TURNED:
+        # A cheap test that most pairs of a video fail.
+        if _rotated_share(np.eye(3), *rays, self.max_error / self._focal) > _MAX_ROTATED:
             return None
         candidates = self._candidates(one, other, rows)
         if not candidates:
             return None
         parallax = [self._parallax(pose, *rays) for pose in candidates]
-        if max(parallax) < _MIN_PARALLAX:
+        if max(parallax) < MIN_PARALLAX:
             self.best_parallax = max(self.best_parallax, *parallax)
             return None
         witnesses = self._witnesses(first, second)
@@ -111,18 +115,17 @@ class Initialiser:
         if share < _MIN_SUPPORT:
             return None
         self.best_parallax = max(self.best_parallax, parallax[best])
-        if parallax[best] < _MIN_PARALLAX:
+        if parallax[best] < MIN_PARALLAX:
             return None
-        lead = _LEAD if len(witnesses) > _FEW else _LEAD_OF_FEW
+        lead = _MIN_LEAD if len(witnesses) > _FEW_WITNESSES else _MIN_LEAD_OF_FEW
         for pose, (rival, _) in zip(candidates, scores, strict=True):
             if support < lead * rival and not _alike(pose, candidates[best]):
                 return None
         return candidates[best]
 
-    def _candidates(self, one: Sighting, other: Sighting, rows: Ids) -> list[Array]:
-        """The relative pose that fits best, and those that the scene as a plane allows."""
-        import poselib
-
+    def _candidates(self, one: Frame, other: Frame, rows: Ids) -> list[Array]:
+        """The relative pose that fits best, and those that a planar scene allows."""
+        poselib = optional("poselib")
         camera, focal = self.camera.as_dict(), self._focal
         a, b = (s.keypoints[rows[:, k]].astype(np.float64) for k, s in enumerate((one, other)))
         sampling = {"min_iterations": MIN_ITERATIONS, "max_iterations": MAX_ITERATIONS, "seed": 0}
@@ -134,7 +137,7 @@ class Initialiser:
         ray_a, ray_b = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
         pose = np.asarray(found.Rt, np.float64)
         limit = self.max_error / focal
-        if _turned(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_TURNED:
+        if _rotated_share(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_ROTATED:
             return []
         plane, facts = poselib.estimate_homography(
             focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, **sampling}, {}
@@ -153,19 +156,20 @@ class Initialiser:
             if not np.isfinite(pose).all() or length < 1e-9:
                 continue
             pose[:, 3] /= length
-            good = self._good(pose, ray_a, ray_b)[0]
+            good = self._verify(pose, ray_a, ray_b)[0]
             if good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
                 out.append(pose)
         return out
 
     def _parallax(self, pose: Array, ray_a: Array, ray_b: Array) -> float:
         """Median angle between the two rays of a match, degrees."""
-        good, _, angle = self._good(pose, ray_a, ray_b)
+        good, _, angle = self._verify(pose, ray_a, ray_b)
         return float(np.degrees(np.median(angle[good])))
 
-    def _good(
+    def _verify(
         self, pose: Array, ray_a: Array, ray_b: Array
-    ) -> tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], Array, Array]:
+    ) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which matches fit a pose, the depth in the first frame and the angle of each."""
         rotation, translation = pose[:, :3], pose[:, 3]
         depth, angle = depth_of_first(rotation, translation, ray_a, ray_b)
         error = epipolar_error(rotation, translation, ray_a, ray_b) * self._focal
@@ -173,16 +177,16 @@ class Initialiser:
         good = (depth > 0) & (depth * in_second + translation[2] > 0) & (error <= self.max_error)
         return good, depth, angle
 
-    def _witnesses(self, first: int, second: int) -> list[tuple[Sighting, Ids]]:
-        """Other frames, rather those between, with their matches with the first one."""
+    def _witnesses(self, first: int, second: int) -> list[tuple[Frame, Ids]]:
+        """Other frames, those between first, with their matches with the first one."""
         between = list(range(first + 1, second))
         near = sorted(set(range(second)) - {first, *between}, key=lambda i: abs(i - first))
-        at = np.linspace(0, len(between) - 1, min(_WITNESSES, len(between))).round().astype(int)
-        chosen = [between[k] for k in at] + near[: max(0, _WITNESSES - len(at))]
+        at = np.linspace(0, len(between) - 1, min(_MAX_WITNESSES, len(between))).round().astype(int)
+        chosen = [between[k] for k in at] + near[: max(0, _MAX_WITNESSES - len(at))]
         one = self.waiting[first]
         return [(self.waiting[i], self._match(one, self.waiting[i])) for i in chosen]
 
-    def _match(self, one: Sighting, other: Sighting) -> Ids:
+    def _match(self, one: Frame, other: Frame) -> Ids:
         key = one.name, other.name
         if key not in self._matches:
             self._matches[key] = match(one, other)
@@ -190,17 +194,17 @@ class Initialiser:
 
     def _support(
         self,
-        one: Sighting,
-        other: Sighting,
+        one: Frame,
+        other: Frame,
         rows: Ids,
         pose: Array,
-        witnesses: list[tuple[Sighting, Ids]],
+        witnesses: list[tuple[Frame, Ids]],
     ) -> tuple[float, float]:
-        """How well landmarks of this relative pose fit what others saw, and which share fits.
+        """How well landmarks of this relative pose fit the witnesses: a score, and the share.
 
-        The first counts each landmark as 1 less its squared error over the squared limit.
+        The score counts each landmark as 1 less its squared error over the squared limit.
         """
-        good, depth, _ = self._good(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
+        good, depth, _ = self._verify(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
         points = np.full((len(one.keypoints), 3), np.nan)
         at = rows[good, 0]
         points[at] = np.column_stack([one.rays[at], np.ones(len(at))]) * depth[good, None]
@@ -213,36 +217,39 @@ class Initialiser:
             pixels = witness.keypoints[pairs[known, 1]].astype(np.float64)
             seen = points[pairs[known, 0]]
             total += len(seen)
-            found = absolute_pose(self.camera, pixels, seen, limit)
+            found = estimate_pose(pixels, seen, self.camera, limit)
             if found is not None:
-                error = reprojection_error(self.camera, pixels, seen, found[0])
+                error = reprojection_error(found.cam_from_world, pixels, seen, self.camera)
                 fit += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
                 fitting += int((error <= limit).sum())
         return fit, fitting / max(total, 1)
 
 
 def _alike(first: Array, second: Array) -> bool:
-    turn = np.linalg.norm(first[:, :3] - second[:, :3]) / np.sqrt(8)
-    way = float(first[:, 3] @ second[:, 3])
-    return bool(2 * np.degrees(np.arcsin(min(turn, 1.0))) < 1 and way > np.cos(np.radians(10)))
+    """Whether two relative poses differ by less than 1 degree, and 10 degrees of direction."""
+    chord = np.linalg.norm(first[:, :3] - second[:, :3]) / np.sqrt(8)
+    cosine = float(first[:, 3] @ second[:, 3])
+    return bool(2 * np.degrees(np.arcsin(min(chord, 1.0))) < 1 and cosine > np.cos(np.radians(10)))
 
 
-def match(first: Sighting, second: Sighting) -> Ids:
-    """(k, 2) mutual nearest neighbours that pass the ratio test."""
+def match(first: Frame, second: Frame) -> Ids:
+    """Mutual nearest neighbours (k, 2) that pass the ratio test."""
+    assert first.descriptors is not None
+    assert second.descriptors is not None
     if len(first.descriptors) < 2 or len(second.descriptors) < 2:
         return np.zeros((0, 2), np.int64)
-    index, distance = pm.hamming_search(first.descriptors, second.descriptors, k=2)
+    index, distance = hamming_search(first.descriptors, second.descriptors, k=2)
     rows = np.flatnonzero(distance[:, 0] < RATIO * distance[:, 1])
     target = index[rows, 0]
-    back, _ = pm.hamming_search(second.descriptors[target], first.descriptors, k=1)
+    back, _ = hamming_search(second.descriptors[target], first.descriptors, k=1)
     mutual = back[:, 0] == rows
     return np.column_stack([rows[mutual], target[mutual]]).astype(np.int64)
 
 
-def _turned(rotation: Array, first: Array, second: Array, limit: float) -> float:
-    """Share of ray pairs that some rotation alone explains.
+def _rotated_share(rotation: Array, first: Array, second: Array, limit: float) -> float:
+    """Share of ray pairs that a rotation alone explains.
 
-    The rotation is fitted robustly: from the given one on, least squares over what fits best.
+    The rotation is fitted robustly: starting with the given one, least squares over the better half.
     """
     a = np.column_stack([first, np.ones(len(first))])
     b = np.column_stack([second, np.ones(len(second))])

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+import protomark as pm
+from protomark.features.extractor import Extractor
+from protomark.geometry.absolute_pose import refine_pose
+from protomark.geometry.camera import Camera
 from protomark.mapping import adjustment, culling, loop
 from protomark.mapping.clock import Clock
-from protomark.mapping.history import REGISTERED, Entry, History
-from protomark.mapping.initialisation import Initialiser
+from protomark.mapping.frame import Array, Frame, InputImage
+from protomark.mapping.history import REGISTERED, FrameRecord, History
+from protomark.mapping.initialisation import Initialiser, TwoViewPose
 from protomark.mapping.keyframes import is_keyframe
-from protomark.mapping.memory import Memory, make_memory
-from protomark.mapping.merging import merge
-from protomark.mapping.pose import refine_pose
+from protomark.mapping.memory import Memory, Prototypes, prototypes_for
+from protomark.mapping.merging import merge_duplicates
+from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
-from protomark.mapping.settings import Settings
-from protomark.mapping.sighting import Sighting
-from protomark.mapping.structure import Array, Frame, Structure
-from protomark.mapping.tracking import Matches, Tracked, Tracker
+from protomark.mapping.structure import Structure
+from protomark.mapping.tracking import LandmarkMatches, TrackedPose, Tracker
 from protomark.mapping.triangulation import remember, triangulate
-from protomark.tracks.colmap import focal_length, rays
-from protomark.tracks.features import Extractor
-from protomark.tracks.file import Camera
+from protomark.progress import Progress, silent
+
+# Gives the images of some names once more, in their order or backward.
+Reread = Callable[[set[str], bool], Iterable[InputImage]]
 
 # Fewer keypoints than this are a black or blurred frame.
 _MIN_KEYPOINTS = 50
@@ -34,71 +36,53 @@ _LOCAL_ITERATIONS = 8
 # The whole map is adjusted whenever it has grown by this factor.
 _GROWTH = 1.5
 _FIRST_GLOBAL = 6
-# A map with fewer keyframes that loses this many frames in a row was begun wrongly.
-_YOUNG = 4
-_YOUNG_LOSSES = 3
-# A pose under which less of what is in view is seen is held against one from the whole map.
-_DOUBTFUL = 0.3
+# A map with fewer keyframes that loses this many frames in a row was initialised wrongly.
+_YOUNG_KEYFRAMES = 4
+_MAX_YOUNG_LOSSES = 3
+# A pose by prediction that matches a smaller share of the landmarks in view is compared with one
+# by relocalization.
+_DOUBTFUL_SHARE = 0.3
 _LOOP_EVERY = 3
-# A guessed focal length that the map finds to be off by more than this made a bad beginning. So
-# many keyframes tell, or all there are: from the first ones of `hololens` it comes out at 530 to
-# 790 pixels and is 495.
-_GUESS_OFF = 0.05
-_CALIBRATED = 196
-_LOOP_SCALE = 8.0
-
-
-@dataclass
-class Picture:
-    """One image of the input.
-
-    Attributes:
-        index: place in its input, from 0.
-        name: unique name.
-        time: seconds, or the index.
-        image: (height, width) uint8, None where it cannot be read; then `trouble` says why.
-        pose: (3, 4) given pose, or None.
-        trouble: why there is no image.
-    """
-
-    index: int
-    name: str
-    time: float
-    image: NDArray[np.uint8] | None
-    pose: Array | None = None
-    trouble: str = ""
+_LOOP_LOSS_SCALE = 8.0
+# If the map finds a guessed focal length to be off by more than this, its beginning is bent and the
+# map is restarted. So many keyframes decide, or all there are: after the first ones of `hololens`
+# the estimate is 530 to 790 pixels, and 495 in the end.
+_MAX_FOCAL_OFFSET = 0.05
+_CALIBRATED_KEYFRAMES = 196
 
 
 class Mapper:
     """A map in the making.
 
     Args:
-        settings: how to make it.
+        options: how to make it.
         camera: camera of the frames to come.
         threads: threads to search and adjust on.
+        new_memory: makes an empty memory; prototypes by default.
     """
 
-    def __init__(self, settings: Settings, camera: Camera, threads: int = 1) -> None:
-        self.settings, self.threads = settings, threads
-        self.structure = Structure()
-        self.memory: Memory = make_memory(settings)
+    def __init__(
+        self,
+        options: MappingOptions,
+        camera: Camera,
+        threads: int = 1,
+        new_memory: Callable[[MappingOptions], Memory] = prototypes_for,
+    ) -> None:
+        self.options, self.threads = options, threads
+        self._new_memory = new_memory
+        self.structure = Structure({1: camera})
+        self.memory = new_memory(options)
         self.history = History()
         self.clock = Clock()
         self.camera_id = 1
-        self.structure.cameras[1] = camera
         self.next_global = _FIRST_GLOBAL
         self.lost_in_row = 0
-        self.looking_again = False
-        # Focal length that the map began with, 0 where that is settled; whether it has begun again.
-        self.guess = focal_length(camera) if settings.calibrate else 0.0
-        self.begun_again = False
-        self._extractor = Extractor(settings.descriptor, settings.max_keypoints)
-        self._start_over()
-
-    # State that lives between two frames and is no part of the map.
-
-    def _start_over(self) -> None:
-        self.initialiser = Initialiser(self.camera, self._pixels(self.settings.max_error))
+        self.retrying = False
+        # Focal length that the map began with, 0 once it is settled.
+        self.guessed_focal = camera.focal_length if options.calibrate else 0.0
+        self.restarted = False
+        self._extractor = Extractor(options.descriptor, options.max_keypoints)
+        self._reset_initialiser()
 
     @property
     def camera(self) -> Camera:
@@ -106,151 +90,284 @@ class Mapper:
         return self.structure.cameras[self.camera_id]
 
     @property
-    def tracker(self) -> Tracker:
-        """Finds frames in the map as it is."""
-        s = self.settings
-        return Tracker(self.structure, self.memory, s.max_error, s.min_inliers, self.threads)
+    def scene(self) -> pm.PrototypeMap:
+        """The map of prototypes."""
+        if not isinstance(self.memory, Prototypes):
+            raise TypeError("only a memory of prototypes is a map that can be saved")
+        return self.memory.map
 
     @property
-    def width(self) -> int:
+    def tracker(self) -> Tracker:
+        """Finds frames in the map as it is."""
+        o = self.options
+        return Tracker(self.structure, self.memory, o.max_error, o.min_inliers, self.threads)
+
+    @property
+    def descriptor_bytes(self) -> int:
         """Bytes of a descriptor."""
         return self._extractor.kind.bytes
 
-    def _pixels(self, share: float) -> float:
-        return self.structure.tolerance(self.camera_id, share)
+    # One frame: the paper's Section 3.
 
-    # The camera.
-
-    def misjudged(self, ended: bool = False) -> bool:
-        """Whether the camera is so unlike the guess that the map should begin again with it.
-
-        Args:
-            ended: no frame is left, so what keyframes there are must tell.
-        """
-        if not self.guess or self.begun_again:
-            return False
-        keyframes = len(self.structure.keyframes())
-        if keyframes < (_FIRST_GLOBAL if ended else _CALIBRATED):
-            return False
-        if ended:
-            self._adjust_all(2)
-        return abs(focal_length(self.camera) / self.guess - 1) > _GUESS_OFF
-
-    def begin_again(self) -> Mapper:
-        """An empty map with the camera as it was found."""
-        new = Mapper(self.settings, self.camera, self.threads)
-        new.begun_again = True
-        new.history.events.append(
-            f"the map begins again: focal length {new.guess:.0f}, not {self.guess:.0f} pixels"
-        )
-        return new
-
-    # One frame.
-
-    def add(self, picture: Picture) -> Entry:
-        """Take up the next frame; says what became of it."""
+    def add(self, image: InputImage) -> FrameRecord:
+        """Add the next frame to the map; its record says what became of it."""
         self.clock.lap()
-        entry = self.history.entries.get(picture.name)
-        again = entry is not None
-        if entry is None:
-            entry = self.history.entries[picture.name] = Entry(picture.index, picture.name, "")
-        sighting = self._look(picture, entry)
-        if sighting is not None:
-            if self.settings.fixed_poses and picture.pose is None:
-                entry.outcome = "no pose is given for it"
-            elif picture.pose is not None:
-                self._place(sighting, picture.pose, entry)
+        record = self.history.records.get(image.name)
+        first_time = record is None
+        if record is None:
+            record = FrameRecord(image.index, image.name, "")
+            self.history.records[image.name] = record
+        frame = self._detect(image, record)
+        if frame is not None:
+            if self.options.fixed_poses and image.pose is None:
+                record.outcome = "no pose is given for it"
+            elif image.pose is not None:
+                self._register_given_pose(frame, image.pose)
             elif self.structure.frames:
-                self._track(sighting, entry)
-                self._doubt(entry)
+                self._register(frame, record)
+                self._check_young_map(record)
             else:
-                self._initialise(sighting, entry)
-        if not again:
-            self._measure(entry)
+                self._initialise(frame, record)
+        if first_time:
+            self._measure(record)
         for stage, seconds in self.clock.lap().items():
-            entry.seconds[stage] = entry.seconds.get(stage, 0.0) + seconds
-        return entry
+            record.seconds[stage] = record.seconds.get(stage, 0.0) + seconds
+        return record
 
-    def _look(self, picture: Picture, entry: Entry) -> Sighting | None:
-        if picture.image is None:
-            entry.outcome = picture.trouble
+    def _register(self, frame: Frame, record: FrameRecord) -> None:
+        """Track or relocalize a frame, and update the map with it."""
+        found = self._track(frame)
+        if found is None:
+            self.lost_in_row += 1
+            record.outcome = "not found in the map: too few matches agree on a pose"
+            return
+        self.lost_in_row = 0
+        self._insert(frame, found)
+
+    def _insert(self, frame: Frame, found: TrackedPose) -> None:
+        """Let a frame with a pose update the landmarks it sees, and extend the map if a keyframe."""
+        index = self._observe(frame, found)
+        if self.structure.frames[index].keyframe:
+            self._triangulate(index)
+            self._adjust_local(index)
+            self._shrink_window()
+            self._close_loop(index)
+            self._adjust_if_grown()
+        self._record(index)
+
+    def _detect(self, image: InputImage, record: FrameRecord) -> Frame | None:
+        """Keypoints, descriptors and codes of an image; None if it is not usable."""
+        if image.image is None:
+            record.outcome = image.problem
             return None
-        height, width = picture.image.shape
+        height, width = image.image.shape
         camera = self.camera
         if (width, height) != (camera.width, camera.height):
-            entry.outcome = (
+            record.outcome = (
                 f"{width}x{height} pixels, but the camera has {camera.width}x{camera.height}"
             )
             return None
         with self.clock.stage("detect"):
-            features = self._extractor(picture.image)
-        entry.keypoints = len(features)
+            features = self._extractor(image.image)
+        record.keypoints = len(features)
         if len(features) < _MIN_KEYPOINTS:
-            entry.outcome = f"only {len(features)} keypoints: black, blurred or without texture"
+            record.outcome = f"only {len(features)} keypoints: black, blurred or without texture"
             return None
         with self.clock.stage("encode"):
             encoded = self.memory.encode(features.descriptors)
-        return Sighting(
-            picture.index,
-            picture.name,
-            picture.time,
+        return Frame(
+            image.index,
+            image.name,
+            image.time,
             self.camera_id,
             features.keypoints,
-            rays(camera, features.keypoints),
+            camera.rays(features.keypoints),
             features.descriptors,
             encoded,
         )
 
+    def _track(self, frame: Frame) -> TrackedPose | None:
+        """The pose of a frame by prediction from its neighbours, or by relocalization."""
+        with self.clock.stage("match"):
+            predicted = predict(self.structure.frames, frame.index, frame.camera_id)
+            found = None if predicted is None else self.tracker.track(frame, predicted)
+            if found is None or found.share < _DOUBTFUL_SHARE:
+                # A wrong prediction may have led to a wrong pose.
+                rough = self.tracker.relocalize(frame)
+                other = self.tracker.track_local_map(frame, rough.pose) if rough else None
+                if found is None or (other and len(other.matches) > len(found.matches)):
+                    found = other
+        return found
+
+    def _observe(self, frame: Frame, found: TrackedPose) -> int:
+        """Add a frame and its observations, from which prototypes learn (Eq. 2); returns its index."""
+        structure = self.structure
+        frame = frame.at(found.pose)
+        keyframes = structure.keyframes()
+        structure.observe(frame, found.matches.rows, found.matches.ids)
+        last = structure.frames[keyframes[-1]] if keyframes else None
+        frame.keyframe = is_keyframe(structure, last, frame)
+        structure.frames.append(frame)
+        remember(self.memory, frame, frame.observed)
+        if not frame.keyframe:
+            frame.leave_window()
+        return len(structure.frames) - 1
+
+    def _triangulate(self, index: int) -> None:
+        """New landmarks from the descriptors of the window; duplicates are merged."""
+        o = self.options
+        with self.clock.stage("triangulate"):
+            window = [i for i in self._window() if i != index]
+            duplicates = triangulate(
+                self.structure, self.memory, index, window, o.max_error, o.min_angle
+            )
+            merge_duplicates(self.structure, self.memory, duplicates, o.max_error)
+
+    def _adjust_local(self, index: int) -> None:
+        """Adjust the keyframes around a new one, and remove what does not fit."""
+        with self.clock.stage("adjust"):
+            if self.options.fixed_poses:
+                moved = self._window()
+                adjustment.adjust(self.structure, [], moved, 0)
+            else:
+                moved = adjustment.adjust_local(
+                    self.structure, index, _LOCAL_SIZE, _LOCAL_ITERATIONS
+                )
+            self._cull(moved)
+
+    def _cull(self, frames: list[int]) -> None:
+        o = self.options
+        culling.cull(self.structure, self.memory, frames, o.max_error, o.min_angle)
+
+    def _shrink_window(self) -> None:
+        for i in self._window()[: -self.options.window]:
+            self.structure.frames[i].leave_window()
+
+    def _close_loop(self, index: int) -> None:
+        """Merge landmarks of a place seen before, and distribute the drift since then."""
+        interval = 1 if self.retrying else _LOOP_EVERY
+        if self.options.fixed_poses or len(self.structure.keyframes()) % interval:
+            return
+        with self.clock.stage("match"):
+            merged, drift = loop.close_loop(
+                self.structure, self.memory, self.tracker, index, self.options.max_error
+            )
+        if merged or drift:
+            self.history.events.append(
+                f"{self.structure.frames[index].name}: a place seen before, {merged} landmarks "
+                f"merged{', drift corrected' if drift else ''}"
+            )
+        if drift:
+            with self.clock.stage("adjust"):
+                adjustment.adjust_global(
+                    self.structure, 20, loss_scale=_LOOP_LOSS_SCALE, threads=self.threads
+                )
+            self._adjust_globally(1)
+
+    def _adjust_if_grown(self) -> None:
+        keyframes = len(self.structure.keyframes())
+        if keyframes >= self.next_global:
+            self.next_global = int(keyframes * _GROWTH) + 1
+            self._adjust_globally(2)
+
+    def _adjust_globally(self, rounds: int) -> None:
+        """Global bundle adjustment and culling, with the camera if it is being calibrated."""
+        structure, o = self.structure, self.options
+        # After a restart the first keyframes must not overrule what all frames found.
+        fixed = self.restarted and self.guessed_focal
+        fixed = fixed and len(structure.keyframes()) < _CALIBRATED_KEYFRAMES
+        with self.clock.stage("adjust"):
+            for _ in range(rounds):
+                adjustment.adjust_global(
+                    structure,
+                    intrinsics=o.calibrate and not fixed,
+                    poses=not o.fixed_poses,
+                    threads=self.threads,
+                )
+                self._cull(structure.keyframes())
+            self._refine_other_frames()
+
+    def _refine_other_frames(self) -> None:
+        """Refine the poses of frames that are not keyframes on the landmarks that they see."""
+        if self.options.fixed_poses:
+            return
+        structure = self.structure
+        for frame in structure.frames:
+            rows = frame.observed
+            if not frame.keyframe and len(rows) >= 6:
+                frame.pose, _ = refine_pose(
+                    frame.pose,
+                    frame.keypoints[rows].astype(np.float64),
+                    structure.positions[frame.landmarks[rows]],
+                    structure.cameras[frame.camera_id],
+                    structure.tolerance(frame.camera_id, self.options.max_error),
+                )
+
+    def _window(self) -> list[int]:
+        return [i for i, frame in enumerate(self.structure.frames) if frame.in_window]
+
+    def _record(self, index: int) -> None:
+        frame = self.structure.frames[index]
+        record = self.history.records[frame.name]
+        record.outcome, record.keyframe = REGISTERED, frame.keyframe
+        record.inliers = len(frame.seen)
+
+    def _register_given_pose(self, frame: Frame, pose: Array) -> None:
+        """Register a frame whose pose is given."""
+        matches = LandmarkMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        if len(self.structure.ids):
+            with self.clock.stage("match"):
+                matches = self.tracker.match_projected(frame, pose, 1.5 * self.options.max_error)
+        self._insert(frame, TrackedPose(pose, matches))
+
     # The first two frames.
 
-    def _initialise(self, sighting: Sighting, entry: Entry) -> None:
+    def _reset_initialiser(self) -> None:
+        tolerance = self.structure.tolerance(self.camera_id, self.options.max_error)
+        self.initialiser = Initialiser(self.camera, tolerance)
+
+    def _initialise(self, frame: Frame, record: FrameRecord) -> None:
+        """Begin the map with two frames of enough parallax, once there are such."""
         with self.clock.stage("initialise"):
-            found = self.initialiser.push(sighting)
-        if found is None:
-            entry.outcome = "before the first two frames with enough parallax"
+            pair = self.initialiser.push(frame)
+        if pair is None:
+            record.outcome = "before the first two frames with enough parallax"
             return
         waiting = self.initialiser.waiting
-        first, second = waiting[found.first], waiting[found.second]
-        origin = np.eye(3, 4)
-        for one, pose in ((first, origin), (second, found.pose)):
-            self.structure.frames.append(one.at(pose))
-        self._triangulate(1)
-        if len(self.structure.ids) < 2 * self.settings.min_inliers:
-            return self._give_up(entry, "the first two frames share too few landmarks")
-        with self.clock.stage("adjust"):
-            adjustment.adjust(self.structure, [0, 1], [], iterations=20)
-            self._normalise()
-            self._cull([0, 1])
-        for one in (first, second):
-            self._register(one.name, self.structure.frames[0 if one is first else 1])
-        # The frames between, then those before, from near to far.
-        between = waiting[found.first + 1 : found.second]
-        for one in [*between, *waiting[: found.first][::-1]]:
-            self._track(one, self.history.entries[one.name])
+        first, second = waiting[pair.first], waiting[pair.second]
+        if not self._begin_map(first, second, pair):
+            self._abort_initialisation(record, "the first two frames share too few landmarks")
+            return
+        # The frames between the two, then those before, from near to far.
+        between = waiting[pair.first + 1 : pair.second]
+        for one in [*between, *waiting[: pair.first][::-1]]:
+            self._register(one, self.history.records[one.name])
         if len(between) > 1 and len(self.structure.frames) < 2 + len(between) // 2:
-            return self._give_up(entry, "the frames between the first two do not fit them")
+            reason = "the frames between the first two do not fit them"
+            self._abort_initialisation(record, reason)
+            return
         self.history.events.append(
             f"{second.name}: the map begins, with {first.name} and this frame"
         )
-        self._start_over()
+        self._reset_initialiser()
         self.lost_in_row = 0
-        return None
 
-    def _give_up(self, entry: Entry, reason: str) -> None:
-        """Forget a map that was begun wrongly, and look for another start."""
-        for frame in self.structure.frames:
-            known = self.history.entries[frame.name]
-            known.outcome, known.inliers, known.keyframe = f"begun wrongly: {reason}", 0, False
-        entry.outcome = reason
-        camera, waiting = self.camera, self.initialiser.waiting[-1:]
-        self.structure = Structure({self.camera_id: camera})
-        self.memory = make_memory(self.settings)
-        self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
-        self._start_over()
-        self.initialiser.waiting = waiting
+    def _begin_map(self, first: Frame, second: Frame, pair: TwoViewPose) -> bool:
+        """Triangulate and adjust two frames; False if they share too few landmarks."""
+        self.structure.frames += [first.at(np.eye(3, 4)), second.at(pair.pose)]
+        self._triangulate(1)
+        if len(self.structure.ids) < 2 * self.options.min_inliers:
+            return False
+        with self.clock.stage("adjust"):
+            adjustment.adjust(self.structure, [0, 1], [], iterations=20)
+            self._normalise_scale()
+            self._cull([0, 1])
+        self._record(0)
+        self._record(1)
+        return True
 
-    def _normalise(self) -> None:
-        """Median depth of the first frame 1."""
+    def _normalise_scale(self) -> None:
+        """Scale the map so that the median depth in the first frame is 1."""
         structure = self.structure
         pose = structure.frames[0].pose
         depth = structure.positions[structure.ids] @ pose[2, :3] + pose[2, 3]
@@ -258,216 +375,109 @@ class Mapper:
         structure.positions *= scale
         for frame in structure.frames:
             frame.pose[:, 3] *= scale
-        structure.look_again()
+        structure.recompute_views()
 
-    # Every other frame.
+    def _abort_initialisation(self, record: FrameRecord, reason: str) -> None:
+        """Drop a map that was initialised wrongly, and wait for another pair of frames."""
+        for frame in self.structure.frames:
+            dropped = self.history.records[frame.name]
+            dropped.outcome = f"initialised wrongly: {reason}"
+            dropped.inliers, dropped.keyframe = 0, False
+        record.outcome = reason
+        waiting = self.initialiser.waiting[-1:]
+        self.structure = Structure({self.camera_id: self.camera})
+        self.memory = self._new_memory(self.options)
+        self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
+        self._reset_initialiser()
+        self.initialiser.waiting = waiting
 
-    def _track(self, sighting: Sighting, entry: Entry) -> None:
-        with self.clock.stage("match"):
-            found = self._find(sighting)
-        if found is None:
-            self.lost_in_row += 1
-            entry.outcome = "not found in the map: too few matches agree on a pose"
-            return
-        self.lost_in_row = 0
-        self._take_up(sighting, found, entry)
+    def _check_young_map(self, record: FrameRecord) -> None:
+        """Abort a map that loses the camera when it has just begun."""
+        young = len(self.structure.keyframes()) < _YOUNG_KEYFRAMES and not self.retrying
+        if young and self.lost_in_row >= _MAX_YOUNG_LOSSES:
+            self._abort_initialisation(record, "the map was lost when it had just begun")
 
-    def _doubt(self, entry: Entry) -> None:
-        """A map that loses the camera when it has just begun was begun wrongly."""
-        young = len(self.structure.keyframes()) < _YOUNG and not self.looking_again
-        if young and self.lost_in_row >= _YOUNG_LOSSES:
-            self._give_up(entry, "the map was lost when it had just begun")
+    # The camera.
 
-    def _find(self, sighting: Sighting) -> Tracked | None:
-        predicted = predict(self.structure.frames, sighting.index, sighting.camera_id)
-        found = None
-        if predicted is not None:
-            found = self.tracker.track(sighting, predicted)
-        if found is None or found.share < _DOUBTFUL:
-            # A wrong prediction may have led to a wrong pose.
-            rough = self.tracker.relocalize(sighting)
-            other = self.tracker.settle(sighting, rough.pose) if rough else None
-            if found is None or (other and len(other.matches) > len(found.matches)):
-                found = other
-        return found
+    def needs_restart(self, at_end: bool = False) -> bool:
+        """Whether the camera turned out so unlike the guess that the map has to begin again.
 
-    def _place(self, sighting: Sighting, pose: Array, entry: Entry) -> None:
-        """A frame whose pose is given."""
-        matches = Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
-        if len(self.structure.ids):
-            with self.clock.stage("match"):
-                matches = self.tracker.guided(sighting, pose, 1.5 * self.settings.max_error)
-        self._take_up(sighting, Tracked(pose, matches), entry)
-
-    def _take_up(self, sighting: Sighting, found: Tracked, entry: Entry) -> None:
-        """A frame with a pose becomes part of the map, and updates what it sees (Eq. 2)."""
-        structure = self.structure
-        frame = sighting.at(found.pose)
-        keyframes = structure.keyframes()
-        structure.observe(frame, found.matches.rows, found.matches.ids)
-        last = structure.frames[keyframes[-1]] if keyframes else None
-        frame.keyframe = is_keyframe(structure, last, frame)
-        structure.frames.append(frame)
-        remember(self.memory, frame, frame.observed)
-        place = len(structure.frames) - 1
-        if frame.keyframe:
-            self._grow(place)
-        else:
-            frame.forget()
-        self._register(sighting.name, frame)
-
-    def _register(self, name: str, frame: Frame) -> None:
-        entry = self.history.entries[name]
-        entry.outcome, entry.keyframe = REGISTERED, frame.keyframe
-        entry.inliers = len(frame.seen)
-
-    def _window(self) -> list[int]:
-        return [i for i, f in enumerate(self.structure.frames) if f.descriptors is not None]
-
-    def _triangulate(self, place: int) -> None:
-        s = self.settings
-        with self.clock.stage("triangulate"):
-            window = [i for i in self._window() if i != place]
-            same = triangulate(self.structure, self.memory, place, window, s.max_error, s.min_angle)
-            merge(self.structure, self.memory, same, s.max_error)
-
-    def _cull(self, frames: list[int]) -> None:
-        s = self.settings
-        culling.cull(self.structure, self.memory, frames, s.max_error, s.min_angle)
-
-    def _grow(self, place: int) -> None:
-        """What a new keyframe brings: landmarks, adjustment, and places seen before."""
-        self._triangulate(place)
-        with self.clock.stage("adjust"):
-            if not self.settings.fixed_poses:
-                moved = adjustment.adjust_local(
-                    self.structure, place, _LOCAL_SIZE, _LOCAL_ITERATIONS
-                )
-            else:
-                moved = self._window()
-                adjustment.adjust(self.structure, [], moved, 0)
-            self._cull(moved)
-        for i in self._window()[: -self.settings.window]:
-            self.structure.frames[i].forget()
+        Args:
+            at_end: no frame is left, so the keyframes there are must decide.
+        """
+        if not self.guessed_focal or self.restarted:
+            return False
         keyframes = len(self.structure.keyframes())
-        often = 1 if self.looking_again else _LOOP_EVERY
-        if not self.settings.fixed_poses and keyframes % often == 0:
-            self._close_loop(place)
-        if keyframes >= self.next_global:
-            self.next_global = int(keyframes * _GROWTH) + 1
-            self._adjust_all(2)
+        if keyframes < (_FIRST_GLOBAL if at_end else _CALIBRATED_KEYFRAMES):
+            return False
+        if at_end:
+            self._adjust_globally(2)
+        return abs(self.camera.focal_length / self.guessed_focal - 1) > _MAX_FOCAL_OFFSET
 
-    def _close_loop(self, place: int) -> None:
-        with self.clock.stage("match"):
-            merged, drift = loop.revisit(
-                self.structure, self.memory, self.tracker, place, self.settings.max_error
-            )
-        if merged or drift:
-            self.history.events.append(
-                f"{self.structure.frames[place].name}: a place seen before, "
-                f"{merged} landmarks merged" + (", drift taken back" if drift else "")
-            )
-        if drift:
-            with self.clock.stage("adjust"):
-                adjustment.adjust_global(
-                    self.structure, 20, loss_scale=_LOOP_SCALE, threads=self.threads
-                )
-            self._adjust_all(1)
-
-    def _adjust_all(self, rounds: int) -> None:
-        """Global bundle adjustment, with the camera if it is being calibrated, and culling."""
-        structure, s = self.structure, self.settings
-        # What all frames told is not given up for what the first ones say.
-        held = self.begun_again and self.guess and len(structure.keyframes()) < _CALIBRATED
-        with self.clock.stage("adjust"):
-            for _ in range(rounds):
-                adjustment.adjust_global(
-                    structure,
-                    intrinsics=s.calibrate and not held,
-                    poses=not s.fixed_poses,
-                    threads=self.threads,
-                )
-                self._cull(structure.keyframes())
-            self._follow()
-
-    def _follow(self) -> None:
-        """Frames that are no keyframes follow the landmarks that they see."""
-        if self.settings.fixed_poses:
-            return
-        structure = self.structure
-        for frame in structure.frames:
-            rows = frame.observed
-            if not frame.keyframe and len(rows) >= 6:
-                frame.pose, _ = refine_pose(
-                    structure.cameras[frame.camera_id],
-                    frame.keypoints[rows].astype(np.float64),
-                    structure.positions[frame.landmarks[rows]],
-                    frame.pose,
-                    structure.tolerance(frame.camera_id, self.settings.max_error),
-                )
+    def restart(self) -> Mapper:
+        """An empty map that begins with the camera that this one found."""
+        new = Mapper(self.options, self.camera, self.threads, self._new_memory)
+        new.restarted = True
+        new.history.events.append(
+            f"the map restarts: focal length {new.guessed_focal:.0f}, not "
+            f"{self.guessed_focal:.0f} pixels"
+        )
+        return new
 
     # The end.
 
-    def finish(
-        self,
-        again: Callable[[set[str], bool], Iterable[Picture]] | None = None,
-        done: Callable[[int, int], None] = lambda done, total: None,
-    ) -> None:
-        """Look once more for frames that were not found, adjust everything, forget descriptors.
+    def finish(self, reread: Reread | None = None, progress: Progress = silent) -> None:
+        """Retry frames that were not found, adjust everything, and drop the window's descriptors.
 
         Args:
-            again: gives the pictures of some names once more, in their order or backward; None:
-                no second look.
-            done: called with frames looked at again, and how many there are.
+            reread: gives lost frames once more; None: they are not retried.
+            progress: called with each frame that is retried.
         """
         self.clock.lap()
-        if again is not None and self.structure.frames and not self.settings.fixed_poses:
-            self._second_looks(again, done)
+        if reread is not None and self.structure.frames and not self.options.fixed_poses:
+            self._retry_lost_frames(reread, progress)
+        progress("adjust", 0, 0)
         if self.structure.frames:
-            self._adjust_all(2)
+            self._adjust_globally(2)
         for frame in self.structure.frames:
             frame.descriptors = frame.encoded = None
-        # The window is gone: what was never confirmed goes now.
+        # No landmark can be confirmed any more.
         with self.clock.stage("adjust"):
-            culling.discard_weak(
-                self.structure, self.memory, self.structure.ids, self.settings.min_angle
+            culling.remove_weak(
+                self.structure, self.memory, self.structure.ids, self.options.min_angle
             )
         for frame in self.structure.frames:
-            frame.forget()
-        later = self.clock.lap()
-        for name, seconds in later.items():
-            self.history.later[name] = self.history.later.get(name, 0.0) + seconds
+            frame.leave_window()
+        for name, seconds in self.clock.lap().items():
+            total = self.history.closing_seconds
+            total[name] = total.get(name, 0.0) + seconds
 
-    def _second_looks(
-        self,
-        again: Callable[[set[str], bool], Iterable[Picture]],
-        done: Callable[[int, int], None],
-    ) -> None:
-        """Backward first: a frame that was not found yet often leads to one that was."""
-        self.looking_again = True
-        fruitless = 0
-        backward = True
+    def _retry_lost_frames(self, reread: Reread, progress: Progress) -> None:
+        """Retry backward first: a frame before the first one found often leads to the next."""
+        self.retrying = True
+        fruitless, backward = 0, True
         while fruitless < 2:
-            missing = {
-                e.name
-                for e in self.history.entries.values()
-                if e.outcome != REGISTERED and e.keypoints >= _MIN_KEYPOINTS
+            lost = {
+                record.name
+                for record in self.history.records.values()
+                if record.outcome != REGISTERED and record.keypoints >= _MIN_KEYPOINTS
             }
             found = 0
-            for number, picture in enumerate(again(missing, backward), 1):
-                found += self.add(picture).outcome == REGISTERED
-                done(number, len(missing))
-            if found == len(missing):
+            for number, image in enumerate(reread(lost, backward), 1):
+                found += self.add(image).outcome == REGISTERED
+                progress("retry lost frames", number, len(lost))
+            if found == len(lost):
                 return
             fruitless = 0 if found else fruitless + 1
             backward = not backward
 
-    def _measure(self, entry: Entry) -> None:
+    def _measure(self, record: FrameRecord) -> None:
+        """Record the size of the map after a frame."""
         structure = self.structure
-        entry.landmarks = len(structure.ids)
-        entry.observations = len(structure.pairs()[0])
-        entry.memory_bytes = self.memory.bytes
-        entry.descriptor_bytes = self.width * entry.observations
-        entry.window_bytes = self.width * sum(
-            len(f.keypoints) for f in structure.frames if f.descriptors is not None
+        record.landmarks = len(structure.ids)
+        record.observations = len(structure.pairs()[0])
+        record.memory_bytes = self.memory.bytes
+        record.descriptor_bytes = self.descriptor_bytes * record.observations
+        record.window_bytes = self.descriptor_bytes * sum(
+            len(frame.keypoints) for frame in structure.frames if frame.in_window
         )

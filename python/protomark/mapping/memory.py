@@ -1,66 +1,69 @@
-"""What a map remembers of its landmarks' descriptors; the one place where this is chosen."""
+"""What a map keeps of its landmarks' descriptors, and how frames are matched with it."""
 
 from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.acceptance import Acceptance
+from protomark.features.descriptors import descriptor_kind
+from protomark.mapping.options import MappingOptions
+from protomark.match_calibration import NO_DISTANCE, MatchCalibration
+from protomark.matching import MIN_PROBABILITY
 
-if TYPE_CHECKING:
-    from protomark.mapping.settings import Settings
-
-# Rows that are no longer anyone's are dropped when they are this share of all.
-_DEAD_SHARE = 0.25
 _CHUNK = 256
 _PAIRS = 4096
-_SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
 class Memory(ABC):
-    """What is kept of descriptors, and how a new frame is matched with it.
+    """What a map keeps of descriptors, and how a frame is matched with it.
 
-    A descriptor is encoded once for each frame; all other calls take the encoded form, which for
-    binary memories is the descriptor itself.
+    Descriptors are encoded once per frame; all other calls take the encoded form. Prototypes are
+    the memory of every map that Protomark makes; `protomark evaluate-mapping` compares others.
 
     Attributes:
-        euclidean: whether distances are Euclidean, of codes, and not Hamming.
+        ratio: largest ratio of what `search` gives for the nearest and second nearest landmark,
+            for a memory without calibration.
+        guided_ratio: largest ratio of `distances` among landmarks that project near the keypoint.
+        max_distance: largest distance among landmarks that project near the keypoint, as a share of
+            the median distance between keypoints and landmarks elsewhere.
     """
 
-    euclidean: bool
+    ratio = 0.85**2
+    guided_ratio = 0.9
+    max_distance = 0.75
 
     @abstractmethod
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
-        """(n, bytes) uint8 -> (n, width), what is compared."""
+        """Encode descriptors (n, bytes) uint8 as (n, width), the form that is compared."""
 
     @abstractmethod
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """Add observations: unknown ids are new landmarks."""
 
     @abstractmethod
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Take observations back that were added before, exactly."""
+    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """Take back observations that were added before, exactly."""
 
     @abstractmethod
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """Join each source landmark to the one in `into`."""
+    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """Merge each source landmark into the one in `into`."""
 
     @abstractmethod
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """Forget landmarks."""
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """Remove landmarks."""
 
     @abstractmethod
     def search(
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """The two nearest landmarks of each, exactly: ids (q, 2), -1 for none, and distances.
+        """The two nearest landmarks of each descriptor, exactly: ids and distances (q, 2).
 
-        These are squared if they are Euclidean, and 2^31 - 1 for none.
+        Where there is none, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
 
         Args:
             encoded: (q, width).
@@ -72,30 +75,35 @@ class Memory(ABC):
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """(p,) distances between row `rows[i]` of `encoded` and landmark `ids[i]`."""
+        """Distances (p,) between row `rows[i]` of `encoded` and landmark `ids[i]`."""
 
     @abstractmethod
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of these landmarks it remembers."""
+    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of these landmarks the memory holds."""
 
     @property
     @abstractmethod
     def bytes(self) -> int:
         """Bytes that matching needs for all landmarks, positions apart."""
 
-    @abstractmethod
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """What beside a map file must be kept to go on later; empty for prototypes."""
+    def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Rows of distances (q, 2) whose nearest landmark is accepted, the clearest first."""
+        nearest, second = distances.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.where(second > 0, nearest / second, 1.0)
+        return clearest_rows(nearest, ratio, self.ratio)
 
-    @abstractmethod
-    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
-        """Take up what `arrays` gave and, for prototypes, the saved map."""
+
+def clearest_rows(
+    nearest: NDArray[np.int32], doubt: NDArray[np.floating], limit: float
+) -> NDArray[np.int64]:
+    """Rows (k,) of `doubt` (q,) below a limit, by doubt and then by distance."""
+    rows = np.flatnonzero((nearest < NO_DISTANCE) & (doubt < limit))
+    return rows[np.lexsort((nearest[rows], doubt[rows]))]
 
 
 class Prototypes(Memory):
-    """One prototype a landmark; descriptors are thrown away (the paper's method)."""
-
-    euclidean = True
+    """One prototype per landmark, and no descriptors (the paper's method)."""
 
     def __init__(self, encoder: pm.Encoder, dim: int) -> None:
         if dim not in encoder.dims:
@@ -105,9 +113,9 @@ class Prototypes(Memory):
             )
         self.encoder, self.dim = encoder, dim
         self.map = pm.PrototypeMap(encoder, dim)
-        self.acceptance: Acceptance | None = None
+        self.calibration: MatchCalibration | None = None
         with contextlib.suppress(ValueError):
-            self.acceptance = encoder.acceptance(dim)
+            self.calibration = MatchCalibration.of(encoder, dim)
 
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
         """See `Memory.encode`."""
@@ -117,8 +125,8 @@ class Prototypes(Memory):
         """Eq. 1 and Eq. 2 of the paper."""
         self.map.add_codes(ids, encoded)
 
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`; a landmark halved at 255 observations may keep its share."""
+    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+        """See `Memory.subtract`; a landmark halved at 255 observations may keep its share."""
         try:
             self.map.remove_codes(ids, encoded)
         except ValueError:
@@ -126,12 +134,12 @@ class Prototypes(Memory):
                 with contextlib.suppress(ValueError):
                     self.map.remove_codes(ids[i : i + 1], encoded[i : i + 1])
 
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """See `Memory.merge`."""
+    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+        """See `Memory.merge_landmarks`."""
         self.map.merge(into, source)
 
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """See `Memory.discard`."""
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """See `Memory.remove`."""
         self.map.discard(ids)
 
     def search(
@@ -143,7 +151,7 @@ class Prototypes(Memory):
         # Sums of integers far below 2^24: exact in float32.
         codes, places = encoded.astype(np.float32), self._rounded(among)
         ids = np.full((len(codes), 2), -1, np.int64)
-        distances = np.full((len(codes), 2), np.iinfo(np.int32).max, np.int32)
+        distances = np.full((len(codes), 2), NO_DISTANCE, np.int32)
         if not len(among):
             return ids, distances
         lengths = (places * places).sum(1)
@@ -170,15 +178,15 @@ class Prototypes(Memory):
         at[known] = np.arange(len(known))
         codes, places = encoded.astype(np.float32), self._rounded(known)
         squares = np.empty(len(rows), np.float32)
-        # What stays in the processor's cache is several times faster.
+        # Pieces that fit into the cache are several times faster.
         for a in range(0, len(rows), _PAIRS):
             b = a + _PAIRS
             difference = places[at[ids[a:b]]] - codes[rows[a:b]]
             squares[a:b] = np.einsum("pd,pd->p", difference, difference)
         return np.sqrt(squares)
 
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """See `Memory.known`."""
+    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See `Memory.contains`."""
         return np.isin(ids, self.map.ids)
 
     def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -188,248 +196,38 @@ class Prototypes(Memory):
 
     @property
     def bytes(self) -> int:
-        """A sealed map's: one byte a dimension and one for the count."""
+        """As in a sealed map: one byte per dimension and one for the count."""
         return len(self.map) * (self.dim + 1)
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """See `Memory.arrays`."""
-        return {}
+    def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
+        """See `Memory.accepted`; the probability decides if the encoder was calibrated."""
+        if self.calibration is None:
+            return super().accepted(distances)
+        doubt = 1 - self.calibration.probability(distances)
+        return clearest_rows(distances[:, 0], doubt, 1 - MIN_PROBABILITY)
 
-    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
-        """See `Memory.restore`."""
-        if scene is None:
-            raise ValueError("a memory of prototypes needs its map file")
+    def use(self, scene: pm.PrototypeMap) -> None:
+        """Continue with a map that was saved.
+
+        Raises:
+            ValueError: it was made with another encoder or other dimensions.
+        """
         if scene.dim != self.dim or scene.encoder.identity != self.encoder.identity:
             raise ValueError("the map was made with another encoder or other dimensions")
         self.map = scene
 
 
-class Descriptors(Memory):
-    """Every descriptor of every landmark, kept and searched: the traditional way."""
-
-    euclidean = False
-
-    def __init__(self, width: int) -> None:
-        self._descriptors = np.zeros((0, width), np.uint8)
-        self._owners = np.zeros(0, np.int64)
-        self._sorted: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
-        self._padded: tuple[NDArray[np.uint8], NDArray[np.uint64]] | None = None
-
-    def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
-        """See `Memory.encode`."""
-        return descriptors
-
-    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.add`."""
-        self._sorted = None
-        self._descriptors = np.concatenate([self._descriptors, encoded])
-        self._owners = np.concatenate([self._owners, ids])
-
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`."""
-        self._sorted = None
-        order = np.argsort(self._owners, kind="stable")
-        sorted_owners = self._owners[order]
-        first, last = (np.searchsorted(sorted_owners, ids, side) for side in ("left", "right"))
-        for owner, descriptor, a, b in zip(ids, encoded, first, last, strict=True):
-            rows = order[a:b]
-            same = (self._descriptors[rows] == descriptor).all(1) & (self._owners[rows] == owner)
-            if not same.any():
-                raise ValueError(f"landmark {owner} has no such observation")
-            self._owners[rows[np.argmax(same)]] = -1
-        self._compact()
-
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """See `Memory.merge`."""
-        self._sorted = None
-        order = np.argsort(source)
-        at = np.minimum(np.searchsorted(source[order], self._owners), max(len(source) - 1, 0))
-        if len(source):
-            hit = source[order][at] == self._owners
-            self._owners[hit] = into[order][at[hit]]
-
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """See `Memory.discard`."""
-        self._sorted = None
-        self._owners[np.isin(self._owners, ids)] = -1
-        self._compact()
-
-    def _compact(self) -> None:
-        alive = self._owners >= 0
-        if len(alive) and 1 - alive.mean() > _DEAD_SHARE:
-            self._owners, self._descriptors = self._owners[alive], self._descriptors[alive]
-
-    def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Owners (n,), ascending, and descriptors (n, bytes) that matching compares with."""
-        if self._sorted is None:
-            order = np.argsort(self._owners, kind="stable")
-            order = order[np.searchsorted(self._owners[order], 0) :]
-            self._sorted = self._owners[order], self._descriptors[order]
-        return self._sorted
-
-    def search(
-        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """See `Memory.search`."""
-        owners, descriptors = self.table()
-        if among is not None:
-            chosen = np.isin(owners, among)
-            owners, descriptors = owners[chosen], descriptors[chosen]
-        return pm.hamming_search(encoded, descriptors, k=2, landmarks=owners, threads=threads)
-
-    def distances(
-        self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
-        """See `Memory.distances`."""
-        if not len(rows):
-            return np.zeros(0, np.float32)
-        owners, _ = self.table()
-        many = np.bincount(owners, minlength=int(ids.max()) + 1)
-        counts = many[ids]
-        starts = np.cumsum(counts) - counts
-        pair = np.repeat(np.arange(len(ids)), counts)
-        row = np.arange(len(pair)) + np.repeat((np.cumsum(many) - many)[ids] - starts, counts)
-        words, others = _words(encoded), self._table_words()
-        bits = np.empty(len(pair), np.int32)
-        for a in range(0, len(pair), _PAIRS):
-            b = a + _PAIRS
-            bits[a:b] = _set_bits(words[rows[pair[a:b]]] ^ others[row[a:b]])
-        return np.minimum.reduceat(bits, starts).astype(np.float32)
-
-    def _table_words(self) -> NDArray[np.uint64]:
-        descriptors = self.table()[1]
-        if self._padded is None or self._padded[0] is not descriptors:
-            self._padded = descriptors, _words(descriptors)
-        return self._padded[1]
-
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """See `Memory.known`."""
-        return np.isin(ids, self._owners)
-
-    @property
-    def bytes(self) -> int:
-        """Each descriptor, with nothing for the landmark it is of."""
-        return int((self._owners >= 0).sum()) * int(self._descriptors.shape[1])
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """See `Memory.arrays`."""
-        return {"memory_descriptors": self._descriptors, "memory_owners": self._owners}
-
-    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
-        """See `Memory.restore`."""
-        self._descriptors = arrays["memory_descriptors"]
-        self._owners = arrays["memory_owners"]
-        self._sorted = None
-
-
-class Medoids(Descriptors):
-    """Of each landmark the descriptor that is closest to its others, as ORB-SLAM matches.
-
-    The medoid follows new observations only if all descriptors stay, so they do; `bytes` counts
-    the medoids, which matching needs.
-    """
-
-    def __init__(self, width: int) -> None:
-        super().__init__(width)
-        self._medoids: dict[int, NDArray[np.uint8]] = {}
-        self._changed: set[int] = set()
-        self._chosen: tuple[NDArray[np.int64], NDArray[np.uint8]] | None = None
-
-    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.add`."""
-        super().add(ids, encoded)
-        self._changed.update(ids.tolist())
-
-    def remove(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.remove`."""
-        super().remove(ids, encoded)
-        self._changed.update(ids.tolist())
-
-    def merge(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
-        """See `Memory.merge`."""
-        super().merge(into, source)
-        self._changed.update(into.tolist(), source.tolist())
-
-    def discard(self, ids: NDArray[np.int64]) -> None:
-        """See `Memory.discard`."""
-        super().discard(ids)
-        self._changed.update(ids.tolist())
-
-    def restore(self, arrays: dict[str, NDArray[Any]], scene: pm.PrototypeMap | None) -> None:
-        """See `Memory.restore`."""
-        super().restore(arrays, scene)
-        self._medoids.clear()
-        self._chosen = None
-        self._changed = set(self._owners[self._owners >= 0].tolist())
-
-    def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """See `Descriptors.table`."""
-        self._follow()
-        if self._chosen is None:
-            ids = np.array(sorted(self._medoids), np.int64)
-            rows = [self._medoids[i] for i in ids.tolist()]
-            width = self._descriptors.shape[1]
-            self._chosen = ids, np.array(rows, np.uint8).reshape(-1, width)
-        return self._chosen
-
-    def _follow(self) -> None:
-        from protomark.evaluation.methods.medoid import medoid
-        from protomark.evaluation.support import Support
-
-        if not self._changed:
-            return
-        self._chosen = None
-        changed = np.array(sorted(self._changed), np.int64)
-        self._changed.clear()
-        for i in changed.tolist():
-            self._medoids.pop(i, None)
-        rows = np.isin(self._owners, changed)
-        if rows.any():
-            found = medoid(Support(self._owners[rows], self._descriptors[rows]))
-            self._medoids.update(zip(found.landmarks.tolist(), found.descriptors, strict=True))
-
-    @property
-    def bytes(self) -> int:
-        """Medoids only."""
-        self._follow()
-        return len(self._medoids) * int(self._descriptors.shape[1])
-
-
-def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """(n, bytes) uint8 -> (n, ceil(bytes / 8)), the same bits and zeros."""
-    many, width = descriptors.shape
-    padded = np.zeros((many, -(-width // 8) * 8), np.uint8)
-    padded[:, :width] = descriptors
-    return padded.view(np.uint64)
-
-
-def _set_bits(words: NDArray[np.uint64]) -> NDArray[np.int32]:
-    """(n, words) -> (n,) how many bits are set."""
-    if hasattr(np, "bitwise_count"):
-        return np.asarray(np.bitwise_count(words).sum(1, dtype=np.int32))
-    return np.asarray(_SET_BITS[words.view(np.uint8)].sum(1, dtype=np.int32))
-
-
-MEMORIES = ("prototypes", "medoids", "descriptors")
-
-
-def make_memory(settings: Settings) -> Memory:
-    """The memory that the settings ask for.
+def prototypes_for(options: MappingOptions) -> Prototypes:
+    """An empty memory of prototypes.
 
     Raises:
         ValueError: the encoder is for another descriptor, or lacks that number of dimensions.
     """
-    from protomark.tracks.features import descriptor_kind
-
-    kind = descriptor_kind(settings.descriptor)
-    if settings.memory == "descriptors":
-        return Descriptors(kind.bytes)
-    if settings.memory == "medoids":
-        return Medoids(kind.bytes)
-    encoder = pm.Encoder.load(settings.encoder or kind.name)
+    kind = descriptor_kind(options.descriptor)
+    encoder = pm.Encoder.load(options.encoder or kind.name)
     if encoder.descriptor != kind.name or encoder.bits != kind.bits:
         raise ValueError(
             f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, "
             f"not for {kind.name}"
         )
-    return Prototypes(encoder, settings.dim)
+    return Prototypes(encoder, options.dim)

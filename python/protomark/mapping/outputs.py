@@ -1,29 +1,49 @@
-"""What a map leaves on disk for others: a map file, a COLMAP model, a trajectory."""
+"""Writes what a map leaves for others: a map file, a COLMAP model, a trajectory, a report."""
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from protomark.files import write_text
-from protomark.localization.absolute_pose import centre
-from protomark.localization.poses import quaternion_of
-from protomark.mapping.memory import Memory, Prototypes
+from protomark.files import replacing_folder, write_text
+from protomark.geometry.colmap import pycolmap, quiet
+from protomark.geometry.pose_files import tum_trajectory
+from protomark.mapping.mapper import Mapper
 from protomark.mapping.structure import Structure
-from protomark.tracks.colmap import pycolmap, quiet
+from protomark.mapping.summary import map_pictures, summarise
+from protomark.maps.open import SCENE_MAP
+from protomark.report import map_page
 
-MAP, MODEL, TRAJECTORY = "scene.pmk", "sparse", "trajectory.txt"
+MODEL, TRAJECTORY, REPORT, FIGURES = "sparse", "trajectory.txt", "report.html", "report.json"
 
 
-def write_map(structure: Structure, memory: Memory, path: Path) -> None:
-    """Write prototypes and positions; nothing for memories that are not prototypes."""
-    if isinstance(memory, Prototypes):
-        ids = memory.map.ids
-        memory.map.set_positions(ids, structure.positions[ids])
-        memory.map.save(path)
+def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> dict[str, Any]:
+    """Write all outputs of a map; returns its figures.
+
+    Args:
+        mapper: the map.
+        scene: folder to write to.
+        source: name of the input.
+        finished: whether all frames of the input were added.
+    """
+    structure = mapper.structure
+    figures = {"input": source, "finished": finished, **summarise(mapper)}
+    ids = mapper.scene.ids
+    mapper.scene.set_positions(ids, structure.positions[ids])
+    mapper.scene.save(scene / SCENE_MAP)
+    write_model(structure, scene / MODEL)
+    frames = sorted(structure.frames, key=lambda f: (f.time, f.name))
+    times = np.array([frame.time for frame in frames])
+    poses = np.array([frame.pose for frame in frames]).reshape(-1, 3, 4)
+    write_text(scene / TRAJECTORY, tum_trajectory(times, poses))
+    page = map_page(figures, map_pictures(mapper, figures), f"Map of {source}")
+    write_text(scene / REPORT, page)
+    history = [vars(record) for record in mapper.history.records.values()]
+    write_text(scene / FIGURES, json.dumps({**figures, "history": history}, indent=1) + "\n")
+    return figures
 
 
 def write_model(structure: Structure, folder: Path) -> None:
@@ -52,33 +72,6 @@ def write_model(structure: Structure, folder: Path) -> None:
         )
         for image_id, index in tracks[landmark]:
             reconstruction.images[image_id].set_point3D_for_point2D(index, landmark)
-    with quiet():
+    with quiet(), replacing_folder(folder) as temporary:
         reconstruction.update_point_3d_errors()
-        replace_folder(folder, reconstruction.write)
-
-
-def replace_folder(folder: Path, write: object) -> None:
-    """Let `write` fill a new folder, then put it in the place of `folder`."""
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    temporary.chmod(0o755)
-    old = folder.with_name(f".{folder.name}.old")
-    try:
-        write(str(temporary))  # type: ignore[operator]
-        if folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            folder.rename(old)
-        temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def write_trajectory(structure: Structure, path: Path) -> None:
-    """Write camera poses in the world, in TUM format: time tx ty tz qx qy qz qw."""
-    lines = ["# time tx ty tz qx qy qz qw (camera in world)"]
-    for frame in sorted(structure.frames, key=lambda f: (f.time, f.name)):
-        w, x, y, z = quaternion_of(frame.pose[:, :3].T)
-        place = centre(frame.pose)
-        numbers = [f"{v + 0.0:.9g}" for v in (*place, x, y, z, w)]
-        lines.append(" ".join([f"{frame.time:.6f}", *numbers]))
-    write_text(path, "\n".join(lines) + "\n")
+        reconstruction.write(str(temporary))

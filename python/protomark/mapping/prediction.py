@@ -1,29 +1,29 @@
-"""Where a camera should be, by where it was in the frames beside."""
+"""Predicts the pose of a frame from the poses of its neighbours in the input."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-import cv2
 import numpy as np
 
-from protomark.mapping.structure import Array, Frame
-from protomark.tracks.geometry import relative_pose
+from protomark.extras import optional
+from protomark.geometry.pose import relative_pose
+from protomark.mapping.frame import Array, Frame
 
-# Frames further than this from each other in the input say nothing of each other's poses.
-REACH = 3
+# Frames further apart than this in the input do not predict each other's poses.
+MAX_STEP = 3
 
 
 def predict(frames: Iterable[Frame], index: int, camera_id: int) -> Array | None:
-    """The pose if the camera moves steadily along the two frames nearest to it in the input.
+    """The pose of a camera that moves steadily through the two nearest frames of the input.
 
     Args:
         frames: frames with a pose.
-        index: place of the new frame in the input.
+        index: index of the new frame in the input.
         camera_id: its camera.
 
     Returns:
-        (3, 4) cam_from_world, None where no frame is near. Where one is alone, its pose.
+        (3, 4) cam_from_world; that of the only near frame if there is one, None if there is none.
     """
     by_index = {frame.index: frame.pose for frame in frames if frame.camera_id == camera_id}
     near = _nearest(by_index, index)
@@ -33,30 +33,31 @@ def predict(frames: Iterable[Frame], index: int, camera_id: int) -> Array | None
     if other is None:
         return by_index[near]
     share = (index - near) / (near - other)
-    return _go_on(by_index[other], by_index[near], share)
+    return _extrapolate(by_index[other], by_index[near], share)
 
 
 def _nearest(by_index: dict[int, Array], index: int) -> int | None:
-    """Of the frames within reach the nearest, the one before where two are."""
-    for step in range(1, REACH + 1):
+    """The nearest frame within `MAX_STEP`, the earlier one of two."""
+    for step in range(1, MAX_STEP + 1):
         for other in (index - step, index + step):
             if other in by_index:
                 return other
     return None
 
 
-def _go_on(first: Array, second: Array, share: float) -> Array:
-    """The pose after a share more of the motion (a screw) from one pose to another."""
+def _extrapolate(first: Array, second: Array, share: float) -> Array:
+    """The pose after a further share of the screw motion from one pose to another."""
+    cv2 = optional("cv2")
     rotation, shift = relative_pose(first, second)
     turn = np.asarray(cv2.Rodrigues(rotation)[0][:, 0], np.float64)
-    velocity = np.linalg.solve(_sweep(turn), shift)
+    velocity = np.linalg.solve(_translation_jacobian(turn), shift)
     pose = cv2.Rodrigues(share * turn)[0] @ second
-    pose[:, 3] += _sweep(share * turn) @ (share * velocity)
+    pose[:, 3] += _translation_jacobian(share * turn) @ (share * velocity)
     return np.asarray(pose)
 
 
-def _sweep(turn: Array) -> Array:
-    """(3, 3), the shift that a velocity gives while it turns: the integral of the rotation."""
+def _translation_jacobian(turn: Array) -> Array:
+    """The (3, 3) integral of the rotation, which maps a velocity to the translation it causes."""
     angle = float(np.linalg.norm(turn))
     x, y, z = turn
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -1,138 +1,205 @@
-"""Frames one after the other: a folder of images, or a video."""
+"""Reads frames one after the other, from a folder of images or a video."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from protomark.mapping.mapper import Picture
-from protomark.tracks.colmap import natural_key
-from protomark.tracks.features import read_gray
+from protomark.extras import optional
+from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray, to_gray
+from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
+from protomark.geometry.camera_files import camera_from_exif
+from protomark.geometry.pose_files import PoseSet
+from protomark.mapping.frame import InputImage
 
+# Frames of a video that are held in memory to be read backward.
 _CHUNK = 64
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+_GUESSED_MODEL = "SIMPLE_RADIAL"
 
 
-@dataclass(frozen=True)
-class Folder:
-    """A folder of images, in natural order of their names (img2 before img10).
+class FrameSource(ABC):
+    """Frames in the order in which they came from the camera.
 
     Attributes:
-        path: the folder.
-        names: image names, relative to it.
-        times: seconds, if all names are decimal numbers such as 1305031102.175304.png; else places.
+        path: the folder or video.
+        prefix: what comes before the names of the frames in the map.
+        poses: given poses, or None.
     """
 
-    path: Path
-    names: list[str]
-    times: list[float]
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.prefix = ""
+        self.poses: PoseSet | None = None
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of frames; a video's is what its file says."""
+
+    @abstractmethod
+    def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]: ...
+
+    @abstractmethod
+    def names(self) -> list[str]:
+        """Names of all frames, without prefix."""
+
+    def images(
+        self, start: int = 0, only: set[str] | None = None, backward: bool = False
+    ) -> Iterator[InputImage]:
+        """Images with their names in the map and their given poses.
+
+        Args:
+            start: index of the first one.
+            only: names in the map; None: all.
+            backward: from the last to the first.
+        """
+        if only is not None:
+            size = len(self.prefix)
+            only = {name[size:] for name in only if name.startswith(self.prefix)}
+        for image in self._read(start, only, backward):
+            pose = self.poses.find(image.name, image.time) if self.poses else None
+            yield replace(image, name=self.prefix + image.name, pose=pose)
+
+    def size(self) -> tuple[int, int]:
+        """Width and height of the first image that can be read.
+
+        Raises:
+            ValueError: none can be read.
+        """
+        for image in self._read(0, None, False):
+            if image.image is not None:
+                return image.image.shape[1], image.image.shape[0]
+        raise ValueError(f"{self.path}: none of its {len(self)} frames can be read")
+
+    def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
+        """A camera to begin with, and where its focal length comes from.
+
+        Args:
+            focal: focal length in pixels; None: from EXIF, else COLMAP's guess.
+        """
+        width, height = self.size()
+        origin = "given"
+        if focal is None:
+            focal, origin = self._exif_focal_length(), "from EXIF"
+        if focal is None:
+            focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), "a guess"
+        if not (np.isfinite(focal) and focal > 0):
+            raise ValueError(f"--focal {focal}: give a positive number of pixels")
+        return Camera(_GUESSED_MODEL, width, height, (focal, width / 2, height / 2, 0.0)), origin
+
+    def _exif_focal_length(self) -> float | None:
+        return None
+
+
+class ImageFolder(FrameSource):
+    """A folder of images, in natural order of their names (img2 before img10).
+
+    Times are seconds if all names are decimal numbers such as 1305031102.175304.png, else indices.
+    """
+
+    def __init__(self, path: Path, every: int = 1) -> None:
+        super().__init__(path)
+        self._names = image_names(path)[::every]
+        if not self._names:
+            suffixes = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
+            raise FileNotFoundError(f"{path}: no images in this folder ({suffixes})")
+        self._times = _times(self._names)
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self._names)
 
-    def pictures(
-        self, start: int = 0, only: set[str] | None = None, backward: bool = False
-    ) -> Iterator[Picture]:
-        """Pictures from a place on, or those of some names, or from the last to the first."""
-        places = range(start, len(self.names))
-        for index in reversed(places) if backward else places:
-            name = self.names[index]
+    def names(self) -> list[str]:
+        """See `FrameSource.names`."""
+        return self._names
+
+    def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]:
+        indices = range(start, len(self._names))
+        for index in reversed(indices) if backward else indices:
+            name = self._names[index]
             if only is not None and name not in only:
                 continue
-            image, trouble = None, ""
+            image, problem = None, ""
             try:
                 image = read_gray(self.path / name)
             except (OSError, ValueError) as error:
-                trouble = str(error)
-            yield Picture(index, name, self.times[index], image, trouble=trouble)
+                problem = str(error)
+            yield InputImage(index, name, self._times[index], image, problem=problem)
 
-    def size(self) -> tuple[int, int]:
-        """Width and height of the first image that can be read."""
-        for picture in self.pictures():
-            if picture.image is not None:
-                return picture.image.shape[1], picture.image.shape[0]
-        raise ValueError(f"{self.path}: none of its {len(self)} images can be read")
+    def _exif_focal_length(self) -> float | None:
+        camera = camera_from_exif(self.path / self._names[0])
+        return None if camera is None else camera.params[0]
 
 
-@dataclass(frozen=True)
-class Video:
-    """A video file, of which every n-th frame counts.
+class Video(FrameSource):
+    """A video file, of which every n-th frame is taken."""
 
-    Attributes:
-        path: the file.
-        every: step between frames that are taken.
-        count: frames that are taken, as the file says; some say it wrongly.
-        rate: frames a second of the file.
-    """
-
-    path: Path
-    every: int
-    count: int
-    rate: float
+    def __init__(self, path: Path, every: int = 1) -> None:
+        super().__init__(path)
+        self._every = every
+        cv2, video = optional("cv2"), _open_video(path)
+        count, rate = (float(video.get(p)) for p in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
+        decodes = video.grab()
+        video.release()
+        if not decodes:
+            raise ValueError(f"{path}: no frame of this video decodes, convert it with ffmpeg")
+        self._rate = rate if np.isfinite(rate) and rate > 0 else 30.0
+        self._count = max(1, -(-int(max(count, 1)) // every))
 
     def __len__(self) -> int:
-        return self.count
+        return self._count
 
-    def pictures(
-        self, start: int = 0, only: set[str] | None = None, backward: bool = False
-    ) -> Iterator[Picture]:
-        """Pictures from a place on, or those of some names, or from the last to the first.
+    def names(self) -> list[str]:
+        """See `FrameSource.names`."""
+        return [image.name for image in self._read_forward(0, None, decode=False)]
 
-        Backward decodes the video anew for each `_CHUNK` frames, which it holds in memory.
-        """
+    def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]:
         if not backward:
-            yield from self._forward(start, only)
+            yield from self._read_forward(start, only)
             return
-        wanted = [p.index for p in self._forward(start, only, decode=False)]
+        # A video decodes forward only: once for each chunk, which is then reversed.
+        wanted = [image.index for image in self._read_forward(start, only, decode=False)]
         for last in range(len(wanted), 0, -_CHUNK):
             chunk = set(wanted[max(0, last - _CHUNK) : last])
-            yield from reversed(list(self._forward(start, only, chunk)))
+            yield from reversed(list(self._read_forward(start, only, chunk)))
 
-    def _forward(
+    def _read_forward(
         self,
         start: int,
         only: set[str] | None,
         chunk: set[int] | None = None,
         decode: bool = True,
-    ) -> Iterator[Picture]:
+    ) -> Iterator[InputImage]:
         video = _open_video(self.path)
         try:
-            place = 0
+            number = -1
             while video.grab():
-                index, rest = divmod(place, self.every)
-                name = f"{self.path.stem}-{place:06d}"
-                place += 1
+                number += 1
+                index, rest = divmod(number, self._every)
+                name = f"{self.path.stem}-{number:06d}"
                 if rest or index < start or (only is not None and name not in only):
                     continue
                 if chunk is not None and index not in chunk:
                     continue
                 if not decode:
-                    yield Picture(index, name, 0.0, None)
+                    yield InputImage(index, name, 0.0, None)
                     continue
-                fine, image = video.retrieve()
-                gray, trouble = (_gray(image), "") if fine else (None, "this frame does not decode")
-                yield Picture(index, name, (place - 1) / self.rate, gray, trouble=trouble)
+                decoded, image = video.retrieve()
+                gray = to_gray(np.asarray(image)) if decoded else None
+                problem = "" if decoded else "this frame does not decode"
+                yield InputImage(index, name, number / self._rate, gray, problem=problem)
         finally:
             video.release()
 
-    def size(self) -> tuple[int, int]:
-        """Width and height of the first frame."""
-        for picture in self.pictures():
-            if picture.image is not None:
-                return picture.image.shape[1], picture.image.shape[0]
-        raise ValueError(f"{self.path}: no frame of this video decodes, convert it with ffmpeg")
 
-
-def open_source(path: Path, every: int = 1) -> Folder | Video:
-    """A folder of images or a video.
+def open_source(path: Path, every: int = 1) -> FrameSource:
+    """Open a folder of images or a video.
 
     Args:
-        path: folder or file.
+        path: folder or file; the folder of a sequence, which holds images/, too.
         every: take every n-th frame only.
 
     Raises:
@@ -142,28 +209,10 @@ def open_source(path: Path, every: int = 1) -> Folder | Video:
     if every < 1:
         raise ValueError(f"--every {every}: it must be at least 1")
     if path.is_dir():
-        # A sequence folder holds its images in images/.
-        if (path / "images").is_dir():
-            path = path / "images"
-        files = [f for f in path.rglob("*") if f.suffix.lower() in SUFFIXES and f.is_file()]
-        names = sorted((f.relative_to(path).as_posix() for f in files), key=natural_key)[::every]
-        if not names:
-            raise FileNotFoundError(
-                f"{path}: no images in this folder ({', '.join(s[1:] for s in SUFFIXES)})"
-            )
-        return Folder(path, names, _times(names))
+        return ImageFolder(path / "images" if (path / "images").is_dir() else path, every)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such folder of images or video file")
-    import cv2
-
-    video = _open_video(path)
-    count, rate = (float(video.get(p)) for p in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-    fine = video.grab()
-    video.release()
-    if not fine:
-        raise ValueError(f"{path}: no frame of this video decodes, convert it with ffmpeg")
-    rate = rate if np.isfinite(rate) and rate > 0 else 30.0
-    return Video(path, every, max(1, -(-int(max(count, 1)) // every)), rate)
+    return Video(path, every)
 
 
 def _times(names: list[str]) -> list[float]:
@@ -179,9 +228,8 @@ def _times(names: list[str]) -> list[float]:
 
 
 def _open_video(path: Path) -> Any:
-    import cv2
-
-    # OpenCV and FFmpeg print what they think of a broken file; our sentence says it.
+    cv2 = optional("cv2")
+    # OpenCV and FFmpeg would print their own view of a broken file.
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(0)
     try:
@@ -194,11 +242,3 @@ def _open_video(path: Path) -> Any:
             "ffmpeg -i IN -c:v libx264 OUT.mp4, or give a folder of images"
         )
     return video
-
-
-def _gray(image: Any) -> NDArray[np.uint8]:
-    import cv2
-
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return np.asarray(image, np.uint8)

@@ -1,12 +1,14 @@
-"""New landmarks from the descriptors that the window still keeps."""
+"""Makes new landmarks from the descriptors of the window."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from protomark.geometry.pose import relative_pose
+from protomark.geometry.triangulation import depth_of_first, refine_points, reprojection_residuals
+from protomark.mapping.frame import Frame, Ids
 from protomark.mapping.memory import Memory
-from protomark.mapping.structure import Frame, Ids, Structure
-from protomark.tracks.geometry import depth_of_first, refine_points, relative_pose, residuals
+from protomark.mapping.structure import Structure
 from protomark.tracks.matching import View, match
 
 RATIO = 0.8
@@ -20,28 +22,29 @@ def triangulate(
     max_error: float,
     min_angle: float,
 ) -> list[tuple[int, int]]:
-    """Match a frame with those of the window, make landmarks, and lengthen those there are.
+    """Match a frame with those of the window, make landmarks, and extend existing ones.
 
-    Exact Hamming search, ratio test, mutual, near the epipolar line; then landmarks of two rays
-    whose angle is wide enough and that project back to where they were seen. Where one of the two
-    keypoints sees a landmark already, the other one joins it if it projects there.
+    Matches are mutual nearest neighbours in Hamming distance that pass the ratio test and lie near
+    the epipolar line. Two keypoints without a landmark make one if the angle of their rays is wide
+    enough and the landmark projects back to both. If one of the two sees a landmark already, the
+    other observes it, too, if it projects there.
 
     Args:
         structure: frames and landmarks.
         memory: gets every new observation.
-        newest: the frame, a place in `structure.frames`; it has its descriptors.
-        window: other frames that still have theirs.
+        newest: index of the frame, which is in the window.
+        window: indices of the other frames of the window.
         max_error: largest reprojection error, as a share of the image's longer side.
         min_angle: smallest angle between the two rays, degrees.
 
     Returns:
-        Pairs of landmarks that a match says are one.
+        Pairs of landmarks that are duplicates by a match.
     """
     frame = structure.frames[newest]
-    same: list[tuple[int, int]] = []
-    for place in sorted(window):
-        same += _pair(structure, memory, structure.frames[place], frame, max_error, min_angle)
-    return same
+    duplicates: list[tuple[int, int]] = []
+    for i in sorted(window):
+        duplicates += _pair(structure, memory, structure.frames[i], frame, max_error, min_angle)
+    return duplicates
 
 
 def _pair(
@@ -56,19 +59,19 @@ def _pair(
     limit = structure.tolerance(new.camera_id, max_error)
     rows = match(views[0], views[1], RATIO, limit).rows
     a, b = rows[:, 0], rows[:, 1]
-    known_a, known_b = old.landmarks[a], new.landmarks[b]
-    fresh = (known_a < 0) & (known_b < 0)
+    landmark_a, landmark_b = old.landmarks[a], new.landmarks[b]
+    fresh = (landmark_a < 0) & (landmark_b < 0)
     _create(structure, memory, old, new, a[fresh], b[fresh], max_error, min_angle)
-    only_a, only_b = (known_a >= 0) & (known_b < 0), (known_a < 0) & (known_b >= 0)
-    _join(structure, memory, new, b[only_a], known_a[only_a], limit)
-    _join(structure, memory, old, a[only_b], known_b[only_b], limit)
-    both = (known_a >= 0) & (known_b >= 0) & (known_a != known_b)
-    return list(zip(known_a[both].tolist(), known_b[both].tolist(), strict=True))
+    only_a, only_b = (landmark_a >= 0) & (landmark_b < 0), (landmark_a < 0) & (landmark_b >= 0)
+    _extend(structure, memory, new, b[only_a], landmark_a[only_a], limit)
+    _extend(structure, memory, old, a[only_b], landmark_b[only_b], limit)
+    both = (landmark_a >= 0) & (landmark_b >= 0) & (landmark_a != landmark_b)
+    return list(zip(landmark_a[both].tolist(), landmark_b[both].tolist(), strict=True))
 
 
 def _view(structure: Structure, frame: Frame) -> View:
     if frame.descriptors is None:
-        raise ValueError(f"{frame.name}: its descriptors are gone, it has left the window")
+        raise ValueError(f"{frame.name}: no descriptors, it has left the window")
     return View(frame.descriptors, frame.rays, frame.pose, structure.focal(frame.camera_id))
 
 
@@ -90,15 +93,15 @@ def _create(
     a, b, depth = a[wide], b[wide], depth[wide]
     local = np.column_stack([old.rays[a], np.ones(len(a))]) * depth[:, None]
     points = (local - old.pose[:, 3]) @ old.pose[:, :3]
-    many = len(points)
-    poses = np.repeat(np.stack([old.pose, new.pose]), many, axis=0)
+    count = len(points)
+    poses = np.repeat(np.stack([old.pose, new.pose]), count, axis=0)
     seen = np.concatenate([old.rays[a], new.rays[b]])
-    focal = np.repeat([structure.focal(f.camera_id) for f in (old, new)], many)
-    points = refine_points(points, np.tile(np.arange(many), 2), poses, seen, focal, iterations=2)
-    difference, depth = residuals(np.tile(points, (2, 1)), poses, seen)
+    focal = np.repeat([structure.focal(f.camera_id) for f in (old, new)], count)
+    points = refine_points(points, np.tile(np.arange(count), 2), poses, seen, focal, iterations=2)
+    difference, depth = reprojection_residuals(np.tile(points, (2, 1)), poses, seen)
     error = np.linalg.norm(difference, axis=1) * focal
-    limits = np.repeat([structure.tolerance(f.camera_id, max_error) for f in (old, new)], many)
-    fits = ((error <= limits) & (depth > 0)).reshape(2, many).all(0)
+    limits = np.repeat([structure.tolerance(f.camera_id, max_error) for f in (old, new)], count)
+    fits = ((error <= limits) & (depth > 0)).reshape(2, count).all(0)
     a, b = a[fits], b[fits]
     ids = structure.create(points[fits])
     for frame, rows in ((old, a), (new, b)):
@@ -106,13 +109,13 @@ def _create(
         remember(memory, frame, rows)
 
 
-def _join(
+def _extend(
     structure: Structure, memory: Memory, frame: Frame, rows: Ids, ids: Ids, limit: float
 ) -> None:
-    """Let keypoints see landmarks that project to them and that the frame does not see yet."""
+    """Let keypoints observe landmarks that project to them and that the frame does not see yet."""
     if not len(rows):
         return
-    difference, depth = residuals(
+    difference, depth = reprojection_residuals(
         structure.positions[ids], np.repeat(frame.pose[None], len(ids), axis=0), frame.rays[rows]
     )
     error = np.linalg.norm(difference, axis=1) * structure.focal(frame.camera_id)
@@ -127,6 +130,6 @@ def _join(
 
 
 def remember(memory: Memory, frame: Frame, rows: Ids) -> None:
-    """Add what keypoints of a frame look like to the landmarks that they see."""
+    """Add the codes of keypoints to the landmarks that they see (Eq. 2)."""
     if len(rows) and frame.encoded is not None:
         memory.add(frame.landmarks[rows], frame.encoded[rows])

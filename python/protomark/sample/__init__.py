@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protomark.tracks import Tracks
+from protomark.tracks.file import Tracks
 
 NAME = "toy.freak.safetensors"
 

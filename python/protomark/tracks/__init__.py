@@ -1,5 +1,5 @@
 """Observations: which descriptor of which keyframe saw which landmark."""
 
-from protomark.tracks.file import Camera, Tracks
+from protomark.tracks.file import Tracks
 
-__all__ = ["Camera", "Tracks"]
+__all__ = ["Tracks"]

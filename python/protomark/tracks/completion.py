@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import project
-from protomark.tracks.geometry import refine_points, widest_angle
+from protomark.geometry.neighbours import near_pairs
+from protomark.geometry.pose import transform
+from protomark.geometry.triangulation import refine_points, widest_angle
 from protomark.tracks.merging import merge
 from protomark.tracks.scene import Scene
 
@@ -134,11 +135,10 @@ def _candidates(
     landmarks = np.flatnonzero(seen)
     camera = scene.model.cameras[int(scene.model.camera_ids[keyframe])]
     pose = scene.model.cam_from_world[keyframe]
-    pixels = project(camera, scene.positions[landmarks] @ pose[:, :3].T + pose[:, 3])
-    # NaN, behind the camera, is not inside.
+    pixels = camera.project(transform(pose, scene.positions[landmarks]))
     inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
     landmarks, pixels = landmarks[inside], pixels[inside]
-    a, b = within(pixels, scene.keypoints[own].astype(np.float64), radius)
+    a, b = near_pairs(pixels, scene.keypoints[own].astype(np.float64), radius)
     if not len(a):
         return nothing, nothing, nothing
     landmarks, keypoints = landmarks[a], b + own.start
@@ -152,34 +152,3 @@ def _candidates(
     distance = _POPCOUNT[bits].sum(1, dtype=np.int64)
     smallest = np.minimum.reduceat(distance, np.cumsum(length) - length)
     return landmarks, keypoints, smallest
-
-
-def within(
-    first: NDArray[np.float64], second: NDArray[np.float64], radius: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Index pairs of points (n, 2) and (m, 2) at most `radius` apart; coordinates >= -radius."""
-    if not len(first) or not len(second):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    a, b = (np.floor(p / radius).astype(np.int64) + 2 for p in (first, second))
-    stride = int(max(a[:, 0].max(), b[:, 0].max())) + 3
-    key = b[:, 1] * stride + b[:, 0]
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    left, right = [], []
-    for row in (-1, 0, 1):
-        # Three cells side by side are one run of keys.
-        base = (a[:, 1] + row) * stride + a[:, 0]
-        start, stop = (
-            np.searchsorted(key, base - 1, "left"),
-            np.searchsorted(key, base + 1, "right"),
-        )
-        length = stop - start
-        i = np.repeat(np.arange(len(first)), length)
-        at = np.arange(len(i)) - np.repeat(np.cumsum(length) - length, length) + start[i]
-        left.append(i)
-        right.append(order[at])
-    i, j = np.concatenate(left), np.concatenate(right)
-    near = ((first[i] - second[j]) ** 2).sum(1) <= radius * radius
-    i, j = i[near], j[near]
-    order = np.lexsort((j, i))
-    return i[order], j[order]

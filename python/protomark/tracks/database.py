@@ -1,4 +1,4 @@
-"""Tracks straight from a COLMAP database and model that already hold binary descriptors."""
+"""Reads tracks from a COLMAP database and model that already hold binary descriptors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.features import DESCRIPTORS, Features, descriptor_kind
+from protomark.features.descriptors import DESCRIPTORS, descriptor_kind
+from protomark.features.extractor import Features
 from protomark.tracks.file import Tracks
 
 _FAR = 1e9  # pixels; a product of two such numbers is still a float32
@@ -41,7 +42,9 @@ def digest_of(database: Path, model: Path) -> str:
     return digest.hexdigest()
 
 
-def from_database(database: Path, model_path: Path, descriptor: str, name: str = "") -> Tracks:
+def tracks_from_database(
+    database: Path, model_path: Path, descriptor: str, name: str = ""
+) -> Tracks:
     """Keypoints and descriptors of the database, landmarks of the model.
 
     A landmark that the model saw twice in one image keeps the keypoint with the smaller
@@ -57,13 +60,13 @@ def from_database(database: Path, model_path: Path, descriptor: str, name: str =
         FileNotFoundError: the database or the model is missing.
         ValueError: they are broken, or do not fit together, or the descriptors are not binary.
     """
-    from protomark.tracks.colmap import model_of, read_reconstruction
+    from protomark.geometry.colmap import model_from_reconstruction, read_reconstruction
 
     if not database.is_file():
         raise FileNotFoundError(f"{database}: no such COLMAP database")
     kind = descriptor_kind(descriptor)
     reconstruction = read_reconstruction(model_path)
-    model = model_of(reconstruction, model_path)
+    model = model_from_reconstruction(reconstruction, model_path)
     if not reconstruction.points3D:
         raise ValueError(
             f"{model_path}: the model has no points, so the database's descriptors have no "
@@ -120,7 +123,7 @@ def from_database(database: Path, model_path: Path, descriptor: str, name: str =
         landmark_positions=positions[keep],
         info={
             "sequence": name,
-            "settings": {"descriptor": kind.name, "database": True},
+            "options": {"descriptor": kind.name, "database": True},
             "input": digest_of(database, model_path),
             "images_without_pose": model.unposed,
             "poses_refined": False,
@@ -233,13 +236,11 @@ def _features(image: _Image) -> Features:
     )
 
 
-def is_done(path: Path, descriptor: str, digest: str) -> bool:
+def is_up_to_date(path: Path, database: Path, model: Path, descriptor: str) -> bool:
     """Whether `path` holds the tracks of this very database and model."""
-    if not path.is_file():
-        return False
     try:
         info: dict[str, Any] = Tracks.load(path).info
     except (ValueError, OSError):
         return False
-    settings = {"descriptor": descriptor_kind(descriptor).name, "database": True}
-    return info.get("settings") == settings and info.get("input") == digest
+    options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
+    return info.get("options") == options and info.get("input") == digest_of(database, model)

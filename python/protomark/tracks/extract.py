@@ -1,56 +1,61 @@
-"""From an image folder with a COLMAP sparse model to tracks."""
+"""Makes tracks from an image folder with a COLMAP sparse model."""
 
 from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.features import Extractor, Features, descriptor_kind, read_gray
+from protomark.extras import optional
+from protomark.features.descriptors import descriptor_kind
+from protomark.features.extractor import Extractor, Features
+from protomark.features.images import image_names, read_gray
+from protomark.geometry import colmap
+from protomark.progress import Progress, silent
+from protomark.threads import parallel_map
+from protomark.tracks import completion, pairs, triangulation
 from protomark.tracks.file import Tracks
+from protomark.tracks.matching import VerifiedMatches, View, match, with_errors
+from protomark.tracks.scene import Scene
 
-S = TypeVar("S")
-T = TypeVar("T")
-# Called with a stage's name, steps done and steps in all.
-Progress = Callable[[str, int, int], None]
+Pairs = dict[tuple[int, int], VerifiedMatches]
 
-# Matches are kept this far (pixels) from the epipolar line until it is known how good poses are.
+# Matches are kept this far (pixels) from the epipolar line until the error of the poses is known.
 _ROUGH_ERROR = 16.0
 # Poses with a larger epipolar error (pixels, median over pairs of each pair's median) are refined
-# under `refine_poses="auto"`. Structure from motion shows 0.2 to 0.7, rough poses 1.3 and more.
+# under `refine_poses="auto"`. Structure from motion has 0.2 to 0.7, rough poses 1.3 and more.
 _ROUGH_POSES = 1.0
 _MIN_MATCHES = 15
 _REFINE_ERRORS = (12.0, 4.0)
-# Keypoints of an image, the strongest, that take part in refinement; more cost time, not error.
+# The strongest keypoints of an image that take part in refinement; more cost time and do not
+# lower the error.
 _REFINE_KEYPOINTS = 700
-_PASSES = 3
-# Goes up whenever the same settings give other tracks, so that old files are made anew.
+_COMPLETION_PASSES = 3
+# Raised whenever the same options give other tracks, so that old files are made anew.
 _METHOD = 3
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How tracks are made. A file made with other settings is made anew.
+class TracksOptions:
+    """How tracks are made. A file made with other options is made anew.
 
     Attributes:
-        descriptor: name of the descriptor, see `protomark.tracks.features.DESCRIPTORS`.
+        descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
         max_keypoints: keypoints kept in an image.
         partners: about how many keyframes each keyframe is matched with.
         ratio: ratio test, nearest to second nearest Hamming distance.
         max_error: largest epipolar and reprojection error, pixels.
         min_angle: smallest angle between two rays of a landmark, degrees.
         min_length: fewest observations of a landmark.
-        refine_poses: "yes", "no", or "auto": where matches say that poses are only roughly right.
+        refine_poses: "yes", "no", or "auto": where matches show that poses are only roughly right.
         max_unlabelled: keypoints without a landmark that a keyframe keeps, the strongest; None
-            keeps all. Fewer make smaller files, but a query frame then shows fewer of the
-            keypoints that match nothing.
+            keeps all. Fewer make smaller files, but a query frame then has fewer of the keypoints
+            that match nothing.
     """
 
     descriptor: str = "freak"
@@ -65,6 +70,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)
+        unlabelled = self.max_unlabelled
         checks = (
             ("max_keypoints", self.max_keypoints >= 2, "at least 2"),
             ("partners", self.partners >= 1, "at least 1"),
@@ -72,20 +78,16 @@ class Settings:
             ("max_error", 0 < self.max_error <= _ROUGH_ERROR, f"in (0, {_ROUGH_ERROR:g}]"),
             ("min_angle", 0 <= self.min_angle < 90, "in [0, 90)"),
             ("min_length", self.min_length >= 2, "at least 2"),
-            (
-                "max_unlabelled",
-                self.max_unlabelled is None or self.max_unlabelled >= 0,
-                "at least 0",
-            ),
+            ("max_unlabelled", unlabelled is None or unlabelled >= 0, "at least 0"),
             ("refine_poses", self.refine_poses in ("auto", "yes", "no"), "auto, yes or no"),
         )
-        for name, fine, want in checks:
-            if not fine:
-                raise ValueError(f"{name} is {getattr(self, name)}, it must be {want}")
+        for name, valid, expected in checks:
+            if not valid:
+                raise ValueError(f"{name} is {getattr(self, name)}, it must be {expected}")
 
 
 @dataclass(frozen=True)
-class Source:
+class SequenceFolder:
     """Where a sequence lies.
 
     Attributes:
@@ -99,14 +101,14 @@ class Source:
     model: Path
 
 
-def find_source(folder: Path, images: Path | None = None, model: Path | None = None) -> Source:
+def find_sequence(
+    folder: Path, images: Path | None = None, model: Path | None = None
+) -> SequenceFolder:
     """Find images/ and sparse/ or sparse/0/ in a folder, unless told otherwise.
 
     Raises:
         FileNotFoundError: the folder, its images or its model are missing.
     """
-    from protomark.tracks.colmap import find_model
-
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder")
     images = images or folder / "images"
@@ -114,178 +116,107 @@ def find_source(folder: Path, images: Path | None = None, model: Path | None = N
         raise FileNotFoundError(f"{images}: no such folder of images, name it with --images")
     if not any(file.is_file() for file in images.rglob("*")):
         raise FileNotFoundError(f"{images}: the folder is empty, it should hold the images")
-    return Source(folder.resolve().name, images, model or find_model(folder))
+    return SequenceFolder(folder.resolve().name, images, model or colmap.find_model(folder))
 
 
-def fingerprint(source: Source) -> str:
+def read_posed_model(folder: Path) -> colmap.ColmapModel:
+    """A model whose poses landmarks can be triangulated from.
+
+    Raises:
+        FileNotFoundError, ValueError: as `colmap.read_model`, or the model holds too little.
+    """
+    model = colmap.read_model(folder)
+    model.check_for_triangulation(folder)
+    return model
+
+
+def fingerprint(sequence: SequenceFolder, model: colmap.ColmapModel) -> str:
     """Digest of what the tracks are made from: cameras, poses, image names and file sizes.
 
     Raises:
         FileNotFoundError: an image that the model names is missing.
-        ValueError: the model is broken or holds too little.
     """
-    from protomark.tracks.colmap import read_model
-
-    model = read_model(source.model)
     digest = hashlib.sha256(model.cam_from_world.tobytes())
     digest.update(repr((sorted(model.cameras.items()), model.camera_ids.tolist())).encode())
     for name in model.names:
-        path = source.images / name
+        path = sequence.images / name
         if not path.is_file():
             raise FileNotFoundError(
-                f"{path}: image is missing, though the model {source.model} has a pose for it"
+                f"{path}: image is missing, though the model {sequence.model} has a pose for it"
             )
         digest.update(f"{name}\0{path.stat().st_size}\0".encode())
     return digest.hexdigest()
 
 
-def is_done(path: Path, settings: Settings, digest: str) -> bool:
-    """Whether `path` holds tracks made with these settings from this very input."""
-    if not path.is_file():
-        return False
+def is_up_to_date(path: Path, options: TracksOptions, sequence: SequenceFolder) -> bool:
+    """Whether `path` holds tracks made with these options from this very input."""
     try:
         info = Tracks.load(path).info
-    except (ValueError, OSError):
+        made_with = TracksOptions(**info.get("options", {}))
+    except (ValueError, OSError, TypeError):
         return False
-    try:
-        # Options that came after the file was made have their defaults.
-        made_with = Settings(**info.get("settings", {}))
-    except (TypeError, ValueError):
+    if info.get("method") != _METHOD or made_with != options:
         return False
-    if info.get("method") != _METHOD:
-        return False
-    return made_with == settings and info.get("input") == digest
+    return info.get("input") == fingerprint(sequence, read_posed_model(sequence.model))
 
 
 def extract(
-    source: Source,
-    settings: Settings,
+    sequence: SequenceFolder,
+    options: TracksOptions,
     threads: int = 1,
-    progress: Progress = lambda stage, done, total: None,
+    progress: Progress = silent,
 ) -> Tracks:
     """Detect, describe, match, triangulate and complete: the tracks of one sequence.
 
     Args:
-        source: images and model, see `find_source`.
-        settings: how to make them.
+        sequence: images and model, see `find_sequence`.
+        options: how to make them.
         threads: threads for detection and matching; the result is the same.
-        progress: called with each stage's name, steps done and steps in all.
+        progress: called with each stage.
 
     Raises:
         FileNotFoundError: an image or the model is missing.
-        ValueError: a broken image or model, or nothing could be triangulated.
+        ValueError: an image or the model is broken, or nothing could be triangulated.
     """
-    from protomark.tracks import colmap, completion, pairs, triangulation
-    from protomark.tracks.matching import Matches, View, match
-    from protomark.tracks.scene import Scene
-
-    digest = fingerprint(source)
-    model = colmap.read_model(source.model)
-    features = _detect(source, model, settings, threads, progress)
-    keypoints = [f.keypoints for f in features]
-    focal = {k: colmap.focal_length(c) for k, c in model.cameras.items()}
-
-    def views_of(model: colmap.Model) -> list[View]:
-        return [
-            View(f.descriptors, ray, pose, focal[int(c)])
-            for f, ray, pose, c in zip(
-                features, all_rays, model.cam_from_world, model.camera_ids, strict=True
-            )
-        ]
-
-    all_rays = [
-        colmap.rays(model.cameras[int(c)], k)
-        for c, k in zip(model.camera_ids, keypoints, strict=True)
-    ]
-    views = views_of(model)
-
-    def match_all(chosen: list[tuple[int, int]], stage: str) -> dict[tuple[int, int], Matches]:
-        found = _parallel(
-            lambda ij: match(views[ij[0]], views[ij[1]], settings.ratio, _ROUGH_ERROR),
-            chosen,
-            threads,
-            lambda done: progress(stage, done, len(chosen)),
-        )
-        return dict(zip(chosen, found, strict=True))
-
-    matches = match_all(pairs.neighbour_pairs(len(views)), "match neighbours")
-    overlap = pairs.overlaps(model, pairs.depth_quartiles(views, matches))
-    chosen = pairs.covisible_pairs(overlap, settings.partners)
-    matches |= match_all([p for p in chosen if p not in matches], "match covisible")
-    if not any(len(m) for m in matches.values()):
-        raise _nothing(source)
-    error = _pose_error(matches)
-    refine = settings.refine_poses == "yes" or (
-        settings.refine_poses == "auto" and error > _ROUGH_POSES
+    given = read_posed_model(sequence.model)
+    digest = fingerprint(sequence, given)
+    features = _detect(sequence, given, options, threads, progress)
+    work = _Matching(given, features, options, threads, progress)
+    overlap = work.match_covisible()
+    if not any(len(m) for m in work.matches.values()):
+        raise _nothing_triangulated(sequence)
+    error = _epipolar_error(work.matches)
+    refine = options.refine_poses == "yes" or (
+        options.refine_poses == "auto" and error > _ROUGH_POSES
     )
-    given = model
-    if refine:
-        for step, limit in enumerate(_REFINE_ERRORS):
-            progress("refine poses", step, len(_REFINE_ERRORS))
-            near = {
-                p: m.where((m.errors <= limit) & (m.rows < _REFINE_KEYPOINTS).all(1))
-                for p, m in matches.items()
-            }
-            reconstruction = triangulation.triangulate(
-                model, keypoints, near, limit, settings.min_angle
-            )
-            if not reconstruction.points3D:
-                raise _nothing(source)
-            model = triangulation.refine_poses(model, reconstruction)
-            views = views_of(model)
-            matches = {p: _with_errors(m, views[p[0]], views[p[1]]) for p, m in matches.items()}
-        progress("refine poses", len(_REFINE_ERRORS), len(_REFINE_ERRORS))
-
-    matches = {p: m.where(m.errors <= settings.max_error) for p, m in matches.items()}
+    if refine and not work.refine_poses():
+        raise _nothing_triangulated(sequence)
+    matches = {p: m.where(m.errors <= options.max_error) for p, m in work.matches.items()}
     progress("triangulate", 0, 1)
+    keypoints = [f.keypoints for f in features]
     reconstruction = triangulation.triangulate(
-        model, keypoints, matches, settings.max_error, settings.min_angle
+        work.model, keypoints, matches, options.max_error, options.min_angle
     )
     if not reconstruction.points3D:
-        raise _nothing(source)
-    labels, positions = triangulation.labels_of(reconstruction, keypoints)
-    progress("triangulate", 1, 1)
-
-    counts = np.array([len(k) for k in keypoints])
-    keyframe = np.repeat(np.arange(len(counts)), counts)
-    scene = Scene(
-        model=model,
-        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        keyframe=keyframe,
-        keypoints=np.concatenate(keypoints),
-        rays=np.concatenate(all_rays),
-        focal=np.array([focal[int(c)] for c in model.camera_ids])[keyframe],
-        descriptors=np.concatenate([f.descriptors for f in features]),
-        labels=labels,
-        positions=positions,
-    )
-    completion.clean(scene, settings.max_error, settings.min_angle, 2)
+        raise _nothing_triangulated(sequence)
+    scene = _scene(work, *triangulation.labels_of(reconstruction, keypoints))
     # A descriptor agrees with a landmark's if nearly all verified matches are no closer.
     distances = np.concatenate([m.distances for m in matches.values()])
     max_distance = int(np.percentile(distances, 99)) if len(distances) else 0
-    partners = [np.flatnonzero(overlap[i] > pairs.MIN_OVERLAP) for i in range(len(views))]
-    added = merged = 0
-    for step in range(_PASSES):
-        progress("complete", step, _PASSES)
-        more, joined = completion.complete(scene, partners, settings.max_error, max_distance)
-        added, merged = added + more, merged + joined
-        completion.clean(scene, settings.max_error, settings.min_angle, 2)
-    completion.clean(scene, settings.max_error, settings.min_angle, settings.min_length)
-    progress("complete", _PASSES, _PASSES)
+    added, merged = _complete(scene, overlap, max_distance, options, progress)
     if not len(scene.positions):
-        raise _nothing(source)
+        raise _nothing_triangulated(sequence)
+    shift = np.linalg.norm(given.centers - work.model.centers, axis=1)
     info: dict[str, Any] = {
-        "sequence": source.name,
+        "sequence": sequence.name,
         "method": _METHOD,
-        "settings": asdict(settings),
+        "options": asdict(options),
         "input": digest,
         "epipolar_error": round(error, 3),
         "poses_refined": refine,
-        "pose_shift_median": float(
-            np.median(np.linalg.norm(given.centers - model.centers, axis=1))
-        ),
+        "pose_shift_median": float(np.median(shift)),
         "images_without_pose": sorted(
-            {*model.unposed, *_image_files(source.images)} - set(model.names)
+            {*given.unposed, *image_names(sequence.images)} - set(given.names)
         ),
         "pairs": len(matches),
         "observations_completed": added,
@@ -293,10 +224,118 @@ def extract(
         "max_descriptor_distance": max_distance,
         "software": _versions(),
     }
-    tracks = tracks_of(scene, features, settings.descriptor, info)
-    if settings.max_unlabelled is not None:
-        tracks = tracks.where(_labelled_or_strong(tracks, settings.max_unlabelled))
+    tracks = tracks_from_scene(scene, features, options.descriptor, info)
+    if options.max_unlabelled is not None:
+        tracks = tracks.where(_labelled_or_strong(tracks, options.max_unlabelled))
     return tracks
+
+
+class _Matching:
+    """Matches between keyframes under poses that may be refined.
+
+    Attributes:
+        model: cameras and poses.
+        rays: undistorted keypoints of each keyframe.
+        matches: between keyframes (i, j), i < j.
+    """
+
+    def __init__(
+        self,
+        model: colmap.ColmapModel,
+        features: list[Features],
+        options: TracksOptions,
+        threads: int,
+        progress: Progress,
+    ) -> None:
+        self.model, self.features = model, features
+        self.options, self.threads, self.progress = options, threads, progress
+        self.rays = [
+            model.cameras[int(c)].rays(f.keypoints)
+            for c, f in zip(model.camera_ids, features, strict=True)
+        ]
+        self.focal = np.array([model.cameras[int(c)].focal_length for c in model.camera_ids])
+        self.views = self._make_views()
+        self.matches: Pairs = {}
+
+    def _make_views(self) -> list[View]:
+        parts = (self.features, self.rays, self.model.cam_from_world, self.focal)
+        return [View(f.descriptors, *rest) for f, *rest in zip(*parts, strict=True)]
+
+    def _match(self, chosen: list[tuple[int, int]], stage: str) -> None:
+        def one(pair: tuple[int, int]) -> VerifiedMatches:
+            i, j = pair
+            return match(self.views[i], self.views[j], self.options.ratio, _ROUGH_ERROR)
+
+        found = parallel_map(one, chosen, self.threads, self.progress, stage)
+        self.matches |= dict(zip(chosen, found, strict=True))
+
+    def match_covisible(self) -> NDArray[np.float64]:
+        """Match keyframes that see the same; returns the overlap (m, m) of their views."""
+        self._match(pairs.neighbour_pairs(len(self.views)), "match neighbours")
+        overlap = pairs.overlaps(self.model, pairs.depth_quartiles(self.views, self.matches))
+        chosen = pairs.covisible_pairs(overlap, self.options.partners)
+        self._match([p for p in chosen if p not in self.matches], "match covisible")
+        return overlap
+
+    def refine_poses(self) -> bool:
+        """Bundle-adjust the poses on the strongest keypoints; False if nothing triangulates."""
+        keypoints = [f.keypoints for f in self.features]
+        for step, limit in enumerate(_REFINE_ERRORS):
+            self.progress("refine poses", step, len(_REFINE_ERRORS))
+            near = {
+                p: m.where((m.errors <= limit) & (m.rows < _REFINE_KEYPOINTS).all(1))
+                for p, m in self.matches.items()
+            }
+            reconstruction = triangulation.triangulate(
+                self.model, keypoints, near, limit, self.options.min_angle
+            )
+            if not reconstruction.points3D:
+                return False
+            self.model = triangulation.refine_poses(self.model, reconstruction)
+            self.views = self._make_views()
+            self.matches = {
+                (i, j): with_errors(m, self.views[i], self.views[j])
+                for (i, j), m in self.matches.items()
+            }
+        self.progress("refine poses", len(_REFINE_ERRORS), len(_REFINE_ERRORS))
+        return True
+
+
+def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.float64]) -> Scene:
+    counts = np.array([len(f) for f in work.features])
+    keyframe = np.repeat(np.arange(len(counts)), counts)
+    return Scene(
+        model=work.model,
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        keyframe=keyframe,
+        keypoints=np.concatenate([f.keypoints for f in work.features]),
+        rays=np.concatenate(work.rays),
+        focal=work.focal[keyframe],
+        descriptors=np.concatenate([f.descriptors for f in work.features]),
+        labels=labels,
+        positions=positions,
+    )
+
+
+def _complete(
+    scene: Scene,
+    overlap: NDArray[np.float64],
+    max_distance: int,
+    options: TracksOptions,
+    progress: Progress,
+) -> tuple[int, int]:
+    """Add observations that matching missed; returns how many, and how many landmarks merged."""
+    completion.clean(scene, options.max_error, options.min_angle, 2)
+    partners = [np.flatnonzero(row > pairs.MIN_OVERLAP) for row in overlap]
+    added = merged = 0
+    for step in range(_COMPLETION_PASSES):
+        progress("complete", step, _COMPLETION_PASSES)
+        more, joined = completion.complete(scene, partners, options.max_error, max_distance)
+        added, merged = added + more, merged + joined
+        completion.clean(scene, options.max_error, options.min_angle, 2)
+    completion.clean(scene, options.max_error, options.min_angle, options.min_length)
+    progress("complete", _COMPLETION_PASSES, _COMPLETION_PASSES)
+    return added, merged
 
 
 def _labelled_or_strong(tracks: Tracks, limit: int) -> NDArray[np.bool_]:
@@ -308,15 +347,15 @@ def _labelled_or_strong(tracks: Tracks, limit: int) -> NDArray[np.bool_]:
     return keep
 
 
-def _nothing(source: Source) -> ValueError:
+def _nothing_triangulated(sequence: SequenceFolder) -> ValueError:
     return ValueError(
-        f"{source.name}: no landmark could be triangulated; "
+        f"{sequence.name}: no landmark could be triangulated; "
         "do images and poses belong together, and does the camera move?"
     )
 
 
-def tracks_of(
-    scene: Any, features: list[Features], descriptor: str, info: dict[str, Any]
+def tracks_from_scene(
+    scene: Scene, features: list[Features], descriptor: str, info: dict[str, Any]
 ) -> Tracks:
     """Put a labelled scene and its features into a Tracks."""
     model = scene.model
@@ -343,23 +382,26 @@ def tracks_of(
 
 
 def _detect(
-    source: Source, model: Any, settings: Settings, threads: int, progress: Progress
+    sequence: SequenceFolder,
+    model: colmap.ColmapModel,
+    options: TracksOptions,
+    threads: int,
+    progress: Progress,
 ) -> list[Features]:
-    import cv2
-
-    # One extractor a thread: OpenCV's are costly to make and not to be shared.
+    cv2 = optional("cv2")
+    # OpenCV's detectors are costly to make and not safe to share, so each thread keeps its own.
     local = threading.local()
 
     def one(index: int) -> Features:
         if not hasattr(local, "extractor"):
-            local.extractor = Extractor(settings.descriptor, settings.max_keypoints)
-        name = model.names[index]
-        image = read_gray(source.images / name)
+            local.extractor = Extractor(options.descriptor, options.max_keypoints)
+        path = sequence.images / model.names[index]
+        image = read_gray(path)
         camera = model.cameras[int(model.camera_ids[index])]
         if image.shape != (camera.height, camera.width):
             raise ValueError(
-                f"{source.images / name}: {image.shape[1]}x{image.shape[0]} pixels, but its camera "
-                f"in the model has {camera.width}x{camera.height}; use the images of this model"
+                f"{path}: {image.shape[1]}x{image.shape[0]} pixels, but its camera in the model "
+                f"has {camera.width}x{camera.height}; use the images of this model"
             )
         features: Features = local.extractor(image)
         return features
@@ -367,69 +409,22 @@ def _detect(
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _parallel(
-            one,
-            range(len(model.names)),
-            threads,
-            lambda done: progress("detect and describe", done, len(model.names)),
-        )
+        indices = range(len(model.names))
+        return parallel_map(one, indices, threads, progress, "detect and describe")
     finally:
         cv2.setNumThreads(before)
 
 
-def _pose_error(matches: dict[tuple[int, int], Any]) -> float:
-    """Epipolar error of a typical pair: each pair counts once, so near pairs do not outvote far."""
+def _epipolar_error(matches: Pairs) -> float:
+    """Median over pairs of each pair's median, so that a pair with many matches counts once."""
     medians = [float(np.median(m.errors)) for m in matches.values() if len(m) >= _MIN_MATCHES]
     return float(np.median(medians)) if medians else 0.0
-
-
-def _with_errors(matches: Any, first: Any, second: Any) -> Any:
-    from protomark.tracks.geometry import epipolar_error, relative_pose
-
-    rotation, translation = relative_pose(first.pose, second.pose)
-    errors = epipolar_error(
-        rotation, translation, first.rays[matches.rows[:, 0]], second.rays[matches.rows[:, 1]]
-    )
-    return replace(matches, errors=errors * 0.5 * (first.focal + second.focal))
-
-
-def _parallel(
-    function: Callable[[S], T], items: Iterable[S], threads: int, done: Callable[[int], None]
-) -> list[T]:
-    """Map in order, on several threads if asked; OpenCV and the core release the GIL."""
-    results = []
-    if threads <= 1:
-        for item in items:
-            results.append(function(item))
-            done(len(results))
-        return results
-    with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(function, item) for item in items]
-        try:
-            for future in futures:
-                results.append(future.result())
-                done(len(results))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return results
-
-
-def _image_files(folder: Path) -> list[str]:
-    suffixes = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp"}
-    return [
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.suffix.lower() in suffixes
-    ]
 
 
 def _versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
-    import cv2
-
-    found = {"opencv": cv2.__version__}
+    found = {"opencv": optional("cv2").__version__}
     for package in ("protomark", "pycolmap"):
         try:
             found[package] = version(package)

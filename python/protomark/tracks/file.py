@@ -8,23 +8,24 @@ that is not an array (cameras, image names, provenance) is JSON in the file's me
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.extras import optional
+from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.files import replacing
+from protomark.geometry.camera import Camera, cameras_from_json
 
 FORMAT = "protomark-tracks"
 VERSION = 1
 
-# name -> (dtype, shape), with m keyframes, n keypoints, l landmarks, b bytes a descriptor
+# name -> (dtype, shape), with m keyframes, n keypoints, l landmarks, b bytes per descriptor
 _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "keyframe_camera": (np.int32, ("m",)),
     "cam_from_world": (np.float64, ("m", 3, 4)),
@@ -39,69 +40,6 @@ _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "landmark_ids": (np.int64, ("l",)),
     "landmark_positions": (np.float64, ("l", 3)),
 }
-
-# How many parameters a camera of each of COLMAP's models has (src/colmap/sensor/models.h there).
-CAMERA_MODELS = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12,
-    "FOV": 5,
-    "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5,
-    "THIN_PRISM_FISHEYE": 12,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
-    "SIMPLE_DIVISION": 4,
-    "DIVISION": 5,
-    "SIMPLE_FISHEYE": 3,
-    "FISHEYE": 4,
-    "EUCM": 6,
-    "EQUIRECTANGULAR": 2,
-}
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A COLMAP camera: model name (for example "PINHOLE"), image size and parameters in pixels."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """The form that PoseLib and pycolmap take."""
-        return {
-            "model": self.model,
-            "width": self.width,
-            "height": self.height,
-            "params": list(self.params),
-        }
-
-    def check(self) -> None:
-        """Raise ValueError unless model, size and parameters are those of a COLMAP camera."""
-        for size in (self.width, self.height):
-            if type(size) is not int or not 0 < size < 2**31:
-                raise ValueError(f"{str(size)[:40]!r} is no number of pixels")
-        self.check_params()
-
-    def check_params(self) -> None:
-        """Raise ValueError unless the model is one of COLMAP's and the parameters are its own."""
-        wanted = CAMERA_MODELS.get(self.model) if isinstance(self.model, str) else None
-        if wanted is None:
-            raise ValueError(
-                f"camera model {str(self.model)[:40]!r} is none of COLMAP's: "
-                f"{', '.join(CAMERA_MODELS)}"
-            )
-        if len(self.params) != wanted:
-            raise ValueError(
-                f"a camera of model {self.model} has {wanted} parameters, not {len(self.params)}"
-            )
-        if not all(isinstance(p, Real) and math.isfinite(p) for p in self.params):
-            raise ValueError(f"the parameters {self.params} are not all finite numbers")
 
 
 @dataclass
@@ -173,13 +111,34 @@ class Tracks:
         offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
         return replace(self, offsets=offsets, **rows)
 
+    def upright(self) -> Tracks:
+        """The tracks with angles and sizes in the descriptors, named `<descriptor>-upright`.
+
+        Raises:
+            ValueError: no keypoint has an angle.
+        """
+        if not (self.angles >= 0).any():
+            raise ValueError(
+                f"no keypoint of these {self.descriptor} tracks has an angle; the upright encoders "
+                "need them"
+            )
+        return replace(
+            self,
+            descriptor=self.descriptor + SUFFIX,
+            descriptors=upright_descriptors(self.descriptors, self.angles, self.sizes),
+        )
+
+    def positions_of(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions (n, 3) of landmarks (n,) that the tracks hold."""
+        return self.landmark_positions[np.searchsorted(self.landmark_ids, landmark_ids)]
+
     def check(self) -> None:
         """Raise ValueError, naming the array, if shapes, types or indices do not fit together."""
         names = self.keyframe_names
         if not isinstance(names, list) or not all(map(_is_text, names)):
             raise ValueError("tracks: keyframe_names are not a list of texts")
         if not _is_text(self.descriptor):
-            raise ValueError("tracks: descriptor is no text")
+            raise ValueError("tracks: descriptor is not a text")
         sizes = {
             "m": len(self.keyframe_names),
             "m+1": len(self.keyframe_names) + 1,
@@ -233,8 +192,7 @@ class Tracks:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file whole or not at all: beside the target, then renamed over it."""
-        from safetensors.numpy import save
-
+        save = optional("safetensors.numpy").save
         self.check()
         header = {
             "format": FORMAT,
@@ -256,13 +214,12 @@ class Tracks:
             FileNotFoundError: there is no such file.
             ValueError: the file is not a tracks file, or is broken.
         """
-        from safetensors import SafetensorError, safe_open
-
+        safetensors = optional("safetensors")
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such tracks file")
         try:
-            with safe_open(path, framework="numpy") as file:
+            with safetensors.safe_open(path, framework="numpy") as file:
                 header = file.metadata() or {}
                 if header.get("format") != FORMAT:
                     raise ValueError("a safetensors file, but not a Protomark tracks file")
@@ -273,13 +230,13 @@ class Tracks:
                 arrays = {name: file.get_tensor(name) for name in _ARRAYS}
             tracks = cls(
                 descriptor=header["descriptor"],
-                cameras=cameras_of(_json(header, "cameras")),
+                cameras=cameras_from_json(_json(header, "cameras")),
                 keyframe_names=_json(header, "keyframe_names"),
                 info=_json(header, "info"),
                 **arrays,
             )
             tracks.check()
-        except SafetensorError as error:
+        except safetensors.SafetensorError as error:
             raise ValueError(f"{path}: not a tracks file, or a broken one ({error})") from None
         except (KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ValueError(f"{path}: broken tracks file ({error!r})") from None
@@ -288,31 +245,9 @@ class Tracks:
         return tracks
 
 
-def cameras_of(value: Any) -> dict[int, Camera]:
-    """Cameras that were kept as JSON: id to `Camera.as_dict`.
-
-    Raises:
-        ValueError: they are something else, or one of them is no COLMAP camera.
-    """
-    if not isinstance(value, dict):
-        raise ValueError("cameras are not a JSON object")
-    cameras = {}
-    for number, c in value.items():
-        try:
-            params = c["params"]
-            if not isinstance(params, list) or any(type(p) not in (int, float) for p in params):
-                raise ValueError("params are not a list of numbers")
-            camera = Camera(c["model"], c["width"], c["height"], tuple(map(float, params)))
-            camera.check()
-            cameras[int(number)] = camera
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"cameras: {number[:20]!r}: {error}") from None
-    return cameras
-
-
 def _check_version(text: str) -> None:
     if not re.fullmatch("[1-9][0-9]{0,8}", text):
-        raise ValueError(f"version {text[:20]!r} is none that a tracks file can have")
+        raise ValueError(f"version {text[:20]!r} is not one that a tracks file can have")
     if int(text) > VERSION:
         raise ValueError(f"tracks version {text}, this Protomark reads up to {VERSION}; update it")
 

@@ -1,13 +1,15 @@
-"""Matches between the descriptors of two keyframes, held against their known poses."""
+"""Matches the descriptors of two keyframes and verifies them against their known poses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.geometry import epipolar_error, relative_pose
+from protomark._core import hamming_search
+from protomark.geometry.pose import relative_pose
+from protomark.geometry.triangulation import epipolar_error
 
 
 @dataclass
@@ -28,7 +30,7 @@ class View:
 
 
 @dataclass
-class Matches:
+class VerifiedMatches:
     """k matches between two keyframes.
 
     Attributes:
@@ -44,12 +46,12 @@ class Matches:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def where(self, keep: NDArray[np.bool_]) -> Matches:
+    def where(self, keep: NDArray[np.bool_]) -> VerifiedMatches:
         """The matches for which `keep` (k,) is true."""
-        return Matches(self.rows[keep], self.distances[keep], self.errors[keep])
+        return VerifiedMatches(self.rows[keep], self.distances[keep], self.errors[keep])
 
 
-def match(first: View, second: View, ratio: float, max_error: float) -> Matches:
+def match(first: View, second: View, ratio: float, max_error: float) -> VerifiedMatches:
     """Mutual nearest neighbours that pass the ratio test and lie on each other's epipolar lines.
 
     Args:
@@ -58,26 +60,35 @@ def match(first: View, second: View, ratio: float, max_error: float) -> Matches:
         ratio: the nearest distance must be below this share of the second nearest; in (0, 1].
         max_error: largest epipolar error in pixels.
     """
-    import protomark as pm
-
-    empty = Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0))
+    empty = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0))
     if len(first.descriptors) < 2 or len(second.descriptors) < 2:
         return empty
-    index, distance = pm.hamming_search(first.descriptors, second.descriptors, k=2)
+    index, distance = hamming_search(first.descriptors, second.descriptors, k=2)
     rows = np.flatnonzero(distance[:, 0] < ratio * distance[:, 1])
     target = index[rows, 0]
-    rotation, translation = relative_pose(first.pose, second.pose)
-    error = epipolar_error(rotation, translation, first.rays[rows], second.rays[target])
-    error *= 0.5 * (first.focal + second.focal)
+    error = _epipolar_errors(first, second, rows, target)
     near = error <= max_error  # NaN is not
     rows, target, error = rows[near], target[near], error[near]
     if not len(rows):
         return empty
-    back, _ = pm.hamming_search(second.descriptors[target], first.descriptors, k=1)
+    back, _ = hamming_search(second.descriptors[target], first.descriptors, k=1)
     mutual = back[:, 0] == rows
     rows, target, error = rows[mutual], target[mutual], error[mutual]
-    return Matches(
+    return VerifiedMatches(
         np.column_stack([rows, target]).astype(np.int64),
         distance[rows, 0].astype(np.int32),
         error,
     )
+
+
+def with_errors(matches: VerifiedMatches, first: View, second: View) -> VerifiedMatches:
+    """The same matches with their errors under other poses."""
+    return replace(matches, errors=_epipolar_errors(first, second, *matches.rows.T))
+
+
+def _epipolar_errors(
+    first: View, second: View, rows: NDArray[np.int64], target: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    rotation, translation = relative_pose(first.pose, second.pose)
+    error = epipolar_error(rotation, translation, first.rays[rows], second.rays[target])
+    return error * (0.5 * (first.focal + second.focal))

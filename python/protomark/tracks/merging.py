@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.geometry import group, refine_points, residuals
+from protomark.geometry.neighbours import runs
+from protomark.geometry.triangulation import refine_points, reprojection_residuals
 from protomark.tracks.scene import Scene
 
 # Landmarks this close (pixels) are one, though detection found two keypoints in some keyframe.
@@ -75,7 +76,7 @@ def _round(
         return into, refused
     poses, seen, focal = scene.model.cam_from_world[keyframes], scene.rays[rows], scene.focal[rows]
     moved = refine_points(scene.positions, after, poses, seen, focal)
-    difference, depth = residuals(moved[after], poses, seen)
+    difference, depth = reprojection_residuals(moved[after], poses, seen)
     error = np.where(depth > 0, np.linalg.norm(difference, axis=1) * focal, np.inf)
     # Of two keypoints in one keyframe the better one counts, the other loses its landmark.
     order = np.lexsort((error, keyframes, after))
@@ -98,7 +99,7 @@ def _share_keyframe(
     pairs: NDArray[np.int64], labels: NDArray[np.int64], keyframes: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """Whether the two landmarks of each pair (n, 2) are seen together; labels ascending."""
-    starts, lengths = group(labels)
+    starts, lengths = runs(labels)
     seen = {
         int(labels[s]): frozenset(keyframes[s : s + n].tolist())
         for s, n in zip(starts, lengths, strict=True)
@@ -118,8 +119,8 @@ def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> N
     at = rows[np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]]
     poses = scene.model.cam_from_world[scene.keyframe[at]]
     nothing = np.zeros((len(at), 2))
-    first, _ = residuals(scene.positions[pairs[pair, 0]], poses, nothing)
-    second, _ = residuals(scene.positions[pairs[pair, 1]], poses, nothing)
+    first, _ = reprojection_residuals(scene.positions[pairs[pair, 0]], poses, nothing)
+    second, _ = reprojection_residuals(scene.positions[pairs[pair, 1]], poses, nothing)
     distance = np.linalg.norm(first - second, axis=1) * scene.focal[at]
     order = np.lexsort((distance, pair))
     out = np.full(len(pairs), np.inf)

@@ -11,9 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import Model, rays
-from protomark.tracks.geometry import depth_of_first, relative_pose
-from protomark.tracks.matching import Matches, View
+from protomark.geometry.colmap import ColmapModel
+from protomark.geometry.pose import relative_pose
+from protomark.geometry.triangulation import depth_of_first
+from protomark.tracks.matching import VerifiedMatches, View
 
 MIN_OVERLAP = 0.2
 MAX_VIEWING_ANGLE = 50.0  # degrees; binary descriptors do not match across more
@@ -29,7 +30,7 @@ def neighbour_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def depth_quartiles(
-    views: list[View], matches: dict[tuple[int, int], Matches]
+    views: list[View], matches: dict[tuple[int, int], VerifiedMatches]
 ) -> NDArray[np.float64]:
     """(m, 3) quartiles of the depths each keyframe sees; those of all where it sees too few."""
     seen: list[list[NDArray[np.float64]]] = [[] for _ in views]
@@ -48,14 +49,14 @@ def depth_quartiles(
     ).reshape(-1, 3)
 
 
-def overlaps(model: Model, depths: NDArray[np.float64]) -> NDArray[np.float64]:
+def overlaps(model: ColmapModel, depths: NDArray[np.float64]) -> NDArray[np.float64]:
     """(m, m) float64: share of view i that view j sees from a like angle and distance."""
     m = len(model.names)
     grids, bounds = {}, {}
     for camera_id, camera in model.cameras.items():
         x = (np.arange(_GRID) + 0.5) / _GRID * camera.width
         y = (np.arange(_GRID) + 0.5) / _GRID * camera.height
-        grid = rays(camera, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+        grid = camera.rays(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
         grids[camera_id] = grid[np.isfinite(grid).all(1)]
         # The outermost grid rays, widened to the image border.
         middle, half = grids[camera_id].mean(0), np.ptp(grids[camera_id], axis=0) / 2

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import Model
-from protomark.tracks.geometry import residuals
+from protomark.geometry.colmap import ColmapModel
+from protomark.geometry.triangulation import reprojection_residuals
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Scene:
         positions: (l, 3) float64.
     """
 
-    model: Model
+    model: ColmapModel
     offsets: NDArray[np.int64]
     keyframe: NDArray[np.int64]
     keypoints: NDArray[np.float32]
@@ -47,7 +47,7 @@ class Scene:
 
         Measured in the undistorted image, scaled by the focal length.
         """
-        difference, depth = residuals(
+        difference, depth = reprojection_residuals(
             self.positions[self.labels[rows]],
             self.model.cam_from_world[self.keyframe[rows]],
             self.rays[rows],

@@ -1,4 +1,4 @@
-"""Figures that describe tracks: how many, how long, how exact."""
+"""Counts, track lengths and reprojection errors of tracks."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from protomark.tracks.file import Tracks
 
 def reprojection_errors(tracks: Tracks) -> NDArray[np.float64]:
     """(n,) float64, pixels, of each observation in the order of `tracks.observations`."""
-    from protomark.tracks.colmap import project
-
     rows = tracks.observations
     keyframe = tracks.keyframe_of_keypoint[rows]
     index = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
@@ -24,7 +22,7 @@ def reprojection_errors(tracks: Tracks) -> NDArray[np.float64]:
     pixels = np.zeros((len(rows), 2))
     for camera_id, camera in tracks.cameras.items():
         mine = tracks.keyframe_camera[keyframe] == camera_id
-        pixels[mine] = project(camera, local[mine])
+        pixels[mine] = camera.project(local[mine])
     errors: NDArray[np.float64] = np.linalg.norm(pixels - tracks.keypoints[rows], axis=1)
     return errors
 
@@ -34,14 +32,6 @@ def summarise(tracks: Tracks) -> dict[str, Any]:
     rows = tracks.observations
     lengths = np.unique(tracks.landmark_of_keypoint[rows], return_counts=True)[1]
     errors = reprojection_errors(tracks)
-    edges = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
-    upper = (*(e - 1 for e in edges[1:]), None)
-    histogram = {}
-    for low, high in zip(edges, upper, strict=True):
-        label = f"{low}+" if high is None else str(low) if low == high else f"{low}-{high}"
-        histogram[label] = int(
-            ((lengths >= low) & (lengths <= (high or lengths.max(initial=0)))).sum()
-        )
     return {
         "sequence": tracks.info.get("sequence", ""),
         "descriptor": tracks.descriptor,
@@ -53,8 +43,22 @@ def summarise(tracks: Tracks) -> dict[str, Any]:
         "track_length_mean": float(lengths.mean()) if len(lengths) else 0.0,
         "track_length_median": float(np.median(lengths)) if len(lengths) else 0.0,
         "track_length_max": int(lengths.max(initial=0)),
-        "track_length_histogram": histogram,
+        "track_length_histogram": length_histogram(lengths),
         "reprojection_error_mean": float(errors.mean()) if len(errors) else 0.0,
         "reprojection_error_median": float(np.median(errors)) if len(errors) else 0.0,
         "poses_refined": bool(tracks.info.get("poses_refined", False)),
     }
+
+
+def length_histogram(lengths: NDArray[np.int64]) -> dict[str, int]:
+    """Number of tracks by their number of observations, for example {"2": 17, "4-5": 9}."""
+    edges = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
+    histogram = {}
+    for low, end in zip(edges, (*edges[1:], None), strict=True):
+        if end is None:
+            label, inside = f"{low}+", lengths >= low
+        else:
+            label = str(low) if end == low + 1 else f"{low}-{end - 1}"
+            inside = (lengths >= low) & (lengths < end)
+        histogram[label] = int(inside.sum())
+    return histogram

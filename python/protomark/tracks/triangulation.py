@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.tracks.colmap import Model, focal_length, pycolmap, quiet
-from protomark.tracks.matching import Matches
+from protomark.geometry.colmap import ColmapModel, pycolmap, quiet
+from protomark.tracks.matching import VerifiedMatches
 
 _SEED = 0
 # Enough to fix the six numbers of a pose many times over.
@@ -19,9 +19,9 @@ _POINTS_PER_POSE = 200
 
 
 def triangulate(
-    model: Model,
+    model: ColmapModel,
     keypoints: list[NDArray[np.float32]],
-    matches: dict[tuple[int, int], Matches],
+    matches: dict[tuple[int, int], VerifiedMatches],
     max_error: float,
     min_angle: float,
 ) -> Any:
@@ -51,7 +51,7 @@ def triangulate(
     options.min_angle = min_angle
     options.merge_max_reproj_error = options.complete_max_reproj_error = max_error
     # The triangulator bounds angles, the user pixels; the widest-angled camera decides.
-    focal = min(focal_length(camera) for camera in model.cameras.values())
+    focal = min(camera.focal_length for camera in model.cameras.values())
     angle = float(np.degrees(np.arctan(1.5 * max_error / focal)))
     options.create_max_angle_error = options.continue_max_angle_error = angle
     options.re_max_angle_error = 2 * angle
@@ -67,7 +67,7 @@ def triangulate(
         )
 
 
-def _posed(model: Model, keypoints: list[NDArray[np.float32]]) -> Any:
+def _posed(model: ColmapModel, keypoints: list[NDArray[np.float32]]) -> Any:
     reconstruction = pycolmap.Reconstruction()
     for camera_id, camera in model.cameras.items():
         reconstruction.add_camera_with_trivial_rig(
@@ -89,7 +89,7 @@ def _write_database(
     path: Path,
     reconstruction: Any,
     keypoints: list[NDArray[np.float32]],
-    matches: dict[tuple[int, int], Matches],
+    matches: dict[tuple[int, int], VerifiedMatches],
 ) -> None:
     database = pycolmap.Database.open(str(path))
     try:
@@ -141,7 +141,7 @@ def labels_of(
     return labels, positions
 
 
-def refine_poses(model: Model, reconstruction: Any) -> Model:
+def refine_poses(model: ColmapModel, reconstruction: Any) -> ColmapModel:
     """Bundle adjustment of poses and points (not of cameras), robust against wrong matches.
 
     The result stays in the world of `model`: scale, rotation and origin are those that bring the
@@ -189,7 +189,7 @@ def _thin(reconstruction: Any) -> None:
             reconstruction.delete_point3D(point_id)
 
 
-def _aligned(source: Model, target: Model) -> Model:
+def _aligned(source: ColmapModel, target: ColmapModel) -> ColmapModel:
     """Source moved by the similarity that brings its cameras closest to those of target.
 
     The rotation comes from the cameras' orientations, which also serves where their centres lie on

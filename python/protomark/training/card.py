@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from protomark.training.data import Source
+from protomark.training.data import TrainingSource
 
 
 @dataclass(frozen=True)
-class Figures:
+class SequencePrecision:
     """Precision on one sequence, averaged over splits.
 
     Attributes:
@@ -19,7 +19,7 @@ class Figures:
         role: "validation" or "report".
         seeds: how many splits.
         unaggregated: of the raw descriptors on the same queries.
-        medoid: of one descriptor a landmark, the one closest to its others.
+        medoid: of one descriptor per landmark, the one closest to its others.
         majority: of the quantised mean, each bit as most of the landmark's descriptors have it.
         float_precision: of the float network, by dimension.
         integer_precision: of the integer encoder with int8 prototypes, by dimension.
@@ -36,7 +36,7 @@ class Figures:
 
 
 @dataclass(frozen=True)
-class Card:
+class EncoderCard:
     """Everything a card says; also what `protomark train --json` writes.
 
     Attributes:
@@ -57,8 +57,8 @@ class Card:
         best_step: the one whose weights were kept.
         figures: precision, by sequence.
         history: (step, loss, mean validation precision) of each validation.
-        curve: file name of the picture of the training, beside the card, or "".
-        calibrated_on: sequences that the acceptance of matches was fitted to, or "".
+        plot: file name of the picture of the training, beside the card, or "".
+        calibrated_on: sequences that the match calibration was fitted to, or "".
     """
 
     name: str
@@ -69,16 +69,16 @@ class Card:
     bytes: int
     encode_ns: float
     licence: str
-    sources: list[Source]
-    validation: list[Source]
+    sources: list[TrainingSource]
+    validation: list[TrainingSource]
     command: str
     seconds: float
     machine: str
     steps: int
     best_step: int
-    figures: list[Figures]
+    figures: list[SequencePrecision]
     history: list[tuple[int, float, float]] = field(default_factory=list)
-    curve: str = ""
+    plot: str = ""
     calibrated_on: str = ""
 
     @property
@@ -96,14 +96,14 @@ class Card:
             f"{dims} numbers (each shorter code is the start of the longer one).",
             "",
             f"- network: {'-'.join(map(str, self.widths))}, SELU, int8 weights; "
-            f"{self.multiply_adds:,} multiply-adds a descriptor",
-            f"- encode: {self.encode_ns:,.0f} ns a descriptor on one thread of "
+            f"{self.multiply_adds:,} multiply-adds per descriptor",
+            f"- encode: {self.encode_ns:,.0f} ns per descriptor on one thread of "
             f"{platform.machine()}",
             f"- file: {self.bytes:,} bytes",
             f"- licence: {self.licence or 'none stated'}",
             f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "
             f"the weights of step {self.best_step} kept",
-            f"- which matches to accept: fitted to {self.calibrated_on or 'nothing'} "
+            f"- match calibration: fitted to {self.calibrated_on or 'nothing'} "
             "(`protomark calibrate`)",
             "",
             "Train it again:",
@@ -128,12 +128,12 @@ class Card:
             "## Precision",
             "",
             "Share of queries whose nearest prototype is their own landmark's: 90 % of the "
-            "keyframes build the map, the others ask; mean of the splits. *Unaggregated*: all raw "
-            "descriptors of the landmarks; *medoid*, *majority*: one binary descriptor a landmark; "
-            "*float*: the network before rounding, *integer*: the encoder in this file with int8 "
-            "prototypes.",
+            "keyframes build the map, the others query it; mean of the splits. *Unaggregated*: all "
+            "raw descriptors of the landmarks; *medoid*, *majority*: one binary descriptor per "
+            "landmark; *float*: the network before rounding, *integer*: the encoder in this file "
+            "with int8 prototypes.",
             "",
-            "| sequence | splits | unaggregated | medoid | majority | dim | bytes a landmark "
+            "| sequence | splits | unaggregated | medoid | majority | dim | bytes per landmark "
             "| float | integer | ratio to unaggregated |",
             "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
         ]
@@ -145,8 +145,8 @@ class Card:
                     f"| {f.float_precision[d]:.4f} | {f.integer_precision[d]:.4f} "
                     f"| {f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f} |"
                 )
-        if self.curve:
-            lines += ["", "## Training", "", f"![loss and validation precision]({self.curve})"]
+        if self.plot:
+            lines += ["", "## Training", "", f"![loss and validation precision]({self.plot})"]
         return "\n".join(lines) + "\n"
 
 
@@ -155,6 +155,6 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min" if minutes else f"{seconds:.0f} s"
 
 
-def describe_data(sources: Sequence[Source]) -> str:
+def describe_data(sources: Sequence[TrainingSource]) -> str:
     """One line for the model file: the sequences and their licences."""
     return "; ".join(f"{s.name} ({s.licence})" if s.licence else s.name for s in sources)

@@ -1,4 +1,4 @@
-"""Reading tracks for training, with every check that can be made before the first step."""
+"""Reads tracks for training, and checks before the first step all that can be checked."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from protomark.console import track
-from protomark.inputs import lengthen
+from protomark.progress import Progress, silent, tracked
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.sampling import Views
 from protomark.training.validation import Trial
 
 MIN_BITS = 64
 MAX_BITS = 1024
+# Landmarks with 3 or more views that all training sequences together must have.
 MIN_LANDMARKS = 500
-"""Landmarks with 3 or more views that all training sequences together must have."""
 
 
 @dataclass(frozen=True)
-class Source:
+class TrainingSource:
     """What the card says of one tracks file.
 
     Attributes:
@@ -58,18 +57,19 @@ class TrainingData:
     bits: int
     views: list[Views]
     trials: list[Trial]
-    sources: list[Source]
-    validation_sources: list[Source]
+    sources: list[TrainingSource]
+    validation_sources: list[TrainingSource]
     fingerprint: str
 
 
-def read_tracks(path: Path, inputs: str) -> Tracks:
-    """A tracks file, its descriptors longer by `inputs` (`protomark.inputs`)."""
-    return lengthen(Tracks.load(path), inputs)
+def read_tracks(path: Path, upright: bool) -> Tracks:
+    """A tracks file, with upright descriptors (`protomark.features.upright`) if asked for."""
+    tracks = Tracks.load(path)
+    return tracks.upright() if upright else tracks
 
 
 def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """The files to learn from and those that pick: the last one, if none is named for it.
+    """The files to train on and those to validate on: the last one, if none is named for it.
 
     Raises:
         ValueError: a single file would have to do both.
@@ -78,7 +78,7 @@ def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list
         return list(training), list(validation)
     if len(training) < 2:
         raise ValueError(
-            f"{training[0]}: one tracks file cannot both train and pick the model; give another "
+            f"{training[0]}: one tracks file cannot serve for training and validation; give another "
             "sequence with --validation"
         )
     return list(training[:-1]), [training[-1]]
@@ -87,7 +87,7 @@ def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list
 def load_trials(
     tracks: Tracks, path: Path, seeds: Sequence[int], max_queries: int = 10_000
 ) -> list[Trial]:
-    """Splits of one sequence, one for each seed."""
+    """Splits of one sequence, one per seed."""
     return [Trial.from_tracks(tracks, sequence_name(path), s, max_queries) for s in seeds]
 
 
@@ -97,17 +97,19 @@ def load_training(
     seeds: Sequence[int] = (0,),
     max_queries: int = 5_000,
     licences: Mapping[str, str] | None = None,
-    inputs: str = "",
+    upright: bool = False,
+    progress: Progress = silent,
 ) -> TrainingData:
     """Read and check training and validation tracks.
 
     Args:
-        training: tracks files to learn from.
-        validation: tracks files to pick the model by, none of them in `training`.
-        seeds: one split of each validation sequence for each.
+        training: tracks files to train on.
+        validation: tracks files that select the model, none of them in `training`.
+        seeds: each validation sequence is split once per seed.
         max_queries: queries of one split.
         licences: of the sequences, by name, for the card.
-        inputs: of keypoints that are added to the descriptors, see `protomark.inputs`.
+        upright: train on angles and sizes of keypoints, too.
+        progress: called with each file.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -128,17 +130,17 @@ def load_training(
     unknown = set(licences) - {sequence_name(p) for p in [*training, *validation]}
     if unknown:
         raise ValueError(
-            f"a licence is given for {min(unknown)}, which is none of the sequences; "
+            f"a licence is given for {min(unknown)}, which is not one of the sequences; "
             "a sequence's name is its file's name up to the first dot"
         )
     descriptor, bits = "", 0
     views: list[Views] = []
     trials: list[Trial] = []
-    sources: list[Source] = []
+    sources: list[TrainingSource] = []
     learned: dict[str, str] = {}  # digest of what tracks were made from -> their file
     digest = hashlib.sha256()
-    for i, path in enumerate(track([*training, *validation], "reading tracks")):
-        tracks = read_tracks(path, inputs)
+    for i, path in enumerate(tracked([*training, *validation], progress, "read tracks")):
+        tracks = read_tracks(path, upright)
         if not views and not trials:
             descriptor, bits = tracks.descriptor, tracks.bits
             if not MIN_BITS <= bits <= MAX_BITS:
@@ -155,7 +157,7 @@ def load_training(
         if i < len(training):
             learned[made_from] = path.name
         elif made_from and made_from in learned:
-            # Tracks with varied copies of the keyframes are another file of the same sequence.
+            # Augmented tracks are another file of the same sequence.
             raise ValueError(
                 f"{path.name} and {learned[made_from]} are of the same images; validate on a "
                 "sequence that is not trained on"
@@ -190,9 +192,9 @@ def load_training(
     )
 
 
-def _source(tracks: Tracks, path: Path, licences: Mapping[str, str]) -> Source:
+def _source(tracks: Tracks, path: Path, licences: Mapping[str, str]) -> TrainingSource:
     name = sequence_name(path)
-    return Source(
+    return TrainingSource(
         name,
         path.name,
         len(tracks.keyframe_names),

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,18 +20,19 @@ import torch
 from torch import Tensor
 
 from protomark.files import replacing
+from protomark.interrupt import deferred_interrupt
 from protomark.training.loss import PrototypeLoss
 from protomark.training.network import EncoderNetwork, embed, to_signs
 from protomark.training.quantization import QuantizedNetwork
 from protomark.training.sampling import BatchSampler, Views
 from protomark.training.validation import Trial, mean_precision
 
-CHECKPOINT_VERSION = 2
+CHECKPOINT_VERSION = 1
 
 
 @dataclass(frozen=True)
-class Options:
-    """What decides the weights, besides the data.
+class TrainingOptions:
+    """What determines the weights, besides the data.
 
     Attributes:
         dims: prefixes trained to serve alone, ascending; the last is the embedding's length.
@@ -106,7 +104,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Progress:
+class ValidationStep:
     """What one validation found.
 
     Attributes:
@@ -131,7 +129,7 @@ class Progress:
         return sum(self.precision.values()) / len(self.precision)
 
 
-class Interrupted(Exception):  # noqa: N818 - no error, as KeyboardInterrupt is none
+class TrainingInterrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
     """Training was stopped by Ctrl-C after a whole step; the checkpoint is written."""
 
     def __init__(self, step: int) -> None:
@@ -145,7 +143,7 @@ class Trainer:
     Args:
         sequences: training views, all of one descriptor length; see `data.load_training`.
         trials: validation splits.
-        options: see `Options`.
+        options: see `TrainingOptions`.
         checkpoint: file to write checkpoints to, None for none.
         fingerprint: of the data, so that a checkpoint is not continued with other data.
         device: "cpu" or "cuda".
@@ -156,7 +154,7 @@ class Trainer:
         self,
         sequences: Sequence[Views],
         trials: Sequence[Trial],
-        options: Options,
+        options: TrainingOptions,
         checkpoint: Path | None = None,
         fingerprint: str = "",
         device: str = "cpu",
@@ -195,27 +193,27 @@ class Trainer:
         )
         self.step = 0
         self.seconds = 0.0
-        self.history: list[Progress] = []
+        self.history: list[ValidationStep] = []
         self.best = -1.0
         self.best_step = 0
         self.best_state: dict[str, Tensor] = {}
         self._losses: list[float] = []
 
-    def run(self, report: Callable[[int, float, Progress | None], None]) -> None:
+    def run(self, report: Callable[[int, float, ValidationStep | None], None]) -> None:
         """Train to the end; afterwards `quantized` holds the best model.
 
         Args:
-            report: called after every step with the steps done, the loss, and a `Progress` if
+            report: called after every step with the steps done, the loss, and a `ValidationStep` if
                 validation ran.
 
         Raises:
-            Interrupted: Ctrl-C was pressed.
+            TrainingInterrupted: Ctrl-C was pressed.
             ValueError: the loss is no longer finite.
         """
         options = self.options
         self.network.train()
         started = time.perf_counter() - self.seconds
-        with _interrupt_flag() as interrupted:
+        with deferred_interrupt() as interrupted:
             while self.step < options.steps:
                 if self.step == options.quantized_from:
                     self.calibrate()
@@ -229,7 +227,7 @@ class Trainer:
                 report(self.step, loss, progress)
                 if interrupted() and self.step < options.steps:
                     self.save_checkpoint()
-                    raise Interrupted(self.step)
+                    raise TrainingInterrupted(self.step)
         self.quantized.load_state_dict(self.best_state)
 
     def _train_step(self) -> float:
@@ -264,13 +262,13 @@ class Trainer:
         """Set the ranges of `quantized` by descriptors of all training sequences."""
         self.quantized.calibrate(to_signs(self._calibration, self.device))
 
-    def _validate(self) -> Progress:
+    def _validate(self) -> ValidationStep:
         in_loop = self.step > self.options.quantized_from
         model = self.quantized if in_loop else self.network
         found = mean_precision(
             self.trials, lambda d: embed(model, d, self.device), self.options.dims
         )
-        progress = Progress(
+        progress = ValidationStep(
             self.step,
             self.options.steps,
             float(np.mean(self._losses)),
@@ -341,35 +339,11 @@ class Trainer:
         self.quantized.load_state_dict(state["model"])
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.history = [Progress(**p) for p in state["history"]]
+        self.history = [ValidationStep(**p) for p in state["history"]]
         self._losses = state["losses"]
         self.best = state["best"]
         self.best_step = state["best_step"]
         self.best_state = state["best_state"]
-
-
-@contextmanager
-def _interrupt_flag() -> Iterator[Callable[[], bool]]:
-    """Within, the first Ctrl-C only sets the flag that the yielded function reads.
-
-    An exception in the middle of a step would leave half-updated weights. A second Ctrl-C stops at
-    once.
-    """
-    pressed = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed.is_set
-        return
-
-    def press(signum: int, frame: object) -> None:
-        if pressed.is_set():
-            raise KeyboardInterrupt
-        pressed.set()
-
-    before = signal.signal(signal.SIGINT, press)
-    try:
-        yield pressed.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def keep_freed_memory() -> None:

@@ -1,0 +1,1 @@
+"""`protomark evaluate-mapping`: `protomark map` with several memories, beside COLMAP."""

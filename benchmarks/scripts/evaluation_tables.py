@@ -1,0 +1,193 @@
+"""Writes the tables of docs/evaluation.md and of the encoders' cards from an evaluation's JSON.
+
+python benchmarks/scripts/evaluation_tables.py [RESULTS.json ...]
+
+Without arguments: from all benchmarks/results/evaluation.*.json, which `protomark evaluate --json`
+wrote. Methods of one sequence may come from several files; of the same method the last file counts.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from protomark.evaluation.methods import method_choices
+from protomark.evaluation.results import (
+    SequenceResult,
+    evaluation_markdown,
+    load_json,
+    mean_rows,
+    save_precision_plot,
+)
+from protomark.files import write_text
+from protomark_bench.report import ReportTable, number
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+DOCUMENT = ROOT / "docs" / "evaluation.md"
+MODELS = ROOT / "python" / "protomark" / "models"
+DIMS = (8, 16, 32, 64)
+SPLITS = {
+    "train": ("hololens", "desk_rpy", "viking", "conch", "seneca"),
+    "validation": ("caliterra",),
+    "test": ("toy", "kitchen", "castle", "kitti07"),
+}
+COLUMNS = {
+    "unaggregated": "all",
+    "medoid": "medoid",
+    "majority": "majority",
+    **{f"pca-{dim}": f"PCA {dim}" for dim in (16, 32, 64)},
+    **{f"protomark-{dim}": f"**{dim}**" for dim in DIMS},
+    **{f"protomark-{dim}x4": f"**{dim} x 4 bits**" for dim in (16, 32, 64)},
+    **{f"appearances-{size}": f"**appearances, {size} B**" for size in (17, 33, 65)},
+}
+# Bytes per landmark -> what is kept in them: int8, 4 bits, 4 bits and several appearances.
+BUDGETS = {
+    9: ("protomark-8", "protomark-16x4", None),
+    17: ("protomark-16", "protomark-32x4", "appearances-17"),
+    33: ("protomark-32", "protomark-64x4", "appearances-33"),
+    65: ("protomark-64", None, "appearances-65"),
+}
+PAPER = {65: 0.849}  # Komorowski and Trzcinski, 16 float32 numbers and the count: 0.676 of 0.796
+
+
+def replace_tables(document: Path, tables: str) -> None:
+    """Puts tables between the document's marks, or with marks at its end if it has none."""
+    start, end = "<!-- tables: start -->", "<!-- tables: end -->"
+    text = document.read_text(encoding="utf-8")
+    if start not in text:
+        text = f"{text.rstrip()}\n\n{start}\n{end}\n"
+    before, rest = text.split(start)
+    _, after = rest.split(end)
+    write_text(document, f"{before}{start}\n\n{tables}\n\n{end}{after}")
+
+
+def split_of(sequence: str) -> str:
+    """Whether a sequence trained, validated or tests what ships."""
+    return next(name for name, members in SPLITS.items() if sequence in members)
+
+
+def joined(results: Sequence[SequenceResult]) -> list[SequenceResult]:
+    """One result per descriptor and sequence, with all methods that were measured on its queries.
+
+    Raises:
+        ValueError: two files measured a sequence on other queries.
+    """
+    families = [choice.family for choice in method_choices()]
+    families += ["protomark", "protomark-4bit", "protomark-appearances"]
+    whole: dict[tuple[str, str], SequenceResult] = {}
+    for result in results:
+        first = whole.setdefault((result.descriptor, result.sequence), result)
+        if (first.queries, first.seeds) != (result.queries, result.seeds):
+            raise ValueError(
+                f"{result.sequence}, {result.descriptor}: measured on other queries in another "
+                "file; evaluate both on the same tracks and seeds"
+            )
+        methods = {method.name: method for method in [*first.methods, *result.methods]}
+        first.methods = sorted(
+            methods.values(),
+            key=lambda m: (families.index(m.family), m.bytes_per_landmark[0]),
+        )
+    return list(whole.values())
+
+
+def precision_table(results: Sequence[SequenceResult], names: Sequence[str]) -> ReportTable:
+    """Precision of these methods, a row per sequence."""
+    rows = []
+    for result in results:
+        found = {row.name: row.precision for row in result.rows()}
+        cells = [number(found.get(name)) for name in names]
+        rows.append([result.sequence, split_of(result.sequence), *cells])
+    return ReportTable(["sequence", "split", *(COLUMNS[n] for n in names)], rows, words=2)
+
+
+def ratio_table(results: Sequence[SequenceResult]) -> str:
+    """Mean share of the unaggregated precision, by bytes per landmark."""
+
+    def mean_ratio(name: str | None) -> float | None:
+        found = [row.ratio or 0.0 for r in results for row in r.rows() if row.name == name]
+        return sum(found) / len(found) if found and len(found) == len(results) else None
+
+    paper = PAPER if results[0].descriptor == "freak" else {}
+    rows = [
+        [f"{size}", number(paper.get(size)), *(number(mean_ratio(name)) for name in kept)]
+        for size, kept in BUDGETS.items()
+    ]
+    heads = ["bytes per landmark", "paper", "int8", "4 bits", "4 bits, several appearances"]
+    names = ", ".join(result.sequence for result in results)
+    title = f"Mean ratio to the unaggregated precision ({names}):"
+    return f"{title}\n\n{ReportTable(heads, rows, words=0).markdown()}"
+
+
+def card_text(results: Sequence[SequenceResult]) -> str:
+    """What a card says of the test sequences; all results are of its descriptor."""
+    names = ["unaggregated", "medoid", "majority", *(f"protomark-{dim}" for dim in DIMS)]
+    missing = [name for name in SPLITS["test"] if name not in {r.sequence for r in results}]
+    parts = [
+        "## Test sequences",
+        "Measured once training was over; nothing was chosen by them. Integer encoder, int8\n"
+        "prototypes, mean of three splits, as `protomark evaluate` measures.",
+        precision_table(results, names).markdown(),
+        f"Not measured: {', '.join(missing)}." if missing else "",
+        "With 4 bits a number, and with several appearances per landmark:",
+        precision_table(
+            results, [n for kept in BUDGETS.values() for n in kept[1:] if n]
+        ).markdown(),
+        ratio_table(results),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def upright_table(plain: Sequence[SequenceResult], upright: Sequence[SequenceResult]) -> str:
+    """Precision without and with angle and size of the keypoint, a row per sequence."""
+    names = ["protomark-32", "protomark-32x4", "appearances-17", "appearances-33", "appearances-65"]
+    others = {result.sequence: result for result in upright}
+    rows = []
+    for result in plain:
+        if result.sequence in others:
+            one = {row.name: row.precision for row in result.rows()}
+            other = {row.name: row.precision for row in others[result.sequence].rows()}
+            cells = [f"{one[name]:.3f}, {other[name]:.3f}" for name in names]
+            rows.append([result.sequence, f"{one['unaggregated']:.3f}", *cells])
+    heads = ["sequence", "all", *(f"{COLUMNS[name].strip('*')}: plain, upright" for name in names)]
+    title = "Plain, and with angle and size of the keypoint:"
+    return f"{title}\n\n{ReportTable(heads, rows).markdown()}"
+
+
+def main() -> None:
+    """Writes the tables."""
+    paths = [Path(p) for p in sys.argv[1:]] or sorted(RESULTS.glob("evaluation.*.json"))
+    order = [name for members in SPLITS.values() for name in members]
+    results = sorted(
+        joined([result for path in paths for result in load_json(path)]),
+        key=lambda result: (result.descriptor, order.index(result.sequence)),
+    )
+    parts = []
+    for descriptor in dict.fromkeys(result.descriptor for result in results):
+        same = [result for result in results if result.descriptor == descriptor]
+        parts += [f"### {descriptor.upper()}", precision_table(same, list(COLUMNS)).markdown()]
+        tests = [result for result in same if split_of(result.sequence) == "test"]
+        if tests:
+            title = f"{descriptor.upper()}: mean of {', '.join(r.sequence for r in tests)}"
+            save_precision_plot(
+                mean_rows(tests), DOCUMENT.parent / f"precision.{descriptor}.png", title
+            )
+            parts += [ratio_table(tests), f"![{title}](precision.{descriptor}.png)"]
+            replace_tables(MODELS / f"{descriptor}.md", card_text(tests))
+        upright = RESULTS / f"upright.{descriptor}.json"
+        if upright.is_file():
+            table = upright_table(same, load_json(upright))
+            parts += [f"#### Cameras that do not roll: `{descriptor}-upright`", table]
+            card = MODELS / f"{descriptor}-upright.md"
+            replace_tables(card, f"## Beside the plain encoder\n\n{table}")
+    parts.append("### Every figure")
+    for split, members in SPLITS.items():
+        chosen = [result for result in results if result.sequence in members]
+        if chosen:
+            parts.append(f"**Split: {split}**\n\n{evaluation_markdown(chosen).rstrip()}")
+    replace_tables(DOCUMENT, "\n\n".join(parts))
+
+
+if __name__ == "__main__":
+    main()

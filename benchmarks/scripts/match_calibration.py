@@ -1,0 +1,181 @@
+"""Compares which matches to accept: calibrated probabilities beside fixed ratios, on real frames.
+
+python benchmarks/scripts/match_calibration.py TRACKS... [--dim 32]
+
+Keyframes of the later half of each sequence are localized in a map of the earlier half, and a
+random tenth in a map of the other nine. The calibration is fitted to the other sequences. Precision
+and recall are those of accepted matches over all keypoints; a pose is found if it is off by at most
+1 % of the median scene depth and 2 degrees. Then the same fit, to maps of 8 bits a number, on maps
+of 4 bits and of several appearances per landmark. Prints the tables of docs/localization.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import protomark as pm
+from protomark.cli.terminal import progress_bar
+from protomark.evaluation.frames import FrameMatches, QueryFrame, right_matches, scene_depth
+from protomark.evaluation.methods import APPEARANCE_BITS
+from protomark.evaluation.protocol import split
+from protomark.geometry.pose import pose_error
+from protomark.localization.solve import CANDIDATES, Candidates, solve_pose
+from protomark.maps.build import build_map
+from protomark.match_calibration import MatchCalibration
+from protomark.matching import accept
+from protomark.progress import tracked
+from protomark.tracks.file import Tracks, sequence_name
+from protomark.training.match_calibration import (
+    fit_calibration,
+    held_out_frames,
+    label_matches,
+    matches_by_dim,
+    measure_calibration,
+)
+from protomark_bench.report import ReportTable
+
+PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
+RATIOS = (0.7, 0.8, 0.9, 0.95)
+PARTS = ("tenth", "half")
+KINDS = ("8 bits", "4 bits", "appearances")
+FRAMES = 40
+# A rule: squared distances (n, 2) -> a score of each match, and the least one that is accepted.
+Rule = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], float]]
+
+
+def clearness(distances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) from 0, the two nearest are as far away, to 1."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(distances[:, 1] > 0, 1 - np.sqrt(distances[:, 0] / distances[:, 1]), 0.0)
+
+
+def rules(calibration: MatchCalibration) -> dict[str, Rule]:
+    """All that are compared, by name."""
+
+    def by_probability(least: float) -> Rule:
+        return lambda distances: (calibration.probability(distances), least)
+
+    def by_ratio(limit: float) -> Rule:
+        return lambda distances: (clearness(distances), 1 - limit)
+
+    def quarter(distances: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        score = clearness(distances)
+        return score, float(np.quantile(score, 0.75))
+
+    found = {f"probability {least}": by_probability(least) for least in PROBABILITIES}
+    found |= {f"ratio {limit}": by_ratio(limit) for limit in RATIOS}
+    return found | {"clearest quarter": quarter}
+
+
+def measure(
+    tracks: Tracks, encoder: pm.Encoder, dim: int, compared: dict[str, Rule]
+) -> NDArray[np.float64]:
+    """(part, rule, 4): accepted matches per frame, precision, recall, share of poses found."""
+    depth = scene_depth(tracks)
+    half = len(tracks.keyframe_names) // 2
+    part, rows = split(tracks, 0), tracks.observations
+    cuts = {
+        "tenth": (part.support_rows, part.query_keyframes),
+        "half": (
+            rows[tracks.keyframe_of_keypoint[rows] < half],
+            np.arange(half, len(tracks.keyframe_names)),
+        ),
+    }
+    result = np.zeros((len(PARTS), len(compared), 4))
+    for i, name in enumerate(PARTS):
+        support, asked = cuts[name]
+        used = np.zeros(len(tracks.keypoints), bool)
+        used[support] = True
+        scene = build_map(tracks.where(used), encoder, dim)
+        sums = np.zeros((len(compared), 5))
+        for keyframe in asked[:: max(1, len(asked) // FRAMES)]:
+            frame = QueryFrame.of(tracks, int(keyframe))
+            ids, distances = scene.search(frame.descriptors, k=CANDIDATES)
+            positions = tracks.landmark_positions[np.searchsorted(tracks.landmark_ids, ids)]
+            every = FrameMatches(np.arange(len(ids)), ids[:, 0])
+            right = right_matches(frame, every, positions[:, 0])
+            for j, score in enumerate(compared.values()):
+                values, least = score(distances.astype(np.float64))
+                taken = accept(ids[:, 0], values, least)
+                candidates = Candidates(frame.keypoints, ids, positions, values)
+                found = solve_pose(candidates, frame.camera, least, "known")
+                good = False
+                if found.cam_from_world is not None:
+                    off, angle = pose_error(found.cam_from_world, frame.cam_from_world)
+                    good = off <= 0.01 * depth and angle <= 2
+                sums[j] += (len(taken), right[taken.keypoints].sum(), right.sum(), good, 1)
+        accepted, true, all_right, good_poses, frames = sums.T
+        precision, recall = true / np.maximum(accepted, 1), true / np.maximum(all_right, 1)
+        result[i] = np.stack([accepted / frames, precision, recall, good_poses / frames], axis=1)
+    return result
+
+
+def kinds(
+    tracks: Tracks, encoder: pm.Encoder, dim: int, calibration: MatchCalibration
+) -> NDArray[np.float64]:
+    """(kind of map, 3): precision of accepted matches, the expected one, recall."""
+    rows, queries = held_out_frames(tracks)
+    result = []
+    for kind in KINDS:
+        scene = pm.PrototypeMap(encoder, dim, APPEARANCE_BITS if kind == "appearances" else 0)
+        scene.add(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
+        with tempfile.TemporaryDirectory() as folder:
+            sealed = scene.seal(Path(folder) / "scene.pmk", bits=4 if kind == "4 bits" else 8)
+            given = label_matches(tracks, queries, sealed.search)
+        found = measure_calibration("", dim, calibration, given)
+        result.append([found.precision, found.expected, found.recall])
+    return np.array(result)
+
+
+def main() -> None:
+    """Measures and prints means over the sequences."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("tracks", type=Path, nargs="+")
+    parser.add_argument("--encoder", help="by default the one of the tracks' descriptor")
+    parser.add_argument("--dim", type=int, default=32)
+    asked = parser.parse_args()
+    loaded = {sequence_name(path): Tracks.load(path) for path in asked.tracks}
+    encoder = pm.Encoder.load(asked.encoder or next(iter(loaded.values())).descriptor)
+    by_rule, by_kind, given = [], [], {}
+    with progress_bar() as progress:
+        for name, tracks in tracked(loaded.items(), progress, "query maps"):
+            given[name] = matches_by_dim(encoder, tracks)[asked.dim]
+        for name, tracks in tracked(loaded.items(), progress, "localize"):
+            fitted = fit_calibration([m for other, m in given.items() if other != name])
+            by_rule.append(measure(tracks, encoder, asked.dim, rules(fitted)))
+            by_kind.append(kinds(tracks, encoder, asked.dim, fitted))
+    names = list(rules(MatchCalibration((0.0, 0.0, 0.0))))
+    means = np.mean(by_rule, axis=0)
+    rows = [
+        [
+            name,
+            *(text for p in means[:, i] for text in (f"{p[0]:.0f}", *(f"{x:.3f}" for x in p[1:]))),
+        ]
+        for i, name in enumerate(names)
+    ]
+    heads = [
+        f"{part}: {head}" for part in PARTS for head in ("matches", "precision", "recall", "found")
+    ]
+    print(ReportTable(["accepted", *heads], rows).markdown(), end="\n\n")
+    rows = [
+        [kind, *(f"{x:.3f}" for x in row)]
+        for kind, row in zip(KINDS, np.mean(by_kind, axis=0), strict=True)
+    ]
+    print(ReportTable(["map", "precision", "expected", "recall"], rows).markdown(), end="\n\n")
+    rows = [
+        [name, kind, *(f"{x:.3f}" for x in row)]
+        for name, table in zip(loaded, by_kind, strict=True)
+        for kind, row in zip(KINDS, table, strict=True)
+    ]
+    heads = ["sequence", "map", "precision", "expected", "recall"]
+    print(ReportTable(heads, rows, words=2).markdown())
+
+
+if __name__ == "__main__":
+    main()

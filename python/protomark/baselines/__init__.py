@@ -1,0 +1,1 @@
+"""What maps keep of a landmark's descriptors without Protomark: the methods to compare with."""

@@ -1,0 +1,110 @@
+"""Binary baselines: one or more packed descriptors per landmark, searched by Hamming distance."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark._core import hamming_search
+from protomark.baselines.method import Method
+from protomark.baselines.support import Support, unpack
+
+# The medoids of landmarks with equally many observations are computed together, as many at a time
+# as have this many bits.
+_BITS = 1 << 24
+
+
+class HammingMap(Method):
+    """Descriptors, each of a landmark, sorted by landmark id."""
+
+    def __init__(
+        self,
+        descriptors: NDArray[np.uint8],
+        landmarks: NDArray[np.int64],
+        bytes_per_landmark: float,
+    ) -> None:
+        self.descriptors = np.ascontiguousarray(descriptors)
+        self.landmarks = landmarks
+        self.bytes_per_landmark = bytes_per_landmark
+
+    def match(
+        self, descriptors: NDArray[np.uint8], threads: int = 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """See `Method.match`."""
+        landmarks, distances = hamming_search(
+            descriptors, self.descriptors, k=2, landmarks=self.landmarks, threads=threads
+        )
+        return landmarks, np.where(landmarks >= 0, distances, np.inf).astype(np.float32)
+
+
+def unaggregated(support: Support) -> HammingMap:
+    """Every descriptor; a landmark costs its mean number of descriptors and one byte for it.
+
+    The byte says how many descriptors follow, which is the least that leads from a descriptor back
+    to its landmark.
+    """
+    observations = len(support.descriptors) / len(support.ids)
+    return HammingMap(
+        support.descriptors, support.landmarks, observations * support.descriptors.shape[1] + 1
+    )
+
+
+def first_seen(support: Support) -> HammingMap:
+    """The descriptor of the earliest keyframe."""
+    return _one_each(support, support.descriptors[support.starts])
+
+
+def random_sample(support: Support) -> HammingMap:
+    """A descriptor drawn at random."""
+    rng = np.random.default_rng(support.seed)
+    rows = support.starts + rng.integers(0, support.counts)
+    return _one_each(support, support.descriptors[rows])
+
+
+def majority(support: Support) -> HammingMap:
+    """The mean of each bit, quantised at 0.5; a bit set in exactly half of them is set.
+
+    Other rules for ties (clear, as in the first descriptor, at random) change the precision by
+    less than its spread over seeds.
+    """
+    bits = 2 * support.bit_sums >= support.counts[:, None]
+    return _one_each(support, np.packbits(bits, axis=1, bitorder="little"))
+
+
+def bitwise_and(support: Support) -> HammingMap:
+    """A bit is set where every observation has it set."""
+    return _one_each(support, np.bitwise_and.reduceat(support.descriptors, support.starts, axis=0))
+
+
+def medoid(support: Support) -> HammingMap:
+    """What ORB-SLAM (Mur-Artal et al. 2015) and stella_vslam keep of a landmark.
+
+    Of each descriptor, the median of its Hamming distances to all of the landmark's descriptors,
+    itself included (the lower one of two middle values); the least median wins, on a tie the
+    first. This is `MapPoint::ComputeDistinctiveDescriptors` of ORB-SLAM.
+    """
+    chosen = support.starts.copy()
+    for size in np.unique(support.counts):
+        same = np.flatnonzero(support.counts == size)
+        step = max(1, _BITS // (int(size) * support.bits))
+        for at in range(0, len(same), step):
+            some = same[at : at + step]
+            rows = support.starts[some][:, None] + np.arange(size)
+            chosen[some] += _least_median(support.descriptors[rows])
+    return HammingMap(support.descriptors[chosen], support.ids, support.descriptors.shape[1])
+
+
+def _least_median(groups: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """(g, n, bytes) uint8 -> (g,) which of the n has the least median distance."""
+    many, size, width = groups.shape
+    bits = unpack(groups.reshape(-1, width)).astype(np.float32).reshape(many, size, -1)
+    set_bits = bits.sum(axis=2)
+    # Sums of at most a few thousand ones: exact in float32.
+    distances = set_bits[:, :, None] + set_bits[:, None, :] - 2 * bits @ bits.transpose(0, 2, 1)
+    middle = (size - 1) // 2
+    medians = np.partition(distances, middle, axis=2)[:, :, middle]
+    return np.argmin(medians, axis=1)
+
+
+def _one_each(support: Support, descriptors: NDArray[np.uint8]) -> HammingMap:
+    return HammingMap(descriptors, support.ids, descriptors.shape[1])

@@ -1,1 +1,0 @@
-"""What is measured, a file each: `run` adds what it found to the results."""

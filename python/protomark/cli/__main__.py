@@ -1,5 +1,0 @@
-"""`python -m protomark.cli`."""
-
-from protomark.cli import main
-
-main()

@@ -1,0 +1,55 @@
+"""The command `protomark merge`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def merge(
+    maps: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="MAP", help="Learning maps of the same encoder, dimensions and appearance bits."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
+    renumber: Annotated[
+        bool,
+        typer.Option(
+            "--renumber",
+            help="The maps have no landmark in common, whatever the ids say: landmarks of each "
+            "further map get new ids above all earlier ones.",
+        ),
+    ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the facts to this file.")
+    ] = None,
+) -> None:
+    """Merge maps that were built apart, exactly.
+
+    The result is the map that would have been built from all observations together.
+    Landmarks with the same id are one landmark, and their observations are summed. The command
+    prints how many there are, as ids may be equal by accident. docs/sharing.md says more.
+    """
+    from protomark.cli.terminal import (
+        check_outputs,
+        console,
+        facts_table,
+        progress_bar,
+        write_json,
+    )
+    from protomark.maps.merge import merge_files
+
+    check_outputs(output, json_file)
+    with progress_bar() as progress:
+        facts = merge_files(maps, output, renumber, progress)
+    write_json(json_file, facts)
+    rows = []
+    for i, one in enumerate(facts["inputs"]):
+        shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
+        rows.append((Path(one["file"]).name, f"{one['landmarks']:,} landmarks{shared}"))
+    rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
+    console.print(facts_table(rows))

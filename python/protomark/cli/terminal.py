@@ -1,0 +1,166 @@
+"""What all commands share: terminal output, progress, result files, and checks of outputs."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from protomark.files import write_text
+from protomark.progress import Progress as Report
+
+# Results go to stdout; what only matters while waiting goes to stderr, so that pipes stay clean.
+console = Console()
+error_console = Console(stderr=True)
+
+# Seconds between lines of progress where stderr is no terminal.
+_LINE_EVERY = 10.0
+
+
+def printable(text: str) -> str:
+    """The text with everything escaped that would control a terminal, or that none can show."""
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
+
+
+def say(text: str) -> None:
+    """Print one line with markup on stdout, without wrapping it."""
+    console.print(text, highlight=False, soft_wrap=True)
+
+
+def note(text: str) -> None:
+    """Print one line as it is on stderr, without wrapping it."""
+    error_console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress_bar(prefix: str = "") -> Iterator[Report]:
+    """A function that draws the progress of one stage after the other.
+
+    On a terminal this is a bar that disappears at the end, elsewhere a line every ten seconds.
+
+    Args:
+        prefix: printed before the name of each stage.
+    """
+    if not error_console.is_terminal:
+        yield _plain_lines(prefix)
+        return
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=error_console,
+        transient=True,
+        # Results printed meanwhile appear above the bar, unless stdout goes elsewhere.
+        redirect_stdout=console.is_terminal,
+    ) as bar:
+        task, current = bar.add_task(prefix, total=None), ""
+
+        def report(stage: str, done: int, total: int) -> None:
+            nonlocal current
+            # A stage may append figures to its name after a comma; its clock goes on then.
+            name = stage.partition(",")[0]
+            if name != current:
+                bar.reset(task)
+                current = name
+            bar.update(task, description=prefix + stage, completed=done, total=total or None)
+
+        yield report
+
+
+def _plain_lines(prefix: str) -> Report:
+    last = time.monotonic()
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _LINE_EVERY:
+            last = now
+            note(f"{prefix}{stage}: {done} of {total}" if total else f"{prefix}{stage}: {done}")
+
+    return report
+
+
+def table_of(*columns: str, title: str = "", left: int = 1) -> Table:
+    """A table without rules but under its head; columns after the first `left` align right."""
+    from rich.box import SIMPLE_HEAD
+
+    table = Table(
+        title=title or None,
+        title_justify="left",
+        title_style="bold",
+        header_style="",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+        show_edge=False,
+    )
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i < left else "right", no_wrap=True)
+    return table
+
+
+def facts_table(rows: list[tuple[str, str]]) -> Table:
+    """A table of names and values, without head or rules."""
+    from rich.markup import escape
+
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        table.add_row(*(escape(printable(cell)) for cell in row))
+    return table
+
+
+def readable_size(count: float) -> str:
+    """A number of bytes as KB or MB (powers of ten)."""
+    return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.0f} KB"
+
+
+def check_outputs(*paths: Path | None) -> None:
+    """Raise before any work if a result could not be written after it."""
+    for path in paths:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder: name a file to write")
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"{path.parent}: no such folder to write {path.name} to")
+
+
+def write_json(path: Path | None, facts: Any) -> None:
+    """Write the facts of a command to the file of `--json`, if one was named."""
+    if path is not None:
+        write_text(path, json.dumps(facts, indent=2) + "\n")
+
+
+def comma_separated(text: str) -> tuple[str, ...]:
+    """The names in a list such as toy,kitchen."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def comma_separated_numbers(option: str, text: str) -> tuple[int, ...]:
+    """The numbers in a list such as 10000,1000000.
+
+    Raises:
+        ValueError: the text is not such a list; the error names the option.
+    """
+    try:
+        return tuple(int(number) for number in comma_separated(text))
+    except ValueError:
+        raise ValueError(f"{option} {text}: not numbers with commas between them") from None

@@ -1,0 +1,159 @@
+"""Localizes whole query keyframes from matches with a map, and measures how far off they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.geometry.absolute_pose import estimate_pose
+from protomark.geometry.camera import Camera
+from protomark.geometry.pose import pose_error, transform
+from protomark.tracks.file import Tracks
+
+# A pose is found if it is off by at most this share of the median scene depth, and this angle.
+DEPTH_SHARE = 0.01
+DEGREES = 2.0
+# This share of a frame's keypoints, those with the clearest matches, goes to RANSAC.
+SELECTED_SHARE = 0.25
+# Reprojection error of an inlier, and of a right match, as a share of the image's longer side.
+PIXEL_SHARE = 0.005
+
+
+@dataclass(frozen=True)
+class QueryFrame:
+    """One query keyframe: all its keypoints, with and without landmark.
+
+    Attributes:
+        camera: its camera.
+        cam_from_world: (3, 4) float64, its true pose.
+        keypoints: (n, 2) float64, pixels.
+        descriptors: (n, bits / 8) uint8.
+        landmarks: (n,) int64, the true landmark of each keypoint, -1 where none is known.
+    """
+
+    camera: Camera
+    cam_from_world: NDArray[np.float64]
+    keypoints: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    landmarks: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, tracks: Tracks, keyframe: int) -> QueryFrame:
+        """Keyframe number `keyframe` of some tracks."""
+        rows = tracks.keypoints_of(keyframe)
+        return cls(
+            camera=tracks.cameras[int(tracks.keyframe_camera[keyframe])],
+            cam_from_world=tracks.cam_from_world[keyframe],
+            keypoints=tracks.keypoints[rows].astype(np.float64),
+            descriptors=tracks.descriptors[rows],
+            landmarks=tracks.landmark_of_keypoint[rows],
+        )
+
+    @property
+    def max_error(self) -> float:
+        """Pixels by which a right match may be off."""
+        return PIXEL_SHARE * max(self.camera.width, self.camera.height)
+
+
+@dataclass(frozen=True)
+class FrameMatches:
+    """Selected matches of one frame, the clearest first.
+
+    Attributes:
+        keypoints: (a,) int64, row of the keypoint in its frame.
+        landmarks: (a,) int64.
+    """
+
+    keypoints: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class LocalizedFrame:
+    """The pose of one frame, beside its true one.
+
+    Attributes:
+        cam_from_world: (3, 4) float64, or None where RANSAC found no pose.
+        position_error: distance of the camera centres, in world units, infinite without a pose.
+        angle_error: angle between the orientations in degrees, infinite without a pose.
+        inliers: (a,) bool, which of the selected matches support the pose.
+    """
+
+    cam_from_world: NDArray[np.float64] | None
+    position_error: float
+    angle_error: float
+    inliers: NDArray[np.bool_]
+
+    def found(self, scene_depth: float) -> bool:
+        """Whether the pose is within `DEPTH_SHARE` of the depth and `DEGREES`."""
+        return self.position_error <= DEPTH_SHARE * scene_depth and self.angle_error <= DEGREES
+
+
+def select_matches(
+    landmarks: NDArray[np.int64], distances: NDArray[np.floating], share: float = SELECTED_SHARE
+) -> FrameMatches:
+    """The clearest matches of one frame.
+
+    Keypoints are ranked by the ratio of the distances to their two nearest landmarks, equal
+    ratios by distance, then by order. A landmark keeps its best keypoint only. The first `share`
+    of the frame's keypoints is selected. A threshold on the ratio would favour some methods,
+    since ratios of Hamming and of Euclidean distances, and of few and of many dimensions,
+    spread differently; a share treats all alike.
+
+    Args:
+        landmarks: (n, 2) int64, two nearest landmarks, -1 where there is none.
+        distances: (n, 2) float32.
+        share: how many of the n keypoints are selected at most.
+    """
+    nearest, second = distances[:, 0].astype(np.float64), distances[:, 1].astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where(second > 0, nearest / second, 1.0)
+    order = np.lexsort((nearest, ratio))
+    order = order[landmarks[order, 0] >= 0]
+    _, best = np.unique(landmarks[order, 0], return_index=True)
+    selected = order[np.sort(best)][: int(np.ceil(share * len(landmarks)))]
+    return FrameMatches(selected, landmarks[selected, 0])
+
+
+def right_matches(
+    frame: QueryFrame, matches: FrameMatches, positions: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether each match (a,) is the keypoint's true landmark, or one that projects near it.
+
+    Args:
+        frame: the frame, with its true pose.
+        matches: its selected matches.
+        positions: (a, 3) float64, position of each match's landmark.
+    """
+    labelled = frame.landmarks[matches.keypoints] == matches.landmarks
+    pixels = frame.camera.project(transform(frame.cam_from_world, positions))
+    error = np.linalg.norm(pixels - frame.keypoints[matches.keypoints], axis=1)
+    return labelled | (error <= frame.max_error)
+
+
+def localize_frame(
+    frame: QueryFrame, matches: FrameMatches, positions: NDArray[np.float64]
+) -> LocalizedFrame:
+    """Absolute pose by PoseLib's RANSAC and refinement, beside the frame's true pose.
+
+    Args:
+        frame: the frame.
+        matches: its selected matches, the clearest first.
+        positions: (a, 3) float64, position of each match's landmark.
+    """
+    pixels = frame.keypoints[matches.keypoints]
+    found = estimate_pose(pixels, positions, frame.camera, frame.max_error)
+    if found is None:
+        return LocalizedFrame(None, np.inf, np.inf, np.zeros(len(positions), dtype=bool))
+    pose = found.cam_from_world
+    return LocalizedFrame(pose, *pose_error(pose, frame.cam_from_world), found.inliers)
+
+
+def scene_depth(tracks: Tracks) -> float:
+    """Median, over all observations, of the landmark's depth in front of the camera."""
+    rows = tracks.observations
+    positions = tracks.positions_of(tracks.landmark_of_keypoint[rows])
+    poses = tracks.cam_from_world[tracks.keyframe_of_keypoint[rows]]
+    return float(np.median(np.einsum("nj,nj->n", poses[:, 2, :3], positions) + poses[:, 2, 3]))

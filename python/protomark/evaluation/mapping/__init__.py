@@ -1,1 +1,0 @@
-"""The incremental pipeline on whole sequences, with several memories, beside COLMAP."""

@@ -1,0 +1,62 @@
+"""Optional dependencies: imported when they are first needed, and named by the error if absent."""
+
+from __future__ import annotations
+
+import json
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, distribution
+from typing import Any
+from urllib.parse import unquote, urlparse
+
+# Module -> what people call it, and the extra of this package that brings it.
+_EXTRAS = {
+    "cv2": ("OpenCV (opencv-contrib-python-headless)", "localize"),
+    "cv2.xfeatures2d": ("OpenCV's contrib modules (opencv-contrib-python-headless)", "localize"),
+    "matplotlib": ("matplotlib", "map"),
+    "poselib": ("PoseLib", "localize"),
+    "pycolmap": ("pycolmap", "localize"),
+    "rerun": ("the Rerun SDK (rerun-sdk)", "view"),
+    "rich": ("Rich", "cli"),
+    "safetensors": ("safetensors", "map"),
+    "torch": ("PyTorch", "train"),
+    "typer": ("Typer", "cli"),
+}
+
+
+def optional(module: str) -> Any:
+    """Import a module that one of the package's extras brings.
+
+    Raises:
+        ModuleNotFoundError: the module is absent; the error says how to install it.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        root = (error.name or module).partition(".")[0]
+        if root not in _EXTRAS:
+            raise
+        raise missing(root) from error
+
+
+def missing(module: str) -> ModuleNotFoundError:
+    """The error for an optional module that is absent."""
+    name, extra = _EXTRAS[module]
+    return ModuleNotFoundError(
+        f"this needs {name}, which is not installed: {install_command(extra)}", name=module
+    )
+
+
+def install_command(extra: str) -> str:
+    """The pip command that installs an extra: from the clone Protomark came from, else the index.
+
+    pip records where it installed a package from (PEP 610, direct_url.json).
+    """
+    source = "protomark"
+    try:
+        record = distribution("protomark").read_text("direct_url.json")
+        url = urlparse(json.loads(record)["url"]) if record else None
+        if url is not None and url.scheme == "file" and not url.path.endswith((".whl", ".gz")):
+            source = unquote(url.path)
+    except (PackageNotFoundError, ValueError, KeyError):
+        pass
+    return f"pip install '{source}[{extra}]'"

@@ -1,0 +1,54 @@
+"""The binary descriptors that OpenCV computes, each with the detector it is commonly used with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DescriptorKind:
+    """A descriptor as it is commonly used.
+
+    Attributes:
+        name: name on the command line and in files, for example "freak".
+        bytes: length of a descriptor in bytes.
+        detector: the detector that finds its keypoints.
+    """
+
+    name: str
+    bytes: int
+    detector: str
+
+    @property
+    def bits(self) -> int:
+        """Length of a descriptor in bits."""
+        return 8 * self.bytes
+
+
+# docs/tracks.md explains these pairs and gives their sources.
+DESCRIPTORS = {
+    kind.name: kind
+    for kind in (
+        DescriptorKind("freak", 64, "BRISK (multi-scale AGAST)"),
+        DescriptorKind("orb", 32, "ORB (oriented FAST)"),
+        DescriptorKind("brisk", 64, "BRISK (multi-scale AGAST)"),
+        DescriptorKind("akaze", 61, "AKAZE"),
+        DescriptorKind("latch", 32, "ORB (oriented FAST)"),
+        DescriptorKind("beblid", 64, "ORB (oriented FAST)"),
+        DescriptorKind("teblid", 32, "ORB (oriented FAST)"),
+    )
+}
+
+
+def descriptor_kind(name: str) -> DescriptorKind:
+    """The descriptor of a name.
+
+    Raises:
+        ValueError: there is no such descriptor.
+    """
+    try:
+        return DESCRIPTORS[name.lower()]
+    except KeyError:
+        raise ValueError(
+            f"{name}: unknown descriptor, choose one of {', '.join(DESCRIPTORS)}"
+        ) from None

@@ -1,0 +1,1 @@
+"""Cameras, poses, COLMAP models and the estimation of poses. Conventions are COLMAP's."""

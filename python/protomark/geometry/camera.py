@@ -1,0 +1,193 @@
+"""Cameras: COLMAP's models, as numbers that need no other library until pixels are projected."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# How many parameters each of COLMAP's camera models has (src/colmap/sensor/models.h there).
+CAMERA_MODELS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}
+# COLMAP's guess of an unknown focal length, as a share of the image's longer side.
+DEFAULT_FOCAL_RATIO = 1.2
+CAMERA_EXAMPLE = "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A COLMAP camera.
+
+    Attributes:
+        model: name of the camera model, for example "PINHOLE".
+        width: image width in pixels; 0 if the camera serves images of any size.
+        height: image height in pixels, likewise.
+        params: the model's parameters in COLMAP's order. The centre of the upper left pixel is at
+            (0.5, 0.5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @classmethod
+    def parse(cls, text: str) -> Camera:
+        """Read MODEL:PARAMETERS, or MODEL WIDTH HEIGHT PARAMETERS as in COLMAP's cameras.txt.
+
+        Raises:
+            ValueError: the text describes no camera that poses can be estimated for.
+        """
+        has_size = ":" not in text
+        words = text.replace(":", " ").replace(",", " ").split()
+        try:
+            size = (int(words[1]), int(words[2])) if has_size else (0, 0)
+            params = tuple(map(float, words[3 if has_size else 1 :]))
+            name = words[0].upper()
+        except IndexError:
+            raise ValueError(
+                f"camera {text!r} lacks numbers, for example {CAMERA_EXAMPLE}"
+            ) from None
+        except ValueError:
+            raise ValueError(
+                f"camera {text!r} has a parameter that is not a number, for example "
+                f"{CAMERA_EXAMPLE}"
+            ) from None
+        if has_size and min(size) < 1:
+            raise ValueError(f"camera {text!r} has no pixels, for example {CAMERA_EXAMPLE}")
+        camera = cls(name, *size, params)
+        camera.check_params()
+        if camera.params[0] <= 0:
+            raise ValueError(f"camera {text!r} has a focal length that is not positive")
+        return camera
+
+    @classmethod
+    def guess(cls, width: int, height: int) -> Camera:
+        """A pinhole camera for an image of which nothing else is known, as COLMAP guesses it."""
+        focal = DEFAULT_FOCAL_RATIO * max(width, height)
+        return cls("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The form that PoseLib and pycolmap take."""
+        return {
+            "model": self.model,
+            "width": self.width,
+            "height": self.height,
+            "params": list(self.params),
+        }
+
+    def __str__(self) -> str:
+        """A line of COLMAP's cameras.txt without the id."""
+        params = " ".join(f"{p:.12g}" for p in self.params)
+        return f"{self.model} {self.width} {self.height} {params}"
+
+    def check(self) -> None:
+        """Raise ValueError unless model, size and parameters are those of a COLMAP camera."""
+        for size in (self.width, self.height):
+            if type(size) is not int or not 0 < size < 2**31:
+                raise ValueError(f"{str(size)[:40]!r} is not a number of pixels")
+        self.check_params()
+
+    def check_params(self) -> None:
+        """Raise ValueError unless the model is one of COLMAP's and has these parameters."""
+        expected = CAMERA_MODELS.get(self.model) if isinstance(self.model, str) else None
+        if expected is None:
+            raise ValueError(
+                f"COLMAP has no camera model {str(self.model)[:40]!r}; its models are "
+                f"{', '.join(CAMERA_MODELS)}"
+            )
+        if len(self.params) != expected:
+            raise ValueError(
+                f"a camera of model {self.model} has {expected} parameters, not {len(self.params)}"
+            )
+        if not all(isinstance(p, Real) and math.isfinite(p) for p in self.params):
+            raise ValueError(f"the parameters {self.params} are not all finite numbers")
+
+    @property
+    def colmap(self) -> Any:
+        """The same camera as a `pycolmap.Camera`.
+
+        Raises:
+            ValueError: the installed pycolmap does not know the model, or refuses the parameters.
+        """
+        return _colmap_camera(self)
+
+    @property
+    def focal_length(self) -> float:
+        """Mean focal length in pixels."""
+        return float(self.colmap.mean_focal_length())
+
+    def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
+        """Undistort pixels (n, 2) to (n, 2) float64 x / z and y / z, NaN where the model fails."""
+        out = np.full((len(pixels), 2), np.nan)
+        if len(pixels):
+            out[:] = np.asarray(self.colmap.cam_from_img(np.asarray(pixels, np.float64)))
+        return out
+
+    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project points (n, 3) in camera coordinates to (n, 2) pixels, infinite behind it."""
+        out = np.full((len(points), 2), np.inf)
+        front = points[:, 2] > 0
+        if front.any():
+            out[front] = np.asarray(self.colmap.img_from_cam(np.asarray(points[front], np.float64)))
+        return out
+
+
+@lru_cache(maxsize=256)
+def _colmap_camera(camera: Camera) -> Any:
+    from protomark.geometry.colmap import pycolmap
+
+    # pycolmap reads past the end of too few parameters.
+    camera.check_params()
+    try:
+        converted = pycolmap.Camera(camera.as_dict())
+    except (RuntimeError, ValueError):
+        raise ValueError(f"this pycolmap does not know camera model {camera.model}") from None
+    if not converted.verify_params():
+        raise ValueError(f"{camera.params} are not parameters of camera model {camera.model}")
+    return converted
+
+
+def cameras_from_json(value: Any) -> dict[int, Camera]:
+    """Cameras by id from a JSON object whose values are those of `Camera.as_dict`.
+
+    Raises:
+        ValueError: the value is something else, or one of the cameras is not COLMAP's.
+    """
+    if not isinstance(value, dict):
+        raise ValueError("cameras are not a JSON object")
+    cameras = {}
+    for number, c in value.items():
+        try:
+            params = c["params"]
+            if not isinstance(params, list) or any(type(p) not in (int, float) for p in params):
+                raise ValueError("params are not a list of numbers")
+            camera = Camera(c["model"], c["width"], c["height"], tuple(map(float, params)))
+            camera.check()
+            cameras[int(number)] = camera
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"cameras: {number[:20]!r}: {error}") from None
+    return cameras

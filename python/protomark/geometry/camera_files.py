@@ -1,0 +1,117 @@
+"""Reads the camera of each image: from a COLMAP model, a cameras.txt, an option, or EXIF data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from protomark.geometry.camera import CAMERA_EXAMPLE, CAMERA_MODELS, Camera
+
+
+@dataclass(frozen=True)
+class CameraSet:
+    """Cameras, and which image was taken by which.
+
+    Attributes:
+        cameras: all of them; one without a size (0 x 0) serves images of any size.
+        by_image: camera by image name, where the source names images.
+    """
+
+    cameras: tuple[Camera, ...] = ()
+    by_image: Mapping[str, Camera] = field(default_factory=dict)
+
+    def find(self, name: str, width: int, height: int) -> Camera:
+        """The camera of an image: by its name, else the only one of its size.
+
+        Raises:
+            ValueError: no camera fits, or several do.
+        """
+        for key in (name, Path(name).name):
+            if key in self.by_image:
+                return self.by_image[key]
+        sized = {c if c.width else replace(c, width=width, height=height) for c in self.cameras}
+        fitting = [c for c in sized if (c.width, c.height) == (width, height)]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            raise ValueError(
+                f"{len(fitting)} of the cameras have {width} x {height} pixels and none names this "
+                "image: give a model folder with images, or one camera"
+            )
+        sizes = ", ".join(sorted({f"{c.width} x {c.height}" for c in sized}))
+        raise ValueError(
+            f"the image has {width} x {height} pixels, and none of the cameras does ({sizes}): "
+            "scale one of them"
+        )
+
+
+def read_cameras(source: str) -> CameraSet:
+    """Read cameras from a cameras.txt, a folder with a COLMAP model, or a camera written out.
+
+    Raises:
+        FileNotFoundError, ValueError: the source is none of these, or broken.
+    """
+    if source.partition(":")[0].partition(" ")[0].upper() in CAMERA_MODELS:
+        return CameraSet((Camera.parse(source),))
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"{source}: no cameras.txt, no folder with a COLMAP model, and no camera such as "
+            f"{CAMERA_EXAMPLE}"
+        )
+    if path.is_file() and path.suffix == ".txt":
+        return _read_text(path)
+    folder = path if path.is_dir() else path.parent
+    has_images = any((folder / f"images.{suffix}").is_file() for suffix in ("txt", "bin"))
+    if (folder / "cameras.txt").is_file() and not has_images:
+        return _read_text(folder / "cameras.txt")
+    return _read_model(folder)
+
+
+def _read_text(path: Path) -> CameraSet:
+    cameras = []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            params = tuple(float(word) for word in words[4:])
+            camera = Camera(words[1], int(words[2]), int(words[3]), params)
+            if not camera.focal_length > 0:
+                raise ValueError
+        except (ValueError, IndexError, OverflowError, TypeError):
+            raise ValueError(
+                f"{path}, line {number}: not a COLMAP camera (id, model, width, height, parameters)"
+            ) from None
+        cameras.append(camera)
+    if not cameras:
+        raise ValueError(f"{path}: no cameras in it")
+    return CameraSet(tuple(cameras))
+
+
+def _read_model(folder: Path) -> CameraSet:
+    from protomark.geometry.colmap import find_model, read_model
+
+    model = read_model(find_model(folder))
+    by_image = {
+        name: model.cameras[int(i)] for name, i in zip(model.names, model.camera_ids, strict=True)
+    }
+    return CameraSet(tuple(model.cameras.values()), by_image)
+
+
+def camera_from_exif(image: Path) -> Camera | None:
+    """A camera with the focal length that the image's EXIF data give; None without one."""
+    from protomark.geometry.colmap import pycolmap, quiet
+
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = "SIMPLE_PINHOLE"
+    with quiet():
+        try:
+            camera = pycolmap.infer_camera_from_image(str(image), options)
+        except (ValueError, RuntimeError):
+            return None
+    if not camera.has_prior_focal_length:
+        return None
+    params = tuple(float(p) for p in camera.params)
+    return Camera(camera.model.name, camera.width, camera.height, params)

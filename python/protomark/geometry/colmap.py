@@ -1,0 +1,178 @@
+"""COLMAP sparse models; the only module that imports pycolmap.
+
+Everything else that needs pycolmap imports it from here: `from protomark.geometry.colmap import
+pycolmap`. pycolmap carries a zlib of its own, and Python's `zlib` breaks for the whole process if
+it is first imported after pycolmap, so the order of the two imports below matters.
+"""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401  (must come before pycolmap, see above)
+
+# isort: split
+import contextlib
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.extras import optional
+from protomark.files import natural_key
+from protomark.geometry.camera import Camera
+from protomark.geometry.pose import camera_centers
+
+pycolmap = optional("pycolmap")
+
+__all__ = ["ColmapModel", "find_model", "pycolmap", "quiet", "read_model", "read_reconstruction"]
+
+_FILES = ("cameras", "images")
+
+
+@dataclass
+class ColmapModel:
+    """Cameras of a sparse model, and its images that have a pose, in natural order of their names.
+
+    Attributes:
+        cameras: COLMAP camera id -> camera.
+        names: m image names (img2 comes before img10).
+        image_ids: (m,) int64, COLMAP image ids.
+        camera_ids: (m,) int32, camera of each image.
+        cam_from_world: (m, 3, 4) float64.
+        unposed: names of images in the model that have no pose.
+    """
+
+    cameras: dict[int, Camera]
+    names: list[str]
+    image_ids: NDArray[np.int64]
+    camera_ids: NDArray[np.int32]
+    cam_from_world: NDArray[np.float64]
+    unposed: list[str]
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(m, 3) float64, camera centres in the world."""
+        return camera_centers(self.cam_from_world)
+
+    def check_for_triangulation(self, path: Path) -> None:
+        """Raise ValueError unless two images have poses at different places."""
+        if len(self.names) < 2:
+            raise ValueError(
+                f"{path}: {len(self.names)} image(s) with a pose, at least two are needed; "
+                "is this the right model?"
+            )
+        if np.ptp(self.centers, axis=0).max() <= 1e-9 * max(1.0, np.abs(self.centers).max()):
+            raise ValueError(
+                f"{path}: all cameras stand at the same place, so no landmark can be triangulated"
+            )
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep COLMAP's log off the terminal; failures reach the caller as exceptions."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def find_model(folder: Path) -> Path:
+    """The sparse model of a sequence folder: sparse/, sparse/0/ or the folder itself.
+
+    Raises:
+        FileNotFoundError: none of them holds a model.
+    """
+    for candidate in (folder / "sparse", folder / "sparse" / "0", folder):
+        if _suffix(candidate):
+            return candidate
+    raise FileNotFoundError(
+        f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/, "
+        "name it with --model"
+    )
+
+
+def _suffix(path: Path) -> str | None:
+    for suffix in (".bin", ".txt"):
+        if all((path / f"{name}{suffix}").is_file() for name in _FILES):
+            return suffix
+    return None
+
+
+def read_reconstruction(path: Path) -> Any:
+    """Read a sparse model, text or binary, with or without a file of points.
+
+    Returns:
+        A `pycolmap.Reconstruction`.
+
+    Raises:
+        FileNotFoundError: there is no model at `path`.
+        ValueError: the model is broken.
+    """
+    suffix = _suffix(path)
+    if suffix is None:
+        raise FileNotFoundError(
+            f"{path}: no COLMAP model here (it needs cameras and images, .bin or .txt)"
+        )
+    for name in _FILES:
+        if (path / f"{name}{suffix}").stat().st_size == 0:
+            raise ValueError(f"{path / (name + suffix)}: empty file, export the COLMAP model anew")
+    with quiet(), tempfile.TemporaryDirectory(prefix="protomark-") as temporary:
+        source = path
+        if not (path / f"points3D{suffix}").is_file():
+            source = Path(temporary)
+            for file in path.iterdir():
+                if file.is_file() and file.suffix == suffix:
+                    os.symlink(file.resolve(), source / file.name)
+            (source / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        try:
+            return pycolmap.Reconstruction(str(source))
+        except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
+            reason = re.sub(r"^\[.*?\] ", "", str(error))[:120]
+            raise ValueError(
+                f"{path}: broken COLMAP model ({reason}), export it anew from COLMAP"
+            ) from None
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Cameras and poses of a sparse model.
+
+    Raises:
+        FileNotFoundError: there is no model at `folder`.
+        ValueError: the model is broken.
+    """
+    return model_from_reconstruction(read_reconstruction(folder), folder)
+
+
+def model_from_reconstruction(reconstruction: Any, path: Path) -> ColmapModel:
+    """The cameras and poses of a pycolmap reconstruction that was read from `path`.
+
+    Raises:
+        ValueError: a camera or a pose is broken.
+    """
+    cameras = {}
+    for camera_id, c in reconstruction.cameras.items():
+        camera = Camera(c.model.name, c.width, c.height, tuple(float(p) for p in c.params))
+        if not np.isfinite(camera.params).all() or c.mean_focal_length() <= 0:
+            raise ValueError(f"{path}: camera {camera_id} has no valid focal length")
+        cameras[int(camera_id)] = camera
+    images = sorted(reconstruction.images.values(), key=lambda image: natural_key(image.name))
+    posed = [image for image in images if image.has_pose]
+    poses = np.array([i.cam_from_world().matrix() for i in posed], np.float64).reshape(-1, 3, 4)
+    for image, pose in zip(posed, poses, strict=True):
+        if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:, :3]) - 1) > 1e-3:
+            raise ValueError(f"{path}: the pose of image {image.name} is not a rigid motion")
+    return ColmapModel(
+        cameras=cameras,
+        names=[image.name for image in posed],
+        image_ids=np.array([image.image_id for image in posed], np.int64),
+        camera_ids=np.array([image.camera_id for image in posed], np.int32),
+        cam_from_world=poses,
+        unposed=[image.name for image in images if not image.has_pose],
+    )

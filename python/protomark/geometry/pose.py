@@ -1,0 +1,72 @@
+"""Rigid motions: poses are (3, 4) float64 `cam_from_world` matrices, as COLMAP has them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def transform(cam_from_world: Array, points: Array) -> Array:
+    """Points (n, 3) in the world to (n, 3) in camera coordinates."""
+    return np.asarray(points @ cam_from_world[:, :3].T + cam_from_world[:, 3])
+
+
+def camera_centers(cam_from_world: Array) -> Array:
+    """Camera centres (..., 3) in the world, of poses (..., 3, 4)."""
+    rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
+    return np.asarray(-np.einsum("...ji,...j->...i", rotation, translation))
+
+
+def relative_pose(first: Array, second: Array) -> tuple[Array, Array]:
+    """Rotation (3, 3) and translation (3,) from the first camera's coordinates to the second's."""
+    rotation = second[:, :3] @ first[:, :3].T
+    return rotation, second[:, 3] - rotation @ first[:, 3]
+
+
+def pose_error(estimate: Array, true: Array) -> tuple[float, float]:
+    """Distance of the camera centres in world units, and angle of the rotation in degrees."""
+    distance = np.linalg.norm(camera_centers(estimate) - camera_centers(true))
+    # The distance of the matrices is exact for small angles, where arccos of the trace is not.
+    chord = np.linalg.norm(estimate[:, :3] - true[:, :3]) / np.sqrt(8)
+    return float(distance), float(np.degrees(2 * np.arcsin(min(chord, 1.0))))
+
+
+def rotation_from_quaternion(quaternion: Array) -> Array:
+    """Rotation matrix (3, 3) of a quaternion w, x, y, z.
+
+    Raises:
+        ValueError: the quaternion is not of length 1 (within 5 %).
+    """
+    norm = np.linalg.norm(quaternion)
+    if not np.isfinite(norm) or abs(norm - 1) > 0.05:
+        raise ValueError(f"quaternion {quaternion.tolist()} is not of length 1")
+    w, *v = quaternion / norm
+    x = np.array(v)
+    cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
+
+
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Quaternion w, x, y, z with w >= 0 of a rotation matrix (3, 3).
+
+    The eigenvector of Bar-Itzhack (2000), which is well conditioned for every rotation.
+    """
+    r = rotation
+    k = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], 0, 0, 0],
+            [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], 0, 0],
+            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0],
+            [
+                r[1, 0] - r[0, 1],
+                r[2, 0] + r[0, 2],
+                r[2, 1] + r[1, 2],
+                r[2, 2] - r[0, 0] - r[1, 1],
+            ],
+        ]
+    )
+    _, vectors = np.linalg.eigh(k)  # reads the lower triangle
+    q = vectors[:, -1]
+    return np.asarray(q if q[0] >= 0 else -q)

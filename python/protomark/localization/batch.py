@@ -1,0 +1,338 @@
+"""Localizes many images, and writes their poses as a COLMAP model and a table."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.features.images import image_names, read_gray
+from protomark.files import write_text
+from protomark.geometry.absolute_pose import FocalLength, check_pose_model
+from protomark.geometry.camera import Camera
+from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras
+from protomark.geometry.pose import camera_centers, pose_error
+from protomark.geometry.pose_files import PoseSet, images_txt, read_poses
+from protomark.interrupt import deferred_interrupt
+from protomark.localization.localizer import Localizer
+from protomark.localization.prior import PosePrior
+from protomark.localization.solve import Localization
+from protomark.progress import Progress, silent
+
+POSES, CAMERAS, POINTS, TABLE = "images.txt", "cameras.txt", "points3D.txt", "poses.csv"
+# Distance in world units (metres where the map is metric) and degrees, as hloc reports them.
+THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+STAGES = ("features", "encode", "search", "pose", "total")
+
+
+@dataclass(frozen=True)
+class LocalizationRequest:
+    """What to localize, and how.
+
+    Attributes:
+        scene: a map file, or the folder that `protomark map` wrote.
+        images: image files, and folders of them.
+        camera: a cameras.txt, a folder with a COLMAP model, or a camera written out; None: focal
+            lengths come from EXIF data and matches.
+        refine_focal_length: whether focal lengths of given cameras are refined for each image.
+        true_poses: poses to measure against; None: nothing is measured.
+        priors: rough poses; None: the whole map is searched.
+        prior_distance: the priors' error in world units.
+        prior_degrees: the priors' error.
+        min_confidence: poses at least so likely to be right are written.
+        max_keypoints: the most keypoints to keep in an image.
+        threads: threads to encode and search on.
+    """
+
+    scene: Path
+    images: Sequence[Path]
+    camera: str | None = None
+    refine_focal_length: bool = False
+    true_poses: Path | None = None
+    priors: Path | None = None
+    prior_distance: float = 1.0
+    prior_degrees: float = 15.0
+    min_confidence: float = 0.9
+    max_keypoints: int = 2000
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class ImageResult:
+    """The result for one image.
+
+    Attributes:
+        name: of the image.
+        found: None where the image could not be read or has no fitting camera.
+        error: what was wrong with the image, or "".
+        true_error: distance and degrees from the true pose, infinite without a pose; None where
+            no true pose was given.
+    """
+
+    name: str
+    found: Localization | None
+    error: str = ""
+    true_error: tuple[float, float] | None = None
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the pose is right, 0 without one."""
+        return self.found.confidence if self.found else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON values, and as a row of the table."""
+        found = self.found
+        pose = found.cam_from_world if found else None
+        return {
+            "image": self.name,
+            "confidence": round(self.confidence, 6),
+            "inliers": found.inliers if found else 0,
+            "matches": found.evidence.matches if found else 0,
+            "cam_from_world": None if pose is None else pose.tolist(),
+            "focal_length": None if pose is None or found is None else found.camera.params[0],
+            "position_error": self.true_error[0] if self.true_error else None,
+            "angle_error": self.true_error[1] if self.true_error else None,
+            "seconds": {k: round(v, 6) for k, v in found.seconds.items()} if found else {},
+            "note": self.error or (found.reason if found else ""),
+        }
+
+
+@dataclass(frozen=True)
+class LocalizationBatch:
+    """The results for several images.
+
+    Attributes:
+        images: in their order.
+        min_confidence: poses at least so likely to be right are written and counted.
+        interrupted: whether Ctrl-C ended the run early.
+    """
+
+    images: Sequence[ImageResult]
+    min_confidence: float
+    interrupted: bool = False
+
+    def pose(self, image: ImageResult) -> NDArray[np.float64] | None:
+        """An image's pose if that is likely enough, else None."""
+        if image.found is None or image.found.confidence < self.min_confidence:
+            return None
+        return image.found.cam_from_world
+
+    def accepted(self, image: ImageResult) -> bool:
+        """Whether an image's pose is likely enough."""
+        return self.pose(image) is not None
+
+    def recall(self) -> list[dict[str, float]]:
+        """Share of the images with a true pose that were accepted within each of `THRESHOLDS`."""
+        measured = [i for i in self.images if i.true_error is not None]
+        rows = []
+        for distance, degrees in THRESHOLDS if measured else ():
+            right = [
+                self.accepted(i)
+                and i.true_error is not None
+                and i.true_error[0] <= distance
+                and i.true_error[1] <= degrees
+                for i in measured
+            ]
+            rows.append({"distance": distance, "degrees": degrees, "recall": float(np.mean(right))})
+        return rows
+
+    def summary(self) -> dict[str, Any]:
+        """Figures over all images."""
+        accepted = [i for i in self.images if self.accepted(i)]
+        posed = [i for i in self.images if i.found and i.found.cam_from_world is not None]
+        timed = [i.found.seconds for i in self.images if i.found]
+        errors = np.array([i.true_error for i in accepted if i.true_error is not None])
+        inliers = [i.found.inliers for i in accepted if i.found]
+        return {
+            "images": len(self.images),
+            "localized": len(accepted),
+            "below_confidence": len(posed) - len(accepted),
+            "unreadable": sum(i.found is None for i in self.images),
+            "min_confidence": self.min_confidence,
+            "median_inliers": float(np.median(inliers)) if accepted else None,
+            "median_seconds": {
+                stage: float(np.median([s[stage] for s in timed if stage in s]))
+                for stage in STAGES
+                if any(stage in s for s in timed)
+            },
+            "with_true_pose": sum(i.true_error is not None for i in self.images),
+            "median_position_error": float(np.median(errors[:, 0])) if len(errors) else None,
+            "median_angle_error": float(np.median(errors[:, 1])) if len(errors) else None,
+            "recall": self.recall(),
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {**self.summary(), "each": [i.as_dict() for i in self.images]}
+
+    def write(self, folder: Path) -> None:
+        """Write a COLMAP model of the accepted poses, and a table of all images."""
+        camera_lines: dict[str, int] = {}
+        poses, camera_ids = {}, {}
+        for image in self.images:
+            pose = self.pose(image)
+            if image.found is None or pose is None:
+                continue
+            poses[image.name] = pose
+            line = str(image.found.camera)
+            camera_ids[image.name] = camera_lines.setdefault(line, len(camera_lines) + 1)
+        text = "".join(f"{number} {line}\n" for line, number in camera_lines.items())
+        write_text(folder / CAMERAS, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS\n{text}")
+        write_text(folder / POSES, images_txt(poses, camera_ids))
+        write_text(folder / POINTS, "# The landmarks are in the map\n")
+        write_text(folder / TABLE, self.table())
+
+    def table(self) -> str:
+        """All images as CSV; a pose is the camera's centre and the rows of cam_from_world's R."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        header = ["image", "accepted", "confidence", "inliers", "matches", "x", "y", "z"]
+        header += [f"r{i}{j}" for i in range(3) for j in range(3)]
+        header += ["focal_length", "position_error", "angle_error"]
+        writer.writerow([*header, *(f"seconds_{stage}" for stage in STAGES), "note"])
+        for image in self.images:
+            row = image.as_dict()
+            pose = image.found.cam_from_world if image.found else None
+            numbers = [""] * 12
+            if pose is not None:
+                numbers = [f"{n:.9g}" for n in (*camera_centers(pose), *pose[:, :3].ravel())]
+            writer.writerow(
+                [
+                    *(row["image"], int(self.accepted(image))),
+                    *(row[key] for key in ("confidence", "inliers", "matches")),
+                    *numbers,
+                    *(row[key] for key in ("focal_length", "position_error", "angle_error")),
+                    *(row["seconds"].get(stage, "") for stage in STAGES),
+                    row["note"],
+                ]
+            )
+        return out.getvalue()
+
+
+def localize_files(
+    request: LocalizationRequest, output: Path, progress: Progress = silent
+) -> LocalizationBatch:
+    """Localize images and write their poses; one that cannot be read does not end the run.
+
+    Args:
+        request: what to localize, and how.
+        output: folder for the poses; it is made if it does not exist.
+        progress: called with each image.
+
+    Raises:
+        FileNotFoundError, ValueError: the map, cameras or poses are broken or do not fit, or no
+            image can be read.
+        FileExistsError: the folder holds another COLMAP model.
+    """
+    images = list_images(request.images)
+    if (output / POSES).exists() and not (output / TABLE).exists():
+        raise FileExistsError(
+            f"{output} holds a COLMAP model that `protomark localize` did not write: name another "
+            "folder with -o"
+        )
+    localizer = Localizer(
+        request.scene, max_keypoints=request.max_keypoints, threads=request.threads
+    )
+    cameras = read_cameras(request.camera) if request.camera else None
+    for camera in cameras.cameras if cameras else ():
+        check_pose_model(camera)
+    true_poses = _poses_of(request.true_poses, images)
+    priors = _poses_of(request.priors, images)
+    output.mkdir(parents=True, exist_ok=True)
+    results: list[ImageResult] = []
+    with deferred_interrupt() as interrupted:
+        for name, path in images:
+            progress("localize", len(results), len(images))
+            prior = priors.find(name)
+            results.append(
+                _localize_file(
+                    localizer,
+                    name,
+                    path,
+                    cameras,
+                    request,
+                    None
+                    if prior is None
+                    else PosePrior(prior, request.prior_distance, request.prior_degrees),
+                    true_poses.find(name),
+                )
+            )
+            if interrupted():
+                break
+        stopped = interrupted() and len(results) < len(images)
+    if all(result.found is None for result in results):
+        raise ValueError(
+            f"none of {len(results)} images can be localized; {results[0].name}: {results[0].error}"
+        )
+    batch = LocalizationBatch(results, request.min_confidence, stopped)
+    batch.write(output)
+    return batch
+
+
+def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Names and paths of images; those of a folder are in natural order and named from there.
+
+    Raises:
+        FileNotFoundError: a source is missing, or a folder holds no image.
+        ValueError: two images have the same name.
+    """
+    found: dict[str, Path] = {}
+    for source in sources:
+        if source.is_dir():
+            names = [(name, source / name) for name in image_names(source)]
+            if not names:
+                raise FileNotFoundError(f"{source}: no image in this folder")
+        elif source.is_file():
+            names = [(source.name, source)]
+        else:
+            raise FileNotFoundError(f"{source}: no such image or folder")
+        for name, path in names:
+            if name in found:
+                raise ValueError(f"two images are called {name}: {found[name]} and {path}")
+            found[name] = path
+    return list(found.items())
+
+
+def _poses_of(source: Path | None, images: Sequence[tuple[str, Path]]) -> PoseSet:
+    """Poses from a file or folder, which must be of some of the images."""
+    if source is None:
+        return PoseSet({})
+    poses = read_poses(source)
+    if all(poses.find(name) is None for name, _ in images):
+        raise ValueError(
+            f"{source}: none of its {len(poses)} poses belongs to one of the images, such as "
+            f"{images[0][0]}; it has one of {poses.example}"
+        )
+    return poses
+
+
+def _localize_file(
+    localizer: Localizer,
+    name: str,
+    path: Path,
+    cameras: CameraSet | None,
+    request: LocalizationRequest,
+    prior: PosePrior | None,
+    true_pose: NDArray[np.float64] | None,
+) -> ImageResult:
+    camera: Camera | None
+    focal_length: FocalLength = "rough" if request.refine_focal_length else "known"
+    lost = None if true_pose is None else (np.inf, np.inf)
+    try:
+        image = read_gray(path)
+        if cameras is None:
+            camera, focal_length = camera_from_exif(path), "rough"
+        else:
+            camera = cameras.find(name, image.shape[1], image.shape[0])
+        found = localizer.localize(image, camera, prior, focal_length=focal_length)
+    except (OSError, ValueError) as error:
+        return ImageResult(name, None, str(error), lost)
+    if true_pose is None or found.cam_from_world is None:
+        return ImageResult(name, found, true_error=lost)
+    return ImageResult(name, found, true_error=pose_error(found.cam_from_world, true_pose))

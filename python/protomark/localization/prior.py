@@ -1,0 +1,91 @@
+"""A rough pose, and the landmarks that a camera near it can see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.geometry.camera import Camera
+from protomark.geometry.pose import camera_centers
+
+# Points along each border of the image, which distortion bends.
+_BORDER = 33
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Roughly where a camera stands, from odometry, GPS or the frame before.
+
+    Attributes:
+        cam_from_world: (3, 4) float64.
+        distance: the camera's camera_centers is at most so far off, in world units.
+        degrees: its orientation is at most so far off.
+    """
+
+    cam_from_world: NDArray[np.float64]
+    distance: float
+    degrees: float
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.cam_from_world)
+        if shape != (3, 4) or not np.isfinite(self.cam_from_world).all():
+            raise ValueError(f"a prior pose is a finite (3, 4) matrix, not {shape}")
+        if not (self.distance >= 0 and self.degrees >= 0):
+            raise ValueError(
+                f"distance {self.distance} and degrees {self.degrees} of a prior pose must not be "
+                "negative"
+            )
+
+
+def visible(prior: PosePrior, camera: Camera, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which positions are in the image of some pose that the prior allows.
+
+    No such position is missed; a few others may be included, and occlusion is not considered.
+
+    Args:
+        prior: the rough pose.
+        camera: the camera.
+        positions: (n, 3) float64, world coordinates, NaN where there are none.
+
+    Returns:
+        (n,) bool, False for NaN.
+    """
+    normals = _field_of_view(camera)
+    away = positions - camera_centers(prior.cam_from_world)
+    distance = np.linalg.norm(away, axis=1)
+    placed = np.isfinite(distance)
+    away, distance = np.where(placed[:, None], away, 0.0), np.where(placed, distance, 0.0)
+    # The angle by which an error of the centre can change a landmark's direction: any angle for
+    # landmarks within that error.
+    near = distance <= prior.distance
+    ratio = np.where(near, 1.0, prior.distance / np.where(near, 1.0, distance))
+    slack = np.arcsin(np.clip(ratio, 0.0, 1.0)) + np.radians(prior.degrees)
+    direction = away @ prior.cam_from_world[:, :3].T / np.maximum(distance, 1e-300)[:, None]
+    inside = np.arcsin(np.clip(direction @ normals.T, -1.0, 1.0)).min(axis=1, initial=np.pi)
+    return placed & (near | (inside >= -slack))
+
+
+def _field_of_view(camera: Camera) -> NDArray[np.float64]:
+    """Inward normals (s, 3) of planes through the camera's centre that bound its field of view.
+
+    s is 0 for a field of view of 180 degrees or more.
+    """
+    t = np.linspace(0, 1, _BORDER)
+    w, h = camera.width * t, camera.height * t
+    zero, one = np.zeros(_BORDER), np.ones(_BORDER)
+    border = np.concatenate(
+        [
+            np.column_stack([w, zero]),
+            np.column_stack([w, camera.height * one]),
+            np.column_stack([zero, h]),
+            np.column_stack([camera.width * one, h]),
+        ]
+    )
+    rays = camera.rays(border)
+    if not np.isfinite(rays).all() or np.abs(rays).max() > 1e3:
+        return np.zeros((0, 3))
+    (left, top), (right, bottom) = rays.min(axis=0), rays.max(axis=0)
+    planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]], np.float64)
+    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))

@@ -1,0 +1,99 @@
+"""Frames on their way into the map: the input image, and its keypoints with or without a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+
+@dataclass
+class InputImage:
+    """One image of the input.
+
+    Attributes:
+        index: place in its input, from 0.
+        name: name, unique in the map.
+        time: seconds, or the index where no times are known.
+        image: (height, width) uint8, None where it cannot be read.
+        pose: (3, 4) given pose, or None.
+        problem: why there is no image, else "".
+    """
+
+    index: int
+    name: str
+    time: float
+    image: NDArray[np.uint8] | None
+    pose: Array | None = None
+    problem: str = ""
+
+
+@dataclass
+class Frame:
+    """Keypoints and descriptors of an image, and once it is registered its pose and landmarks.
+
+    Attributes:
+        index: place in its input, from 0.
+        name: image name, unique in the map.
+        time: seconds, or the index where no times are known.
+        camera_id: its camera.
+        keypoints: (n, 2) float32, pixels; those without a landmark are dropped when the frame
+            leaves the window.
+        rays: (n, 2) float64, undistorted.
+        descriptors: (n, bytes) uint8, None outside of the window.
+        encoded: (n, width), the same as the memory compares them; None outside of the window.
+        pose: (3, 4) float64, cam_from_world; NaN before the frame is registered.
+        landmarks: (n,) int64, landmark that a keypoint sees, -1 for none.
+        keyframe: whether its observations take part in bundle adjustment.
+    """
+
+    index: int
+    name: str
+    time: float
+    camera_id: int
+    keypoints: NDArray[np.float32]
+    rays: Array
+    descriptors: NDArray[np.uint8] | None = None
+    encoded: NDArray[Any] | None = None
+    pose: Array = field(default_factory=lambda: np.full((3, 4), np.nan))
+    landmarks: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    keyframe: bool = True
+
+    def at(self, pose: Array) -> Frame:
+        """The frame with a pose and no landmarks yet, to register in a map."""
+        landmarks = np.full(len(self.keypoints), -1, np.int64)
+        return replace(self, pose=np.ascontiguousarray(pose), landmarks=landmarks)
+
+    @property
+    def observed(self) -> Ids:
+        """Rows of the keypoints that see a landmark."""
+        return np.flatnonzero(self.landmarks >= 0)
+
+    @property
+    def seen(self) -> Ids:
+        """The landmarks of these keypoints."""
+        return self.landmarks[self.landmarks >= 0]
+
+    @property
+    def codes(self) -> NDArray[Any]:
+        """The encoded descriptors of a frame in the window."""
+        if self.encoded is None:
+            raise ValueError(f"{self.name}: no descriptors, it has left the window")
+        return self.encoded
+
+    @property
+    def in_window(self) -> bool:
+        """Whether the frame still has its descriptors."""
+        return self.descriptors is not None
+
+    def leave_window(self) -> None:
+        """Drop the descriptors, and the keypoints that see no landmark."""
+        rows = self.observed
+        self.keypoints, self.rays = self.keypoints[rows], self.rays[rows]
+        self.landmarks = self.landmarks[rows]
+        self.descriptors = self.encoded = None

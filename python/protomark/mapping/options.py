@@ -1,0 +1,49 @@
+"""How a map is made: everything that determines its content."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protomark.features.descriptors import descriptor_kind
+
+
+@dataclass(frozen=True)
+class MappingOptions:
+    """How a map is made. docs/mapping.md says how each default was chosen.
+
+    Attributes:
+        descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
+        max_keypoints: the most keypoints to keep in a frame.
+        encoder: name or file of the encoder; empty: the one that ships for the descriptor.
+        dim: dimensions of a prototype.
+        window: number of latest keyframes that keep their descriptors, to triangulate landmarks.
+        max_error: largest reprojection error of an observation, as a share of the longer side.
+        min_angle: smallest angle between two rays of a landmark, degrees.
+        min_inliers: fewest matches that must agree with a frame's pose.
+        calibrate: whether focal length and distortion are refined while mapping.
+        fixed_poses: whether poses are given and not adjusted.
+    """
+
+    descriptor: str = "akaze"
+    max_keypoints: int = 2000
+    encoder: str = ""
+    dim: int = 32
+    window: int = 8
+    max_error: float = 0.005
+    min_angle: float = 1.0
+    min_inliers: int = 20
+    calibrate: bool = False
+    fixed_poses: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)
+        checks = (
+            ("max_keypoints", self.max_keypoints >= 50, "at least 50"),
+            ("window", self.window >= 2, "at least 2"),
+            ("max_error", 0 < self.max_error <= 0.05, "in (0, 0.05]"),
+            ("min_angle", 0 < self.min_angle < 45, "in (0, 45)"),
+            ("min_inliers", self.min_inliers >= 8, "at least 8"),
+        )
+        for name, valid, expected in checks:
+            if not valid:
+                raise ValueError(f"{name} is {getattr(self, name)}, it must be {expected}")

@@ -1,0 +1,1 @@
+"""Map files: built from tracks, merged, split and described."""

@@ -1,0 +1,66 @@
+"""Builds a map from tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protomark import Encoder, PrototypeMap
+from protomark.features.upright import SUFFIX
+from protomark.tracks.file import Tracks
+
+
+def build_map(
+    tracks: Tracks,
+    encoder: Encoder,
+    dim: int | None = None,
+    *,
+    min_observations: int = 2,
+    look_bits: int = 0,
+    threads: int = 1,
+) -> PrototypeMap:
+    """A learning map with the prototypes and the position of every landmark of `tracks`.
+
+    Args:
+        tracks: the observations.
+        encoder: an encoder for their descriptor, or for its upright form.
+        dim: dimensions of a prototype, one of `encoder.dims`; None: all.
+        min_observations: landmarks with fewer are left out.
+        look_bits: signs of a code that tell the appearances of a landmark apart; 0: each landmark
+            has one prototype.
+        threads: threads to encode on.
+
+    Raises:
+        ValueError: the encoder is for another descriptor, no landmark is left, or `dim` or
+            `look_bits` do not fit the encoder.
+    """
+    tracks = tracks_for(encoder, tracks)
+    rows = tracks.observations
+    landmarks = tracks.landmark_of_keypoint[rows]
+    ids, inverse, counts = np.unique(landmarks, return_inverse=True, return_counts=True)
+    keep = counts[inverse] >= min_observations
+    if not keep.any():
+        raise ValueError(
+            f"no landmark has {min_observations} observations: there is no map to build"
+        )
+    scene = PrototypeMap(encoder, dim, look_bits)
+    scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
+    ids = ids[counts >= min_observations]
+    scene.set_positions(ids, tracks.positions_of(ids))
+    return scene
+
+
+def tracks_for(encoder: Encoder, tracks: Tracks) -> Tracks:
+    """The tracks with the descriptors that an encoder takes, upright ones if it needs them.
+
+    Raises:
+        ValueError: the encoder is for another descriptor.
+    """
+    if encoder.descriptor == tracks.descriptor + SUFFIX:
+        tracks = tracks.upright()
+    if (encoder.descriptor, encoder.bits) != (tracks.descriptor, tracks.bits):
+        raise ValueError(
+            f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, the "
+            f"tracks hold {tracks.descriptor} with {tracks.bits}: choose an encoder for "
+            f"{tracks.descriptor}"
+        )
+    return tracks

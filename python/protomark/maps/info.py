@@ -1,0 +1,133 @@
+"""Describes what a file holds: a map, an encoder or tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import protomark as pm
+from protomark.tracks.file import Tracks
+
+
+def is_tracks(path: Path) -> bool:
+    """Whether `describe` reads a file as tracks, by its suffix."""
+    return path.suffix == ".safetensors"
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Facts about a file as JSON values; `kind` says what it is.
+
+    Raises:
+        OSError, ValueError: the file cannot be read, or is not one of Protomark's.
+    """
+    if is_tracks(path):
+        return _describe_tracks(path)
+    kinds = dict(pm.file_sections(path))
+    if "network" in kinds:
+        return _describe_encoder(path)
+    return _describe_map(path, kinds)
+
+
+def _describe_tracks(path: Path) -> dict[str, Any]:
+    tracks = Tracks.load(path)
+    observations = len(tracks.observations)
+    return {
+        "kind": "tracks",
+        "descriptor": tracks.descriptor,
+        "bits": tracks.bits,
+        "keyframes": len(tracks.keyframe_names),
+        "keypoints": len(tracks.keypoints),
+        "landmarks": len(tracks.landmark_ids),
+        "observations": observations,
+        "observations_per_landmark": observations / max(1, len(tracks.landmark_ids)),
+        "cameras": [camera.as_dict() for camera in tracks.cameras.values()],
+        "info": tracks.info,
+        "bytes": path.stat().st_size,
+    }
+
+
+def _encoder_facts(encoder: pm.Encoder) -> dict[str, Any]:
+    return {
+        "name": encoder.name,
+        "descriptor": encoder.descriptor,
+        "bits": encoder.bits,
+        "dims": encoder.dims,
+        "multiply_adds": encoder.multiply_adds,
+        "identity": encoder.identity,
+        "data": encoder.data,
+        "licence": encoder.licence,
+        "notes": dict(encoder.notes),
+    }
+
+
+def _describe_encoder(path: Path) -> dict[str, Any]:
+    encoder = pm.Encoder.load(path)
+    return {"kind": "encoder", **_encoder_facts(encoder), "bytes": path.stat().st_size}
+
+
+def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
+    """Bytes per landmark that matching needs of a sealed map: prototypes and count, not ids.
+
+    A learning map counts as if it were sealed without loss. The numbers that pad a prototype to a
+    multiple of 4 bytes are counted; the up to 15 rows that pad the whole section
+    (`docs/format.md`) are not, as they do not grow with the map.
+    """
+    bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
+    in_a_word = 32 // bits
+    prototype = 4 * -(-scene.dim // in_a_word)
+    if scene.prototype_count == len(scene):
+        return prototype + 1
+    # One more byte says how many prototypes a landmark has.
+    return prototype * scene.prototype_count / len(scene) + 2
+
+
+def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]) -> float | None:
+    """Bytes per landmark of a sealed map's index, with the rows that pad its blocks."""
+    if not isinstance(scene, pm.SealedMap) or scene.index_cells == 0:
+        return None
+    width = {8: 4, 4: 8}[scene.code_bits]  # dimensions in 4 bytes
+    blocks = -(-scene.prototype_count // 16)
+    packed = blocks * 16 * -(-scene.dim // width) * 4
+    sections_bytes = sum(
+        sections.get(name, 0) for name in ("cells", "cellrows", "order", "ordersum", "probes")
+    )
+    return (sections_bytes + sections["protos"] - packed) / max(1, len(scene))
+
+
+def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
+    scene = pm.open(path)
+    summary = scene.summary()
+    sealed = scene if isinstance(scene, pm.SealedMap) else None
+    landmarks = max(1, len(scene))
+    ids = sum(sections.get(name, 0) for name in ("ids", "idblocks", "idrests")) / landmarks
+    error = None if sealed is None else sealed.position_error
+    look_bits = scene.look_bits if isinstance(scene, pm.PrototypeMap) else 0
+    several = look_bits > 0 or scene.prototype_count != len(scene)
+    return {
+        "kind": "learning map" if sealed is None else "sealed map",
+        "landmarks": len(scene),
+        "prototypes": scene.prototype_count if several else None,
+        "prototypes_per_landmark": scene.prototype_count / landmarks if several else None,
+        "look_bits": look_bits or None,
+        "dim": scene.dim,
+        "code_bits": None if sealed is None else sealed.code_bits,
+        "index_cells": scene.index_cells or None,
+        "index_bytes_per_landmark": _index_bytes(scene, sections),
+        "observations": summary["observations"],
+        "count_histogram": np.trim_zeros(summary["count_histogram"], "b").tolist(),
+        "landmarks_with_position": summary["landmarks_with_position"],
+        "position_bits": None if sealed is None else sealed.position_bits or None,
+        "position_error": None if error is None else error.tolist(),
+        "extent": None if summary["extent"] is None else summary["extent"].tolist(),
+        "metadata": dict(scene.metadata),
+        "bytes_per_landmark_for_matching": None if sealed is None else matching_bytes(scene) + ids,
+        "bytes": path.stat().st_size,
+        "bytes_by_section": sections,
+        "bytes_per_landmark_by_section": {
+            name: size / landmarks for name, size in sections.items()
+        },
+        "journal": pm.file_journal(path),
+        "encoder": _encoder_facts(scene.encoder),
+    }

@@ -1,0 +1,96 @@
+"""Merges maps that were built apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import protomark as pm
+from protomark.progress import Progress, silent, tracked
+
+MAX_ID = 2**63 - 1
+
+
+def merge_files(
+    inputs: Sequence[Path], output: Path, renumber: bool = False, progress: Progress = silent
+) -> dict[str, Any]:
+    """Merge learning maps, in this order, into the map file `output`; facts as JSON values.
+
+    Args:
+        inputs: map files of the same encoder, dimensions and appearance bits.
+        output: the file to write; none of the inputs.
+        renumber: landmarks of different files are different landmarks, whatever their ids: those of
+            each further file get new ids above all earlier ones.
+        progress: called with each map.
+
+    Raises:
+        ValueError: there are fewer than two inputs, one occurs twice, is sealed, does not fit the
+            first, or is the output.
+        OSError: a file cannot be read or written.
+    """
+    _check_inputs(inputs, output)
+    files: list[dict[str, Any]] = []
+    merged: pm.PrototypeMap | None = None
+    for path in tracked(inputs, progress, "merge"):
+        scene = open_learning_map(path)
+        facts = {"file": str(path), "landmarks": len(scene), "in_common": 0}
+        if merged is None:
+            merged = scene
+        else:
+            before = len(merged)
+            try:
+                if renumber:
+                    _merge_renumbered(merged, scene)
+                else:
+                    merged.update(scene)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
+            facts["in_common"] = before + len(scene) - len(merged)
+        files.append(facts)
+    assert merged is not None
+    merged.save(output)
+    return {
+        "kind": "learning map",
+        "inputs": files,
+        "landmarks": len(merged),
+        "dim": merged.dim,
+        "look_bits": merged.look_bits or None,
+        "bytes": output.stat().st_size,
+    }
+
+
+def _check_inputs(inputs: Sequence[Path], output: Path) -> None:
+    if len(inputs) < 2:
+        raise ValueError("name at least two maps to merge")
+    seen: set[Path] = set()
+    for path in inputs:
+        if path.resolve() in seen:
+            raise ValueError(f"{path} is named twice: its observations would count twice")
+        seen.add(path.resolve())
+        if path.exists() and output.exists() and path.samefile(output):
+            raise ValueError(f"{output} is one of the maps to merge: name another file to write")
+
+
+def open_learning_map(path: Path) -> pm.PrototypeMap:
+    """Open a map that takes observations.
+
+    Raises:
+        ValueError: the file holds a sealed map.
+        OSError: the file cannot be read.
+    """
+    scene = pm.open(path)
+    if not isinstance(scene, pm.PrototypeMap):
+        raise ValueError(f"{path} is a sealed map, which keeps no sums: give the learning map")
+    return scene
+
+
+def _merge_renumbered(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
+    theirs, existing = scene.ids, merged.ids
+    if not (len(theirs) and len(existing)):
+        merged.update(scene)
+        return
+    first = int(existing[-1]) + 1
+    if int(theirs[-1]) > MAX_ID - first:
+        raise ValueError(f"landmark ids from {first} on leave no room for those up to {theirs[-1]}")
+    merged.update(scene, into=theirs + first, source=theirs)

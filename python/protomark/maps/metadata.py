@@ -1,0 +1,52 @@
+"""Metadata that commands write into a map; the library itself writes none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from datetime import datetime, timezone
+
+
+def creation_time() -> str:
+    """Now in UTC, such as 2026-11-23T03:39:41Z, or the time that SOURCE_DATE_EPOCH gives.
+
+    That variable makes builds repeatable (https://reproducible-builds.org/specs/source-date-epoch).
+
+    Raises:
+        ValueError: SOURCE_DATE_EPOCH is not a number of seconds since 1970 up to the year 9999.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        time = datetime.now(timezone.utc) if epoch is None else _utc(int(epoch))
+    except (ValueError, OverflowError, OSError):
+        raise ValueError(
+            f"SOURCE_DATE_EPOCH={epoch} is not a number of seconds since 1970: unset or correct it"
+        ) from None
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _utc(seconds: int) -> datetime:
+    if seconds < 0:
+        raise ValueError(seconds)
+    return datetime.fromtimestamp(seconds, timezone.utc)
+
+
+def command_metadata(frame: str | None, pairs: Sequence[str]) -> dict[str, str]:
+    """The metadata of a map that a command makes: "created", and what the user gives.
+
+    Args:
+        frame: the coordinate frame; None: not given.
+        pairs: texts of the form NAME=TEXT, as --metadata takes them.
+
+    Raises:
+        ValueError: one of `pairs` is not of that form.
+    """
+    metadata = {"created": creation_time()}
+    if frame is not None:
+        metadata["frame"] = frame
+    for pair in pairs:
+        name, separator, text = pair.partition("=")
+        if not separator:
+            raise ValueError(f"--metadata {pair!r} is not of the form NAME=TEXT")
+        metadata[name] = text
+    return metadata

@@ -1,0 +1,89 @@
+"""Splits a map into parts that can be served apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import protomark as pm
+from protomark.maps.merge import open_learning_map
+from protomark.progress import Progress, silent, tracked
+
+
+def split_file(
+    path: Path,
+    folder: Path,
+    ids: list[int] | None = None,
+    parts: int | None = None,
+    cell_size: float | None = None,
+    sealed: bool = False,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Split a learning map by one of `ids`, `parts` and `cell_size`; facts as JSON values.
+
+    The files are NAME.0.pmk, NAME.1.pmk, ... by id, and NAME.I_J_K.pmk and NAME.nowhere.pmk by
+    space; sealed ones are NAME.0.sealed.pmk and so on. A part without landmarks gets no file.
+
+    Args:
+        path: the map file, NAME.pmk.
+        folder: where the parts go; it is made if it does not exist.
+        ids: ascending ids at which a part begins.
+        parts: number of parts by id, of equally many landmarks (give or take one).
+        cell_size: edge of the cubes into which space is cut, in the unit of the positions.
+        sealed: seal the parts.
+        progress: called with each part.
+
+    Raises:
+        ValueError: none or several of the three are given, the one does not fit the map, the map is
+            sealed, or a part would replace it.
+        OSError: a file cannot be read or written.
+    """
+    if sum(option is not None for option in (ids, parts, cell_size)) != 1:
+        raise ValueError("say how to split: one of --ids, --parts and --cell-size")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: name a folder to write the parts to")
+    scene = open_learning_map(path)
+    named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)
+    ending = ".sealed.pmk" if sealed else ".pmk"
+    files = [(folder / f"{path.stem}.{name}{ending}", part) for name, part in named if len(part)]
+    for file, _ in files:
+        if file.exists() and file.samefile(path):
+            raise ValueError(f"{file} is the map itself: name another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for file, part in tracked(files, progress, "write"):
+        if sealed:
+            part.seal(file)
+        else:
+            part.save(file)
+        part_ids = part.ids
+        written.append(
+            {
+                "file": str(file),
+                "landmarks": len(part),
+                "ids": [int(part_ids[0]), int(part_ids[-1])],
+                "bytes": file.stat().st_size,
+            }
+        )
+    return {"map": str(path), "landmarks": len(scene), "parts": written}
+
+
+def _by_id(
+    scene: pm.PrototypeMap, boundaries: list[int] | None, parts: int | None
+) -> list[tuple[str, pm.PrototypeMap]]:
+    if boundaries is None:
+        ids = scene.ids
+        if parts is None or not 1 <= parts <= len(ids):
+            raise ValueError(f"--parts {parts}: a map of {len(ids)} landmarks has 1 to {len(ids)}")
+        boundaries = ids[np.arange(1, parts) * len(ids) // parts].tolist()
+    width = len(str(len(boundaries)))
+    return [(f"{i:0{width}}", part) for i, part in enumerate(scene.split(boundaries))]
+
+
+def _by_space(scene: pm.PrototypeMap, cell_size: float) -> list[tuple[str, pm.PrototypeMap]]:
+    return [
+        ("nowhere" if cell is None else "_".join(map(str, cell)), part)
+        for cell, part in scene.split(cell_size=cell_size).items()
+    ]

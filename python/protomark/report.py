@@ -1,0 +1,120 @@
+"""Text of reports: Markdown tables, and the HTML page of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from protomark.plot import INK, MUTED, MapPictures, map_figures, svg_text
+
+_MAX_NAMES = 20
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>{title}</title>
+<meta name="viewport" content="width=device-width">
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; color: {ink}; max-width: 70rem; margin: 2rem auto;
+  padding: 0 1rem }}
+table {{ border-collapse: collapse }} td {{ padding: .2rem 1.2rem .2rem 0; vertical-align: top }}
+td:first-child {{ color: {muted} }} svg {{ max-width: 100%; height: auto }}
+</style>
+<h1>{title}</h1>
+<table>{rows}</table>
+{plots}
+<h2>Frames without a pose</h2>{unregistered}
+<h2>Events</h2>{events}
+</html>
+"""
+
+
+def markdown_table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    bold: Sequence[bool] = (),
+    left: int = 1,
+) -> str:
+    """A GitHub table; columns after the first `left` are aligned right.
+
+    Args:
+        head: names of the columns.
+        rows: one text per column.
+        bold: which rows stand out.
+        left: columns that are aligned left.
+    """
+    lines = [
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * left + "---:|" * (len(head) - left),
+    ]
+    marks = [*bold, *[False] * (len(rows) - len(bold))]
+    for row, strong in zip(rows, marks, strict=True):
+        lines.append("| " + " | ".join(f"**{c}**" if strong else c for c in row) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def percent(share: float | None) -> str:
+    """A share in percent, or a dash."""
+    return "–" if share is None else f"{100 * share:.1f}%"
+
+
+def map_page(facts: Mapping[str, Any], pictures: MapPictures, title: str) -> str:
+    """The report of a map: one HTML page that holds its plots.
+
+    Args:
+        facts: see `protomark.mapping.summary.summarise`.
+        pictures: what the plots show.
+        title: heading.
+    """
+    events = "".join(f"<li>{escape(event)}" for event in facts["events"])
+    return _PAGE.format(
+        title=escape(title),
+        ink=INK,
+        muted=MUTED,
+        rows="".join(f"<tr><td>{escape(k)}<td>{escape(v)}" for k, v in _map_rows(facts)),
+        plots="\n".join(svg_text(figure) for figure in map_figures(pictures)),
+        unregistered=_unregistered(facts["not_registered"]),
+        events=f"<ul>{events}</ul>" if events else "<p>None.",
+    )
+
+
+def _map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    ratio = facts["descriptor_bytes"] / max(facts["memory_bytes"], 1)
+    camera = facts["camera"]
+    params = ", ".join(f"{p:.5g}" for p in camera["params"])
+    return [
+        ("frames registered", f"{facts['registered']} of {facts['frames']}"),
+        ("keyframes", f"{facts['keyframes']}"),
+        ("landmarks", f"{facts['landmarks']}"),
+        (
+            "observations",
+            f"{facts['observations']} ({facts['track_length_mean']:.1f} per landmark)",
+        ),
+        (
+            "reprojection error",
+            f"mean {facts['reprojection_error_mean']:.2f} pixels, "
+            f"median {facts['reprojection_error_median']:.2f}",
+        ),
+        (
+            "memory for matching",
+            f"{facts['memory_bytes']:,} bytes, "
+            f"{facts['bytes_per_landmark']:.0f} per landmark; all {facts['descriptor']} "
+            f"descriptors of these observations: {facts['descriptor_bytes']:,} bytes, "
+            f"{ratio:.1f} times that",
+        ),
+        ("camera", f"{camera['model']}, {camera['width']}x{camera['height']}: {params}"),
+        (
+            "time",
+            f"{facts['seconds_total']:.1f} s, {facts['frames_per_second']:.1f} frames per second",
+        ),
+    ]
+
+
+def _unregistered(by_reason: Mapping[str, Sequence[str]]) -> str:
+    if not by_reason:
+        return "<p>None."
+    items = []
+    for reason, names in by_reason.items():
+        more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+        shown = escape(", ".join(names[:_MAX_NAMES]))
+        items.append(f"<li>{escape(reason)} ({len(names)}): {shown}{more}")
+    return f"<ul>{''.join(items)}</ul>"

@@ -1,1 +1,0 @@
-"""The paper's whole evaluation, run again on other sequences (`protomark reproduce`)."""

@@ -1,0 +1,153 @@
+"""Makes tracks files, and keeps those that are up to date."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from protomark.geometry.colmap import find_model
+from protomark.progress import Progress, silent
+from protomark.tracks import database
+from protomark.tracks.augmentation import METHOD, add_augmentations
+from protomark.tracks.extract import TracksOptions, extract, find_sequence, is_up_to_date
+from protomark.tracks.file import Tracks
+from protomark.tracks.summary import summarise
+
+
+@dataclass(frozen=True)
+class TracksInput:
+    """Where tracks are made from.
+
+    Attributes:
+        folder: a sequence, which holds images/ and a COLMAP model in sparse/ or sparse/0/.
+        images: folder of the images, if it is another one.
+        model: folder of the COLMAP model, if it is another one.
+        database: a COLMAP database that already holds binary descriptors; images are not read then.
+    """
+
+    folder: Path
+    images: Path | None = None
+    model: Path | None = None
+    database: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence."""
+        return self.folder.resolve().name
+
+
+@dataclass(frozen=True)
+class TracksFile:
+    """A tracks file that was made, or was up to date.
+
+    Attributes:
+        path: the file.
+        tracks: what it holds.
+        skipped: whether it was there already, made from the same input with the same options.
+        augmentations: copies of each keyframe that it holds, 0 for plain tracks.
+    """
+
+    path: Path
+    tracks: Tracks
+    skipped: bool
+    augmentations: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        facts = {"file": str(self.path), **summarise(self.tracks)}
+        facts |= {"seconds": self.tracks.info.get("seconds"), "skipped": self.skipped}
+        return facts | ({"augmentations": self.augmentations} if self.augmentations else {})
+
+
+def make_tracks(
+    source: TracksInput,
+    options: TracksOptions,
+    output: Path,
+    *,
+    force: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> TracksFile:
+    """Make the tracks of a sequence and save them as NAME.DESCRIPTOR.safetensors.
+
+    Args:
+        source: where to make them from.
+        options: how to make them.
+        output: folder for the file; it is made if it does not exist.
+        force: make the file anew even if it is up to date.
+        threads: threads for detection and matching.
+        progress: called with each stage.
+
+    Raises:
+        FileNotFoundError, ValueError: something is missing, broken, or gives no landmark.
+    """
+    path = output / f"{source.name}.{options.descriptor}.safetensors"
+    make: Callable[[], Tracks]
+    if source.database is not None:
+        if not source.folder.is_dir():
+            raise FileNotFoundError(f"{source.folder}: no such folder")
+        model = source.model or find_model(source.folder)
+        if not model.is_dir():
+            raise FileNotFoundError(f"{model}: no such folder of a COLMAP model")
+        inputs = (source.database, model, options.descriptor)
+        current = not force and database.is_up_to_date(path, *inputs)
+        make = lambda: database.tracks_from_database(*inputs, source.name)  # noqa: E731
+    else:
+        sequence = find_sequence(source.folder, source.images, source.model)
+        current = not force and is_up_to_date(path, options, sequence)
+        make = lambda: extract(sequence, options, threads, progress)  # noqa: E731
+    if current:
+        return TracksFile(path, Tracks.load(path), skipped=True)
+    tracks = _timed(make)
+    output.mkdir(parents=True, exist_ok=True)
+    tracks.save(path)
+    return TracksFile(path, tracks, skipped=False)
+
+
+def make_augmented_tracks(
+    plain: TracksFile,
+    images: Path,
+    count: int,
+    *,
+    force: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> TracksFile:
+    """Add augmented copies of each keyframe, and save NAME.DESCRIPTOR.augmented.safetensors.
+
+    Args:
+        plain: tracks that were made from images.
+        images: folder of these images.
+        count: copies of each keyframe.
+        force: make the file anew even if it is up to date.
+        threads: keyframes to work on at a time.
+        progress: called with each keyframe.
+    """
+    path = augmented_path(plain.path)
+    expected: dict[str, Any] = {"augmentations": count, "augmentation_method": METHOD}
+    expected |= {key: plain.tracks.info.get(key) for key in ("method", "options", "input")}
+    if path.is_file() and not force:
+        try:
+            existing = Tracks.load(path)
+            if all(existing.info.get(key) == value for key, value in expected.items()):
+                return TracksFile(path, existing, skipped=True, augmentations=count)
+        except (ValueError, OSError):
+            pass
+    tracks = _timed(lambda: add_augmentations(plain.tracks, images, count, threads, progress))
+    tracks.save(path)
+    return TracksFile(path, tracks, skipped=False, augmentations=count)
+
+
+def augmented_path(plain: Path) -> Path:
+    """Where augmented tracks go: toy.freak.augmented.safetensors for toy.freak.safetensors."""
+    return plain.with_name(f"{plain.stem}.augmented.safetensors")
+
+
+def _timed(make: Callable[[], Tracks]) -> Tracks:
+    begin = time.perf_counter()
+    tracks = make()
+    tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
+    return tracks

@@ -1,0 +1,372 @@
+"""Trains an encoder from tracks files: reads them, trains, writes the model and its card."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import protomark as pm
+from protomark._core import hamming_search
+from protomark.baselines.binary import majority, medoid
+from protomark.baselines.support import Support
+from protomark.files import write_text
+from protomark.match_calibration import SOURCE_KEY
+from protomark.plot import save_figure, training_figure
+from protomark.progress import Progress, silent
+from protomark.threads import one_blas_thread
+from protomark.tracks.file import Tracks, sequence_name
+from protomark.training.card import EncoderCard, SequencePrecision, describe_data
+from protomark.training.data import TrainingData, load_training, load_trials, read_tracks
+from protomark.training.match_calibration import calibrate
+from protomark.training.network import embed
+from protomark.training.train import (
+    Trainer,
+    TrainingOptions,
+    ValidationStep,
+    has_fast_bfloat16,
+    keep_freed_memory,
+)
+from protomark.training.validation import Trial, precision
+
+REPORT_SEEDS = (0, 1, 2)
+_TIMED_DESCRIPTORS, _TIMED_ROUNDS = 20_000, 5
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """What to train an encoder from, and what to write.
+
+    Attributes:
+        training: tracks files to train on.
+        validation: tracks files that select the model.
+        output: the model file to write; its card (.md) and a picture of the training (.png) are
+            written beside it, and a checkpoint (`<output>.checkpoint`) until training is done.
+        options: what determines the weights.
+        report: tracks files on which the finished encoder is measured, and nothing else.
+        resume: continue from the checkpoint.
+        upright: train on angles and sizes of keypoints, too.
+        name: of the encoder; the output's stem if empty.
+        licence: of the weights.
+        data_licences: of the sequences, by name, for the card and the model file.
+        device: "cpu" or "cuda".
+        threads: for PyTorch on a CPU; 0 for one per core.
+    """
+
+    training: Sequence[Path]
+    validation: Sequence[Path]
+    output: Path
+    options: TrainingOptions
+    report: Sequence[Path] = ()
+    resume: bool = False
+    upright: bool = False
+    name: str = ""
+    licence: str = ""
+    data_licences: Mapping[str, str] = field(default_factory=dict)
+    device: str = "cpu"
+    threads: int = 0
+
+    @property
+    def card_path(self) -> Path:
+        """The card beside the model."""
+        return self.output.with_suffix(".md")
+
+    @property
+    def plot_path(self) -> Path:
+        """The picture of the training beside the model."""
+        return self.output.with_suffix(".png")
+
+    def check(self) -> None:
+        """Raise before the first step if a result could not be written after the last."""
+        self.options.check()
+        if self.device != "cpu" and not self.device.startswith("cuda"):
+            raise ValueError(f"device {self.device!r} is not known; give cpu or cuda")
+        if self.device.startswith("cuda") and not torch.cuda.is_available():
+            raise ValueError("no CUDA device that this PyTorch can use; train with --device cpu")
+        if self.output in (self.card_path, self.plot_path):
+            raise ValueError(
+                f"{self.output}: {self.output.suffix} is the suffix of a file that is written "
+                "beside the model; name the model .pme"
+            )
+        for path in (self.output, self.card_path, self.plot_path):
+            if path.is_dir():
+                raise ValueError(f"{path} is a folder; name a file to write")
+            if not path.absolute().parent.is_dir():
+                raise FileNotFoundError(
+                    f"{path}: the folder {path.absolute().parent} does not exist"
+                )
+
+    def command(self, data: TrainingData) -> str:
+        """The command that trains this encoder again, with files by name only."""
+        words = ["protomark", "train", *(s.file for s in data.sources)]
+        for source in data.validation_sources:
+            words += ["--validation", source.file]
+        for path in self.report:
+            words += ["--report", path.name]
+        words += ["-o", self.output.name]
+        if self.upright:
+            words.append("--upright")
+        default = TrainingOptions()
+        if self.options.dims != default.dims:
+            words += ["--dims", ",".join(map(str, self.options.dims))]
+        for flag, name in (("--steps", "steps"), ("--batch", "landmarks"), ("--seed", "seed")):
+            if getattr(self.options, name) != getattr(default, name):
+                words += [flag, str(getattr(self.options, name))]
+        for flag, value in (("--name", self.name), ("--licence", self.licence)):
+            if value:
+                words += [flag, value]
+        for source in [*data.sources, *data.validation_sources]:
+            if source.name in self.data_licences:
+                words += ["--data-licence", f"{source.name}={source.licence}"]
+        if self.device != "cpu":
+            words += ["--device", self.device]
+        return shlex.join(words)
+
+
+def train_encoder(
+    request: TrainingRequest,
+    progress: Progress = silent,
+    note: Callable[[str], None] = lambda line: None,
+) -> EncoderCard:
+    """Train an encoder, write it with its card and a picture, and measure it.
+
+    Args:
+        request: what to train from, and what to write.
+        progress: called with each step.
+        note: called with a line for each validation, and with warnings.
+
+    Raises:
+        FileNotFoundError: a tracks file, the output's folder, or the checkpoint is missing.
+        ValueError: tracks, outputs, options, device or checkpoint do not fit.
+        TrainingInterrupted: Ctrl-C; `resume` continues.
+    """
+    request.check()
+    keep_freed_memory()
+    threads = request.threads or os.cpu_count() or 1
+    torch.set_num_threads(threads)
+    for path in request.report:
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such tracks file")
+    data = load_training(
+        request.training,
+        request.validation,
+        licences=request.data_licences,
+        upright=request.upright,
+        progress=progress,
+    )
+    for path in request.report:
+        _check_report(path, data, request.upright)
+    half = has_fast_bfloat16(request.device)
+    checkpoint = request.output.with_name(request.output.name + ".checkpoint")
+    trainer = Trainer(
+        data.views,
+        data.trials,
+        request.options,
+        checkpoint,
+        data.fingerprint,
+        request.device,
+        half,
+    )
+    if request.resume:
+        trainer.resume()
+    name = request.name or request.output.stem
+    _run(trainer, request.plot_path, name, progress, note)
+    encoder = pm.Encoder(
+        [{**layer} for layer in trainer.quantized.export()],
+        dims=list(request.options.dims),
+        name=name,
+        descriptor=data.descriptor,
+        scale=float(trainer.quantized.scale),
+        data=describe_data(data.sources),
+        licence=request.licence,
+    )
+    encoder, calibrated_on = _calibrated(
+        encoder, [*request.training, *request.validation], threads, note
+    )
+    encoder.save(request.output)
+    files = [(p, "validation") for p in request.validation]
+    files += [(p, "report") for p in request.report]
+    figures = []
+    for done, (path, role) in enumerate(files):
+        progress("measure", done, len(files))
+        figures.append(_measure(trainer, encoder, path, role, request, threads))
+    card = EncoderCard(
+        name=name,
+        descriptor=data.descriptor,
+        bits=data.bits,
+        widths=[data.bits, *trainer.network.hidden, request.options.dims[-1]],
+        dims=list(request.options.dims),
+        bytes=request.output.stat().st_size,
+        encode_ns=encode_nanoseconds(encoder),
+        licence=request.licence,
+        sources=data.sources,
+        validation=data.validation_sources,
+        command=request.command(data),
+        seconds=trainer.seconds,
+        machine=_machine(request.device, threads, half),
+        steps=request.options.steps,
+        best_step=trainer.best_step,
+        figures=figures,
+        history=[(v.step, v.loss, v.mean_precision) for v in trainer.history],
+        plot=request.plot_path.name,
+        calibrated_on=calibrated_on,
+    )
+    write_text(request.card_path, card.markdown())
+    checkpoint.unlink(missing_ok=True)
+    return card
+
+
+def default_output(tracks: Path, resume: bool = False, upright: bool = False) -> Path:
+    """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
+
+    Raises:
+        FileExistsError: it, its card or its picture exists already, and would be overwritten.
+    """
+    output = Path(f"{read_tracks(tracks, upright).descriptor}.pme")
+    for path in (output, output.with_suffix(".md"), output.with_suffix(".png")):
+        if path.exists() and not resume:
+            raise FileExistsError(f"{path} exists and is kept; name another file with -o")
+    return output
+
+
+def _check_report(path: Path, data: TrainingData, upright: bool) -> None:
+    """Raise before the first step if the encoder could not be measured on these tracks."""
+    tracks = read_tracks(path, upright)
+    if (tracks.descriptor, tracks.bits) != (data.descriptor, data.bits):
+        raise ValueError(
+            f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but the encoder is "
+            f"for {data.descriptor} of {data.bits}; report on tracks of the same descriptor"
+        )
+    load_trials(tracks, path, REPORT_SEEDS)
+
+
+def _run(
+    trainer: Trainer, plot: Path, name: str, progress: Progress, note: Callable[[str], None]
+) -> None:
+    mean = 0.0
+
+    def step(done: int, loss: float, validation: ValidationStep | None) -> None:
+        nonlocal mean
+        mean = 0.98 * mean + 0.02 * loss if mean else loss
+        figures = f"loss {mean:.3f}"
+        if trainer.history:
+            figures += f", precision {trainer.history[-1].mean_precision:.3f}"
+        progress(f"train, {figures}", done, trainer.options.steps)
+        if validation is not None:
+            note(_line(validation))
+            _save_plot(trainer.history, plot, name)
+
+    trainer.run(step)
+
+
+def _line(v: ValidationStep) -> str:
+    precisions = "  ".join(f"{d}: {value:.4f}" for d, value in v.precision.items())
+    stage = "quantised" if v.quantized else "float"
+    return (
+        f"step {v.step:6d}  loss {v.loss:.4f}  precision {precisions}  ({stage}, {v.seconds:.0f} s)"
+    )
+
+
+def _save_plot(history: Sequence[ValidationStep], path: Path, name: str) -> None:
+    figure = training_figure(
+        [v.step for v in history],
+        [v.loss for v in history],
+        {d: [v.precision[d] for v in history] for d in history[-1].precision},
+        next((v.step for v in history if v.quantized), None),
+        name,
+    )
+    save_figure(figure, path, made_by="protomark train", dpi=120)
+
+
+def _calibrated(
+    encoder: pm.Encoder, paths: Sequence[Path], threads: int, note: Callable[[str], None]
+) -> tuple[pm.Encoder, str]:
+    """The encoder with a match calibration, fitted to those files that are not augmented.
+
+    Tracks that leave nothing to fit do not fail the training: the encoder then has no calibration.
+    """
+    plain = [path for path in paths if not Tracks.load(path).info.get("augmentations")]
+    try:
+        with one_blas_thread():  # more threads sum in another order
+            encoder, _ = calibrate(encoder, plain, threads)
+    except ValueError as error:
+        note(
+            "not calibrated, so `protomark localize` will not know which matches to accept: "
+            f"{error}"
+        )
+    return encoder, encoder.notes.get(SOURCE_KEY, "")
+
+
+def _measure(
+    trainer: Trainer,
+    encoder: pm.Encoder,
+    path: Path,
+    role: str,
+    request: TrainingRequest,
+    threads: int,
+) -> SequencePrecision:
+    dims = trainer.options.dims
+    device = request.device
+    trials = load_trials(read_tracks(path, request.upright), path, REPORT_SEEDS)
+    plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if request.upright else trials
+    floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
+    integers = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
+    binary = [
+        _binary_precision(t, seed, threads) for t, seed in zip(plain, REPORT_SEEDS, strict=True)
+    ]
+    return SequencePrecision(
+        sequence_name(path),
+        role,
+        len(trials),
+        float(np.mean([unaggregated_precision(t, threads) for t in plain])),
+        float(np.mean([b["medoid"] for b in binary])),
+        float(np.mean([b["majority"] for b in binary])),
+        {d: float(np.mean([p[d] for p in floats])) for d in dims},
+        {d: float(np.mean([p[d] for p in integers])) for d in dims},
+    )
+
+
+def _binary_precision(trial: Trial, seed: int, threads: int) -> dict[str, float]:
+    """Precision of maps with one binary descriptor per landmark."""
+    support = Support(trial.landmarks, trial.support, seed)
+    found = {}
+    for name, method in (("medoid", medoid(support)), ("majority", majority(support))):
+        nearest, _ = method.match(trial.queries, threads=threads)
+        found[name] = float((nearest[:, 0] == trial.targets).mean())
+    return found
+
+
+def unaggregated_precision(trial: Trial, threads: int = 1) -> float:
+    """Share of queries whose nearest raw descriptor is one of their own landmark's."""
+    found, _ = hamming_search(trial.queries, trial.support, k=1, threads=threads)
+    return float((trial.landmarks[found[:, 0]] == trial.targets).mean())
+
+
+def encode_nanoseconds(encoder: pm.Encoder) -> float:
+    """Nanoseconds to encode one descriptor to full length on one thread, the best of five rounds.
+
+    Of 20,000 random descriptors at a time, in processor time, to which other work on the machine
+    adds little.
+    """
+    rng = np.random.default_rng(0)
+    descriptors = rng.integers(0, 256, (_TIMED_DESCRIPTORS, encoder.bits // 8), np.uint8)
+    seconds = []
+    for _ in range(_TIMED_ROUNDS):
+        began = time.process_time()
+        encoder.encode(descriptors, threads=1)
+        seconds.append(time.process_time() - began)
+    return 1e9 * min(seconds) / _TIMED_DESCRIPTORS
+
+
+def _machine(device: str, threads: int, half: bool) -> str:
+    arithmetic = "bfloat16" if half else "float32"
+    if device.startswith("cuda"):
+        return f"{torch.cuda.get_device_name(device)}, {arithmetic}"
+    return f"{platform.machine()}, {threads} thread{'s' if threads != 1 else ''}, {arithmetic}"

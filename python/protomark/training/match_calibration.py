@@ -1,0 +1,179 @@
+"""Fits the match calibration of an encoder to frames whose landmarks are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import protomark as pm
+from protomark.evaluation.frames import FrameMatches, QueryFrame, right_matches
+from protomark.evaluation.protocol import split
+from protomark.evaluation.run import draw_frames
+from protomark.maps.build import tracks_for
+from protomark.match_calibration import (
+    MatchCalibration,
+    calibration_features,
+    fit_logistic,
+    with_calibration,
+)
+from protomark.matching import MIN_PROBABILITY
+from protomark.progress import Progress, silent, tracked
+from protomark.tracks.file import Tracks, sequence_name
+
+FRAMES = 40
+Search = Callable[[NDArray[np.uint8]], tuple[NDArray[np.int64], NDArray[np.int32]]]
+
+
+@dataclass(frozen=True)
+class LabelledMatches:
+    """The nearest landmarks of all keypoints of some frames, with and without landmark.
+
+    Attributes:
+        distances: (n, 2) float64, squared, to the two nearest landmarks.
+        right: (n,) bool, whether the nearest is the keypoint's own, or projects to within half a
+            percent of the image's longer side.
+        frame: (n,) int64, which frame each keypoint is of.
+    """
+
+    distances: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    frame: NDArray[np.int64]
+
+
+def label_matches(tracks: Tracks, frames: Sequence[QueryFrame], search: Search) -> LabelledMatches:
+    """Search a map of `tracks` for every keypoint of `frames`."""
+    distances, right, number = [], [], []
+    for i, frame in enumerate(frames):
+        ids, away = search(frame.descriptors)
+        rows = np.flatnonzero(ids[:, 0] >= 0)
+        matches = FrameMatches(rows, ids[rows, 0])
+        right.append(right_matches(frame, matches, tracks.positions_of(matches.landmarks)))
+        distances.append(away[rows, :2].astype(np.float64))
+        number.append(np.full(len(rows), i))
+    return LabelledMatches(np.concatenate(distances), np.concatenate(right), np.concatenate(number))
+
+
+def fit_calibration(sequences: Sequence[LabelledMatches]) -> MatchCalibration:
+    """The calibration that fits the matches of some sequences best, each sequence counting alike.
+
+    Raises:
+        ValueError: no match is right, or all are.
+    """
+    distances = np.concatenate([m.distances for m in sequences])
+    right = np.concatenate([m.right for m in sequences])
+    weights = np.concatenate([np.full(len(m.right), 1 / len(m.right)) for m in sequences])
+    features = calibration_features(distances[:, 0], distances[:, 1])
+    return MatchCalibration(tuple(float(w) for w in fit_logistic(features, right, weights)))
+
+
+def held_out_frames(
+    tracks: Tracks, frames: int = FRAMES, seed: int = 0
+) -> tuple[NDArray[np.int64], list[QueryFrame]]:
+    """Rows of the observations that build a map, and frames to query it with.
+
+    A random tenth of the keyframes are queries, as in `protomark evaluate`.
+
+    Raises:
+        ValueError: the tracks are too few or too short.
+    """
+    part = split(tracks, seed)
+    return part.support_rows, draw_frames(tracks, part, frames)
+
+
+def matches_by_dim(
+    encoder: pm.Encoder, tracks: Tracks, frames: int = FRAMES, seed: int = 0, threads: int = 1
+) -> dict[int, LabelledMatches]:
+    """Matches with maps of `tracks` by each length of the encoder's codes."""
+    tracks = tracks_for(encoder, tracks)
+    rows, queries = held_out_frames(tracks, frames, seed)
+    codes = encoder.encode(tracks.descriptors[rows], threads=threads)
+    found = {}
+    for dim in encoder.dims:
+        scene = pm.PrototypeMap(encoder, dim)
+        scene.add_codes(tracks.landmark_of_keypoint[rows], np.ascontiguousarray(codes[:, :dim]))
+        found[dim] = label_matches(tracks, queries, partial(scene.search, threads=threads))
+    return found
+
+
+@dataclass(frozen=True)
+class CalibrationQuality:
+    """How well a calibration fits one sequence that it was not fitted to (or was the only one).
+
+    Attributes:
+        sequence: its name.
+        dim: length of a code.
+        right: share of keypoints whose nearest landmark is right.
+        precision: share of right matches among those accepted.
+        recall: share of right matches that are accepted.
+        expected: mean probability of the accepted ones, to compare with `precision`.
+    """
+
+    sequence: str
+    dim: int
+    right: float
+    precision: float
+    recall: float
+    expected: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return asdict(self)
+
+
+def measure_calibration(
+    sequence: str, dim: int, calibration: MatchCalibration, matches: LabelledMatches
+) -> CalibrationQuality:
+    """How well a calibration predicts which matches of one sequence are right."""
+    probability = calibration.probability(matches.distances)
+    accepted = probability >= MIN_PROBABILITY
+    right = matches.right[accepted]
+    return CalibrationQuality(
+        sequence,
+        dim,
+        float(matches.right.mean()),
+        float(right.mean()) if len(right) else 0.0,
+        float(right.sum() / max(matches.right.sum(), 1)),
+        float(probability[accepted].mean()) if len(right) else 0.0,
+    )
+
+
+def calibrate(
+    encoder: pm.Encoder, paths: Sequence[Path], threads: int = 1, progress: Progress = silent
+) -> tuple[pm.Encoder, list[CalibrationQuality]]:
+    """The encoder with a match calibration, and how well that fits each sequence.
+
+    The quality on each sequence is of a fit to the others, where there are any.
+
+    Args:
+        encoder: the encoder.
+        paths: tracks files of its descriptor (of the plain one, if it is an upright encoder).
+        threads: threads to encode and search on.
+        progress: called with each file.
+
+    Raises:
+        FileNotFoundError, ValueError: a file is missing or broken, or is of another descriptor.
+    """
+    found: dict[str, dict[int, LabelledMatches]] = {}
+    for path in tracked(paths, progress, "query maps"):
+        name = sequence_name(path)
+        if name in found:
+            raise ValueError(f"{path}: two files are of the sequence {name}")
+        tracks = Tracks.load(path)
+        try:
+            found[name] = matches_by_dim(encoder, tracks, threads=threads)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    quality = []
+    for name in found:
+        others = [matches for other, matches in found.items() if other != name] or [found[name]]
+        for dim in encoder.dims:
+            fitted = fit_calibration([matches[dim] for matches in others])
+            quality.append(measure_calibration(name, dim, fitted, found[name][dim]))
+    calibration = {dim: fit_calibration([m[dim] for m in found.values()]) for dim in encoder.dims}
+    return with_calibration(encoder, calibration, ", ".join(found)), quality
