@@ -63,8 +63,8 @@ comma := ,
 sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$(1)
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
-CORE_TESTS := $(addprefix tests/test_,cli.py encoder.py evaluation_protocol.py example_reader.py \
-  features.py files.py four_bit_maps.py hamming.py index.py journal.py limits.py looks.py map_file.py \
+CORE_TESTS := $(addprefix tests/test_,appearances.py cli.py encoder.py evaluation_protocol.py example_reader.py \
+  features.py files.py four_bit_maps.py hamming.py index.py journal.py limits.py map_file.py \
   metadata.py mutated_maps.py mutated_tracks.py prototypes.py sealed_sections.py sharing.py \
   subset.py tracks_file.py training_sampling.py)
 sanitize: sanitize-memory sanitize-threads sanitize-python-memory sanitize-python-threads
@@ -128,7 +128,7 @@ check: .venv-check/installed
 	.venv-check/bin/clang-format --dry-run -Werror $(CPP)
 	$(call cmake,.venv-check) -S core -B build/tidy -DPROTOMARK_BUILD_TESTS=OFF \
 	  -DCMAKE_EXPORT_COMPILE_COMMANDS=ON > /dev/null
-	.venv-check/bin/clang-tidy --quiet -p build/tidy $(wildcard core/src/*.cpp)
+	.venv-check/bin/clang-tidy --quiet -p build/tidy $(wildcard core/src/*/*.cpp)
 
 format: .venv-check/installed
 	.venv-check/bin/ruff format

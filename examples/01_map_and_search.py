@@ -16,8 +16,8 @@ encoder = pm.Encoder.load("freak")
 frame = tracks.keypoints_of(40)
 seen = np.setdiff1d(tracks.observations, np.arange(frame.start, frame.stop))
 
-# 48 of the encoder's 64 numbers; what looks different in 10 signs of a code is kept apart.
-scene = pm.PrototypeMap(encoder, dim=48, look_bits=10)
+# 48 of the encoder's 64 numbers; appearances whose codes differ in one of 10 signs are kept apart.
+scene = pm.PrototypeMap(encoder, dim=48, appearance_bits=10)
 scene.add(tracks.landmark_of_keypoint[seen], tracks.descriptors[seen])
 print(scene)
 
@@ -33,6 +33,6 @@ scene.add(ids[matched, 0][right], tracks.descriptors[frame][matched][right])
 
 scene.metadata = {"frame": "COLMAP, no scale", "source": "sample"}
 scene.save("scene.pmk")
-# 4 bits a number, looks joined until a landmark has 1.29 prototypes on average.
-sealed = scene.seal("scene.sealed.pmk", bits=4, prototypes=1.29)
-print(sealed, f"{matching_bytes(sealed):.0f} bytes a landmark")
+# Numbers get 4 bits, and appearances are merged until a landmark takes 33 bytes on average.
+sealed = scene.seal("scene.sealed.pmk", bytes_per_landmark=33)
+print(sealed, f"{matching_bytes(sealed):.0f} bytes per landmark")

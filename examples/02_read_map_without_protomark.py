@@ -2,7 +2,7 @@
 
     python examples/02_read_map_without_protomark.py scene.pmk
 
-A reader in another language does what stands here. It answers exactly as Protomark does.
+A reader in another language takes the same steps. The answers are exactly those of Protomark.
 """
 
 import struct
@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-ENCODER, OPEN_MAP, SEALED_MAP = 1, 2, 3
+ENCODER, LEARNING_MAP, SEALED_MAP = 1, 2, 3
 
 
 def sections(data: bytes, *kinds: int) -> dict[str, bytes]:
-    """The sections of a file of one of these kinds, bounds and checksums checked."""
+    """Check and return the sections of a file of one of these kinds."""
     if len(data) < 64 or data[:8] != b"PROTOMRK":
         raise ValueError("not a Protomark file")
     version, kind, size, count, crc = struct.unpack_from("<IIQII", data, 8)
     end = 64 + 32 * count
-    if version > 4 or kind not in kinds or size != len(data) or count > 64 or end > size:
-        raise ValueError(f"of version {version} or kind {kind}, or cut off")
+    if version != 1 or kind not in kinds or size != len(data) or count > 64 or end > size:
+        raise ValueError(f"its version is {version}, its kind {kind}, or it is cut off")
     if zlib.crc32(data[:28] + bytes(4) + data[32:end]) != crc:
         raise ValueError("its header does not match its checksum")
     found = {}
@@ -34,28 +34,29 @@ def sections(data: bytes, *kinds: int) -> dict[str, bytes]:
         if len(content) != length or zlib.crc32(content) != crc:
             raise ValueError(f"section {name!r} does not match its checksum")
         found[name.rstrip(b"\0").decode()] = content
-    return found  # those that a reader does not know, it leaves alone
+    return found  # a reader ignores those that it does not know
 
 
 def bit_numbers(content: Any, count: int, width: int) -> Any:
-    """Numbers of `width` bits one after the other, least significant bits first."""
+    """Unpack `count` numbers of `width` bits, least significant bits first."""
     bits = np.unpackbits(content, count=count * width, bitorder="little").reshape(count, width)
     return (bits.astype(np.int64) << np.arange(width)).sum(1)
 
 
 def sealed_ids(parts: dict[str, bytes], n: int) -> Any:
-    """The ids of a sealed map's n landmarks: blocks of 128, plain in old files, or 0 ... n - 1."""
+    """Return the ids of a sealed map's n landmarks: in blocks of 128, or 0 ... n - 1."""
     if "idblocks" not in parts:
-        return np.frombuffer(parts["ids"], "<i8") if "ids" in parts else np.arange(n)
-    rests, ids = np.frombuffer(parts["idrests"], np.uint8), np.arange(n) % 128
-    for i, (base, place) in enumerate(struct.iter_unpack("<qQ", parts["idblocks"])):
+        return np.arange(n)
+    gaps, ids = np.frombuffer(parts["idgaps"], np.uint8), np.arange(n) % 128
+    for i, (first_id, word_and_width) in enumerate(struct.iter_unpack("<qQ", parts["idblocks"])):
+        word, width = divmod(word_and_width, 64)
         block = ids[128 * i : 128 * i + 128]
-        block += base + bit_numbers(rests[place // 64 * 8 :], len(block), place % 64)
+        block += first_id + bit_numbers(gaps[8 * word :], len(block), width)
     return ids
 
 
 def texts(content: bytes) -> Iterator[str]:
-    """What a map says of itself: name, text, name, text, ..."""
+    """Yield the texts of a map's metadata: name, text, name, text, ..."""
     while content:
         end = 4 + int.from_bytes(content[:4], "little")
         yield content[4:end].decode()
@@ -80,7 +81,7 @@ class Encoder:
             self.layers.append((weights, bias, multipliers, shift, table))
 
     def encode(self, descriptors: Any, dim: int) -> Any:
-        """(n, bits / 8) uint8 to (n, dim) integers."""
+        """Encode descriptors (n, bits / 8) uint8 as codes (n, dim), integers."""
         x = np.unpackbits(descriptors, axis=1, bitorder="little").astype(np.int64)
         for weights, bias, multipliers, shift, table in self.layers:
             t = ((x @ weights.T + bias) * multipliers + (1 << (shift - 1))) >> shift
@@ -89,20 +90,29 @@ class Encoder:
 
 
 class Map:
-    """Prototypes (m, k), rounded, `landmarks` (m,) ids of theirs; counts, positions, metadata."""
+    """A map of n landmarks and m prototypes of k numbers.
+
+    Attributes:
+        ids: (n,) landmark ids, ascending.
+        prototypes: (m, k) integers.
+        landmarks: (m,) the landmark id of each prototype.
+        counts: observations, of each prototype in a learning map, of each landmark in a sealed one.
+        positions: (n, 3), NaN where there is none.
+        metadata: texts by name.
+    """
 
     def __init__(self, data: bytes) -> None:
-        parts = sections(data, OPEN_MAP, SEALED_MAP)
+        parts = sections(data, LEARNING_MAP, SEALED_MAP)
         self.encoder = Encoder(parts["encoder"])
         n, k, *origin = struct.unpack("<QQ3d", parts["shape"])
         pairs = texts(parts.get("metadata", b""))
         self.metadata = dict(zip(pairs, pairs, strict=True))
-        is_open = "sums" in parts
-        self.ids = np.frombuffer(parts["ids"], "<i8") if is_open else sealed_ids(parts, n)
-        rows = np.frombuffer(parts["rows"], "<u4" if is_open else "u1") if "rows" in parts else 1
+        learning = "sums" in parts
+        self.ids = np.frombuffer(parts["ids"], "<i8") if learning else sealed_ids(parts, n)
+        rows = np.frombuffer(parts["rows"], "<u4" if learning else "u1") if "rows" in parts else 1
         self.landmarks = np.repeat(self.ids, rows)
-        self.counts = np.frombuffer(parts["counts"], "u1")  # open: of prototypes; else landmarks
-        if is_open:
+        self.counts = np.frombuffer(parts["counts"], "u1")
+        if learning:
             sums = np.frombuffer(parts["sums"], "<i2").reshape(-1, k).astype(np.int64)
             count = self.counts[:, None].astype(np.int64)
             self.prototypes = np.sign(sums) * ((2 * abs(sums) + count) // (2 * count))
@@ -110,35 +120,35 @@ class Map:
             self.prototypes = sealed_prototypes(parts, n, k, len(self.landmarks))
         self.positions = np.full((n, 3), np.nan)
         if "position" in parts:
-            dtype, none, step = "<f8" if is_open else "<f4", np.nan, np.ones(3)
+            dtype, none, step = "<f8" if learning else "<f4", np.nan, np.ones(3)
             if "steps" in parts:  # 16-bit positions
                 dtype, none, step = "<u2", 65535, np.frombuffer(parts["steps"], "<f8")
             xyz = np.frombuffer(parts["position"], dtype).reshape(n, 3)
             self.positions = np.where(xyz == none, np.nan, origin + step * xyz)
 
     def search(self, descriptors: Any) -> tuple[Any, Any]:
-        """The nearest landmark of each descriptor, ties to the smaller id; squared distances."""
+        """Return the nearest landmark of each descriptor and the squared distance to it."""
         codes, p = self.encoder.encode(descriptors, self.prototypes.shape[1]), self.prototypes
         squared = (codes**2).sum(1)[:, None] - 2 * codes @ p.T + (p**2).sum(1)
-        nearest = squared.argmin(1)  # the first: prototypes are sorted by id
+        nearest = squared.argmin(1)  # of equals the first, which has the smallest id
         return self.landmarks[nearest], squared.min(1).astype(np.int32)
 
 
 def sealed_prototypes(parts: dict[str, bytes], n: int, k: int, m: int) -> Any:
-    """The m prototypes of a sealed map by landmark, (m, k)."""
-    if "levels" in parts:  # 4 bits a number
-        half_step = struct.unpack("<II", parts["levels"])[1]
+    """Return the m prototypes of a sealed map by landmark, (m, k)."""
+    if "sq4scale" in parts:  # 4 bits per number
+        scale = int.from_bytes(parts["sq4scale"], "little")
         b = np.frombuffer(parts["protos"], "u1").reshape(-1, -(-k // 8), 16, 4)
-        p = half_step * (2 * np.concatenate([b & 15, b >> 4], axis=3).astype(np.int64) - 15)
+        p = scale * (2 * np.concatenate([b & 15, b >> 4], axis=3).astype(np.int64) - 15)
     else:
         b = np.frombuffer(parts["protos"], "i1").reshape(-1, -(-k // 4), 16, 4)
         p = b.astype(np.int64)
     p = p.transpose(0, 2, 1, 3).reshape(16 * len(b), -1)[:, :k]
-    if "order" not in parts:
+    if "owners" not in parts:
         return p[:m]
-    # An index: prototypes stand by cell; places with no landmark are padding.
-    order = bit_numbers(np.frombuffer(parts["order"], "u1"), len(p), max(n, 1).bit_length())
-    return p[np.argsort(order, kind="stable")[:m]]
+    # With an index, prototypes are sorted by inverted list; rows that landmark n owns are padding.
+    owners = bit_numbers(np.frombuffer(parts["owners"], "u1"), len(p), max(n, 1).bit_length())
+    return p[np.argsort(owners, kind="stable")[:m]]
 
 
 if __name__ == "__main__":

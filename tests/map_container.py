@@ -6,7 +6,7 @@ import zlib
 
 Section = tuple[str, bytes]
 
-OPEN_MAP, SEALED_MAP = 2, 3
+LEARNING_MAP, SEALED_MAP = 2, 3
 
 
 def sections(data: bytes) -> list[Section]:
@@ -18,7 +18,7 @@ def sections(data: bytes) -> list[Section]:
     return found
 
 
-def container(parts: list[Section], version: int = 2, kind: int = SEALED_MAP) -> bytes:
+def container(parts: list[Section], version: int = 1, kind: int = SEALED_MAP) -> bytes:
     """A file of these sections whose checksums are right."""
     table, body = b"", b""
     offset = -(-(64 + 32 * len(parts)) // 64) * 64

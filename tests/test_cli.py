@@ -112,7 +112,7 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(built.positions(built.ids), tracks.landmark_positions)
     rows = tracks.landmark_of_keypoint == 7
     codes = built.encoder.encode(tracks.descriptors[rows], dim=5)
-    np.testing.assert_array_equal(built.prototype([7])[0], codes.astype(np.float32).mean(0))
+    np.testing.assert_array_equal(built.prototypes([7])[0], codes.astype(np.float32).mean(0))
 
     done = protomark("info", scene, "--verify", "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
@@ -160,7 +160,7 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
     for options, message in (
         (["--bytes", 2], "is for sealed maps: add --sealed"),
-        (["--bytes", 5, *appearances[:3]], "10"),
+        (["--bytes", 5, *appearances[:3]], "bytes_per_landmark must be at least 9"),
         (["--appearance-bits", 13], "appearance_bits must be 0 to 12, not 13"),
         (["--appearance-bits", -1], "Invalid value for '--appearance-bits'"),
     ):
@@ -289,13 +289,13 @@ def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     copy = tmp_path / "copy.pmk"
     copy.write_bytes(whole.read_bytes())
     done = protomark("merge", whole, copy, "-o", tmp_path / "joined.pmk")
-    assert "10 of them known before" in done.stdout
+    assert "10 of them in an earlier map" in done.stdout
     np.testing.assert_array_equal(pm.open(tmp_path / "joined.pmk").counts(0), [6])
     done = protomark("merge", whole, copy, "-o", tmp_path / "joined.pmk", "--renumber")
     assert done.returncode == 0, done.stderr
     joined = pm.open(tmp_path / "joined.pmk")
     np.testing.assert_array_equal(joined.ids, np.arange(20))
-    np.testing.assert_array_equal(joined.prototype(np.arange(10, 20)), scene.prototype(scene.ids))
+    np.testing.assert_array_equal(joined.prototypes(np.arange(10, 20)), scene.prototypes(scene.ids))
 
 
 def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path: Path) -> None:

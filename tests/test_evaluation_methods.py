@@ -288,7 +288,7 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
         scene.add(landmarks, descriptors)
         built = choice.build(support)
         assert built.bytes_per_landmark == dim // 2 + 1
-        sealed = scene.seal(tmp_path / "s.pmk", bits=4)
+        sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=dim // 2 + 1)
         assert_same_matches(built, sealed, queries)
         # Rounding to 16 levels shows.
         assert not np.array_equal(sealed.search(queries)[1], scene.search(queries)[1])
@@ -296,29 +296,29 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
     assert several[0] == "protomark-16x4@w"
 
 
-def test_looks_are_a_sealed_map_of_looks_in_the_bytes_of_one_prototype(tmp_path: Path) -> None:
+def test_appearances_take_the_bytes_of_one_prototype(tmp_path: Path) -> None:
     coder = pm.Encoder(
         random_layers([64, 40, 48]), [8, 24, 48], name="w", descriptor="test", scale=0.02
     )
     landmarks, descriptors = structured()
     support = Support(landmarks, descriptors)
-    chosen = choose_methods(method_choices([coder]), ["protomark-looks"])
-    assert [c.name for c in chosen] == ["looks-17", "looks-33"]
-    assert chosen[1].label == "Looks, 48 x 4 bits"
+    chosen = choose_methods(method_choices([coder]), ["protomark-appearances"])
+    assert [c.name for c in chosen] == ["appearances-17", "appearances-33"]
+    assert chosen[1].label == "Appearances, 48 x 4 bits"
     queries = random_descriptors(30)
     for choice, dim, size in zip(chosen, (24, 48), (17, 33), strict=True):
-        scene = pm.PrototypeMap(coder, dim=dim, look_bits=10)
+        scene = pm.PrototypeMap(coder, dim=dim, appearance_bits=10)
         scene.add(landmarks, descriptors)
-        sealed = scene.seal(tmp_path / "s.pmk", bits=4, prototype_map=(size - 2) / (dim / 2))
+        sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
         built = choice.build(support)
-        # What the file really holds; 300 landmarks and their prototype_map fill no block of 16.
+        # What the file really holds; 300 landmarks and their prototypes fill no block of 16.
         held = sealed.prototype_count * dim / 2 + 2 * 300
         assert built.bytes_per_landmark == pytest.approx(held / 300)
         assert size - 1 < built.bytes_per_landmark <= size
         sizes = dict(pm.file_sections(tmp_path / "s.pmk"))
         assert 0 <= sum(sizes[n] for n in ("counts", "rows", "protos")) - held < 16 * dim / 2
         assert_same_matches(built, sealed, queries)
-    assert "looks-17@w" in [c.name for c in method_choices([coder, coder])]
+    assert "appearances-17@w" in [c.name for c in method_choices([coder, coder])]
 
 
 def test_choosing_methods(encoder: pm.Encoder) -> None:

@@ -12,14 +12,15 @@ import pytest
 
 import protomark as pm
 from conftest import random_descriptors, rounded
+from sealing import four_bits
 
 READER: dict[str, Any] = runpy.run_path(
     str(Path(__file__).parents[1] / "examples" / "02_read_map_without_protomark.py")
 )
 
 
-def scene(encoder: pm.Encoder, dim: int, look_bits: int, step: int) -> pm.PrototypeMap:
-    scene = pm.PrototypeMap(encoder, dim=dim, look_bits=look_bits)
+def scene(encoder: pm.Encoder, dim: int, appearance_bits: int, step: int) -> pm.PrototypeMap:
+    scene = pm.PrototypeMap(encoder, dim=dim, appearance_bits=appearance_bits)
     ids = np.random.default_rng(0).integers(0, 100, 600) * step
     scene.add(ids, random_descriptors(600))
     some = scene.ids[::2]
@@ -39,26 +40,26 @@ def test_the_same_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
         )
 
 
-@pytest.mark.parametrize("look_bits", [0, 4])
+@pytest.mark.parametrize("appearance_bits", [0, 4])
 @pytest.mark.parametrize("dim", [5, 12])
 @pytest.mark.parametrize(
-    "kind", ["open", "sealed", "4 bits", "joined", "16-bit positions", "index", "index, 4 bits"]
+    "kind", ["learning", "sealed", "4 bits", "merged", "16-bit positions", "index", "index, 4 bits"]
 )
 def test_the_same_answers(
-    kind: str, dim: int, look_bits: int, encoder: pm.Encoder, tmp_path: Path
+    kind: str, dim: int, appearance_bits: int, encoder: pm.Encoder, tmp_path: Path
 ) -> None:
-    built = scene(encoder, dim, look_bits, step=7 if dim == 5 else 1)
+    built = scene(encoder, dim, appearance_bits, step=7 if dim == 5 else 1)
     if kind.startswith("index"):
         built.build_index(7)
     path = tmp_path / "map.pmk"
     {
-        "open": built.save,
+        "learning": built.save,
         "sealed": built.seal,
-        "4 bits": partial(built.seal, bits=4),
-        "joined": partial(built.seal, prototypes=1.5),
+        "4 bits": partial(built.seal, bytes_per_landmark=four_bits(built)),
+        "merged": partial(built.seal, bytes_per_landmark=four_bits(built, 1.5)),
         "16-bit positions": partial(built.seal, position_bits=16),
         "index": built.seal,
-        "index, 4 bits": partial(built.seal, bits=4),
+        "index, 4 bits": partial(built.seal, bytes_per_landmark=four_bits(built)),
     }[kind](path)
     ours, theirs = pm.open(path), READER["Map"](path.read_bytes())
     ids = ours.ids
@@ -68,24 +69,14 @@ def test_the_same_answers(
     assert len(theirs.prototypes) == ours.prototype_count
     for landmark in ids[:20]:
         np.testing.assert_array_equal(
-            theirs.prototypes[theirs.landmarks == landmark], rounded(ours.looks(landmark))
+            theirs.prototypes[theirs.landmarks == landmark], rounded(ours.appearances(landmark))
         )
     observations = np.minimum(ours.counts(ids), 255)
-    if kind == "open":
+    if kind == "learning":
         counts = [theirs.counts[theirs.landmarks == i].sum() for i in ids]
         np.testing.assert_array_equal(counts, observations)
     else:
         np.testing.assert_array_equal(theirs.counts, observations)
-    queries = random_descriptors(300, seed=9)
-    for a, b in zip(theirs.search(queries), ours.search(queries, k=1), strict=True):
-        np.testing.assert_array_equal(a, b[:, 0])
-
-
-@pytest.mark.parametrize("name", ["open", "sealed"])
-def test_old_files(name: str) -> None:
-    path = Path(__file__).parent / "data" / f"{name}_before_version_4.pmk"
-    ours, theirs = pm.open(path), READER["Map"](path.read_bytes())
-    np.testing.assert_array_equal(theirs.ids, ours.ids)
     queries = random_descriptors(300, seed=9)
     for a, b in zip(theirs.search(queries), ours.search(queries, k=1), strict=True):
         np.testing.assert_array_equal(a, b[:, 0])

@@ -1,11 +1,10 @@
-"""Sealed maps of 4 bits a number, against what docs/format.md says, in NumPy."""
+"""Sealed maps of 4 bits per number, against what docs/format.md says, in NumPy."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 import protomark as pm
 from conftest import NO_DISTANCE, random_descriptors, random_layers, rounded
 from map_container import container, sections
+from sealing import best_scale, four_bits, levels, quantized
 
 
 @pytest.fixture(scope="module")
@@ -33,55 +33,36 @@ def coder() -> pm.Encoder:
 
 
 def filled(coder: pm.Encoder, dim: int, n: int, limit: int, seed: int) -> pm.PrototypeMap:
-    """A map whose prototypes reach up to `limit`."""
+    """A map whose prototypes reach up to `limit`.
+
+    Up to 4 dimensions take the same bytes with 8 bits, so that only merging gives maps of 4 bits:
+    such landmarks have two appearances.
+    """
     rng = np.random.default_rng(seed)
-    scene = pm.PrototypeMap(coder, dim=dim)
+    scene = pm.PrototypeMap(coder, dim=dim, appearance_bits=int(dim <= 4))
     ids = rng.choice(1000, n, replace=False)
-    for _ in range(2):
-        scene.add_codes(ids, rng.integers(-limit, limit + 1, (n, dim)).astype(np.int8))
+    for sign in (1, -1):
+        codes = rng.integers(-limit, limit + 1, (n, dim)).astype(np.int8)
+        codes[:, 0] = np.where(dim <= 4, sign * np.maximum(abs(codes[:, 0]), 1), codes[:, 0])
+        scene.add_codes(ids, codes)
     return scene
-
-
-def levels(half_step: int) -> NDArray[np.int64]:
-    return half_step * (2 * np.arange(16) - 15)
-
-
-@cache
-def nearest_levels(half_step: int) -> NDArray[np.int64]:
-    """Of each value from -128: of two levels the one away from zero, for zero the one above."""
-    return np.array(
-        [
-            min(levels(half_step).tolist(), key=lambda level: (abs(level - v), -abs(level), -level))
-            for v in range(-128, 128)
-        ]
-    )
-
-
-def quantized(prototypes: NDArray[np.int64], half_step: int) -> NDArray[np.int64]:
-    return nearest_levels(half_step)[prototypes + 128]
-
-
-def best_half_step(prototypes: NDArray[np.int64]) -> int:
-    errors = [((prototypes - quantized(prototypes, a)) ** 2).sum() for a in range(1, 9)]
-    return 1 + int(np.argmin(errors))
 
 
 def read_levels(path: Path, n: int, k: int) -> NDArray[np.int64]:
     """Prototypes of a file, by docs/format.md."""
     found = dict(sections(path.read_bytes()))
-    bits, half_step = np.frombuffer(found["levels"], "<u4").astype(int)
-    assert bits == 4
+    scale = int.from_bytes(found["sq4scale"], "little")
     k8, n16 = -(-k // 8) * 8, -(-n // 16) * 16
     b = np.frombuffer(found["protos"], np.uint8).reshape(n16 // 16, k8 // 8, 16, 4)
     u = np.concatenate([b & 15, b >> 4], axis=3).transpose(0, 2, 1, 3).reshape(n16, k8)
     assert not u[n:].any()
     assert not u[:, k:].any()
-    return levels(half_step)[u[:n, :k]]
+    return levels(scale)[u[:n, :k]]
 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    n=st.integers(0, 40),
+    n=st.integers(1, 40),
     k=st.integers(1, 4),
     dim=st.sampled_from([1, 3, 4, 5, 7, 8, 9, 12, 16, 21]),
     limit=st.integers(0, 127),
@@ -103,12 +84,12 @@ def test_levels_and_search_equal_the_definition(
     folder: Path,
 ) -> None:
     scene = filled(coder, dim, n, limit, seed)
-    sealed = scene.seal(folder / "s.pmk", bits=4)
+    sealed = scene.seal(folder / "s.pmk", bytes_per_landmark=four_bits(scene, 1))
     pm.verify_file(folder / "s.pmk")
-    means = rounded(scene.prototype(scene.ids))
-    expected = quantized(means, best_half_step(means))
+    means = rounded(scene.prototypes(scene.ids))
+    expected = quantized(means, best_scale(means))
     np.testing.assert_array_equal(read_levels(folder / "s.pmk", n, dim), expected)
-    np.testing.assert_array_equal(sealed.prototype(scene.ids), expected)
+    np.testing.assert_array_equal(sealed.prototypes(scene.ids), expected)
     np.testing.assert_array_equal(sealed.ids, scene.ids)
     np.testing.assert_array_equal(sealed.counts(scene.ids), scene.counts(scene.ids))
     assert (len(sealed), sealed.dim, sealed.code_bits) == (n, dim, 4)
@@ -136,12 +117,12 @@ def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
     rng = np.random.default_rng(0)
     scene.add_codes(np.arange(3000), rng.integers(-127, 128, (3000, 21)).astype(np.int8))
     scene.set_positions([5], np.array([[1.0, 2.0, 3.0]]))
-    scene.seal(folder / "large.pmk", bits=4)
+    scene.seal(folder / "large.pmk", bytes_per_landmark=four_bits(scene))
     sealed = pm.open(folder / "large.pmk")
     assert isinstance(sealed, pm.SealedMap)
-    assert "21 dimensions of 4 bits" in repr(sealed)
+    assert "4 bits per number" in repr(sealed)
     np.testing.assert_array_equal(sealed.positions([5]), [[1, 2, 3]])
-    prototypes = sealed.prototype(np.arange(3000)).astype(np.int64)
+    prototypes = sealed.prototypes(np.arange(3000)).astype(np.int64)
     descriptors = random_descriptors(50)
     codes = coder.encode(descriptors).astype(np.int64)
     squared = ((codes[:, None] - prototypes[None]) ** 2).sum(-1)
@@ -149,30 +130,34 @@ def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
     np.testing.assert_array_equal(sealed.search(descriptors, k=3)[0], expected)
 
 
-def test_bytes_a_landmark(coder: pm.Encoder, folder: Path) -> None:
+def test_bytes_per_landmark(coder: pm.Encoder, folder: Path) -> None:
     scene = pm.PrototypeMap(coder, dim=16)
     scene.add(np.arange(1600), random_descriptors(1600))
-    scene.seal(folder / "a.pmk", bits=4)
+    scene.seal(folder / "a.pmk", bytes_per_landmark=9)
     sizes = dict(pm.file_sections(folder / "a.pmk"))
-    assert set(sizes) == {"encoder", "shape", "counts", "levels", "protos"}
+    assert set(sizes) == {"encoder", "shape", "counts", "sq4scale", "protos"}
     assert sizes["counts"] + sizes["protos"] == 1600 * (16 // 2 + 1)
 
 
-def test_8_bits_are_the_default_and_as_ever(coder: pm.Encoder, folder: Path) -> None:
+def test_8_bits_where_they_fit(coder: pm.Encoder, folder: Path) -> None:
     scene = filled(coder, 12, 30, 100, 0)
     assert scene.seal(folder / "a.pmk").code_bits == 8
-    scene.seal(folder / "b.pmk", bits=8)
+    assert scene.seal(folder / "b.pmk", bytes_per_landmark=13).code_bits == 8
     data = (folder / "a.pmk").read_bytes()
     assert data == (folder / "b.pmk").read_bytes()
-    ids = ["idblocks", "idrests"]
+    ids = ["idblocks", "idgaps"]
     assert [name for name, _ in sections(data)] == ["encoder", "shape", "counts", "protos", *ids]
+    assert scene.seal(folder / "b.pmk", bytes_per_landmark=12.99).code_bits == 4
+    assert pm.PrototypeMap(coder).seal(folder / "a.pmk", bytes_per_landmark=13).code_bits == 8
 
 
-@pytest.mark.parametrize("bits", [-4, 0, 1, 5, 16])
-def test_other_bits_are_refused(bits: int, coder: pm.Encoder, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=f"with 8 or 4 bits a number, not {bits}"):
-        pm.PrototypeMap(coder).seal(tmp_path / "s.pmk", bits=bits)
+@pytest.mark.parametrize("size", [-4, 0, 8.99, float("nan"), -float("inf")])
+def test_too_few_bytes_are_refused(size: float, coder: pm.Encoder, tmp_path: Path) -> None:
+    scene = filled(coder, 12, 30, 100, 0)
+    with pytest.raises(ValueError, match="bytes_per_landmark must be at least 9 for this map"):
+        scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
     assert not (tmp_path / "s.pmk").exists()
+    scene.seal(tmp_path / "s.pmk", bytes_per_landmark=9)
 
 
 def words(*values: int) -> bytes:
@@ -182,13 +167,12 @@ def words(*values: int) -> bytes:
 @pytest.mark.parametrize(
     ("section", "content", "message"),
     [
-        ("levels", words(4, 0), "half-step of its prototypes is 0, not 1 to 8"),
-        ("levels", words(4, 9), "half-step of its prototypes is 9, not 1 to 8"),
-        ("levels", words(4, 2**32 - 1), "half-step of its prototypes is 4294967295"),
-        ("levels", words(2, 1), "its prototypes have 2 bits a number"),
-        ("levels", words(4), "section 'levels' is shorter than it should be"),
-        ("levels", words(4, 1, 0), "section 'levels' is longer than it should be"),
-        ("levels", None, "section 'protos' has the wrong size"),
+        ("sq4scale", words(0), "scale of its prototypes is 0, not 1 to 8"),
+        ("sq4scale", words(9), "scale of its prototypes is 9, not 1 to 8"),
+        ("sq4scale", words(2**32 - 1), "scale of its prototypes is 4294967295"),
+        ("sq4scale", b"", "section 'sq4scale' is shorter than it should be"),
+        ("sq4scale", words(1, 0), "section 'sq4scale' is longer than it should be"),
+        ("sq4scale", None, "section 'protos' has the wrong size"),
         ("protos", bytes(64), "section 'protos' has the wrong size"),
         ("protos", b"", "section 'protos' has the wrong size"),
         ("protos", None, "it lacks the section 'protos'"),
@@ -199,11 +183,11 @@ def test_hostile_sections_are_refused(
     section: str, content: bytes | None, message: str, coder: pm.Encoder, tmp_path: Path
 ) -> None:
     path = tmp_path / "s.pmk"
-    filled(coder, 9, 20, 100, 0).seal(path, bits=4)
+    filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=9)
     parts = sections(path.read_bytes())
-    assert container(parts, version=4) == path.read_bytes()
+    assert container(parts) == path.read_bytes()
     changed = [(name, content if name == section else old) for name, old in parts]
-    path.write_bytes(container([(n, c) for n, c in changed if c is not None], version=4))
+    path.write_bytes(container([(n, c) for n, c in changed if c is not None]))
     with pytest.raises(pm.FileError, match=message):
         pm.open(path)
 
@@ -211,7 +195,7 @@ def test_hostile_sections_are_refused(
 def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
     """Of 9 dimensions 7 are padding, of 20 landmarks 12: never read, refused in the last block."""
     path = tmp_path / "s.pmk"
-    sealed = filled(coder, 9, 20, 100, 0).seal(path, bits=4)
+    sealed = filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=9)
     queries = np.random.default_rng(1).integers(-127, 128, (20, 9)).astype(np.int8)
     expected = sealed.search_codes(queries)
     parts = dict(sections(path.read_bytes()))
@@ -243,9 +227,9 @@ def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
 
 def test_later_formats_are_refused(coder: pm.Encoder, tmp_path: Path) -> None:
     path = tmp_path / "s.pmk"
-    filled(coder, 9, 20, 100, 0).seal(path, bits=4)
-    path.write_bytes(container(sections(path.read_bytes()), version=5))
-    with pytest.raises(pm.FileError, match="format version 5, this Protomark reads versions 1 to"):
+    filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=9)
+    path.write_bytes(container(sections(path.read_bytes()), version=2))
+    with pytest.raises(pm.FileError, match="format version 2, this Protomark reads version 1"):
         pm.open(path)
 
 
@@ -254,11 +238,11 @@ def test_plain_code_gives_the_same_file_and_answers(coder: pm.Encoder, tmp_path:
     open_path, path = tmp_path / "o.pmk", tmp_path / "s.pmk"
     scene = filled(coder, 21, 900, 60, 3)
     scene.save(open_path)
-    sealed = scene.seal(path, bits=4)
+    sealed = scene.seal(path, bytes_per_landmark=13)
     descriptors = random_descriptors(70)
     script = (
         "import sys, numpy as np, protomark as pm\n"
-        "sealed = pm.open(sys.argv[1]).seal(sys.argv[2], bits=4)\n"
+        "sealed = pm.open(sys.argv[1]).seal(sys.argv[2], bytes_per_landmark=13)\n"
         "ids, distances = sealed.search(np.load(sys.argv[3]), k=5)\n"
         "np.savez(sys.argv[4], ids=ids, distances=distances)\n"
     )

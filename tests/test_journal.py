@@ -42,8 +42,8 @@ def state(scene: pm.PrototypeMap | pm.SealedMap, folder: Path) -> bytes:
     return (folder / "state").read_bytes()
 
 
-def begin(path: Path, encoder: pm.Encoder, look_bits: int = 0) -> pm.PrototypeMap:
-    pm.PrototypeMap(encoder, look_bits=look_bits).save(path)
+def begin(path: Path, encoder: pm.Encoder, appearance_bits: int = 0) -> pm.PrototypeMap:
+    pm.PrototypeMap(encoder, appearance_bits=appearance_bits).save(path)
     return opened(path)
 
 
@@ -52,10 +52,10 @@ def observe(scene: pm.PrototypeMap, seed: int, n: int = 40, ids: int = 20) -> No
     scene.add(rng.integers(0, ids, n), random_descriptors(n, seed=seed))
 
 
-def joined(seed: int, encoder: pm.Encoder, look_bits: int) -> Change:
-    other = pm.PrototypeMap(encoder, look_bits=look_bits)
+def joined(seed: int, encoder: pm.Encoder, appearance_bits: int) -> Change:
+    other = pm.PrototypeMap(encoder, appearance_bits=appearance_bits)
     observe(other, seed, 5)
-    return lambda scene: scene.update(other)
+    return lambda scene: scene.merge_map(other)
 
 
 seeds = st.integers(0, 100)
@@ -68,7 +68,7 @@ changes = st.one_of(
     st.builds(lambda a: ("discard", a), some),
     st.builds(lambda a, x: ("position", a, x), some, st.sampled_from([0.25, np.nan])),
     st.builds(lambda seed: ("update", seed), seeds),
-    st.builds(lambda cells: ("index", cells), st.integers(0, 3)),
+    st.builds(lambda nlist: ("index", nlist), st.integers(0, 3)),
     st.builds(lambda text: ("metadata", text), st.sampled_from(["", "ENU, metres"])),
 )
 
@@ -82,33 +82,33 @@ def apply(scene: pm.PrototypeMap, change: Any) -> None:
                 observe(scene, seed, 600, ids=2)
             case "remove", seed:
                 rng = np.random.default_rng(seed)
-                scene.remove(rng.integers(0, 20, 40), random_descriptors(40, seed=seed))
+                scene.subtract(rng.integers(0, 20, 40), random_descriptors(40, seed=seed))
             case "merge", into, source:
-                scene.merge([into], [source])
+                scene.merge_landmarks([into], [source])
             case "discard", landmark:
-                scene.discard([landmark])
+                scene.remove([landmark])
             case "position", landmark, x:
                 scene.set_positions([landmark], [[x, x, x]])
             case "update", seed:
-                joined(seed, scene.encoder, scene.look_bits)(scene)
+                joined(seed, scene.encoder, scene.appearance_bits)(scene)
             case "metadata", text:
                 scene.metadata = {"frame": text} if text else {}
-            case "index", cells:
-                scene.build_index(cells) if cells else scene.drop_index()
+            case "index", nlist:
+                scene.build_index(nlist) if nlist else scene.drop_index()
 
 
 steps = st.one_of(changes, changes, changes, st.sampled_from(["commit", "compact", "open", "save"]))
 
 
 @settings(max_examples=60)
-@given(script=st.lists(steps, max_size=25), look_bits=st.sampled_from([0, 3]))
+@given(script=st.lists(steps, max_size=25), appearance_bits=st.sampled_from([0, 3]))
 def test_any_history_equals_that_of_a_map_without_a_journal(
-    script: list[Any], look_bits: int, tmp_path_factory: pytest.TempPathFactory
+    script: list[Any], appearance_bits: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("journal")
     path = folder / "scene.pmk"
-    scene = begin(path, balanced_encoder(), look_bits)
-    plain = pm.PrototypeMap(scene.encoder, look_bits=look_bits)
+    scene = begin(path, balanced_encoder(), appearance_bits)
+    plain = pm.PrototypeMap(scene.encoder, appearance_bits=appearance_bits)
     committed, since = state(plain, folder), []
     done: list[Any] = []
     for step in script:
@@ -121,7 +121,7 @@ def test_any_history_equals_that_of_a_map_without_a_journal(
             case "open":  # what was not committed is lost
                 scene.close()
                 scene = opened(path)
-                plain = pm.PrototypeMap(scene.encoder, look_bits=look_bits)
+                plain = pm.PrototypeMap(scene.encoder, appearance_bits=appearance_bits)
                 for change in done:
                     apply(plain, change)
                 since = []
@@ -144,7 +144,7 @@ def two_commits(encoder: pm.Encoder, tmp_path: Path) -> tuple[Path, int, list[by
         before = journal_of(path).stat().st_size
         states = [state(scene, tmp_path)]
         observe(scene, 2, 4)
-        scene.discard([scene.ids[0]])
+        scene.remove([scene.ids[0]])
         assert journal_of(path).stat().st_size == before
     return path, before, [*states, state(scene, tmp_path)]
 
@@ -274,7 +274,7 @@ def test_with_commits_where_all_went_well(encoder: pm.Encoder, tmp_path: Path) -
     assert len(pm.open(path)) == len(scene) > 0
     assert not scene.has_journal
     with pytest.raises(RuntimeError), opened(path) as scene:  # noqa: PT012
-        scene.discard(scene.ids)
+        scene.remove(scene.ids)
         raise RuntimeError
     assert len(pm.open(path)) > 0
 
@@ -343,15 +343,15 @@ def chained(parts: list[bytes]) -> bytes:
     return b"".join(result)
 
 
-@pytest.mark.parametrize("look_bits", [0, 3])
-def test_broken_journals_are_refused_or_read(look_bits: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("appearance_bits", [0, 3])
+def test_broken_journals_are_refused_or_read(appearance_bits: int, tmp_path: Path) -> None:
     print(f"PROTOMARK_SEED={SEED}")
     rng = np.random.default_rng(SEED)
     path = tmp_path / "scene.pmk"
-    with begin(path, balanced_encoder(), look_bits) as scene:
+    with begin(path, balanced_encoder(), appearance_bits) as scene:
         for seed in range(4):
             observe(scene, seed)
-            scene.discard(scene.ids[:2])
+            scene.remove(scene.ids[:2])
             scene.set_positions(scene.ids[:3], np.ones((3, 3)))
             if seed == 2:
                 scene.build_index(3)
@@ -395,30 +395,31 @@ def test_broken_journals_are_refused_or_read(look_bits: int, tmp_path: Path) -> 
     assert FILES / 4 < refused < FILES
 
 
-def landmarks_in(parts: dict[str, bytes], look_bits: int) -> dict[int, Any]:
-    """Of a map or a commit: looks, counts, sums and position of each landmark."""
+def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any]:
+    """Of a map or a commit: appearances, counts, sums and position of each landmark."""
     n, dim = (int(v) for v in np.frombuffer(parts["shape"], "<u8", 2))
     ids = np.frombuffer(parts["ids"], "<i8").tolist()
-    rows = np.frombuffer(parts["rows"], "<u4") if look_bits else np.ones(n, int)
+    rows = np.frombuffer(parts["rows"], "<u4") if appearance_bits else np.ones(n, int)
     ends = np.cumsum(rows)[:-1]
     counts = np.frombuffer(parts["counts"], np.uint8)
-    looks = np.frombuffer(parts["looks"], "<u2") if look_bits else np.zeros(len(counts))
+    several = appearance_bits > 0
+    appearances = np.frombuffer(parts["appear"], "<u2") if several else np.zeros(len(counts))
     sums = np.frombuffer(parts["sums"], "<i2").reshape(len(counts), dim)
     positions = np.full((n, 3), np.nan)
     if "position" in parts:
         positions = np.frombuffer(parts["position"], "<f8").reshape(n, 3)
-    values = [np.split(array, ends) if n else [] for array in (looks, counts, sums)]
+    values = [np.split(array, ends) if n else [] for array in (appearances, counts, sums)]
     return {
         i: ([v.tolist() for v in one], positions[k].tolist())
         for k, (i, one) in enumerate(zip(ids, zip(*values, strict=True), strict=True))
     }
 
 
-def replayed(base: bytes, journal: bytes, look_bits: int) -> dict[int, Any]:
+def replayed(base: bytes, journal: bytes, appearance_bits: int) -> dict[int, Any]:
     """The landmarks of a map and its journal, from docs/format.md alone."""
     size = 64 + 32 * int.from_bytes(base[24:28], "little")
     identity = hashlib.sha256(base[:size]).hexdigest().encode()
-    landmarks = landmarks_in(dict(sections(base)), look_bits)
+    landmarks = landmarks_in(dict(sections(base)), appearance_bits)
     head, *records = containers(journal)
     kinds = [part[12] for part in (head, *records)]
     assert kinds[0] == 4
@@ -432,27 +433,28 @@ def replayed(base: bytes, journal: bytes, look_bits: int) -> dict[int, Any]:
         previous = record
         if number <= last or record[12] != 5:
             continue
-        for gone in np.frombuffer(parts.get("gone", b""), "<i8").tolist():
-            landmarks.pop(gone, None)
-        landmarks |= landmarks_in(parts, look_bits)
+        for removed in np.frombuffer(parts.get("removed", b""), "<i8").tolist():
+            landmarks.pop(removed, None)
+        landmarks |= landmarks_in(parts, appearance_bits)
     return landmarks
 
 
-@pytest.mark.parametrize("look_bits", [0, 3])
-def test_a_reader_can_be_written_from_the_format(look_bits: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("appearance_bits", [0, 3])
+def test_a_reader_can_be_written_from_the_format(appearance_bits: int, tmp_path: Path) -> None:
     path = tmp_path / "scene.pmk"
-    scene = begin(path, balanced_encoder(), look_bits)
+    scene = begin(path, balanced_encoder(), appearance_bits)
     for seed in range(12):
         observe(scene, seed, 10)
         if seed % 3 == 1:
-            scene.discard(scene.ids[:2])
+            scene.remove(scene.ids[:2])
             scene.set_positions(scene.ids[:2], np.full((2, 3), seed))
         scene.commit()
         if seed == 5:
             scene.compact()
         whole = dict(sections(state(scene, tmp_path)))
-        found = replayed(path.read_bytes(), journal_of(path).read_bytes(), look_bits)
-        assert repr(sorted(found.items())) == repr(sorted(landmarks_in(whole, look_bits).items()))
+        found = replayed(path.read_bytes(), journal_of(path).read_bytes(), appearance_bits)
+        expected = landmarks_in(whole, appearance_bits)
+        assert repr(sorted(found.items())) == repr(sorted(expected.items()))
 
 
 def test_a_journal_that_was_moved_takes_no_commit(encoder: pm.Encoder, tmp_path: Path) -> None:

@@ -26,9 +26,9 @@ def test_the_largest_id(scene: pm.PrototypeMap) -> None:
 
 @pytest.mark.parametrize("ids", [[-1, 1], [1, -(2**63)], np.array([1, 2**63], np.uint64)])
 def test_ids_outside(scene: pm.PrototypeMap, ids: Any) -> None:
-    with pytest.raises(ValueError, match="is negative"):
+    with pytest.raises(ValueError, match=r"is negative|is above 2\*\*63 - 1"):
         scene.add(ids, random_descriptors(2))
-    with pytest.raises(KeyError, match="is not in the map"):
+    with pytest.raises((KeyError, ValueError), match=r"is not in the map|is above 2\*\*63 - 1"):
         scene.counts(ids)
     assert len(scene) == 2
 

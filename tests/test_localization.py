@@ -85,18 +85,22 @@ def test_three_lines(folder: Path, scene: pm.PrototypeMap, images: list[Any]) ->
     assert np.abs(pixels - result.pixels).max() < 0.005 * 320
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "4 bits", "looks", "orb", "upright", "64"])
+@pytest.mark.parametrize("kind", ["8 bits", "4 bits", "appearances", "orb", "upright", "64"])
 def test_every_kind_of_map(folder: Path, images: list[Any], kind: str, tmp_path: Path) -> None:
     tracks = tracks_of(folder, "orb" if kind == "orb" else "freak")
     encoder = pm.Encoder.load("freak-upright" if kind == "upright" else tracks.descriptor)
     if kind == "upright":
         tracks = tracks.upright()
-    look_bits = 8 if kind == "looks" else 0
+    appearance_bits = 8 if kind == "appearances" else 0
     dim = 64 if kind == "64" else 32
-    made: pm.PrototypeMap | pm.SealedMap = build_map(tracks, encoder, dim, look_bits=look_bits)
+    made: pm.PrototypeMap | pm.SealedMap = build_map(
+        tracks, encoder, dim, appearance_bits=appearance_bits
+    )
     if kind.endswith("bits"):
         assert isinstance(made, pm.PrototypeMap)
-        made = made.seal(tmp_path / "s.pmk", bits=int(kind[0]))
+        made = made.seal(
+            tmp_path / "s.pmk", bytes_per_landmark=4 * dim // 8 + 1 if kind == "4 bits" else None
+        )
     localizer = Localizer(made, max_keypoints=KEYPOINTS)
     for image, pose in zip(images, NEW_POSES, strict=True):
         assert close(localizer.localize(image, PINHOLE), pose)

@@ -10,7 +10,8 @@ import pytest
 
 import protomark as pm
 from conftest import random_descriptors, rounded
-from map_container import OPEN_MAP, container, sections
+from map_container import LEARNING_MAP, container, sections
+from sealing import four_bits
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def scene(encoder: pm.Encoder) -> pm.PrototypeMap:
     return scene
 
 
-def test_open_map_round_trip(scene: pm.PrototypeMap, tmp_path: Path) -> None:
+def test_learning_map_round_trip(scene: pm.PrototypeMap, tmp_path: Path) -> None:
     path = tmp_path / "scene.pmk"
     scene.save(path)
     read = pm.open(path)
@@ -31,19 +32,19 @@ def test_open_map_round_trip(scene: pm.PrototypeMap, tmp_path: Path) -> None:
     ids = scene.ids
     np.testing.assert_array_equal(read.ids, ids)
     np.testing.assert_array_equal(read.counts(ids), scene.counts(ids))
-    np.testing.assert_array_equal(read.prototype(ids), scene.prototype(ids))
+    np.testing.assert_array_equal(read.prototypes(ids), scene.prototypes(ids))
     np.testing.assert_array_equal(read.positions(ids), scene.positions(ids))
     for a, b in zip(
         read.search(random_descriptors(9)), scene.search(random_descriptors(9)), strict=True
     ):
         np.testing.assert_array_equal(a, b)
     read.add([1000], random_descriptors(1))
-    read.remove([1000], random_descriptors(1))
+    read.subtract([1000], random_descriptors(1))
     read.save(tmp_path / "again.pmk")
     assert (tmp_path / "again.pmk").read_bytes() == path.read_bytes()
 
 
-def test_sealed_map_answers_like_the_open_one(scene: pm.PrototypeMap, tmp_path: Path) -> None:
+def test_sealed_map_answers_like_the_learning_one(scene: pm.PrototypeMap, tmp_path: Path) -> None:
     sealed = scene.seal(tmp_path / "scene.sealed.pmk")
     reopened = pm.open(tmp_path / "scene.sealed.pmk")
     assert isinstance(reopened, pm.SealedMap)
@@ -53,7 +54,7 @@ def test_sealed_map_answers_like_the_open_one(scene: pm.PrototypeMap, tmp_path: 
         assert m.dim == scene.dim
         np.testing.assert_array_equal(m.ids, ids)
         np.testing.assert_array_equal(m.counts(ids), scene.counts(ids))
-        np.testing.assert_array_equal(m.prototype(ids), rounded(scene.prototype(ids)))
+        np.testing.assert_array_equal(m.prototypes(ids), rounded(scene.prototypes(ids)))
         np.testing.assert_allclose(m.positions(ids), scene.positions(ids), atol=1e-5)
         for kwargs in ({"k": 3}, {"k": 1, "ratio": 0.9}, {"k": 2, "max_distance": 40_000}):
             for a, b in zip(
@@ -126,14 +127,14 @@ def section_bytes(data: bytes) -> set[int]:
     return covered
 
 
-@pytest.mark.parametrize("kind", ["model", "open", "sealed", "sealed with 4 bits"])
+@pytest.mark.parametrize("kind", ["model", "learning", "sealed", "sealed with 4 bits"])
 def test_every_flipped_byte_is_noticed(kind: str, scene: pm.PrototypeMap, tmp_path: Path) -> None:
     path = tmp_path / "file"
     {
         "model": scene.encoder.save,
-        "open": scene.save,
+        "learning": scene.save,
         "sealed": scene.seal,
-        "sealed with 4 bits": partial(scene.seal, bits=4),
+        "sealed with 4 bits": partial(scene.seal, bytes_per_landmark=four_bits(scene)),
     }[kind](path)
     data = path.read_bytes()
     covered = section_bytes(data)
@@ -174,10 +175,10 @@ def test_foreign_files_are_named(content: bytes, message: str, tmp_path: Path) -
 
 def test_a_model_is_not_a_map(encoder: pm.Encoder, tmp_path: Path) -> None:
     encoder.save(tmp_path / "x.pme")
-    with pytest.raises(pm.FileError, match="it holds an encoder, not a sealed map"):
+    with pytest.raises(pm.FileError, match="it holds an encoder, not a map"):
         pm.open(tmp_path / "x.pme")
     pm.PrototypeMap(encoder).save(tmp_path / "x.pmk")
-    with pytest.raises(pm.FileError, match="it holds an open map, not an encoder"):
+    with pytest.raises(pm.FileError, match="it holds a learning map, not an encoder"):
         pm.Encoder.load(tmp_path / "x.pmk")
     with pytest.raises(pm.FileError, match=r"missing.pmk: cannot be read: No such file"):
         pm.open(tmp_path / "missing.pmk")
@@ -239,7 +240,7 @@ def test_names_of_sections_are_printable_ascii(
     path = tmp_path / "scene.pmk"
     scene.save(path)
     parts = sections(path.read_bytes())
-    data = container([*parts, ("12345678", b"")], version=1, kind=OPEN_MAP)
+    data = container([*parts, ("12345678", b"")], version=1, kind=LEARNING_MAP)
     data = data.replace(b"12345678", name.ljust(8, b"\0"))
     end = 64 + 32 * (len(parts) + 1)
     crc = zlib.crc32(data[:28] + bytes(4) + data[32:end])

@@ -107,7 +107,7 @@ def test_prototypes_are_what_building_at_once_gives() -> None:
     np.testing.assert_array_equal(memory.map.ids, ids)
     np.testing.assert_array_equal(at_once.ids, ids)
     np.testing.assert_array_equal(at_once.counts(ids), memory.map.counts(ids))
-    np.testing.assert_array_equal(at_once.prototype(ids), memory.map.prototype(ids))
+    np.testing.assert_array_equal(at_once.prototypes(ids), memory.map.prototypes(ids))
 
 
 def test_time_goes_to_the_stage_that_took_it() -> None:

@@ -65,7 +65,7 @@ def check_memory(structure: Structure, memory: Prototypes) -> None:
     ids = expected.ids
     np.testing.assert_array_equal(memory.map.ids, ids)
     np.testing.assert_array_equal(memory.map.counts(ids), expected.counts(ids))
-    np.testing.assert_array_equal(memory.map.prototype(ids), expected.prototype(ids))
+    np.testing.assert_array_equal(memory.map.prototypes(ids), expected.prototypes(ids))
 
 
 def test_ids_count_up_from_one_and_are_never_used_again() -> None:

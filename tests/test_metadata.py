@@ -93,7 +93,7 @@ def test_it_goes_along(scene: pm.PrototypeMap, encoder: pm.Encoder, tmp_path: Pa
     assert pm.open(tmp_path / "scene.pmk").metadata == scene.metadata
     earlier = pm.PrototypeMap(encoder)
     earlier.metadata = {"frame": "ECEF", "created": "2020-01-01T00:00:00Z", "robot": "atlas-2"}
-    scene.update(earlier)
+    scene.merge_map(earlier)
     assert scene.metadata == {
         "frame": "ENU, metres",
         "created": "2020-01-01T00:00:00Z",
@@ -134,12 +134,12 @@ def test_broken_metadata_is_refused(scene: pm.PrototypeMap, tmp_path: Path) -> N
             pm.open(tmp_path / "broken.pmk")
 
 
-@pytest.mark.parametrize("kind", ["open", "sealed"])
+@pytest.mark.parametrize("kind", ["learning", "sealed"])
 def test_the_expected_encoder(
     kind: str, scene: pm.PrototypeMap, encoder: pm.Encoder, tmp_path: Path
 ) -> None:
     path = tmp_path / "scene.pmk"
-    (scene.save if kind == "open" else scene.seal)(path)
+    (scene.save if kind == "learning" else scene.seal)(path)
     encoder.save(tmp_path / "copy.pme")
     for expected in (None, encoder, pm.Encoder.load(tmp_path / "copy.pme")):
         assert len(pm.open(path, encoder=expected, descriptor="test")) == len(scene)

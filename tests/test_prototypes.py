@@ -44,7 +44,7 @@ def assert_equals(scene: pm.PrototypeMap, reference: Reference) -> None:
     np.testing.assert_array_equal(scene.ids, ids)
     if ids:
         np.testing.assert_array_equal(scene.counts(ids), [reference.counts[i] for i in ids])
-        np.testing.assert_array_equal(scene.prototype(ids), reference.means().astype(np.float32))
+        np.testing.assert_array_equal(scene.prototypes(ids), reference.means().astype(np.float32))
 
 
 observations = st.lists(st.tuples(st.integers(0, 12), st.integers(0, 30)), max_size=80)
@@ -80,7 +80,7 @@ def test_any_order_and_any_batches_give_the_same_bytes(
     here, there = pm.PrototypeMap(encoder), pm.PrototypeMap(encoder)
     here.add(ids[::2], descriptors[::2])
     there.add(ids[1::2], descriptors[1::2])
-    here.update(there)
+    here.merge_map(there)
     assert file_bytes(here, folder) == file_bytes(at_once, folder)
 
 
@@ -98,7 +98,7 @@ def test_removing_what_was_added_gives_the_same_bytes(
     scene.add([i for i, _ in first], pool[[d for _, d in first]])
     before = file_bytes(scene, folder)
     scene.add([i for i, _ in second], pool[[d for _, d in second]])
-    scene.remove([i for i, _ in second], pool[[d for _, d in second]])
+    scene.subtract([i for i, _ in second], pool[[d for _, d in second]])
     assert file_bytes(scene, folder) == before
 
 
@@ -120,7 +120,7 @@ def test_merging_equals_joint_construction(
     ]
     scene = pm.PrototypeMap(encoder)
     scene.add(ids, descriptors)
-    scene.merge([a for a, _ in joins], [b for _, b in joins])
+    scene.merge_landmarks([a for a, _ in joins], [b for _, b in joins])
     new_id = {b: a for a, b in joins}
     joint = pm.PrototypeMap(encoder)
     joint.add([new_id.get(int(i), int(i)) for i in ids], descriptors)
@@ -147,10 +147,10 @@ def test_merging_above_255_halves_once(encoder: pm.Encoder) -> None:
     scene = pm.PrototypeMap(encoder)
     scene.add(np.repeat([1, 2], 200), descriptors)
     sums = encoder.encode(descriptors).astype(np.int64).sum(0)
-    scene.merge(1, 2)
+    scene.merge_landmarks(1, 2)
     assert scene.counts([1])[0] == 200
     np.testing.assert_array_equal(
-        scene.prototype([1])[0], (np.trunc(sums / 2) / 200).astype(np.float32)
+        scene.prototypes([1])[0], (np.trunc(sums / 2) / 200).astype(np.float32)
     )
 
 
@@ -158,7 +158,7 @@ def test_extreme_codes_fit(encoder: pm.Encoder) -> None:
     scene = pm.PrototypeMap(encoder, dim=5)
     for value in (127, -127):
         scene.add_codes(np.full(255, value + 127), np.full((255, 5), value, np.int8))
-        np.testing.assert_array_equal(scene.prototype([value + 127]), np.full((1, 5), value))
+        np.testing.assert_array_equal(scene.prototypes([value + 127]), np.full((1, 5), value))
     with pytest.raises(ValueError, match="codes must be -127 to 127"):
         scene.add_codes([1], np.full((1, 5), -128, np.int8))
 
@@ -188,14 +188,14 @@ def test_search_equals_sorting(
     all_ids = rng.choice(1000, n, replace=False)
     for _ in range(2):
         scene.add_codes(all_ids, rng.integers(-values, values + 1, (n, dim)).astype(np.int8))
-    scene.discard(all_ids[: n // 3])
+    scene.remove(all_ids[: n // 3])
     queries = rng.integers(-values, values + 1, (9, dim)).astype(np.int8)
     ids, distances = scene.search_codes(
         queries, k=k, max_distance=max_distance, ratio=ratio, threads=2
     )
 
     known = scene.ids
-    prototypes = rounded(scene.prototype(known))
+    prototypes = rounded(scene.prototypes(known))
     for q, query in enumerate(queries.astype(np.int64)):
         squared = ((prototypes - query) ** 2).sum(1)
         order = np.argsort(squared, kind="stable")
@@ -266,9 +266,9 @@ def test_positions(encoder: pm.Encoder) -> None:
     assert np.isnan(scene.positions([5])).all()
     scene.set_positions([7, 5], np.array([[1e6, 2, 3], [4, 5, 6]]))
     np.testing.assert_array_equal(scene.positions([5, 7]), [[4, 5, 6], [1e6, 2, 3]])
-    scene.merge(6, 5)
+    scene.merge_landmarks(6, 5)
     np.testing.assert_array_equal(scene.positions([6]), [[4, 5, 6]])
-    scene.discard([6])
+    scene.remove([6])
     np.testing.assert_array_equal(scene.positions([7]), [[1e6, 2, 3]])
     with pytest.raises(ValueError, match="position of landmark 7 is not finite"):
         scene.set_positions([7], np.array([[1, np.inf, 2]]))
@@ -282,19 +282,19 @@ def test_wrong_calls_change_nothing(encoder: pm.Encoder, tmp_path: Path) -> None
     scene.add([0, 0, 1, 2, 2, 2], descriptors)
     before = file_bytes(scene, tmp_path)
     calls: list[tuple[type[Exception], str, Any]] = [
-        (KeyError, "landmark 9 is not in the map", lambda: scene.remove([0, 9], descriptors[:2])),
-        (KeyError, "landmark 9 is not in the map", lambda: scene.merge([0], [9])),
-        (KeyError, "landmark 9 is not in the map", lambda: scene.discard([0, 9])),
+        (KeyError, "landmark 9 is not in the map", lambda: scene.subtract([0, 9], descriptors[:2])),
+        (KeyError, "landmark 9 is not in the map", lambda: scene.merge_landmarks([0], [9])),
+        (KeyError, "landmark 9 is not in the map", lambda: scene.remove([0, 9])),
         (KeyError, "landmark 9 is not in the map", lambda: scene.counts([9])),
-        (KeyError, "landmark -1 is not in the map", lambda: scene.prototype([0, -1])),
+        (KeyError, "landmark -1 is not in the map", lambda: scene.prototypes([0, -1])),
         (KeyError, "landmark 9 is not", lambda: scene.set_positions([0, 9], np.zeros((2, 3)))),
         (ValueError, "landmark id -1 is negative", lambda: scene.add([0, -1], descriptors[:2])),
         (ValueError, "2 landmark ids for 3 desc", lambda: scene.add([0, 1], descriptors[:3])),
-        (ValueError, "has 1 observations, 2", lambda: scene.remove([1, 1], descriptors[:2])),
-        (ValueError, "were never added", lambda: scene.remove([1], descriptors[:1])),
-        (ValueError, "merged into itself", lambda: scene.merge([0], [0])),
-        (ValueError, "earlier in the same call", lambda: scene.merge([0, 2], [1, 1])),
-        (ValueError, "cannot be joined to itself", lambda: scene.update(scene)),
+        (ValueError, "has 1 observations, 2", lambda: scene.subtract([1, 1], descriptors[:2])),
+        (ValueError, "were never added", lambda: scene.subtract([1], descriptors[:1])),
+        (ValueError, "merged into itself", lambda: scene.merge_landmarks([0], [0])),
+        (ValueError, "earlier in the same call", lambda: scene.merge_landmarks([0, 2], [1, 1])),
+        (ValueError, "cannot be merged into itself", lambda: scene.merge_map(scene)),
         (ValueError, "7 bytes, encoder", lambda: scene.add([0], np.zeros((1, 7), np.uint8))),
         (TypeError, "landmark ids", lambda: scene.add([0.5], descriptors[:1])),
     ]
@@ -304,7 +304,7 @@ def test_wrong_calls_change_nothing(encoder: pm.Encoder, tmp_path: Path) -> None
         assert file_bytes(scene, tmp_path) == before
 
 
-def test_maps_of_different_encoders_do_not_join(
+def test_maps_of_different_encoders_do_not_merge(
     encoder: pm.Encoder, layers: list[dict[str, Any]]
 ) -> None:
     other = [dict(layer) for layer in layers]
@@ -312,9 +312,9 @@ def test_maps_of_different_encoders_do_not_join(
     stranger = pm.Encoder(other, [5, 12], name="tiny", descriptor="test", scale=0.02)
     scene = pm.PrototypeMap(encoder)
     with pytest.raises(ValueError, match="different encoders"):
-        scene.update(pm.PrototypeMap(stranger))
+        scene.merge_map(pm.PrototypeMap(stranger))
     with pytest.raises(ValueError, match="different encoders or dimensions"):
-        scene.update(pm.PrototypeMap(encoder, dim=5))
+        scene.merge_map(pm.PrototypeMap(encoder, dim=5))
     with pytest.raises(ValueError, match="has no codes of 6 dimensions"):
         pm.PrototypeMap(encoder, dim=6)
 
@@ -331,7 +331,7 @@ def test_ids_of_all_sizes(encoder: pm.Encoder) -> None:
         scene.add_codes(new, np.repeat(code, 200, axis=0))
         there |= set(new.tolist())
         gone = rng.choice(sorted(there), len(there) // 2, replace=False)
-        scene.discard(gone)
+        scene.remove(gone)
         there -= set(gone.tolist())
         np.testing.assert_array_equal(scene.ids, sorted(there))
         assert scene.counts(sorted(there)).min() >= 1

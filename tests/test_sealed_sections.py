@@ -1,4 +1,4 @@
-"""Ids and positions of sealed maps, versions of files, and files from before version 4."""
+"""Ids, positions and summaries of sealed maps."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
-from conftest import protomark, random_descriptors, random_layers
-from map_container import SEALED_MAP, container, sections
+from conftest import protomark, random_descriptors
+from map_container import container, sections
+from sealing import four_bits
 
-OLD = Path(__file__).parent / "data"
 MOST = 2**63 - 1
 
 
@@ -22,10 +22,6 @@ def scene(encoder: pm.Encoder, ids: Any) -> pm.PrototypeMap:
     scene = pm.PrototypeMap(encoder)
     scene.add(ids, random_descriptors(len(ids)))
     return scene
-
-
-def version(path: Path) -> int:
-    return int.from_bytes(path.read_bytes()[8:12], "little")
 
 
 @settings(max_examples=60)
@@ -60,39 +56,11 @@ def test_search_with_an_index_gives_ids(encoder: pm.Encoder, tmp_path: Path) -> 
     built.build_index(8)
     sealed = built.seal(tmp_path / "sealed.pmk")
     queries = random_descriptors(50, seed=1)
-    for options in ({}, {"probes": 2}):
+    for options in ({}, {"nprobe": 2}):
         for a, b in zip(
             built.search(queries, **options), sealed.search(queries, **options), strict=True
         ):
             np.testing.assert_array_equal(a, b)
-
-
-def test_the_version_is_the_oldest_that_will_do(encoder: pm.Encoder, tmp_path: Path) -> None:
-    path = tmp_path / "map.pmk"
-    built = scene(encoder, range(40))
-    built.metadata = {"frame": "ENU"}
-    built.seal(path, position_bits=16)  # no landmark has a position
-    assert version(path) == 1
-    built.set_positions([3], [[1, 2, 3]])
-    for save, expected in (
-        (lambda: built.save(path), 1),
-        (lambda: built.seal(path), 1),
-        (lambda: built.seal(path, bits=4), 2),
-        (lambda: built.build_index(2), 2),
-        (lambda: built.seal(path, bits=4), 3),
-        (lambda: built.save(path), 3),
-        (lambda: built.seal(path, position_bits=16), 4),
-        (lambda: built.discard([0]), 4),
-        (lambda: built.seal(path), 4),
-        (lambda: built.save(path), 3),
-    ):
-        save()
-        assert version(path) == expected
-    path.write_bytes(container(sections(path.read_bytes()), version=5, kind=2))
-    with pytest.raises(
-        pm.FileError, match="format version 5, this Protomark reads versions 1 to 4"
-    ):
-        pm.open(path)
 
 
 def test_broken_ids_are_met_when_they_are_read(encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -100,10 +68,10 @@ def test_broken_ids_are_met_when_they_are_read(encoder: pm.Encoder, tmp_path: Pa
     scene(encoder, np.arange(300) * 7).seal(path)
     for content in (b"\xff", b"\0"):
         parts = [
-            (name, content * len(data) if name == "idrests" else data)
+            (name, content * len(data) if name == "idgaps" else data)
             for name, data in sections(path.read_bytes())
         ]
-        (tmp_path / "broken.pmk").write_bytes(container(parts, version=4, kind=SEALED_MAP))
+        (tmp_path / "broken.pmk").write_bytes(container(parts))
         broken = pm.open(tmp_path / "broken.pmk")
         assert len(broken) == 300
         if content == b"\xff":
@@ -137,14 +105,14 @@ def test_positions_of_16_bits(encoder: pm.Encoder, scale: list[float], tmp_path:
     np.testing.assert_allclose([low, high], [positions.min(0), positions.max(0)], rtol=1e-14)
     sizes = [dict(pm.file_sections(tmp_path / name))["position"] for name in ("16.pmk", "32.pmk")]
     assert sizes == [3000 * 6, 3000 * 12]
-    with pytest.raises(ValueError, match="32 or 16 bits a coordinate, not 8"):
+    with pytest.raises(ValueError, match="position_bits must be 32 or 16, not 8"):
         built.seal(tmp_path / "8.pmk", position_bits=8)
     assert not (tmp_path / "8.pmk").exists()
 
 
 def test_summary(encoder: pm.Encoder, tmp_path: Path) -> None:
-    for look_bits in (0, 3):
-        built = pm.PrototypeMap(encoder, look_bits=look_bits)
+    for appearance_bits in (0, 3):
+        built = pm.PrototypeMap(encoder, appearance_bits=appearance_bits)
         nothing = built.summary()
         assert (nothing["observations"], nothing["extent"]) == (0, None)
         assert not nothing["count_histogram"].any()
@@ -152,7 +120,11 @@ def test_summary(encoder: pm.Encoder, tmp_path: Path) -> None:
         built.add(ids, random_descriptors(5000))
         counts = np.bincount(ids)
         built.set_positions(built.ids[:2], [[1, 5, 3], [4, 2, 3]])
-        for m in (built, built.seal(tmp_path / "s.pmk"), built.seal(tmp_path / "t.pmk", bits=4)):
+        for m in (
+            built,
+            built.seal(tmp_path / "s.pmk"),
+            built.seal(tmp_path / "t.pmk", bytes_per_landmark=four_bits(built)),
+        ):
             summary = m.summary()
             assert summary["observations"] == 5000
             np.testing.assert_array_equal(
@@ -160,40 +132,6 @@ def test_summary(encoder: pm.Encoder, tmp_path: Path) -> None:
             )
             assert summary["landmarks_with_position"] == 2
             np.testing.assert_array_equal(summary["extent"], [[1, 2, 3], [4, 5, 3]])
-
-
-@pytest.fixture
-def old_encoder() -> pm.Encoder:
-    return pm.Encoder(random_layers([64, 12]), [5, 12], name="old", descriptor="test", scale=0.02)
-
-
-def test_files_from_before_version_4(old_encoder: pm.Encoder, tmp_path: Path) -> None:
-    """Written by Protomark 0.1.0 as of 2026-11-23, from the observations below."""
-    ids = np.random.default_rng(0).integers(0, 2**40, 40)
-    built = pm.PrototypeMap(old_encoder)
-    built.add(np.repeat(ids, 2), random_descriptors(80))
-    built.set_positions(ids[::2], np.random.default_rng(1).normal(5e5, 10, (20, 3)))
-    built.build_index(3)
-    new = built.seal(tmp_path / "sealed.pmk")
-    for name in ("open", "sealed"):
-        path = OLD / f"{name}_before_version_4.pmk"
-        assert version(path) == 3
-        pm.verify_file(path)
-        old = pm.open(path, encoder=old_encoder)
-        assert dict(old.metadata) == {}
-        np.testing.assert_array_equal(old.ids, np.sort(ids))
-        np.testing.assert_array_equal(old.counts(ids), built.counts(ids))
-        queries = random_descriptors(100, seed=4)
-        for options in ({}, {"recall": 0.9}):
-            for a, b in zip(
-                old.search(queries, **options), new.search(queries, **options), strict=True
-            ):
-                np.testing.assert_array_equal(a, b)
-        placed = old.positions(old.ids)
-        expected = built if name == "open" else new
-        np.testing.assert_array_equal(placed, expected.positions(old.ids))
-    built.save(tmp_path / "open.pmk")
-    assert (tmp_path / "open.pmk").read_bytes() == (OLD / "open_before_version_4.pmk").read_bytes()
 
 
 def test_info_of_a_sealed_map(encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -214,7 +152,7 @@ def test_info_of_a_sealed_map(encoder: pm.Encoder, tmp_path: Path) -> None:
     assert facts["landmarks_with_position"] == 2
     by_section = facts["bytes_by_section"]
     assert by_section["idblocks"] == 4 * 16
-    assert by_section["idrests"] == 0
+    assert by_section["idgaps"] == 0
     assert facts["bytes_per_landmark_by_section"] == {
         name: size / 500 for name, size in by_section.items()
     }

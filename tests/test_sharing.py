@@ -29,8 +29,10 @@ def file_bytes(scene: pm.PrototypeMap, folder: Path) -> bytes:
     return (folder / "scene.pmk").read_bytes()
 
 
-def build(encoder: pm.Encoder, observed: list[tuple[int, int]], looks: int) -> pm.PrototypeMap:
-    scene = pm.PrototypeMap(encoder, look_bits=looks)
+def build(
+    encoder: pm.Encoder, observed: list[tuple[int, int]], appearance_bits: int
+) -> pm.PrototypeMap:
+    scene = pm.PrototypeMap(encoder, appearance_bits=appearance_bits)
     scene.add([i for i, _ in observed], random_descriptors(31)[[d for _, d in observed]])
     return scene
 
@@ -57,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     new_ids=st.dictionaries(st.integers(0, 12), st.integers(0, 20)),
     here=st.dictionaries(st.integers(0, 12), st.integers(1, 9)),
     there=st.dictionaries(st.integers(0, 12), st.integers(1, 9)),
-    looks=st.sampled_from([0, 2, 12]),
+    appearance_bits=st.sampled_from([0, 2, 12]),
 )
 def test_update_with_other_ids_equals_one_map(
     first: list[tuple[int, int]],
@@ -65,20 +67,20 @@ def test_update_with_other_ids_equals_one_map(
     new_ids: dict[int, int],
     here: dict[int, int],
     there: dict[int, int],
-    looks: int,
+    appearance_bits: int,
     balanced: pm.Encoder,
     folder: Path,
 ) -> None:
-    scene, other = build(balanced, first, looks), build(balanced, second, looks)
+    scene, other = build(balanced, first, appearance_bits), build(balanced, second, appearance_bits)
     place(scene, here)
     place(other, there)
     unchanged = file_bytes(other, folder)
     theirs = {i: new_ids.get(i, i) for i in other.ids.tolist()}
     named = [i for i in new_ids if i in theirs]
-    scene.update(other, into=[new_ids[i] for i in named], source=named)
+    scene.merge_map(other, into=[new_ids[i] for i in named], source=named)
     assert file_bytes(other, folder) == unchanged
 
-    joint = build(balanced, first + [(theirs[i], d) for i, d in second], looks)
+    joint = build(balanced, first + [(theirs[i], d) for i, d in second], appearance_bits)
     # Own positions stay; of several others the one of the smallest id is taken.
     expected = {theirs[i]: float(there[i]) for i in sorted(theirs, reverse=True) if i in there}
     expected |= {i: float(here[i]) for i in {i for i, _ in first} if i in here}
@@ -86,7 +88,7 @@ def test_update_with_other_ids_equals_one_map(
     assert file_bytes(scene, folder) == file_bytes(joint, folder)
 
 
-def test_ids_of_update_are_checked_before_anything_changes(
+def test_ids_of_merge_map_are_checked_before_anything_changes(
     encoder: pm.Encoder, tmp_path: Path
 ) -> None:
     scene, other = build(encoder, [(1, 0), (2, 1)], 0), build(encoder, [(1, 2), (5, 3)], 0)
@@ -101,17 +103,17 @@ def test_ids_of_update_are_checked_before_anything_changes(
     ]
     for error, message, arguments in calls:
         with pytest.raises(error, match=message):
-            scene.update(other, **arguments)
+            scene.merge_map(other, **arguments)
         assert file_bytes(scene, tmp_path) == before
-    with pytest.raises(ValueError, match="joined to itself"):
-        scene.update(scene, into=[9], source=[1])
-    scene.update(other, into=other.ids + scene.ids[-1] + 1, source=other.ids)
+    with pytest.raises(ValueError, match="merged into itself"):
+        scene.merge_map(scene, into=[9], source=[1])
+    scene.merge_map(other, into=other.ids + scene.ids[-1] + 1, source=other.ids)
     np.testing.assert_array_equal(scene.ids, [1, 2, 4, 8])
 
 
-def shard(folder: Path, part: int, parts: int, looks: int) -> None:
+def shard(folder: Path, part: int, parts: int, appearance_bits: int) -> None:
     """Builds and saves the map of every `parts`-th observation; run in a process of its own."""
-    scene = pm.PrototypeMap(pm.Encoder.load(folder / "tiny.pme"), look_bits=looks)
+    scene = pm.PrototypeMap(pm.Encoder.load(folder / "tiny.pme"), appearance_bits=appearance_bits)
     data = np.load(folder / "observations.npz")
     some = slice(part, None, parts)
     for ids, descriptors in zip(
@@ -124,33 +126,35 @@ def shard(folder: Path, part: int, parts: int, looks: int) -> None:
     scene.save(folder / f"shard{part}.pmk")
 
 
-@pytest.mark.parametrize("looks", [0, 6])
+@pytest.mark.parametrize("appearance_bits", [0, 6])
 def test_shards_of_several_processes_join_to_the_same_bytes(
-    looks: int, balanced: pm.Encoder, tmp_path: Path
+    appearance_bits: int, balanced: pm.Encoder, tmp_path: Path
 ) -> None:
     """Landmark 3 gets 255 observations, as many as a prototype holds."""
     balanced.save(tmp_path / "tiny.pme")
     rng = np.random.default_rng(5)
     ids = rng.permutation(np.concatenate([rng.integers(100, 400, 3000), np.full(255, 3)]))
     descriptors = random_descriptors(len(ids), seed=6)
-    if looks:
+    if appearance_bits:
         descriptors[ids == 3] = descriptors[0]  # one look
     np.savez(tmp_path / "observations.npz", ids=ids, descriptors=descriptors)
-    shard(tmp_path, 0, 1, looks)
+    shard(tmp_path, 0, 1, appearance_bits)
     expected = (tmp_path / "shard0.pmk").read_bytes()
 
-    processes = [spawn.Process(target=shard, args=(tmp_path, i, 3, looks)) for i in range(3)]
+    processes = [
+        spawn.Process(target=shard, args=(tmp_path, i, 3, appearance_bits)) for i in range(3)
+    ]
     for process in processes:
         process.start()
     for process in processes:
         process.join()
         assert process.exitcode == 0
     for order in ([0, 1, 2], [2, 0, 1]):
-        whole = pm.PrototypeMap(balanced, look_bits=looks)
+        whole = pm.PrototypeMap(balanced, appearance_bits=appearance_bits)
         for i in order:
             part = pm.open(tmp_path / f"shard{i}.pmk")
             assert isinstance(part, pm.PrototypeMap)
-            whole.update(part)
+            whole.merge_map(part)
         assert whole.counts([3]) == [255]
         assert file_bytes(whole, tmp_path) == expected
 
@@ -167,8 +171,8 @@ def test_beyond_255_two_maps_join_to_the_same_bytes_in_either_order(
         return scene
 
     one, other = half(0), half(1)
-    one.update(half(1))
-    other.update(half(0))
+    one.merge_map(half(1))
+    other.merge_map(half(0))
     assert one.counts([3]) == [200]
     assert file_bytes(one, tmp_path) == file_bytes(other, tmp_path)
 
@@ -179,7 +183,7 @@ def test_beyond_255_two_maps_join_to_the_same_bytes_in_either_order(
     boundaries=[],
     cell_size=2.0,
     placed={2: -5e-324},
-    looks=0,
+    appearance_bits=0,
     order=random.Random(0),
 )
 @settings(max_examples=60, deadline=None)
@@ -188,7 +192,7 @@ def test_beyond_255_two_maps_join_to_the_same_bytes_in_either_order(
     boundaries=st.lists(st.integers(-1, 14), max_size=5).map(sorted),
     cell_size=st.floats(0.1, 20),
     placed=st.dictionaries(st.integers(0, 12), st.floats(-50, 50)),
-    looks=st.sampled_from([0, 12]),
+    appearance_bits=st.sampled_from([0, 12]),
     order=st.randoms(),
 )
 def test_parts_join_to_the_same_bytes(
@@ -196,19 +200,19 @@ def test_parts_join_to_the_same_bytes(
     boundaries: list[int],
     cell_size: float,
     placed: dict[int, float],
-    looks: int,
+    appearance_bits: int,
     order: Any,
     balanced: pm.Encoder,
     folder: Path,
 ) -> None:
-    scene = build(balanced, observed, looks)
+    scene = build(balanced, observed, appearance_bits)
     place(scene, placed)
     before = file_bytes(scene, folder)
-    parts = scene.split(boundaries)
+    parts = scene.split_by_id(boundaries)
     assert [len(part) for part in parts] == [
         len(ids) for ids in np.split(scene.ids, np.searchsorted(scene.ids, boundaries))
     ]
-    tiles = scene.split(cell_size=cell_size)
+    tiles = scene.split_by_space(cell_size)
     known = scene.ids.tolist()
     assert all(len(tile) for tile in tiles.values())
     for cell, tile in tiles.items():
@@ -217,10 +221,10 @@ def test_parts_join_to_the_same_bytes(
         np.testing.assert_array_equal(tile.ids, outside if cell is None else inside)
     assert list(tiles) == sorted(tiles, key=lambda cell: (cell is None, cell))
     for some in (parts, list(tiles.values())):
-        whole = pm.PrototypeMap(balanced, look_bits=looks)
+        whole = pm.PrototypeMap(balanced, appearance_bits=appearance_bits)
         order.shuffle(some)
         for part in some:
-            whole.update(part)
+            whole.merge_map(part)
         assert file_bytes(whole, folder) == before
     assert file_bytes(scene, folder) == before
 
@@ -230,8 +234,8 @@ def test_parts_have_no_index_and_answer_alike(encoder: pm.Encoder, tmp_path: Pat
     scene = pm.PrototypeMap(encoder)
     scene.add_codes(np.arange(500), rng.integers(-127, 128, (500, 12)).astype(np.int8))
     scene.build_index()
-    low, high = scene.split([200])
-    assert low.index_cells == high.index_cells == 0
+    low, high = scene.split_by_id([200])
+    assert low.nlist == high.nlist == 0
     queries = rng.integers(-127, 128, (20, 12)).astype(np.int8)
     ids, _ = scene.search_codes(queries, k=1)
     answers = [part.search_codes(queries, k=1) for part in (low, high)]
@@ -239,7 +243,7 @@ def test_parts_have_no_index_and_answer_alike(encoder: pm.Encoder, tmp_path: Pat
     np.testing.assert_array_equal(
         ids[:, 0], np.array([i[:, 0] for i, _ in answers])[best, range(20)]
     )
-    low.update(high)
+    low.merge_map(high)
     scene.drop_index()
     assert file_bytes(low, tmp_path) == file_bytes(scene, tmp_path)
 
@@ -248,16 +252,16 @@ def test_what_cannot_be_split_is_refused(encoder: pm.Encoder) -> None:
     scene = build(encoder, [(1, 0), (2, 1)], 0)
     scene.set_positions([1], np.array([[1e300, 0, 0]]))
     with pytest.raises(ValueError, match="boundaries of parts must ascend"):
-        scene.split([5, 4])
+        scene.split_by_id([5, 4])
     for size in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="must be above 0 and finite"):
-            scene.split(cell_size=size)
+            scene.split_by_space(size)
     with pytest.raises(ValueError, match="too small for the extent"):
-        scene.split(cell_size=1.0)
+        scene.split_by_space(1.0)
     with pytest.raises(TypeError):
-        scene.split(1.0)  # type: ignore[call-overload]
-    assert [len(part) for part in pm.PrototypeMap(encoder).split([])] == [0]
-    assert pm.PrototypeMap(encoder).split(cell_size=1.0) == {}
+        scene.split_by_id(1.0)  # type: ignore[call-overload]
+    assert [len(part) for part in pm.PrototypeMap(encoder).split_by_id([])] == [0]
+    assert pm.PrototypeMap(encoder).split_by_space(1.0) == {}
 
 
 def seconds_of(work: Callable[[], object]) -> float:
@@ -280,13 +284,13 @@ def test_who_waits_for_the_map_does_not_hold_the_interpreter(encoder: pm.Encoder
     questions: list[Callable[[], object]] = [
         lambda: len(scene),
         lambda: scene.prototype_count,
-        lambda: scene.index_cells,
+        lambda: scene.nlist,
         lambda: scene.ids,
         lambda: scene.counts([0]),
-        lambda: scene.prototype([0]),
+        lambda: scene.prototypes([0]),
         lambda: scene.positions([0]),
-        lambda: scene.looks(0),
-        lambda: scene.look_counts(0),
+        lambda: scene.appearances(0),
+        lambda: scene.appearance_counts(0),
         lambda: repr(scene),
     ]
     threads = [threading.Thread(target=scene.search_codes, args=(queries,))]

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 import protomark as pm
 from conftest import NO_DISTANCE, balanced_encoder, random_descriptors
 from protomark.subset import Subset
+from sealing import four_bits
 
 LANDMARKS = 300
 
 
-def observed(look_bits: int) -> pm.PrototypeMap:
-    rng = np.random.default_rng(look_bits)
-    scene = pm.PrototypeMap(balanced_encoder(), look_bits=look_bits)
+def observed(appearance_bits: int) -> pm.PrototypeMap:
+    rng = np.random.default_rng(appearance_bits)
+    scene = pm.PrototypeMap(balanced_encoder(), appearance_bits=appearance_bits)
     scene.add(3 * rng.integers(0, LANDMARKS, 2000), random_descriptors(2000, seed=1))
     return scene
 
@@ -35,18 +36,20 @@ def filtered(
     return found, away
 
 
-@pytest.mark.parametrize("kind", ["open", "8", "4", "looks", "sealed looks", "looks 4", "index"])
+@pytest.mark.parametrize(
+    "kind", ["learning", "8", "4", "appearances", "sealed appearances", "appearances 4", "index"]
+)
 @pytest.mark.parametrize("size", [0, 1, 2, 40])
 def test_equals_the_answers_of_the_whole_map_without_the_others(
     kind: str, size: int, tmp_path: Path
 ) -> None:
-    scene: pm.PrototypeMap | pm.SealedMap = observed(4 if "looks" in kind else 0)
+    scene: pm.PrototypeMap | pm.SealedMap = observed(4 if "appearances" in kind else 0)
     assert isinstance(scene, pm.PrototypeMap)
     if kind == "index":
         scene.build_index(5)
-    if kind in ("8", "4", "sealed looks", "looks 4", "index"):
-        bits = 4 if "4" in kind else 8
-        scene = scene.seal(tmp_path / "s.pmk", bits=bits)
+    if kind not in ("learning", "appearances"):
+        smaller = four_bits(scene) if "4" in kind else None
+        scene = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=smaller)
     rng = np.random.default_rng(size)
     ids = rng.choice(scene.ids, size, replace=False)
     codes = scene.encoder.encode(random_descriptors(60, seed=2))

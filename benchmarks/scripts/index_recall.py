@@ -100,13 +100,13 @@ def recall(
 ) -> float:
     """Share of queries whose nearest landmark is found."""
     exact = scene.search_codes(queries, k=1)[1]
-    found = scene.search_codes(queries, k=1, recall=stated, probes=nprobe)[1]
+    found = scene.search_codes(queries, k=1, recall=stated, nprobe=nprobe)[1]
     return float(np.mean(found <= exact))
 
 
 def least_nprobe(scene: pm.PrototypeMap, queries: NDArray[np.int8], wanted: float) -> int:
     """The fewest inverted lists that truly bring a recall."""
-    low, high = 1, scene.index_cells
+    low, high = 1, scene.nlist
     while low < high:
         middle = (low + high) // 2
         if recall(scene, queries, None, middle) >= wanted:
@@ -152,7 +152,7 @@ def drift(encoder: pm.Encoder, dim: int, sequences: list[CodedSequence]) -> list
     leaves, enters = round_of(old.landmarks, 0), round_of(new.landmarks, 1)
     for i in range(1, ROUNDS):
         scene.add_codes(new.landmarks[enters == i], new.codes[enters == i])
-        scene.remove_codes(old.landmarks[leaves == i], old.codes[leaves == i])
+        scene.subtract_codes(old.landmarks[leaves == i], old.codes[leaves == i])
         share = i / (ROUNDS - 1)
         frames = np.concatenate(
             [
@@ -185,7 +185,7 @@ def main() -> None:
         for stated, true in zip(RECALLS, trues, strict=True):
             least = least_nprobe(scene, s.frames, stated)
             seen = recall(scene, s.seen, stated, None)
-            cells = [f"{scene.probes(stated)} of {scene.index_cells}", f"{seen:.3f}"]
+            cells = [f"{scene.nprobe(stated)} of {scene.nlist}", f"{seen:.3f}"]
             rows.append([name, f"{stated:.2f}", *cells, f"{true:.3f}", str(least)])
         color = plot.TEAL if name == "all" else plot.MUTED
         label = "all sequences, one map" if name == "all" else ""

@@ -126,7 +126,8 @@ def kinds(
         scene = pm.PrototypeMap(encoder, dim, APPEARANCE_BITS if kind == "appearances" else 0)
         scene.add(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
         with tempfile.TemporaryDirectory() as folder:
-            sealed = scene.seal(Path(folder) / "scene.pmk", bits=4 if kind == "4 bits" else 8)
+            size = 4 * -(-dim // 8) + 1 if kind == "4 bits" else None
+            sealed = scene.seal(Path(folder) / "scene.pmk", bytes_per_landmark=size)
             given = label_matches(tracks, queries, sealed.search)
         found = measure_calibration("", dim, calibration, given)
         result.append([found.precision, found.expected, found.recall])

@@ -45,7 +45,7 @@ class Searcher:
         while not self.stopped:
             query = self.queries[i % len(self.queries)][None]
             begin = time.perf_counter()
-            self.scene.search_codes(query, k=2, probes=self.nprobe)
+            self.scene.search_codes(query, k=2, nprobe=self.nprobe)
             self.times.append((begin, time.perf_counter()))
             i += 1
 
@@ -96,21 +96,21 @@ def works(
 
     def add_and_remove() -> None:
         scene.add_codes(new, codes)
-        scene.discard(new)
+        scene.remove(new)
 
     def add_and_subtract() -> None:
         scene.add_codes(existing, codes)
-        scene.remove_codes(existing, codes)
+        scene.subtract_codes(existing, codes)
 
     def merge() -> None:
         scene.add_codes(new, codes)
-        scene.merge(new[: largest // 2], new[largest // 2 :])
-        scene.discard(new[: largest // 2])
+        scene.merge_landmarks(new[: largest // 2], new[largest // 2 :])
+        scene.remove(new[: largest // 2])
 
     def measure_recall() -> None:
         # So much of the map changes that its recall table is measured anew.
         scene.add_codes(np.arange(landmarks // 8), random_codes(landmarks // 8, dim, rng))
-        scene.probes(0.95)
+        scene.nprobe(0.95)
 
     found: dict[str, Callable[[], object]] = {
         "nothing": lambda: time.sleep(0.1),
@@ -121,7 +121,7 @@ def works(
         f"add_codes and remove, {largest:,} new landmarks": add_and_remove,
         f"add_codes and subtract_codes, {largest:,}": add_and_subtract,
         f"add_codes, merge_landmarks and remove, {largest:,}": merge,
-        f"merge_map with {len(other):,} landmarks": lambda: scene.update(other),
+        f"merge_map with {len(other):,} landmarks": lambda: scene.merge_map(other),
         "save": lambda: scene.save(folder / "scene.pmk"),
         "seal": lambda: scene.seal(folder / "scene.sealed.pmk"),
         "ids": lambda: scene.ids,
@@ -130,7 +130,7 @@ def works(
         found["add_codes of an eighth of the map, nprobe"] = measure_recall
         found["build_index"] = scene.build_index
         # Another nlist than before: else no row moves.
-        rebuild = lambda: scene.build_index(scene.index_cells - 1, in_place=True)  # noqa: E731
+        rebuild = lambda: scene.build_index(scene.nlist - 1, in_place=True)  # noqa: E731
         found["build_index(in_place=True)"] = rebuild
     return found
 
@@ -173,7 +173,7 @@ def main() -> None:
     print(f"{asked.landmarks:,} landmarks, {asked.dim} dimensions, searched exactly\n")
     print(measure(scene, asked.searchers, asked.seconds, None).markdown())
     scene.build_index()
-    print(f"\nby {asked.nprobe} of {scene.index_cells:,} inverted lists\n")
+    print(f"\nby {asked.nprobe} of {scene.nlist:,} inverted lists\n")
     print(measure(scene, asked.searchers, asked.seconds, asked.nprobe).markdown())
 
 

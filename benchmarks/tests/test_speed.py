@@ -60,7 +60,7 @@ def test_real_prototypes_are_those_of_a_map(real: RealLandmarks, encoder: pm.Enc
     scene = pm.PrototypeMap(encoder, dim=32)
     ids = np.repeat(np.arange(len(real)), real.counts)
     scene.add(ids, real.descriptors[real.in_map])
-    means = scene.prototype(np.arange(len(real)))
+    means = scene.prototypes(np.arange(len(real)))
     expected = np.sign(means) * np.floor(np.abs(means) + 0.5)
     assert (real.prototypes(encoder, 32) == expected).all()
 

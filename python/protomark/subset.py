@@ -15,7 +15,7 @@ class Subset:
     and order. Making it costs time in proportion to the landmarks in it, not to the map.
 
     Args:
-        scene: an open or a sealed map.
+        scene: a learning or a sealed map.
         landmark_ids: (n,) int64, those to search.
 
     Raises:
@@ -24,15 +24,15 @@ class Subset:
 
     def __init__(self, scene: pm.PrototypeMap | pm.SealedMap, landmark_ids: ArrayLike) -> None:
         ids = np.unique(np.asarray(landmark_ids, np.int64))
-        self._looks = scene.prototype_count != len(scene)
-        if self._looks:
-            each = [scene.looks(int(i)) for i in ids]
+        self._several = scene.prototype_count != len(scene)
+        if self._several:
+            each = [scene.appearances(int(i)) for i in ids]
             means = np.concatenate([*each, np.zeros((0, scene.dim), np.float32)])
             self._most = max((len(rows) for rows in each), default=1)
             self._landmarks = np.repeat(ids, [len(rows) for rows in each])
             rows = np.arange(len(means))
         else:
-            means = scene.prototype(ids)
+            means = scene.prototypes(ids)
             rows = ids
         # A map compares codes with means rounded to int8, halves away from zero; such a rounded
         # mean, added as the one code of a landmark, is that landmark's prototype again.
@@ -48,7 +48,7 @@ class Subset:
         self, codes: NDArray[np.int8], k: int = 2, threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """As `PrototypeMap.search_codes`: ids (q, k) and distances (q, k)."""
-        if not self._looks:
+        if not self._several:
             return self._map.search_codes(codes, k=k, threads=threads)
         # Rows of a landmark follow each other, so equal distances stay in the order of landmarks.
         rows, distances = self._map.search_codes(codes, k=(k - 1) * self._most + 1, threads=threads)

@@ -114,7 +114,7 @@ class Journal(Case):
             scene.add_codes(*self.some[state])
             return
         for ids, codes in self.some:
-            scene.remove_codes(ids, codes)
+            scene.subtract_codes(ids, codes)
 
     def holds(self, path: Path, state: int) -> bool:
         pm.verify_file(path)
@@ -173,9 +173,9 @@ def opened(path: Path) -> pm.PrototypeMap:
     return scene
 
 
-def scene(landmarks: int, look_bits: int, rng: np.random.Generator) -> pm.PrototypeMap:
+def scene(landmarks: int, appearance_bits: int, rng: np.random.Generator) -> pm.PrototypeMap:
     encoder = pm.Encoder.load("freak")
-    result = pm.PrototypeMap(encoder, dim=16, look_bits=look_bits)
+    result = pm.PrototypeMap(encoder, dim=16, appearance_bits=appearance_bits)
     for begin in range(0, landmarks, 1 << 20):
         ids = 3 * np.arange(begin, min(landmarks, begin + (1 << 20)))
         for _ in range(2):
@@ -191,8 +191,8 @@ def cases(large: int, seed: int) -> list[Case]:
     if large:
         maps = [scene(large + i, 0, rng) for i in range(3)]
         return [
-            Case(f"open map, {large} landmarks", [m.save for m in maps]),
-            Case(f"sealed map, {large} landmarks", [partial(m.seal, bits=4) for m in maps]),
+            Case(f"learning map, {large} landmarks", [m.save for m in maps]),
+            Case(f"sealed map, {large} landmarks", [partial(m.seal, bytes_per_landmark=9) for m in maps]),
         ]
     small = [scene(100 + i, 0, rng) for i in range(3)]
     middle = [scene(20_000 + i, 4, rng) for i in range(3)]
@@ -200,15 +200,15 @@ def cases(large: int, seed: int) -> list[Case]:
     described = [replace(tracks, info={"state": i}) for i in range(3)]
     encoders = [pm.Encoder.load(name) for name in ("freak", "orb", "brisk")]
     return [
-        Case("open map, 100 landmarks", [m.save for m in small]),
-        Case("open map, 20,000 landmarks with looks", [m.save for m in middle]),
+        Case("learning map, 100 landmarks", [m.save for m in small]),
+        Case("learning map, 20,000 landmarks with appearances", [m.save for m in middle]),
         Case("sealed map, 100 landmarks", [m.seal for m in small]),
         Case(
-            "sealed map, 20,000 landmarks, 4 bits, looks joined",
-            [partial(m.seal, bits=4, prototypes=1.5) for m in middle],
+            "sealed map, 20,000 landmarks, 4 bits, appearances merged",
+            [partial(m.seal, bytes_per_landmark=1.5 * 8 + 2) for m in middle],
         ),
         Journal("journal, map of 100 landmarks", scene(100, 0, rng), seed),
-        Journal("journal, map of 20,000 landmarks with looks", scene(20_000, 4, rng), seed),
+        Journal("journal, map of 20,000 landmarks with appearances", scene(20_000, 4, rng), seed),
         Case("encoder", [e.save for e in encoders]),
         Case("tracks", [t.save for t in described], tracks=True),
     ]

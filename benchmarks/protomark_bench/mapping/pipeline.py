@@ -205,7 +205,7 @@ def _different(one: pm.PrototypeMap, other: pm.PrototypeMap) -> int:
     """Landmarks that only one map has, or whose count or prototype differs."""
     both = np.intersect1d(one.ids, other.ids)
     off = one.counts(both) != other.counts(both)
-    off |= (one.prototype(both) != other.prototype(both)).any(axis=1)
+    off |= (one.prototypes(both) != other.prototypes(both)).any(axis=1)
     return int(off.sum()) + len(one) + len(other) - 2 * len(both)
 
 

@@ -220,12 +220,12 @@ def _inverted_lists(bench: Bench, rows: NDArray[np.int8], asked: IndexQueries) -
     scene = map_of(bench.workload.encoder, rows)
     plain = _sealed_bytes(scene)
     scene.build_index(threads=asked.build_threads)
-    nlist = scene.index_cells
+    nlist = scene.nlist
 
     def prepare(nprobe: int) -> Search:
         def run(q: int) -> NDArray[np.int64]:
             codes = asked.codes[:q]
-            return scene.search_codes(codes, k=K, threads=asked.threads, probes=nprobe)[0][:, 0]
+            return scene.search_codes(codes, k=K, threads=asked.threads, nprobe=nprobe)[0][:, 0]
 
         return run
 

@@ -96,9 +96,7 @@ SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_
   const std::size_t smallest = sealed_bytes(1, 1, dim, 4);
   if (!(*bytes_per_landmark >= static_cast<double>(smallest))) {
     throw std::invalid_argument("bytes_per_landmark must be at least " + std::to_string(smallest) +
-                                " for this map, which one prototype of 4 bits per number takes, "
-                                "not " +
-                                std::to_string(*bytes_per_landmark));
+                                " for this map, which one prototype of 4 bits per number takes");
   }
   // What a product of doubles loses must not cost a prototype.
   const double budget = *bytes_per_landmark * static_cast<double>(n) * (1 + 1e-12);

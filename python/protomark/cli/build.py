@@ -33,7 +33,7 @@ def build(
             "example 33. By default nothing is lost.",
         ),
     ] = None,
-    look_bits: Annotated[
+    appearance_bits: Annotated[
         int,
         typer.Option(
             min=0,
@@ -104,7 +104,7 @@ def build(
         Encoder.load(encoder or observed.descriptor),
         dim,
         min_observations=min_observations,
-        look_bits=look_bits,
+        appearance_bits=appearance_bits,
         threads=threads,
     )
     scene.metadata = texts

@@ -246,7 +246,7 @@ def _write_maps(
     dim = APPEARANCE_DIMS[_SIZE]
     several = dim in encoder.dims
     if several:
-        scene = pm.PrototypeMap(encoder, dim=dim, look_bits=APPEARANCE_BITS)
+        scene = pm.PrototypeMap(encoder, dim=dim, appearance_bits=APPEARANCE_BITS)
     else:
         scene = pm.PrototypeMap(encoder)
     scene.add(tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows])

@@ -63,7 +63,7 @@ class Memory(ABC):
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """The two nearest landmarks of each descriptor, exactly: ids and distances (q, 2).
 
-        Where there is none, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
+        Without one, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
 
         Args:
             encoded: (q, width).
@@ -128,19 +128,19 @@ class Prototypes(Memory):
     def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
         """See `Memory.subtract`; a landmark halved at 255 observations may keep its share."""
         try:
-            self.map.remove_codes(ids, encoded)
+            self.map.subtract_codes(ids, encoded)
         except ValueError:
             for i in range(len(ids)):
                 with contextlib.suppress(ValueError):
-                    self.map.remove_codes(ids[i : i + 1], encoded[i : i + 1])
+                    self.map.subtract_codes(ids[i : i + 1], encoded[i : i + 1])
 
     def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
         """See `Memory.merge_landmarks`."""
-        self.map.merge(into, source)
+        self.map.merge_landmarks(into, source)
 
     def remove(self, ids: NDArray[np.int64]) -> None:
         """See `Memory.remove`."""
-        self.map.discard(ids)
+        self.map.remove(ids)
 
     def search(
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
@@ -191,7 +191,7 @@ class Prototypes(Memory):
 
     def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
         """Prototypes as search compares them: to integers, halves away from zero."""
-        means = self.map.prototype(ids)
+        means = self.map.prototypes(ids)
         return np.sign(means) * np.floor(np.abs(means) + np.float32(0.5))
 
     @property

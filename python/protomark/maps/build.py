@@ -15,7 +15,7 @@ def build_map(
     dim: int | None = None,
     *,
     min_observations: int = 2,
-    look_bits: int = 0,
+    appearance_bits: int = 0,
     threads: int = 1,
 ) -> PrototypeMap:
     """A learning map with the prototypes and the position of every landmark of `tracks`.
@@ -25,13 +25,13 @@ def build_map(
         encoder: an encoder for their descriptor, or for its upright form.
         dim: dimensions of a prototype, one of `encoder.dims`; None: all.
         min_observations: landmarks with fewer are left out.
-        look_bits: signs of a code that tell the appearances of a landmark apart; 0: each landmark
-            has one prototype.
+        appearance_bits: signs of a code that tell the appearances of a landmark apart; 0: each
+            landmark has one prototype.
         threads: threads to encode on.
 
     Raises:
         ValueError: the encoder is for another descriptor, no landmark is left, or `dim` or
-            `look_bits` do not fit the encoder.
+            `appearance_bits` do not fit the encoder.
     """
     tracks = tracks_for(encoder, tracks)
     rows = tracks.observations
@@ -42,7 +42,7 @@ def build_map(
         raise ValueError(
             f"no landmark has {min_observations} observations: there is no map to build"
         )
-    scene = PrototypeMap(encoder, dim, look_bits)
+    scene = PrototypeMap(encoder, dim, appearance_bits)
     scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
     ids = ids[counts >= min_observations]
     scene.set_positions(ids, tracks.positions_of(ids))

@@ -85,13 +85,13 @@ def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
 
 def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]) -> float | None:
     """Bytes per landmark of a sealed map's index, with the rows that pad its blocks."""
-    if not isinstance(scene, pm.SealedMap) or scene.index_cells == 0:
+    if not isinstance(scene, pm.SealedMap) or scene.nlist == 0:
         return None
     width = {8: 4, 4: 8}[scene.code_bits]  # dimensions in 4 bytes
     blocks = -(-scene.prototype_count // 16)
     packed = blocks * 16 * -(-scene.dim // width) * 4
     sections_bytes = sum(
-        sections.get(name, 0) for name in ("cells", "cellrows", "order", "ordersum", "probes")
+        sections.get(name, 0) for name in ("centroid", "listrows", "owners", "ownercrc", "recall")
     )
     return (sections_bytes + sections["protos"] - packed) / max(1, len(scene))
 
@@ -101,19 +101,19 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     summary = scene.summary()
     sealed = scene if isinstance(scene, pm.SealedMap) else None
     landmarks = max(1, len(scene))
-    ids = sum(sections.get(name, 0) for name in ("ids", "idblocks", "idrests")) / landmarks
+    ids = sum(sections.get(name, 0) for name in ("ids", "idblocks", "idgaps")) / landmarks
     error = None if sealed is None else sealed.position_error
-    look_bits = scene.look_bits if isinstance(scene, pm.PrototypeMap) else 0
-    several = look_bits > 0 or scene.prototype_count != len(scene)
+    appearance_bits = scene.appearance_bits if isinstance(scene, pm.PrototypeMap) else 0
+    several = appearance_bits > 0 or scene.prototype_count != len(scene)
     return {
         "kind": "learning map" if sealed is None else "sealed map",
         "landmarks": len(scene),
         "prototypes": scene.prototype_count if several else None,
         "prototypes_per_landmark": scene.prototype_count / landmarks if several else None,
-        "look_bits": look_bits or None,
+        "appearance_bits": appearance_bits or None,
         "dim": scene.dim,
         "code_bits": None if sealed is None else sealed.code_bits,
-        "index_cells": scene.index_cells or None,
+        "nlist": scene.nlist or None,
         "index_bytes_per_landmark": _index_bytes(scene, sections),
         "observations": summary["observations"],
         "count_histogram": np.trim_zeros(summary["count_histogram"], "b").tolist(),

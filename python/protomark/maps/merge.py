@@ -43,7 +43,7 @@ def merge_files(
                 if renumber:
                     _merge_renumbered(merged, scene)
                 else:
-                    merged.update(scene)
+                    merged.merge_map(scene)
             except ValueError as error:
                 raise ValueError(f"{path}: {error}") from None
             facts["in_common"] = before + len(scene) - len(merged)
@@ -55,7 +55,7 @@ def merge_files(
         "inputs": files,
         "landmarks": len(merged),
         "dim": merged.dim,
-        "look_bits": merged.look_bits or None,
+        "appearance_bits": merged.appearance_bits or None,
         "bytes": output.stat().st_size,
     }
 
@@ -88,9 +88,9 @@ def open_learning_map(path: Path) -> pm.PrototypeMap:
 def _merge_renumbered(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
     theirs, existing = scene.ids, merged.ids
     if not (len(theirs) and len(existing)):
-        merged.update(scene)
+        merged.merge_map(scene)
         return
     first = int(existing[-1]) + 1
     if int(theirs[-1]) > MAX_ID - first:
         raise ValueError(f"landmark ids from {first} on leave no room for those up to {theirs[-1]}")
-    merged.update(scene, into=theirs + first, source=theirs)
+    merged.merge_map(scene, into=theirs + first, source=theirs)

@@ -79,11 +79,11 @@ def _by_id(
             raise ValueError(f"--parts {parts}: a map of {len(ids)} landmarks has 1 to {len(ids)}")
         boundaries = ids[np.arange(1, parts) * len(ids) // parts].tolist()
     width = len(str(len(boundaries)))
-    return [(f"{i:0{width}}", part) for i, part in enumerate(scene.split(boundaries))]
+    return [(f"{i:0{width}}", part) for i, part in enumerate(scene.split_by_id(boundaries))]
 
 
 def _by_space(scene: pm.PrototypeMap, cell_size: float) -> list[tuple[str, pm.PrototypeMap]]:
     return [
         ("nowhere" if cell is None else "_".join(map(str, cell)), part)
-        for cell, part in scene.split(cell_size=cell_size).items()
+        for cell, part in scene.split_by_space(cell_size).items()
     ]

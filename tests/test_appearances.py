@@ -1,4 +1,4 @@
-"""Several prototypes of a landmark: exact under any history, searched exactly, sealed by Ward."""
+"""Several prototypes per landmark: exact under any history, searched exactly, merged by cost."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from conftest import NO_DISTANCE, balanced_encoder, random_descriptors, rounded
-from map_container import OPEN_MAP, container, sections
+from map_container import LEARNING_MAP, container, sections
+from sealing import best_scale, four_bits, quantized
 
 Key = tuple[int, int]
 
 
-def looks_of(codes: NDArray[np.int8], bits: int) -> list[int]:
+def appearances_of(codes: NDArray[np.int8], bits: int) -> list[int]:
     return [sum(int(code[j] > 0) << j for j in range(bits)) for code in codes]
 
 
 class Reference:
-    """A sum and a count for each look of each landmark, halved at 255."""
+    """A sum and a count for each appearance of each landmark, halved at 255."""
 
     def __init__(self, bits: int) -> None:
         self.bits = bits
@@ -40,24 +41,27 @@ class Reference:
                 total, n = np.trunc(total / 2).astype(np.int64), 127
             self.rows[key] = total + code, n + 1
 
-    def remove(self, ids: Any, codes: NDArray[np.int8]) -> None:
+    def subtract(self, ids: Any, codes: NDArray[np.int8]) -> None:
         for key, code in zip(self.keys(ids, codes), codes.astype(np.int64), strict=True):
             total, n = self.rows.pop(key)
             if n > 1:
                 self.rows[key] = total - code, n - 1
 
-    def merge(self, into: int, source: int) -> None:
-        for _, look in self.of(source):
-            total, n = self.rows.pop((source, look))
-            old, m = self.rows.get((into, look), (0 * total, 0))
-            self.rows[into, look] = total + old, n + m
+    def merge_landmarks(self, into: int, source: int) -> None:
+        for _, appearance in self.of(source):
+            total, n = self.rows.pop((source, appearance))
+            old, m = self.rows.get((into, appearance), (0 * total, 0))
+            self.rows[into, appearance] = total + old, n + m
 
-    def discard(self, landmark: int) -> None:
+    def remove(self, landmark: int) -> None:
         for key in self.of(landmark):
             del self.rows[key]
 
     def keys(self, ids: Any, codes: NDArray[np.int8]) -> list[Key]:
-        return [(int(i), look) for i, look in zip(ids, looks_of(codes, self.bits), strict=True)]
+        return [
+            (int(i), appearance)
+            for i, appearance in zip(ids, appearances_of(codes, self.bits), strict=True)
+        ]
 
     def of(self, landmark: int) -> list[Key]:
         return sorted(key for key in self.rows if key[0] == landmark)
@@ -76,11 +80,11 @@ def assert_equals(scene: pm.PrototypeMap, reference: Reference) -> None:
     np.testing.assert_array_equal(scene.ids, ids)
     for i in ids:
         rows = [reference.rows[key] for key in reference.of(i)]
-        np.testing.assert_array_equal(scene.looks(i), reference.means(i).astype(np.float32))
-        np.testing.assert_array_equal(scene.look_counts(i), [n for _, n in rows])
+        np.testing.assert_array_equal(scene.appearances(i), reference.means(i).astype(np.float32))
+        np.testing.assert_array_equal(scene.appearance_counts(i), [n for _, n in rows])
         total, n = sum(s for s, _ in rows), sum(n for _, n in rows)
         assert scene.counts([i]) == [n]
-        np.testing.assert_array_equal(scene.prototype([i])[0], (total / n).astype(np.float32))
+        np.testing.assert_array_equal(scene.prototypes([i])[0], (total / n).astype(np.float32))
 
 
 def file_bytes(scene: pm.PrototypeMap, folder: Path) -> bytes:
@@ -91,23 +95,23 @@ def file_bytes(scene: pm.PrototypeMap, folder: Path) -> bytes:
 @pytest.fixture(scope="module")
 def encoder() -> pm.Encoder:
     made = balanced_encoder()
-    assert len(set(looks_of(made.encode(random_descriptors(31)), 12))) == 31
+    assert len(set(appearances_of(made.encode(random_descriptors(31)), 12))) == 31
     return made
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("looks")
+    return tmp_path_factory.mktemp("appearances")
 
 
 observations = st.lists(st.tuples(st.integers(0, 12), st.integers(0, 30)), max_size=80)
-look_bits = st.sampled_from([1, 2, 5, 12])
+appearance_bits = st.sampled_from([1, 2, 5, 12])
 
 
 @settings(max_examples=60, deadline=None)
 @given(
     observed=observations,
-    bits=look_bits,
+    bits=appearance_bits,
     order=st.randoms(),
     cuts=st.lists(st.integers(0, 80), max_size=4),
 )
@@ -122,42 +126,42 @@ def test_any_order_and_any_batches_give_the_same_bytes(
     pool = random_descriptors(31)
     ids = np.array([i for i, _ in observed], np.int64)
     descriptors = pool[[d for _, d in observed]]
-    at_once = pm.PrototypeMap(encoder, look_bits=bits)
+    at_once = pm.PrototypeMap(encoder, appearance_bits=bits)
     at_once.add(ids, descriptors, threads=2)
     reference = Reference(bits)
     reference.add(ids, encoder.encode(descriptors))
-    assert at_once.look_bits == bits
+    assert at_once.appearance_bits == bits
     assert_equals(at_once, reference)
 
     rows = list(range(len(ids)))
     order.shuffle(rows)
-    piecewise = pm.PrototypeMap(encoder, look_bits=bits)
+    piecewise = pm.PrototypeMap(encoder, appearance_bits=bits)
     for part in np.split(np.array(rows, np.int64), sorted(c for c in cuts if c < len(rows))):
         piecewise.add(ids[part], descriptors[part])
     assert file_bytes(piecewise, folder) == file_bytes(at_once, folder)
 
-    # Built in two places and joined.
-    here, there = (pm.PrototypeMap(encoder, look_bits=bits) for _ in range(2))
+    # Built in two places and merged.
+    here, there = (pm.PrototypeMap(encoder, appearance_bits=bits) for _ in range(2))
     here.add(ids[::2], descriptors[::2])
     there.add(ids[1::2], descriptors[1::2])
-    here.update(there)
+    here.merge_map(there)
     assert file_bytes(here, folder) == file_bytes(at_once, folder)
 
     read = pm.open(folder / "scene.pmk")
     assert isinstance(read, pm.PrototypeMap)
-    assert read.look_bits == bits
+    assert read.appearance_bits == bits
     assert_equals(read, reference)
 
 
 @settings(max_examples=60, deadline=None)
-@given(bits=look_bits, steps=st.lists(st.tuples(st.sampled_from("aaardm"), observations)))
+@given(bits=appearance_bits, steps=st.lists(st.tuples(st.sampled_from("aaardm"), observations)))
 def test_any_history_of_changes(
     bits: int, steps: list[tuple[str, list[tuple[int, int]]]], encoder: pm.Encoder, folder: Path
 ) -> None:
     """Rows and landmarks come and go; in the end the map is as if built from what is left."""
     pool = random_descriptors(31)
     codes = encoder.encode(pool)
-    scene, reference = pm.PrototypeMap(encoder, look_bits=bits), Reference(bits)
+    scene, reference = pm.PrototypeMap(encoder, appearance_bits=bits), Reference(bits)
     there: list[tuple[int, int]] = []
     for kind, observed in steps:
         if kind == "a":
@@ -167,48 +171,48 @@ def test_any_history_of_changes(
             there += observed
         elif kind == "r":
             gone, there = there[::2], there[1::2]
-            scene.remove([i for i, _ in gone], pool[[d for _, d in gone]])
-            reference.remove([i for i, _ in gone], codes[[d for _, d in gone]])
+            scene.subtract([i for i, _ in gone], pool[[d for _, d in gone]])
+            reference.subtract([i for i, _ in gone], codes[[d for _, d in gone]])
         elif kind == "d":
             known = reference.ids()[: len(observed)]
-            scene.discard(known)
+            scene.remove(known)
             for i in known:
-                reference.discard(i)
+                reference.remove(i)
             there = [(i, d) for i, d in there if i not in known]
         else:
             pairs = list(zip(reference.ids()[::2], reference.ids()[1::2], strict=False))
-            scene.merge([a for a, _ in pairs], [b for _, b in pairs])
+            scene.merge_landmarks([a for a, _ in pairs], [b for _, b in pairs])
             for a, b in pairs:
-                reference.merge(a, b)
+                reference.merge_landmarks(a, b)
             new_id = {b: a for a, b in pairs}
             there = [(new_id.get(i, i), d) for i, d in there]
-        # Nothing is halved with so few observations of one look.
+        # Nothing is halved with so few observations of one appearance.
         assert all(n < 255 for _, n in reference.rows.values())
         assert_equals(scene, reference)
-    fresh = pm.PrototypeMap(encoder, look_bits=bits)
+    fresh = pm.PrototypeMap(encoder, appearance_bits=bits)
     fresh.add([i for i, _ in there], pool[[d for _, d in there]])
     assert file_bytes(scene, folder) == file_bytes(fresh, folder)
 
 
-def test_each_look_is_halved_at_255(encoder: pm.Encoder) -> None:
+def test_each_appearance_is_halved_at_255(encoder: pm.Encoder) -> None:
     rng = np.random.default_rng(0)
     codes = rng.integers(-127, 128, (900, 12)).astype(np.int8)
     ids = np.full(900, 3)
-    scene, reference = pm.PrototypeMap(encoder, look_bits=1), Reference(1)
+    scene, reference = pm.PrototypeMap(encoder, appearance_bits=1), Reference(1)
     for begin in range(0, 900, 50):
         scene.add_codes(ids[begin : begin + 50], codes[begin : begin + 50])
         reference.add(ids[begin : begin + 50], codes[begin : begin + 50])
         assert_equals(scene, reference)
-    assert scene.look_counts(3).dtype == np.uint8
+    assert scene.appearance_counts(3).dtype == np.uint32
     assert scene.counts([3]).dtype == np.uint32
     assert scene.counts([3])[0] > 255
-    other = pm.PrototypeMap(encoder, look_bits=1)
+    other = pm.PrototypeMap(encoder, appearance_bits=1)
     other.add_codes([4] * 200, np.full((200, 12), 7, np.int8))
-    before = scene.look_counts(3)
-    scene.update(other)
-    scene.merge(3, 4)
+    before = scene.appearance_counts(3)
+    scene.merge_map(other)
+    scene.merge_landmarks(3, 4)
     n = int(before[1]) + 200
-    np.testing.assert_array_equal(scene.look_counts(3), [before[0], n // 2 if n > 255 else n])
+    np.testing.assert_array_equal(scene.appearance_counts(3), [before[0], n // 2 if n > 255 else n])
 
 
 def expected_answers(
@@ -231,7 +235,7 @@ def assert_search(
     scene: pm.PrototypeMap | pm.SealedMap, queries: NDArray[np.int8], **options: Any
 ) -> None:
     ids, distances = scene.search_codes(queries, threads=2, **options)
-    landmarks = {int(i): rounded(scene.looks(i)) for i in scene.ids}
+    landmarks = {int(i): rounded(scene.appearances(i)) for i in scene.ids}
     options = {"k": 2, "max_distance": None, "ratio": None} | options
     for q, query in enumerate(queries.astype(np.int64)):
         best = expected_answers(landmarks, query, **options)
@@ -243,7 +247,7 @@ def assert_search(
 @given(
     n=st.integers(0, 90),
     landmarks=st.integers(1, 30),
-    bits=look_bits,
+    bits=appearance_bits,
     values=st.integers(1, 127),
     k=st.integers(1, 4),
     max_distance=st.none() | st.integers(0, 90_000),
@@ -263,53 +267,54 @@ def test_search_equals_sorting(
     folder: Path,
 ) -> None:
     rng = np.random.default_rng(seed)
-    scene = pm.PrototypeMap(encoder, look_bits=bits)
+    scene = pm.PrototypeMap(encoder, appearance_bits=bits)
     ids = rng.integers(0, landmarks, n) * 3
     scene.add_codes(ids, rng.integers(-values, values + 1, (n, 12)).astype(np.int8))
-    scene.discard(scene.ids[:3])
+    scene.remove(scene.ids[:3])
     queries = rng.integers(-values, values + 1, (9, 12)).astype(np.int8)
     options = {"k": k, "max_distance": max_distance, "ratio": ratio}
     assert_search(scene, queries, **options)
     sealed = scene.seal(folder / "s.pmk")
     assert sealed.prototype_count == scene.prototype_count
     for i in scene.ids:
-        np.testing.assert_array_equal(sealed.looks(i), rounded(scene.looks(i)))
+        np.testing.assert_array_equal(sealed.appearances(i), rounded(scene.appearances(i)))
     for a, b in zip(
         sealed.search_codes(queries, **options),
         scene.search_codes(queries, **options),
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
-    assert_search(scene.seal(folder / "s.pmk", bits=4, prototypes=1.5), queries, **options)
+    fewer = scene.seal(folder / "s.pmk", bytes_per_landmark=four_bits(scene, 1.5))
+    assert_search(fewer, queries, **options)
 
 
 def test_search_across_chunks(encoder: pm.Encoder, folder: Path) -> None:
     """A map larger than the chunks that the search works in, landmarks across their borders."""
     rng = np.random.default_rng(0)
-    scene = pm.PrototypeMap(encoder, look_bits=6)
+    scene = pm.PrototypeMap(encoder, appearance_bits=6)
     codes = rng.integers(-127, 128, (6000, 12)).astype(np.int8)
     scene.add_codes(rng.integers(0, 700, 6000), codes)
     queries = rng.integers(-127, 128, (40, 12)).astype(np.int8)
     assert scene.prototype_count > 3000
     assert_search(scene, queries, k=3)
-    for bits in (8, 4):
-        scene.seal(folder / "large.pmk", bits=bits, prototypes=4.3)
+    for size, kept in ((None, scene.prototype_count), (four_bits(scene, 4.3), 700 * 43 // 10)):
+        scene.seal(folder / "large.pmk", bytes_per_landmark=size)
         sealed = pm.open(folder / "large.pmk")
-        assert f"{700 * 43 // 10} prototypes" in repr(sealed)
+        assert f"{kept} prototypes" in repr(sealed)
         assert_search(sealed, queries, k=3)
-        means = np.array([sealed.looks(i).mean(axis=0) for i in range(700)])
-        np.testing.assert_allclose(sealed.prototype(range(700)), means, rtol=1e-6, atol=1e-6)
+        means = np.array([sealed.appearances(i).mean(axis=0) for i in range(700)])
+        np.testing.assert_allclose(sealed.prototypes(range(700)), means, rtol=1e-6, atol=1e-6)
 
 
-def ward_rows(reference: Reference, most: int) -> dict[int, list[tuple[NDArray[np.int64], int]]]:
-    """Plain greedy joining over the whole map, every pair compared at every step."""
+def merged_rows(reference: Reference, limit: int) -> dict[int, list[tuple[NDArray[np.int64], int]]]:
+    """Plain greedy merging over the whole map, every pair compared at every step."""
     rows = {i: [reference.rows[key] for key in reference.of(i)] for i in reference.ids()}
 
     def cost(a: tuple[NDArray[np.int64], int], b: tuple[NDArray[np.int64], int]) -> float:
         (s, n), (t, m) = a, b
         return int(((m * s - n * t) ** 2).sum()) / (n * m * (n + m))
 
-    while sum(map(len, rows.values())) > most:
+    while sum(map(len, rows.values())) > limit:
         pairs = [
             (cost(own[a], own[b]), i, a, b)
             for i, own in rows.items()
@@ -331,7 +336,7 @@ def ward_rows(reference: Reference, most: int) -> dict[int, list[tuple[NDArray[n
     values=st.sampled_from([1, 2, 127]),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_sealing_equals_plain_ward(
+def test_sealing_equals_plain_merging(
     observed: list[tuple[int, int]],
     bits: int,
     prototypes: float,
@@ -343,109 +348,115 @@ def test_sealing_equals_plain_ward(
     """Small values make many costs equal, so that the order of rows decides."""
     pool = np.random.default_rng(seed).integers(-values, values + 1, (31, 12)).astype(np.int8)
     ids, rows = [i for i, _ in observed], [d for _, d in observed]
-    scene, reference = pm.PrototypeMap(encoder, look_bits=bits), Reference(bits)
+    scene, reference = pm.PrototypeMap(encoder, appearance_bits=bits), Reference(bits)
     scene.add_codes(ids, pool[rows])
     reference.add(ids, pool[rows])
-    sealed = scene.seal(folder / "w.pmk", prototypes=prototypes)
+    size = four_bits(scene, prototypes)
+    sealed = scene.seal(folder / "w.pmk", bytes_per_landmark=size)
     pm.verify_file(folder / "w.pmk")
     known = reference.ids()
-    expected = ward_rows(reference, int(prototypes * len(known)))
+    n, m = len(known), len(reference.rows)
+    # 12 numbers take 12 bytes or, of 4 bits, 8.
+    lossless = 12 * m + (2 if m > n else 1) * n <= size * n
+    assert sealed.code_bits == (8 if lossless else 4)
+    expected = merged_rows(reference, m if lossless else int(prototypes * n))
     np.testing.assert_array_equal(sealed.ids, known)
     assert sealed.prototype_count == sum(map(len, expected.values()))
-    assert sealed.prototype_count <= max(prototypes * len(known), len(known))
+    means = {i: rounded(np.array([s / c for s, c in expected[i]])) for i in known}
+    scale = best_scale(np.concatenate(list(means.values()))) if not lossless else 0
     for i in known:
-        means = [rounded(s / n) for s, n in expected[i]]
-        np.testing.assert_array_equal(sealed.looks(i), means)
-        assert sealed.counts([i])[0] == sum(n for _, n in expected[i])
+        exact = means[i] if lossless else quantized(means[i], scale)
+        np.testing.assert_array_equal(sealed.appearances(i), exact)
+        assert sealed.counts([i])[0] == sum(c for _, c in expected[i])
 
 
-def test_bytes_a_landmark(encoder: pm.Encoder, tmp_path: Path) -> None:
+def test_bytes_per_landmark(encoder: pm.Encoder, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
-    scene = pm.PrototypeMap(encoder, look_bits=8)
+    scene = pm.PrototypeMap(encoder, appearance_bits=8)
     codes = rng.integers(-127, 128, (8000, 12)).astype(np.int8)
     scene.add_codes(np.arange(8000) % 1600, codes)
     path = tmp_path / "s.pmk"
-    # Sealed to one prototype a landmark, the file is one without looks.
-    scene.seal(path, prototypes=1)
+    # Sealed to one prototype per landmark, the file is one without appearances.
+    scene.seal(path, bytes_per_landmark=9)
     sizes = dict(pm.file_sections(path))
-    assert set(sizes) == {"encoder", "shape", "counts", "protos"}
+    assert set(sizes) == {"encoder", "shape", "counts", "sq4scale", "protos"}
     plain = pm.PrototypeMap(encoder)
     plain.add_codes(np.arange(8000) % 1600, codes)
-    plain.seal(tmp_path / "plain.pmk")
+    plain.seal(tmp_path / "plain.pmk", bytes_per_landmark=9)
     assert path.read_bytes() == (tmp_path / "plain.pmk").read_bytes()
 
-    sealed = scene.seal(path, prototypes=2)
+    sealed = scene.seal(path, bytes_per_landmark=2 * 8 + 2)
     sizes = dict(pm.file_sections(path))
-    assert set(sizes) == {"encoder", "shape", "counts", "rows", "protos"}
+    assert set(sizes) == {"encoder", "shape", "counts", "rows", "sq4scale", "protos"}
     assert sealed.prototype_count == 3200
-    assert sizes["counts"] + sizes["rows"] + sizes["protos"] == 1600 * (2 * 12 + 2)
-    assert path.read_bytes()[8:12] == (2).to_bytes(4, "little")
+    assert sizes["counts"] + sizes["rows"] + sizes["protos"] == 1600 * (2 * 8 + 2)
 
 
-def test_a_landmark_with_very_many_looks(encoder: pm.Encoder, tmp_path: Path) -> None:
+def test_a_landmark_with_very_many_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
     """A sealed landmark has at most 255 prototypes, and a count of at most 255."""
     rng = np.random.default_rng(3)
-    scene = pm.PrototypeMap(encoder, look_bits=12)
+    scene = pm.PrototypeMap(encoder, appearance_bits=12)
     scene.add_codes([5] * 900 + [6], rng.integers(-127, 128, (901, 12)).astype(np.int8))
     rows = scene.prototype_count
-    assert len(scene.looks(5)) == rows - 1 > 300
+    assert len(scene.appearances(5)) == rows - 1 > 300
     assert scene.counts([5, 6]).tolist() == [900, 1]
-    for prototypes in (None, 1e9, 300.0):
-        sealed = scene.seal(tmp_path / "s.pmk", prototypes=prototypes)
-        assert (len(sealed.looks(5)), sealed.prototype_count) == (255, 256)
+    for size in (None, 1e9, 12 * 128 + 2, 12 * 128 + 1, 8 * 128 + 2):
+        sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
+        assert (len(sealed.appearances(5)), sealed.prototype_count) == (255, 256)
+        assert sealed.code_bits == (4 if size in (12 * 128 + 1, 8 * 128 + 2) else 8)
         assert sealed.counts([5, 6]).tolist() == [255, 1]
-    sealed = scene.seal(tmp_path / "s.pmk", prototypes=50)
-    assert (len(sealed.looks(5)), len(sealed.looks(6))) == (99, 1)
+    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=8 * 50 + 2)
+    assert (len(sealed.appearances(5)), len(sealed.appearances(6))) == (99, 1)
 
 
-def test_maps_without_looks_are_as_ever(encoder: pm.Encoder, tmp_path: Path) -> None:
+def test_maps_without_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
     descriptors, ids = random_descriptors(300), np.arange(300) % 40
-    scene = pm.PrototypeMap(encoder, look_bits=0)
+    scene = pm.PrototypeMap(encoder, appearance_bits=0)
     scene.add(ids, descriptors)
     data = file_bytes(scene, tmp_path)
     assert data[8:12] == (1).to_bytes(4, "little")
-    assert [name for name, _ in sections(data)] == ["encoder", "shape", "ids", "counts", "sums"]
-    assert scene.counts([0]).dtype == np.uint8
+    assert {name for name, _ in sections(data)} == {"encoder", "shape", "ids", "counts", "sums"}
+    assert scene.counts([0]).dtype == np.uint32
     assert scene.prototype_count == len(scene) == 40
-    assert scene.look_bits == 0
-    np.testing.assert_array_equal(scene.looks(3), scene.prototype([3]))
-    np.testing.assert_array_equal(scene.look_counts(3), scene.counts([3]))
-    scene.seal(tmp_path / "a.pmk", prototypes=1)
-    scene.seal(tmp_path / "b.pmk")
-    assert (tmp_path / "a.pmk").read_bytes() == (tmp_path / "b.pmk").read_bytes()
+    assert scene.appearance_bits == 0
+    np.testing.assert_array_equal(scene.appearances(3), scene.prototypes([3]))
+    np.testing.assert_array_equal(scene.appearance_counts(3), scene.counts([3]))
 
 
 def test_wrong_calls_change_nothing(encoder: pm.Encoder, tmp_path: Path) -> None:
-    scene = pm.PrototypeMap(encoder, look_bits=12)
+    scene = pm.PrototypeMap(encoder, appearance_bits=12)
     codes = np.array([[5] * 12, [5] * 12, [-5] * 12], np.int8)
     scene.add_codes([1, 2, 2], codes)
     before = file_bytes(scene, tmp_path)
     calls: list[tuple[type[Exception], str, Any]] = [
-        (ValueError, "look_bits must be 0 to 12, not 13", lambda: pm.PrototypeMap(encoder, 12, 13)),
-        (ValueError, "look_bits must be 0 to 5, not 6", lambda: pm.PrototypeMap(encoder, 5, 6)),
-        (ValueError, "were never added", lambda: scene.remove_codes([2, 1], codes[1:])),
         (
             ValueError,
-            "1 observations of one look, 2",
-            lambda: scene.remove_codes([2, 2], codes[:2]),
-        ),
-        (KeyError, "landmark 9 is not", lambda: scene.remove_codes([1, 9], codes[:2])),
-        (KeyError, "landmark 9 is not in the map", lambda: scene.looks(9)),
-        (KeyError, "landmark 9 is not in the map", lambda: scene.look_counts(9)),
-        (
-            ValueError,
-            "maps of 12 and 3 look bits",
-            lambda: scene.update(pm.PrototypeMap(encoder, look_bits=3)),
+            "appearance_bits must be 0 to 12, not 13",
+            lambda: pm.PrototypeMap(encoder, 12, 13),
         ),
         (
             ValueError,
-            "at least 1 prototype a landmark, not 0.9",
-            lambda: scene.seal(tmp_path / "s.pmk", prototypes=0.9),
+            "appearance_bits must be 0 to 5, not 6",
+            lambda: pm.PrototypeMap(encoder, 5, 6),
+        ),
+        (ValueError, "were never added", lambda: scene.subtract_codes([2, 1], codes[1:])),
+        (
+            ValueError,
+            "1 observations of one appearance, 2",
+            lambda: scene.subtract_codes([2, 2], codes[:2]),
+        ),
+        (KeyError, "landmark 9 is not", lambda: scene.subtract_codes([1, 9], codes[:2])),
+        (KeyError, "landmark 9 is not in the map", lambda: scene.appearances(9)),
+        (KeyError, "landmark 9 is not in the map", lambda: scene.appearance_counts(9)),
+        (
+            ValueError,
+            "maps of 12 and 3 appearance bits",
+            lambda: scene.merge_map(pm.PrototypeMap(encoder, appearance_bits=3)),
         ),
         (
             ValueError,
-            "at least 1 prototype a landmark, not nan",
-            lambda: scene.seal(tmp_path / "s.pmk", prototypes=float("nan")),
+            "bytes_per_landmark must be at least 9 for this map",
+            lambda: scene.seal(tmp_path / "s.pmk", bytes_per_landmark=8.9),
         ),
     ]
     for error, message, call in calls:
@@ -456,13 +467,13 @@ def test_wrong_calls_change_nothing(encoder: pm.Encoder, tmp_path: Path) -> None
 
 
 def test_positions_are_the_landmarks(encoder: pm.Encoder, tmp_path: Path) -> None:
-    scene = pm.PrototypeMap(encoder, look_bits=12)
+    scene = pm.PrototypeMap(encoder, appearance_bits=12)
     scene.add(np.arange(60) % 6, random_descriptors(60))
     scene.set_positions([4, 5], np.array([[1.0, 2, 3], [4, 5, 6]]))
-    scene.merge(1, 5)
-    scene.discard([0])
+    scene.merge_landmarks(1, 5)
+    scene.remove([0])
     file_bytes(scene, tmp_path)
-    sealed = scene.seal(tmp_path / "s.pmk", prototypes=3)
+    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=four_bits(scene, 3))
     for m in (scene, pm.open(tmp_path / "scene.pmk"), sealed):
         np.testing.assert_array_equal(m.positions([1, 4]), [[4, 5, 6], [1, 2, 3]])
         assert np.isnan(m.positions([2, 3])).all()
@@ -475,44 +486,56 @@ def words(*values: int) -> bytes:
 @pytest.mark.parametrize(
     ("section", "content", "message"),
     [
-        ("lookbits", words(0), "its looks have 0 bits, not 1 to 12"),
-        ("lookbits", words(13), "its looks have 13 bits, not 1 to 12"),
-        ("lookbits", words(2**32 - 1), "its looks have 4294967295 bits"),
-        ("lookbits", words(3, 0), "section 'lookbits' is longer than it should be"),
-        ("lookbits", words(2), "the looks of landmark 4 do not ascend"),
-        ("lookbits", None, "section 'counts' is longer than it should be"),
+        ("appbits", words(0), "its appearances have 0 bits, not 1 to 12"),
+        ("appbits", words(13), "its appearances have 13 bits, not 1 to 12"),
+        ("appbits", words(2**32 - 1), "its appearances have 4294967295 bits"),
+        ("appbits", words(3, 0), "section 'appbits' is longer than it should be"),
+        ("appbits", words(2), "the appearances of landmark 4 do not ascend"),
+        ("appbits", None, "section 'counts' is longer than it should be"),
         ("rows", None, "it lacks the section 'rows'"),
         ("rows", words(3), "section 'rows' is shorter"),
         ("rows", words(3, 0), "it has a landmark without prototypes"),
         ("rows", words(2**32 - 1, 2**32 - 1), "more prototypes than a map can hold"),
-        ("rows", words(2**31, 1), "section 'looks' is shorter"),
-        ("rows", words(1, 1), "section 'looks' is longer"),
+        ("rows", words(2**31, 1), "section 'appear' is shorter"),
+        ("rows", words(1, 1), "section 'appear' is longer"),
         ("rows", words(2, 1), None),
-        ("rows", words(1, 2), "the looks of landmark 8 do not ascend"),
-        ("looks", np.array([1, 1, 2], "<u2").tobytes(), "the looks of landmark 4 do not ascend"),
-        ("looks", np.array([7, 1, 2], "<u2").tobytes(), "the looks of landmark 4 do not ascend"),
-        ("looks", np.array([1, 8, 2], "<u2").tobytes(), "the looks of landmark 4 do not ascend"),
-        ("looks", b"", "section 'looks' is shorter"),
-        ("looks", None, "it lacks the section 'looks'"),
+        ("rows", words(1, 2), "the appearances of landmark 8 do not ascend"),
+        (
+            "appear",
+            np.array([1, 1, 2], "<u2").tobytes(),
+            "the appearances of landmark 4 do not ascend",
+        ),
+        (
+            "appear",
+            np.array([7, 1, 2], "<u2").tobytes(),
+            "the appearances of landmark 4 do not ascend",
+        ),
+        (
+            "appear",
+            np.array([1, 8, 2], "<u2").tobytes(),
+            "the appearances of landmark 4 do not ascend",
+        ),
+        ("appear", b"", "section 'appear' is shorter"),
+        ("appear", None, "it lacks the section 'appear'"),
         ("counts", bytes([1, 0, 1]), "landmark 4 has an impossible prototype"),
         ("counts", bytes([1, 1, 0]), "landmark 8 has an impossible prototype"),
         ("counts", bytes([1, 1]), "section 'counts' is shorter"),
         ("ids", np.array([4, 4], "<i8").tobytes(), "landmark ids do not ascend"),
     ],
 )
-def test_hostile_open_maps_are_refused(
+def test_hostile_learning_maps_are_refused(
     section: str, content: bytes | None, message: str | None, encoder: pm.Encoder, tmp_path: Path
 ) -> None:
-    """Two landmarks, 4 with looks 5 and 7, 8 with look 5."""
-    scene = pm.PrototypeMap(encoder, look_bits=3)
+    """Two landmarks, 4 with appearances 5 and 7, 8 with appearance 5."""
+    scene = pm.PrototypeMap(encoder, appearance_bits=3)
     codes = np.full((3, 12), 9, np.int8)
     codes[[0, 2], 1] = -9
     scene.add_codes([4, 4, 8], codes)
     parts = sections(file_bytes(scene, tmp_path))
     path = tmp_path / "scene.pmk"
-    assert container(parts, kind=OPEN_MAP) == path.read_bytes()
+    assert container(parts, kind=LEARNING_MAP) == path.read_bytes()
     changed = [(name, content if name == section else old) for name, old in parts]
-    path.write_bytes(container([(n, c) for n, c in changed if c is not None], kind=OPEN_MAP))
+    path.write_bytes(container([(n, c) for n, c in changed if c is not None], kind=LEARNING_MAP))
     if message is None:
         assert_search(pm.open(path), codes)
         return
@@ -540,36 +563,36 @@ def test_hostile_sealed_maps_are_refused(
     encoder: pm.Encoder,
     tmp_path: Path,
 ) -> None:
-    scene = pm.PrototypeMap(encoder, look_bits=3)
+    scene = pm.PrototypeMap(encoder, appearance_bits=3)
     codes = np.full((5, 12), 9, np.int8)
     codes[[0, 2], 1] = -9
     scene.add_codes([4, 4, 8, 9, 9], codes)
-    scene.merge(9, 8)
+    scene.merge_landmarks(9, 8)
     scene.add_codes([8], codes[:1])
     path = tmp_path / "s.pmk"
-    scene.seal(path, bits=bits)
+    scene.seal(path, bytes_per_landmark=four_bits(scene) if bits == 4 else None)
     assert scene.prototype_count == 5
     parts = sections(path.read_bytes())
-    assert container(parts, version=4) == path.read_bytes()
+    assert container(parts) == path.read_bytes()
     changed = [(name, content if name == section else old) for name, old in parts]
     path.unlink()
-    path.write_bytes(container([(n, c) for n, c in changed if c is not None], version=4))
+    path.write_bytes(container([(n, c) for n, c in changed if c is not None]))
     if message is None:
         # Five prototypes of three landmarks: what is left over is no padding (4 bits), or unread.
         message = "padding of its prototypes is not zero"
         if bits == 8:
-            assert len(pm.open(path).looks(9)) == 1
+            assert len(pm.open(path).appearances(9)) == 1
             return
     with pytest.raises(pm.FileError, match=message):
         pm.open(path)
 
 
 def test_every_flipped_byte_is_noticed(encoder: pm.Encoder, tmp_path: Path) -> None:
-    scene = pm.PrototypeMap(encoder, look_bits=4)
+    scene = pm.PrototypeMap(encoder, appearance_bits=4)
     scene.add(np.arange(90) % 20, random_descriptors(90))
     paths = [tmp_path / "o.pmk", tmp_path / "s.pmk"]
     scene.save(paths[0])
-    scene.seal(paths[1], bits=4, prototypes=2)
+    scene.seal(paths[1], bytes_per_landmark=four_bits(scene, 2))
     rng = np.random.default_rng(5)
     for path in paths:
         data = path.read_bytes()
@@ -590,21 +613,21 @@ def test_every_flipped_byte_is_noticed(encoder: pm.Encoder, tmp_path: Path) -> N
 
 def test_plain_code_gives_the_same_file_and_answers(encoder: pm.Encoder, tmp_path: Path) -> None:
     """The instruction set is chosen when a process starts: another process, with the plain one."""
-    scene = pm.PrototypeMap(encoder, look_bits=7)
+    scene = pm.PrototypeMap(encoder, appearance_bits=7)
     descriptors = random_descriptors(5000)
     scene.add(np.arange(5000) % 600, descriptors)
     scene.save(tmp_path / "o.pmk")
-    sealed = scene.seal(tmp_path / "s.pmk", bits=4, prototypes=2.5)
+    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=2.5 * 8 + 2)
     np.save(tmp_path / "d.npy", descriptors)
     script = (
         "import sys, numpy as np, protomark as pm\n"
         "folder = sys.argv[1]\n"
         "d = np.load(folder + '/d.npy')\n"
-        "scene = pm.PrototypeMap(pm.open(folder + '/o.pmk').encoder, look_bits=7)\n"
+        "scene = pm.PrototypeMap(pm.open(folder + '/o.pmk').encoder, appearance_bits=7)\n"
         "scene.add(np.arange(5000) % 600, d)\n"
         "scene.save(folder + '/o2.pmk')\n"
-        "sealed = scene.seal(folder + '/s2.pmk', bits=4, prototypes=2.5)\n"
-        "maps = {'open': scene, 'sealed': sealed}\n"
+        "sealed = scene.seal(folder + '/s2.pmk', bytes_per_landmark=22)\n"
+        "maps = {'learning': scene, 'sealed': sealed}\n"
         "found = {n: np.column_stack(m.search(d[:70], k=5)) for n, m in maps.items()}\n"
         "np.savez(folder + '/r.npz', **found)\n"
     )
@@ -617,5 +640,5 @@ def test_plain_code_gives_the_same_file_and_answers(encoder: pm.Encoder, tmp_pat
         plain = (tmp_path / f"{name}2.pmk").read_bytes()
         assert plain == (tmp_path / f"{name}.pmk").read_bytes()
     answers: Any = np.load(tmp_path / "r.npz")
-    for name, m in {"open": scene, "sealed": sealed}.items():
+    for name, m in {"learning": scene, "sealed": sealed}.items():
         np.testing.assert_array_equal(answers[name], np.column_stack(m.search(descriptors[:70], 5)))
