@@ -74,11 +74,12 @@ void repair_owners(File& file) {
   const Content* owners = find(section::kOwners);
   Content* checksums = find(section::kOwnerChecksums);
   if (owners == nullptr || checksums == nullptr) return;
-  std::vector<std::uint64_t> words(owners->size() / sizeof(std::uint64_t));
-  std::memcpy(words.data(), owners->data(), words.size() * sizeof(words[0]));
-  BlockChecksums right;
-  right.add(words);
-  const Bytes repaired = std::as_bytes(std::span(right.all()));
+  constexpr std::size_t kBlock = CheckedNumbers::kBlock * sizeof(std::uint64_t);
+  std::vector<std::uint32_t> right;
+  for (Bytes rest = *owners; !rest.empty(); rest = rest.subspan(std::min(kBlock, rest.size()))) {
+    right.push_back(crc32(rest.first(std::min(kBlock, rest.size()))));
+  }
+  const Bytes repaired = std::as_bytes(std::span(right));
   checksums->assign(repaired.begin(), repaired.end());
 }
 

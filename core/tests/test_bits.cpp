@@ -32,16 +32,22 @@ int main() {
     CHECK(equal);
   }
 
-  // Checksums of blocks do not depend on the pieces in which words come.
-  const auto words = random.integers<std::uint64_t>(3 * CheckedNumbers::kBlock + 7, 0, 1000);
-  BlockChecksums checksums;
-  for (std::size_t at = 0; at < words.size();) {
-    const auto n = std::min(words.size() - at, static_cast<std::size_t>(random.integer(0, 900)));
-    checksums.add(std::span(words).subspan(at, n));
-    at += n;
+  // A broken block answers none of its numbers, and no other block suffers.
+  auto words = random.integers<std::uint64_t>(3 * CheckedNumbers::kBlock + 7, 0, 1000);
+  std::vector<std::uint32_t> checksums;
+  for (std::size_t at = 0; at < words.size(); at += CheckedNumbers::kBlock) {
+    const std::size_t n = std::min(CheckedNumbers::kBlock, words.size() - at);
+    checksums.push_back(crc32(std::as_bytes(std::span(words).subspan(at, n))));
   }
-  CHECK(checksums.all().size() == 4 && CheckedNumbers::blocks(words.size()) == 4);
-  CHECK(checksums.all()[3] ==
-        crc32(std::as_bytes(std::span(words).subspan(3 * CheckedNumbers::kBlock))));
+  CHECK(checksums.size() == CheckedNumbers::blocks(words.size()));
+  words[CheckedNumbers::kBlock] ^= 1;
+  const CheckedNumbers numbers(words, 32, checksums, "test");
+  for (std::size_t i = 0; i < 2 * words.size(); ++i) {
+    if (i / 2 / CheckedNumbers::kBlock == 1) {
+      CHECK(check::throws<FileError>([&] { numbers[i]; }));
+    } else {
+      CHECK(numbers[i] == (words[i / 2] >> (i % 2 * 32) & 0xffffffff));
+    }
+  }
   return check::result();
 }

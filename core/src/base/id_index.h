@@ -135,7 +135,7 @@ class IdSet {
     if (contains(id)) return;
     ids_.push_back(id);
     try {
-      index_.insert(ids_, LandmarkIndex{static_cast<std::uint32_t>(ids_.size() - 1)});
+      index_.insert(ids_, landmark_at(ids_.size() - 1));
     } catch (...) {
       ids_.pop_back();
       throw;

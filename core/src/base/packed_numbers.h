@@ -2,13 +2,19 @@
 // first.
 #pragma once
 
+#include <algorithm>
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
 #include <span>
 #include <string>
+#include <utility>
 #include <vector>
+
+#include "base/checksums.h"
+#include "base/text.h"
+#include "protomark/types.h"
 
 namespace protomark {
 
@@ -63,7 +69,12 @@ class CheckedNumbers {
 
   // `checksums` are those of the blocks. Errors begin with `name`.
   CheckedNumbers(std::span<const std::uint64_t> words, int bits,
-                 std::span<const std::uint32_t> checksums, std::string name);
+                 std::span<const std::uint32_t> checksums, std::string name)
+      : words_(words),
+        bits_(bits),
+        checksums_(checksums),
+        name_(std::move(name)),
+        checked_(std::make_unique<std::atomic<bool>[]>(checksums.size())) {}
 
   // Throws FileError if the number's block is broken.
   std::uint64_t operator[](std::size_t i) const {
@@ -77,24 +88,22 @@ class CheckedNumbers {
   void check(std::size_t block) const {
     if (!checked_[block].load(std::memory_order_relaxed)) check_now(block);
   }
-  void check_now(std::size_t block) const;
+  void check_now(std::size_t block) const {
+    const std::size_t first = block * kBlock;
+    const auto words = words_.subspan(first, std::min(kBlock, words_.size() - first));
+    if (crc32(std::as_bytes(words)) != checksums_[block]) {
+      throw FileError(text(name_, " does not match its checksum, in the block at byte ",
+                           first * sizeof(words[0]), " of it"));
+    }
+    // Mapped bytes do not change: any thread that sees this may read them.
+    checked_[block].store(true, std::memory_order_relaxed);
+  }
 
   std::span<const std::uint64_t> words_;
   int bits_;
   std::span<const std::uint32_t> checksums_;
   std::string name_;
   std::unique_ptr<std::atomic<bool>[]> checked_;
-};
-
-// The checksums of blocks, while their words come.
-class BlockChecksums {
- public:
-  void add(std::span<const std::uint64_t> words);
-  const std::vector<std::uint32_t>& all() const { return checksums_; }
-
- private:
-  std::vector<std::uint32_t> checksums_;
-  std::size_t filled_ = 0;  // words of the last block
 };
 
 }  // namespace protomark

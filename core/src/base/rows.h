@@ -2,6 +2,7 @@
 #pragma once
 
 #include <compare>
+#include <cstddef>
 #include <cstdint>
 
 namespace protomark {
@@ -17,6 +18,9 @@ struct LandmarkIndex {
   std::uint32_t value = 0;
   friend constexpr auto operator<=>(LandmarkIndex, LandmarkIndex) = default;
 };
+
+constexpr Row row_at(std::size_t i) { return {static_cast<std::uint32_t>(i)}; }
+constexpr LandmarkIndex landmark_at(std::size_t i) { return {static_cast<std::uint32_t>(i)}; }
 
 inline constexpr Row kNoRow{UINT32_MAX};
 inline constexpr LandmarkIndex kNoLandmark{UINT32_MAX};

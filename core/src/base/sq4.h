@@ -1,23 +1,45 @@
 // Scalar quantization to 4 bits: u, 0 to 15, stands for the level scale * (2 u - 15).
 #pragma once
 
+#include <algorithm>
 #include <array>
+#include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 
 namespace protomark {
 
 inline constexpr int kMaxScale = 8;  // 15 * 8 is the last multiple of 15 that int8 holds
 
 // The u whose level is nearest to `value`; of two the one away from zero, for zero the one above.
-std::uint8_t sq4_quantize(int value, int scale);
+inline std::uint8_t sq4_quantize(int value, int scale) {
+  // Levels are 2 * scale apart; the lowest that is not negative is `scale`.
+  const int above_zero = std::min(std::abs(value) / (2 * scale), 7);
+  return static_cast<std::uint8_t>(value < 0 ? 7 - above_zero : 8 + above_zero);
+}
 
-constexpr int sq4_level(std::uint8_t u, int scale) { return scale * (2 * u - 15); }
+constexpr int sq4_level(int u, int scale) { return scale * (2 * u - 15); }
 
 // How often each int8 value v occurs, at v + 128.
 using Histogram = std::array<std::uint64_t, 256>;
 
 // The scale, 1 to kMaxScale, with the least sum of squared errors over all values; of equals the
 // smallest. For fewer than 2^49 values.
-int sq4_best_scale(const Histogram& histogram);
+inline int sq4_best_scale(const Histogram& histogram) {
+  const auto error = [&](int scale) {
+    std::uint64_t sum = 0;
+    for (int i = 0; i < 256; ++i) {
+      const int value = i - 128;
+      const int difference = value - sq4_level(sq4_quantize(value, scale), scale);
+      sum += static_cast<std::uint64_t>(difference * difference) * histogram[i];
+    }
+    return sum;
+  };
+  int best = 1;
+  for (int scale = 2; scale <= kMaxScale; ++scale) {
+    if (error(scale) < error(best)) best = scale;
+  }
+  return best;
+}
 
 }  // namespace protomark

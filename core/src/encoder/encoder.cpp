@@ -3,13 +3,13 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <limits>
+#include <functional>
 #include <memory>
-#include <stdexcept>
 #include <string_view>
 
 #include "base/checksums.h"
 #include "base/parallel.h"
+#include "base/text.h"
 #include "base/utf8.h"
 #include "encoder/layers.h"
 #include "file/journal.h"
@@ -40,45 +40,29 @@ constexpr Field kFields[] = {{"name", &EncoderInfo::name},
                              {"data", &EncoderInfo::data},
                              {"licence", &EncoderInfo::licence}};
 
-[[noreturn]] void invalid(const std::string& what) {
-  throw std::invalid_argument("encoder: " + what);
-}
-
-// Checks that no input takes a sum beyond 32 bits.
-void check_sums(const Layer& layer, bool first, const std::string& where) {
-  const std::int64_t largest = first ? 1 : 255;
-  for (std::size_t o = 0; o < layer.outputs; ++o) {
-    std::int64_t low = layer.bias[o], high = layer.bias[o];
-    for (std::size_t i = 0; i < layer.inputs; ++i) {
-      const std::int64_t product = largest * layer.weights[o * layer.inputs + i];
-      (product < 0 ? low : high) += product;
-    }
-    if (low < std::numeric_limits<std::int32_t>::min() ||
-        high > std::numeric_limits<std::int32_t>::max()) {
-      invalid(where + ": sums of output " + std::to_string(o) + " could leave 32 bits");
-    }
-  }
-}
-
 void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t number) {
-  const std::string where = "layer " + std::to_string(number);
+  const std::string where = text("encoder: layer ", number);
   if (layer.inputs != inputs) {
-    invalid(where + " has " + std::to_string(layer.inputs) + " inputs, " + std::to_string(inputs) +
-            " are needed");
+    invalid(where, " has ", layer.inputs, " inputs, ", inputs, " are needed");
   }
   if (layer.outputs == 0 || layer.outputs > kMaxWidth) {
-    invalid(where + " has " + std::to_string(layer.outputs) + " outputs, 1 to " +
-            std::to_string(kMaxWidth) + " are allowed");
+    invalid(where, " has ", layer.outputs, " outputs, 1 to ", kMaxWidth, " are allowed");
   }
   if (layer.weights.size() != layer.inputs * layer.outputs || layer.bias.size() != layer.outputs ||
       layer.multipliers.size() != layer.outputs) {
-    invalid(where + ": weights, bias and multipliers do not match its size");
+    invalid(where, ": weights, bias and multipliers do not match its size");
   }
-  if (layer.shift < 1 || layer.shift > 62) invalid(where + ": shift must be 1 to 62");
-  for (const std::int32_t m : layer.multipliers) {
-    if (m <= 0) invalid(where + ": multipliers must be positive");
+  if (layer.shift < 1 || layer.shift > 62) invalid(where, ": shift must be 1 to 62");
+  if (std::ranges::any_of(layer.multipliers, [](std::int32_t m) { return m <= 0; })) {
+    invalid(where, ": multipliers must be positive");
   }
-  check_sums(layer, first, where);
+  const std::int64_t largest = first ? 1 : 255;
+  for (std::size_t o = 0; o < layer.outputs; ++o) {
+    const auto [low, high] = sum_range(layer, o);
+    if (layer.bias[o] + largest * low < INT32_MIN || layer.bias[o] + largest * high > INT32_MAX) {
+      invalid(where, ": sums of output ", o, " could leave 32 bits");
+    }
+  }
 }
 
 // The field of a key, or the end of kFields for a note.
@@ -90,9 +74,9 @@ ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network)
     texts.text(std::string(field.key));
     texts.text(info.*field.text);
   }
-  for (const auto& [key, text] : info.notes) {
+  for (const auto& [key, note] : info.notes) {
     texts.text(key);
-    texts.text(text);
+    texts.text(note);
   }
   ContainerWriter file(FileKind::encoder);
   texts.add_to(file, section::kInfo);
@@ -119,31 +103,30 @@ struct Encoder::Packed {
 Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims,
                  float scale)
     : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
-  if (info_.name.empty() || info_.descriptor.empty()) invalid("name and descriptor must be given");
+  const auto check = [](bool right, const auto&... what) {
+    if (!right) invalid("encoder: ", what...);
+  };
+  check(!info_.name.empty() && !info_.descriptor.empty(), "name and descriptor must be given");
   for (const Field& field : kFields) {
-    if (!is_utf8(info_.*field.text)) invalid("its " + std::string(field.key) + " is not UTF-8");
+    check(is_utf8(info_.*field.text), "its ", field.key, " is not UTF-8");
   }
-  for (const auto& [key, text] : info_.notes) {
-    if (!is_utf8(key) || !is_utf8(text)) invalid("its notes are not UTF-8");
-    if (field_of(key) != std::end(kFields)) invalid("no note may have the key '" + key + "'");
+  for (const auto& [key, note] : info_.notes) {
+    check(is_utf8(key) && is_utf8(note), "its notes are not UTF-8");
+    check(field_of(key) == std::end(kFields), "no note may have the key '", key, "'");
   }
-  if (layers_.empty() || layers_.size() > kMaxLayers) {
-    invalid("it has " + std::to_string(layers_.size()) + " layers, 1 to " +
-            std::to_string(kMaxLayers) + " are allowed");
-  }
+  check(!layers_.empty() && layers_.size() <= kMaxLayers, "it has ", layers_.size(),
+        " layers, 1 to ", kMaxLayers, " are allowed");
   const std::size_t bits = layers_.front().inputs;
-  if (bits < kMinBits || bits > kMaxBits || bits % 8 != 0) {
-    invalid("a descriptor has 64 to 1024 bits, a multiple of 8, not " + std::to_string(bits));
-  }
+  check(bits >= kMinBits && bits <= kMaxBits && bits % 8 == 0,
+        "a descriptor has 64 to 1024 bits, a multiple of 8, not ", bits);
   for (std::size_t l = 0; l < layers_.size(); ++l) {
     check_layer(layers_[l], l == 0 ? bits : layers_[l - 1].outputs, l == 0, l);
   }
-  if (dims_.empty() || dims_.front() == 0 || dims_.back() != layers_.back().outputs ||
-      std::adjacent_find(dims_.begin(), dims_.end(), std::greater_equal<>()) != dims_.end()) {
-    invalid("dims must ascend and end with the number of outputs");
-  }
-  if (dim() > kMaxDim) invalid("a code has at most 256 dimensions");
-  if (!(scale_ > 0) || !std::isfinite(scale_)) invalid("scale must be positive");
+  check(!dims_.empty() && dims_.front() != 0 && dims_.back() == layers_.back().outputs &&
+            std::ranges::adjacent_find(dims_, std::greater_equal<>()) == dims_.end(),
+        "dims must ascend and end with the number of outputs");
+  check(dim() <= kMaxDim, "a code has at most 256 dimensions");
+  check(scale_ > 0 && std::isfinite(scale_), "scale must be positive");
   identity_ = sha256(network_bytes());
   packed_ = std::make_shared<const Packed>(layers_);
 }
@@ -165,18 +148,14 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
   // What OpenCV gives for an image without keypoints has no columns either.
   const bool none = descriptors.rows == 0 && descriptors.columns == 0;
   if (descriptors.columns != bytes() && !none) {
-    throw std::invalid_argument("descriptors have " + std::to_string(descriptors.columns) +
-                                " bytes, encoder '" + info_.name + "' takes " +
-                                std::to_string(bytes()));
+    invalid("descriptors have ", descriptors.columns, " bytes, encoder '", info_.name, "' takes ",
+            bytes());
   }
-  if (codes.rows != descriptors.rows) {
-    throw std::invalid_argument("codes must have as many rows as descriptors");
-  }
+  if (codes.rows != descriptors.rows) invalid("codes must have as many rows as descriptors");
   if (std::ranges::find(dims_, codes.columns) == dims_.end()) {
     std::string allowed;
     for (const std::size_t d : dims_) allowed += (allowed.empty() ? "" : ", ") + std::to_string(d);
-    throw std::invalid_argument("encoder '" + info_.name + "' gives " + allowed +
-                                " dimensions, not " + std::to_string(codes.columns));
+    invalid("encoder '", info_.name, "' gives ", allowed, " dimensions, not ", codes.columns);
   }
   const kernels::Kernels& kernel = kernels::active();
   const Packed& network = *packed_;

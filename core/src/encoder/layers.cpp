@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <bit>
-#include <limits>
 #include <memory>
 
 namespace protomark {
@@ -28,20 +27,22 @@ std::vector<T> padded(const std::vector<T>& values) {
 
 bool fits_16_bits(const Layer& layer) {
   for (std::size_t o = 0; o < layer.outputs; ++o) {
-    int low = 0, high = 0;
-    for (std::size_t i = 0; i < layer.inputs; ++i) {
-      const std::int8_t w = layer.weights[o * layer.inputs + i];
-      (w < 0 ? low : high) += w;
-    }
-    if (low < std::numeric_limits<std::int16_t>::min() ||
-        high > std::numeric_limits<std::int16_t>::max()) {
-      return false;
-    }
+    const auto [low, high] = sum_range(layer, o);
+    if (low < INT16_MIN || high > INT16_MAX) return false;
   }
   return true;
 }
 
 }  // namespace
+
+std::pair<std::int64_t, std::int64_t> sum_range(const Layer& layer, std::size_t output) {
+  std::int64_t low = 0, high = 0;
+  for (std::size_t i = 0; i < layer.inputs; ++i) {
+    const std::int8_t weight = layer.weights[output * layer.inputs + i];
+    (weight < 0 ? low : high) += weight;
+  }
+  return {low, high};
+}
 
 PackedActivation::PackedActivation(const Layer& layer, bool last)
     : bias_(padded(layer.bias)),

@@ -5,6 +5,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "kernels/kernels.h"
@@ -17,6 +18,9 @@ struct LayerOutput {
   std::uint8_t* data;
   std::size_t stride;
 };
+
+// The least and the largest sum that the weights of an output may have.
+std::pair<std::int64_t, std::int64_t> sum_range(const Layer& layer, std::size_t output);
 
 // Turns sums into bytes.
 class PackedActivation {

@@ -7,7 +7,6 @@
 #include <stdexcept>
 
 #include "base/checksums.h"
-#include "protomark/types.h"
 
 namespace protomark {
 namespace {
@@ -109,8 +108,7 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
       const auto& [name, size] = group.parts[i];
       const SectionEntry& entry = table[first + i];
       if (size != kUnknownSize && entry.size != size) {
-        throw std::logic_error("section '" + name + "' has " + std::to_string(entry.size) +
-                               " bytes, not " + std::to_string(size));
+        throw std::logic_error(text("section '", name, "' has ", entry.size, " bytes, not ", size));
       }
       const std::uint64_t end = entry.offset + entry.size;
       offset = align(end);
@@ -158,13 +156,12 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   if (file_.size() < sizeof(header) || !has_magic(file_)) fail("not a Protomark file");
   std::memcpy(&header, file_.data(), sizeof(header));
   if (header.version != kVersion) {
-    fail("format version " + std::to_string(header.version) + ", this Protomark reads version " +
-         std::to_string(kVersion));
+    fail("format version ", header.version, ", this Protomark reads version ", kVersion);
   }
   if (header.sections > kMaxSections) fail("its header is broken");
   if (header.file_size != file_.size()) {
-    fail("it should have " + std::to_string(header.file_size) + " bytes and has " +
-         std::to_string(file_.size()) + (file_.size() < header.file_size ? ": it is cut off" : ""));
+    fail("it should have ", header.file_size, " bytes and has ", file_.size(),
+         file_.size() < header.file_size ? ": it is cut off" : "");
   }
   const auto head = ContainerHead::parse(file_);
   if (!head) fail("its header is broken");
@@ -188,13 +185,13 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
     if (!std::ranges::all_of(entry.name(), [](char c) { return c >= ' ' && c <= '~'; })) {
       fail("its section table is broken: a name is not printable ASCII");
     }
-    if (has(entry.name())) fail("it has two sections '" + std::string(entry.name()) + "'");
+    if (has(entry.name())) fail("it has two sections '", entry.name(), "'");
     sections_.push_back(entry);
   }
 }
 
 void ContainerReader::expect(FileKind kind) const {
-  if (kind_ != kind) fail(std::string("it holds ") + describe(kind_) + ", not " + describe(kind));
+  if (kind_ != kind) fail("it holds ", describe(kind_), ", not ", describe(kind));
 }
 
 const SectionEntry* ContainerReader::find(std::string_view name) const {
@@ -204,13 +201,13 @@ const SectionEntry* ContainerReader::find(std::string_view name) const {
 
 const SectionEntry& ContainerReader::get(std::string_view name) const {
   if (const SectionEntry* found = find(name)) return *found;
-  fail("it lacks the section '" + std::string(name) + "'");
+  fail("it lacks the section '", name, "'");
 }
 
 Bytes ContainerReader::checked(const SectionEntry& section) const {
   const Bytes bytes = file_.subspan(section.offset, section.size);
   if (crc32(bytes) != section.crc) {
-    fail("its section '" + std::string(section.name()) + "' does not match its checksum");
+    fail("its section '", section.name(), "' does not match its checksum");
   }
   return bytes;
 }
@@ -230,12 +227,6 @@ std::vector<std::pair<std::string, std::size_t>> ContainerReader::sections() con
 
 void ContainerReader::verify() const {
   for (const SectionEntry& entry : sections_) checked(entry);
-}
-
-void ContainerReader::fail(const std::string& what) const { throw FileError(name_ + ": " + what); }
-
-void ContainerReader::fail_size(std::string_view section) const {
-  fail("its section '" + std::string(section) + "' has the wrong size");
 }
 
 }  // namespace protomark

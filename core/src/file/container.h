@@ -14,7 +14,9 @@
 #include <utility>
 #include <vector>
 
+#include "base/text.h"
 #include "file/disk.h"
+#include "protomark/types.h"
 
 namespace protomark {
 
@@ -161,9 +163,14 @@ class ContainerReader {
   std::vector<std::pair<std::string, std::size_t>> sections() const;
   // Checks every section.
   void verify() const;
-  // Throws an error about this file.
-  [[noreturn]] void fail(const std::string& what) const;
-  [[noreturn]] void fail_size(std::string_view section) const;
+  // Throw FileError about this file.
+  template <typename... Parts>
+  [[noreturn]] void fail(const Parts&... what) const {
+    throw FileError(text(name_, ": ", what...));
+  }
+  [[noreturn]] void fail_size(std::string_view section) const {
+    fail("its section '", section, "' has the wrong size");
+  }
 
  private:
   template <typename T>

@@ -158,17 +158,17 @@ void TemporaryFile::fail() const {
 }
 
 MappedFile::MappedFile(const std::filesystem::path& path) {
-  const auto fail = [&](const std::string& why) { throw FileError(path.string() + why); };
+  const auto fail = [&](const std::string& why) { throw FileError(path.string() + ": " + why); };
   const auto file = FileDescriptor::open_to_read(path);
   struct stat status;
-  if (!file) fail(": cannot be read: " + system_error());
-  if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail(": not a file");
+  if (!file) fail("cannot be read: " + system_error());
+  if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail("not a file");
   const auto size = static_cast<std::size_t>(status.st_size);
   device_ = status.st_dev;
   inode_ = status.st_ino;
   if (size == 0) return;
   void* data = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.get(), 0);
-  if (data == MAP_FAILED) fail(": cannot be read: " + system_error());
+  if (data == MAP_FAILED) fail("cannot be read: " + system_error());
   bytes_ = {static_cast<const std::byte*>(data), size};
 }
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <bit>
+#include <ranges>
 
 #include "file/sections.h"
 #include "protomark/types.h"
@@ -95,33 +96,24 @@ std::int64_t LandmarkIds::operator[](LandmarkIndex landmark) const {
 }
 
 LandmarkIndex LandmarkIds::find(std::int64_t id) const {
-  const auto index = [](std::size_t i) { return LandmarkIndex{static_cast<std::uint32_t>(i)}; };
   if (are_indices()) {
     if (id < 0 || static_cast<std::uint64_t>(id) >= n_) throw UnknownLandmark(id);
-    return index(static_cast<std::size_t>(id));
+    return landmark_at(static_cast<std::size_t>(id));
   }
-  const auto next = std::upper_bound(
-      blocks_.begin(), blocks_.end(), id,
-      [](std::int64_t wanted, const IdBlock& block) { return wanted < block.first_id; });
+  const auto next = std::ranges::upper_bound(blocks_, id, {}, &IdBlock::first_id);
   if (next == blocks_.begin()) throw UnknownLandmark(id);
-  std::size_t first = static_cast<std::size_t>(next - blocks_.begin() - 1) * kIdBlock;
-  std::size_t end = std::min(n_, first + kIdBlock);
-  while (first < end) {
-    const std::size_t half = first + (end - first) / 2;
-    if ((*this)[index(half)] < id) {
-      first = half + 1;
-    } else {
-      end = half;
-    }
-  }
-  if (first == n_ || (*this)[index(first)] != id) throw UnknownLandmark(id);
-  return index(first);
+  const auto first = static_cast<std::size_t>(next - blocks_.begin() - 1) * kIdBlock;
+  const auto block = std::views::iota(first, std::min(n_, first + kIdBlock));
+  const auto id_at = [&](std::size_t i) { return (*this)[landmark_at(i)]; };
+  const auto found = std::ranges::lower_bound(block, id, {}, id_at);
+  if (found == block.end() || id_at(*found) != id) throw UnknownLandmark(id);
+  return landmark_at(*found);
 }
 
 std::vector<std::int64_t> LandmarkIds::all() const {
   std::vector<std::int64_t> result(n_);
   for (std::size_t i = 0; i < n_; ++i) {
-    result[i] = (*this)[LandmarkIndex{static_cast<std::uint32_t>(i)}];
+    result[i] = (*this)[landmark_at(i)];
     if (i > 0 && result[i] <= result[i - 1]) file_->fail(kNoOrder);
   }
   return result;

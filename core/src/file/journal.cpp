@@ -15,6 +15,7 @@
 namespace protomark {
 namespace {
 
+constexpr char kSaveElsewhere[] = "; save to another path to keep what is in memory";
 // Openings of a journal that somebody else deletes at the same moment.
 constexpr int kTries = 100;
 
@@ -54,19 +55,17 @@ FileDescriptor guard(const std::filesystem::path& map) {
   for (int tries = 0; tries < kTries; ++tries) {
     file = FileDescriptor::open_to_read(path);
     if (!file && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return file;
-    if (!file) throw FileError(path.string() + ": cannot be read: " + system_error());
+    if (!file) throw FileError(text(path.string(), ": cannot be read: ", system_error()));
     if (::flock(file.get(), LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
-      throw FileError(map.string() + ": cannot be written: its journal is held by " + holder(file) +
-                      "; close it there, or save to another path");
+      throw FileError(text(map.string(), ": cannot be written: its journal is held by ",
+                           holder(file), "; close it there, or save to another path"));
     }
     const auto bytes = read_journal(file, path);
-    const std::size_t commits =
-        JournalContent(bytes, path.string()).commits(identity_of(map)).size();
+    const auto commits = JournalContent(bytes, path.string()).commits(identity_of(map)).size();
     if (commits > 0) {
-      throw FileError(map.string() + ": cannot be written: its journal holds " +
-                      std::to_string(commits) +
-                      " commits, which would be lost; open it with journal and compact it, or "
-                      "save to another path");
+      throw FileError(text(map.string(), ": cannot be written: its journal holds ", commits,
+                           " commits, which would be lost; open it with journal and compact it, "
+                           "or save to another path"));
     }
     if (file.is_at(path)) break;
   }
@@ -87,10 +86,10 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
     made_ = bool(file_);
     if (made_) ::fchmod(file_.get(), mode);  // the umask may have taken something away
     if (!made_) file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, mode));
-    if (!file_) fail("cannot be written: " + system_error());
+    if (!file_) fail_write();
     if (::flock(file_.get(), LOCK_EX | LOCK_NB) != 0) {
-      if (errno != EWOULDBLOCK) fail("cannot be locked: " + system_error());
-      fail("is held by " + holder(file_) +
+      if (errno != EWOULDBLOCK) fail("cannot be locked: ", system_error());
+      fail("is held by ", holder(file_),
            ": one map at a time may commit to it; open without journal to read");
     }
     if (file_.is_at(path_)) return;
@@ -106,11 +105,11 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
   // Whoever made the journal, or compacted, may have been killed before this: the new map file's
   // name must be durable before what it replaces is forgotten.
-  if (!sync_folder(path_)) fail("its folder cannot be synced: " + system_error());
+  if (!sync_folder(path_)) fail("its folder cannot be synced: ", system_error());
   if (end_ == 0) {
     begin();
   } else if (!cut(end_) || ::fsync(file_.get()) != 0) {
-    fail("cannot be written: " + system_error());
+    fail_write();
   }
 }
 
@@ -123,7 +122,7 @@ bool Journal::cut(std::size_t size) {
 // Writes an empty file, then a header, so that nothing of before is left behind that.
 void Journal::begin() {
   tail_ = true;
-  if (!cut(0)) fail("cannot be written: " + system_error());
+  if (!cut(0)) fail_write();
   end_ = 0;
   tail_ = true;
   ContainerWriter file(FileKind::journal);
@@ -131,7 +130,7 @@ void Journal::begin() {
   const auto first = file.serialize();
   if (::fsync(file_.get()) != 0 || ::lseek(file_.get(), 0, SEEK_SET) != 0 || !file_.write(first) ||
       ::fsync(file_.get()) != 0) {
-    fail("cannot be written: " + system_error());
+    fail_write();
   }
   end_ = first.size();
   last_ = {0, checksum_of(first), 0};
@@ -140,13 +139,10 @@ void Journal::begin() {
 
 void Journal::check_owner() const {
   if (::getpid() != process_) {
-    fail("was opened by process " + std::to_string(process_) +
+    fail("was opened by process ", process_,
          ", of which this one is a copy (fork); only that one may commit");
   }
-  if (!file_.is_at(path_)) {
-    fail(
-        "was moved or deleted since it was opened; save to another path to keep what is in memory");
-  }
+  if (!file_.is_at(path_)) fail("was moved or deleted since it was opened", kSaveElsewhere);
 }
 
 ContainerWriter Journal::record(FileKind kind) {
@@ -161,21 +157,17 @@ void Journal::append(Bytes record) {
   check_owner();
   const auto now = identity_of(map_);
   if (now != base_ && now != folded_) {
-    fail(
-        "the map file beside it was replaced or deleted since it was opened; save to another "
-        "path to keep what is in memory");
+    fail("the map file beside it was replaced or deleted since it was opened", kSaveElsewhere);
   }
   base_ = now;
-  const auto write = [&] {
-    if (!cut(end_)) return false;
-    tail_ = true;
-    return ::lseek(file_.get(), static_cast<off_t>(end_), SEEK_SET) >= 0 && file_.write(record) &&
-           ::fsync(file_.get()) == 0;
-  };
-  if (!write()) {
-    const std::string why = system_error();
+  if (!cut(end_)) fail_write();
+  tail_ = true;
+  if (::lseek(file_.get(), static_cast<off_t>(end_), SEEK_SET) < 0 || !file_.write(record) ||
+      ::fsync(file_.get()) != 0) {
+    const int error = errno;
     cut(end_);  // or before the next one
-    fail("cannot be written: " + why);
+    errno = error;
+    fail_write();
   }
   tail_ = false;
   end_ += record.size();
@@ -202,8 +194,6 @@ void Journal::abandon() noexcept {
   // Whoever has opened it meanwhile finds it gone once they have the lock, and makes another one.
   if (made_ && file_.is_at(path_)) ::unlink(path_.c_str());
 }
-
-void Journal::fail(const std::string& what) const { throw FileError(path_.string() + ": " + what); }
 
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path) {
   const FileDescriptor before = guard(path);

@@ -134,7 +134,11 @@ class Journal {
   void check_owner() const;
   void begin();
   bool cut(std::size_t size);
-  [[noreturn]] void fail(const std::string& what) const;
+  template <typename... Parts>
+  [[noreturn]] void fail(const Parts&... what) const {
+    throw FileError(text(path_.string(), ": ", what...));
+  }
+  [[noreturn]] void fail_write() const { fail("cannot be written: ", system_error()); }
 
   std::filesystem::path map_, path_;
   FileDescriptor file_;  // locked while it is open, also in a forked child

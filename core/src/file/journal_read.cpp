@@ -126,7 +126,7 @@ std::vector<std::byte> read_journal(const FileDescriptor& file, const std::files
   try {
     result.resize(size);
   } catch (const std::bad_alloc&) {
-    fail("its " + std::to_string(size) + " bytes do not fit into memory");
+    fail(text("its ", size, " bytes do not fit into memory"));
   }
   result.resize(read(result).size());
   return result;
@@ -172,19 +172,18 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
   last_.previous = first->checksum();
   end_ = first->size();
   while (end_ < size_) {
-    const std::string where = name_ + ": record at byte " + std::to_string(end_);
+    const std::string where = text(name_, ": record at byte ", end_);
     const auto record = whole_container(bytes.subspan(end_), where);
     if (!record) {
       check_known(bytes.subspan(end_), where);
       const std::size_t next = find_later(bytes, end_, last_.record);
       if (next == size_) return;
-      throw FileError(where + " is broken, and there are others behind it, at byte " +
-                      std::to_string(next) +
-                      ", which no power cut leaves; to keep the commits before it, cut the journal "
-                      "off (truncate --size=" +
-                      std::to_string(end_) + ")");
+      throw FileError(text(where, " is broken, and there are others behind it, at byte ", next,
+                           ", which no power cut leaves; to keep the commits before it, cut the "
+                           "journal off (truncate --size=",
+                           end_, ")"));
     }
-    if (!is_record(record->kind())) record->fail(std::string("it is ") + describe(record->kind()));
+    if (!is_record(record->kind())) record->fail("it is ", describe(record->kind()));
     const auto link = read_value<ChainLink>(*record, section::kChain);
     if (link.record != last_.record + 1 || link.previous != last_.previous) {
       record->fail("it does not follow the one before it");
@@ -206,13 +205,11 @@ std::span<const JournalContent::Commit> JournalContent::commits(const std::strin
   }
   const std::size_t folded = bases_.empty() ? 0 : bases_.back().commits;
   if (commits_.size() == folded) return {};
-  std::string what =
-      std::to_string(commits_.size()) + " commits to another map file than the one beside it";
-  if (folded != 0) {
-    what += ", of which the first " + std::to_string(folded) + " may be in that file already";
-  }
-  throw FileError(name_ + ": holds " + what +
-                  ": bring that one back, or move the journal away to do without them");
+  const std::string maybe =
+      folded == 0 ? "" : text(", of which the first ", folded, " may be in that file already");
+  throw FileError(text(name_, ": holds ", commits_.size(),
+                       " commits to another map file than the one beside it", maybe,
+                       ": bring that one back, or move the journal away to do without them"));
 }
 
 }  // namespace protomark

@@ -78,20 +78,19 @@ class SectionReader {
   std::string text() {
     const std::vector<char> bytes = values<char>(value<std::uint32_t>());
     std::string result(bytes.begin(), bytes.end());
-    if (!is_utf8(result))
-      file_->fail("its section '" + section_ + "' has a text that is not UTF-8");
+    if (!is_utf8(result)) file_->fail("its section '", section_, "' has a text that is not UTF-8");
     return result;
   }
   bool empty() const { return rest_.empty(); }
   // Throws FileError if bytes are left.
   void finish() const {
-    if (!rest_.empty()) file_->fail("its section '" + section_ + "' is longer than it should be");
+    if (!rest_.empty()) file_->fail("its section '", section_, "' is longer than it should be");
   }
 
  private:
   void check(std::size_t n, std::size_t size) const {
     if (n <= rest_.size() / size) return;
-    file_->fail("its section '" + section_ + "' is shorter than it should be");
+    file_->fail("its section '", section_, "' is shorter than it should be");
   }
 
   const ContainerReader* file_;

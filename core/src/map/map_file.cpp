@@ -1,7 +1,5 @@
 #include "protomark/map_file.h"
 
-#include <stdexcept>
-
 #include "file/journal.h"
 #include "map/map_sections.h"
 
@@ -11,7 +9,7 @@ namespace {
 MapKind kind_of(const ContainerReader& file) {
   if (file.kind() == FileKind::learning_map) return MapKind::learning;
   if (file.kind() == FileKind::sealed_map) return MapKind::sealed;
-  file.fail(std::string("it holds ") + describe(file.kind()) + ", not a map");
+  file.fail("it holds ", describe(file.kind()), ", not a map");
 }
 
 }  // namespace
@@ -33,16 +31,14 @@ void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::
   const auto describe = [](const Encoder& e) {
     return "'" + e.info().name + "' (identity " + e.identity().substr(0, 12) + ")";
   };
-  throw std::invalid_argument(map + ": it was made with encoder " + describe(encoder) +
-                              ", not with " + describe(expected) +
-                              ": use the map's own encoder, or build the map with the other");
+  invalid(map, ": it was made with encoder ", describe(encoder), ", not with ", describe(expected),
+          ": use the map's own encoder, or build the map with the other");
 }
 
 void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
                        const std::string& map) {
   if (encoder.info().descriptor == descriptor) return;
-  throw std::invalid_argument(map + ": it is a map of " + encoder.info().descriptor +
-                              " descriptors, not of " + descriptor);
+  invalid(map, ": it is a map of ", encoder.info().descriptor, " descriptors, not of ", descriptor);
 }
 
 std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path) {

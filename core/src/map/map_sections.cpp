@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <stdexcept>
 #include <string>
 #include <string_view>
 
@@ -16,17 +15,14 @@ namespace {
 
 constexpr char kCreated[] = "created";
 
-[[noreturn]] void invalid(const std::string& what) {
-  throw std::invalid_argument("metadata: " + what);
-}
-
 // Times have exactly one form, so that the order of texts is that of times.
 bool is_utc_time(std::string_view text) {
   constexpr std::string_view kForm = "0000-00-00T00:00:00Z";
-  const auto fits = [](char c, char form) {
-    return form == '0' ? c >= '0' && c <= '9' : c == form;
-  };
-  if (!std::ranges::equal(text, kForm, fits)) return false;
+  if (!std::ranges::equal(text, kForm, [](char c, char form) {
+        return form == '0' ? c >= '0' && c <= '9' : c == form;
+      })) {
+    return false;
+  }
   const auto number = [&](std::size_t at, std::size_t digits) {
     int value = 0;
     for (const char c : text.substr(at, digits)) value = 10 * value + (c - '0');
@@ -42,21 +38,20 @@ bool is_utc_time(std::string_view text) {
 
 void check_metadata(const Metadata& metadata) {
   if (metadata.size() > kMaxMetadata) {
-    invalid("a map has at most " + std::to_string(kMaxMetadata) + " names, not " +
-            std::to_string(metadata.size()));
+    invalid("metadata: a map has at most ", kMaxMetadata, " names, not ", metadata.size());
   }
   for (const auto& [name, text] : metadata) {
-    if (!is_utf8(name) || !is_utf8(text)) invalid("names and texts must be UTF-8");
+    if (!is_utf8(name) || !is_utf8(text)) invalid("metadata: names and texts must be UTF-8");
     if (name.empty() || name.size() > kMaxMetadataName) {
-      invalid("a name has 1 to " + std::to_string(kMaxMetadataName) + " bytes, not " +
-              std::to_string(name.size()));
+      invalid("metadata: a name has 1 to ", kMaxMetadataName, " bytes, not ", name.size());
     }
     if (text.size() > kMaxMetadataText) {
-      invalid("'" + name + "' has " + std::to_string(text.size()) + " bytes, at most " +
-              std::to_string(kMaxMetadataText) + " are allowed");
+      invalid("metadata: '", name, "' has ", text.size(), " bytes, at most ", kMaxMetadataText,
+              " are allowed");
     }
     if (name == kCreated && !is_utc_time(text)) {
-      invalid("'created' must be a time in UTC such as 2026-11-23T03:39:41Z, not '" + text + "'");
+      invalid("metadata: 'created' must be a time in UTC such as 2026-11-23T03:39:41Z, not '", text,
+              "'");
     }
   }
 }

@@ -5,7 +5,6 @@
 #include <cstddef>
 #include <filesystem>
 #include <functional>
-#include <iterator>
 #include <memory>
 #include <mutex>
 #include <shared_mutex>
@@ -92,49 +91,15 @@ class MapChange {
   // Lets a change write: as long as the lock is held no search reads the map.
   std::unique_lock<FairSharedMutex> write() { return std::unique_lock(state_->searching); }
 
-  // The pieces of [0, n), for range-for: each turn of the loop may write, and ends with all rows in
-  // their lists.
-  class Pieces {
-   public:
-    struct Piece {
-      std::size_t begin, end;
-    };
-    class Iterator {
-     public:
-      explicit Iterator(Pieces& pieces) : pieces_(&pieces) {}
-      Piece operator*() const {
-        return {pieces_->first_, std::min(pieces_->n_, pieces_->first_ + kPiece)};
-      }
-      Iterator& operator++() {
-        pieces_->next();
-        return *this;
-      }
-      bool operator==(std::default_sentinel_t) const { return pieces_->first_ >= pieces_->n_; }
-
-     private:
-      Pieces* pieces_;
-    };
-
-    Pieces(MapState& state, std::size_t n) : state_(&state), n_(n) {}
-    Iterator begin() {
-      if (first_ < n_) lock_ = std::unique_lock(state_->searching);
-      return Iterator(*this);
-    }
-    std::default_sentinel_t end() const { return {}; }
-
-   private:
-    void next() {
+  // Calls write_one(i) for all i below n, in pieces that each end with all rows in their lists.
+  template <typename WriteOne>
+  void in_pieces(std::size_t n, const WriteOne& write_one) {
+    for (std::size_t first = 0; first < n; first += kPiece) {
+      const auto lock = write();
+      for (std::size_t i = first; i < std::min(n, first + kPiece); ++i) write_one(i);
       state_->store.reassign(1);
-      lock_.unlock();
-      first_ += kPiece;
-      begin();
     }
-
-    MapState* state_;
-    std::size_t n_, first_ = 0;
-    std::unique_lock<FairSharedMutex> lock_;
-  };
-  Pieces pieces(std::size_t n) { return {*state_, n}; }
+  }
 
   void make_room_for_positions() { state_->store.make_room_for_positions(state_->searching); }
   void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed) {

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
-#include <stdexcept>
 
 #include "file/sections.h"
 
@@ -29,7 +28,7 @@ PositionCodec::PositionCodec(const PositionBox& box, int bits) : bits_(bits) {
   for (std::size_t i = 0; i < 3; ++i) {
     const double reach = std::max(box.high[i] - middle[i], middle[i] - box.low[i]);
     if (reach > std::numeric_limits<float>::max()) {
-      throw std::invalid_argument("positions are too far apart for a sealed map");
+      invalid("positions are too far apart for a sealed map");
     }
     if (bits == 16) step_[i] = (box.high[i] - box.low[i]) / kLast;
   }

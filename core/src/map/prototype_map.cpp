@@ -1,15 +1,29 @@
-// What a learning map tells of its landmarks.
+// What a learning map tells of its landmarks, its index, and search.
 #include "protomark/prototype_map.h"
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
+#include <utility>
 
+#include "base/text.h"
 #include "map/map_state.h"
 #include "map/positions.h"
+#include "search/inverted_lists.h"
 
 namespace protomark {
 namespace {
+
+constexpr char kRemedy[] = "call build_index first";
+// The recall table is measured again once this part of the rows has changed.
+constexpr std::size_t kStalePart = 10;
+
+// From prototypes by id, so that centroids do not depend on how the map came about.
+CoarseQuantizer learn(const PrototypeStore& store, std::size_t nlist, int threads) {
+  const std::size_t rows = store.prototype_count();
+  std::vector<std::size_t> sample(std::min(rows, CoarseQuantizer::sample_size(nlist)));
+  for (std::size_t i = 0; i < sample.size(); ++i) sample[i] = i * rows / sample.size();
+  const std::vector<std::int8_t> codes = store.rounded(store.sorted_rows_at(sample));
+  return CoarseQuantizer::learn({codes.data(), sample.size(), store.dim()}, nlist, threads);
+}
 
 float mean(std::int64_t sum, std::int64_t n) {
   return static_cast<float>(static_cast<double>(sum) / static_cast<double>(n));
@@ -17,16 +31,14 @@ float mean(std::int64_t sum, std::int64_t n) {
 
 std::unique_ptr<MapState> make_state(std::shared_ptr<const Encoder> encoder, std::size_t dim,
                                      std::size_t appearance_bits) {
-  if (encoder == nullptr) throw std::invalid_argument("a map needs an encoder");
+  if (encoder == nullptr) invalid("a map needs an encoder");
   if (dim == 0) dim = encoder->dim();
   if (std::ranges::find(encoder->dims(), dim) == encoder->dims().end()) {
-    throw std::invalid_argument("encoder '" + encoder->info().name + "' has no codes of " +
-                                std::to_string(dim) + " dimensions");
+    invalid("encoder '", encoder->info().name, "' has no codes of ", dim, " dimensions");
   }
   const std::size_t limit = std::min(PrototypeMap::kMaxAppearanceBits, dim);
   if (appearance_bits > limit) {
-    throw std::invalid_argument("appearance_bits must be 0 to " + std::to_string(limit) + ", not " +
-                                std::to_string(appearance_bits));
+    invalid("appearance_bits must be 0 to ", limit, ", not ", appearance_bits);
   }
   return std::make_unique<MapState>(std::move(encoder), dim, appearance_bits);
 }
@@ -73,19 +85,19 @@ Metadata PrototypeMap::metadata() const {
 
 std::vector<Position> PrototypeMap::positions(std::span<const std::int64_t> ids) const {
   const std::shared_lock lock(state_->searching);
-  std::vector<Position> result;
-  result.reserve(ids.size());
-  for (const std::int64_t id : ids) result.push_back(state_->store.position(state_->store.at(id)));
+  std::vector<Position> result(ids.size());
+  const PrototypeStore& store = state_->store;
+  std::ranges::transform(ids, result.begin(),
+                         [&](auto id) { return store.position(store.at(id)); });
   return result;
 }
 
 std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> ids) const {
   const std::shared_lock lock(state_->searching);
-  std::vector<std::uint32_t> result;
-  result.reserve(ids.size());
-  for (const std::int64_t id : ids) {
-    result.push_back(state_->store.observations(state_->store.at(id)));
-  }
+  std::vector<std::uint32_t> result(ids.size());
+  const PrototypeStore& store = state_->store;
+  std::ranges::transform(ids, result.begin(),
+                         [&](auto id) { return store.observations(store.at(id)); });
   return result;
 }
 
@@ -97,7 +109,7 @@ Matrix<float> PrototypeMap::prototypes(std::span<const std::int64_t> ids) const 
   for (std::size_t i = 0; i < ids.size(); ++i) {
     std::ranges::fill(sum, 0);
     std::int64_t n = 0;
-    for (const Row row : store.rows(store.at(ids[i]))) {
+    for (Row row = store.first_row(store.at(ids[i])); row != kNoRow; row = store.next_row(row)) {
       for (std::size_t d = 0; d < dim(); ++d) sum[d] += store.sum(row)[d];
       n += store.count(row);
     }
@@ -133,10 +145,154 @@ MapSummary PrototypeMap::summary() const {
   const PrototypeStore& store = state_->store;
   const std::shared_lock lock(state_->changing);
   SummaryBuilder result;
-  for (LandmarkIndex l{0}; l.value < store.ids().size(); ++l.value) {
-    if (store.id(l) >= 0) result.add(store.observations(l), store.position(l));
-  }
+  store.each_landmark(
+      [&](LandmarkIndex l) { result.add(store.observations(l), store.position(l)); });
   return result.take();
+}
+
+void PrototypeMap::build_index(const IndexOptions& options, int threads) {
+  if (threads < 1) invalid("threads must be at least 1");
+  MapChange change(*state_);
+  const PrototypeStore& store = state_->store;
+  const std::size_t rows = store.prototype_count();
+  if (rows == 0) invalid("a map without landmarks has nothing to index");
+  const std::size_t nlist =
+      options.nlist.value_or(CoarseQuantizer::default_nlist(rows, store.dim(), store.row_bytes()));
+  const std::size_t limit = std::min(rows, CoarseQuantizer::kMaxLists);
+  if (nlist < 1 || nlist > limit) {
+    invalid("nlist must be 1 to ", limit, " for this map, not ", nlist);
+  }
+  change.set_quantizer(learn(store, nlist, threads), threads, options.in_place);
+}
+
+void PrototypeMap::drop_index() { MapChange(*state_).set_quantizer({}, 1, false); }
+
+void MapChange::set_quantizer(CoarseQuantizer quantizer, int threads, bool in_place) {
+  PrototypeStore& store = state_->store;
+  auto arrangement = store.arrange(std::move(quantizer), threads);
+  if (in_place) {
+    store.make_room_for(arrangement, state_->searching);
+    const auto lock = write();
+    store.rearrange(arrangement);
+    return;
+  }
+  PrototypeStore other = store;
+  FairSharedMutex nobody_searches;
+  other.make_room_for(arrangement, nobody_searches);
+  other.rearrange(arrangement);
+  const auto lock = write();
+  std::swap(store, other);  // what was there before is freed after the lock is released
+}
+
+std::size_t PrototypeMap::nlist() const {
+  const std::shared_lock lock(state_->searching);
+  return state_->store.quantizer().nlist();
+}
+
+std::size_t PrototypeMap::nprobe(double recall, int threads) const {
+  std::shared_lock lock(state_->searching);
+  const auto table = state_->recall(lock, recall, threads);
+  return nprobe_for(table->table, recall, state_->store.quantizer().nlist());
+}
+
+Matches PrototypeMap::search(Descriptors queries, std::size_t k,
+                             const SearchOptions& options) const {
+  return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
+}
+
+Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
+                                   const SearchOptions& options) const {
+  Matches matches{{queries.rows, k}, {queries.rows, k}};
+  std::shared_lock lock(state_->searching);
+  const PrototypeStore& store = state_->store;
+  auto nprobe = requested_nprobe(options, store.quantizer().nlist(), kRemedy);
+  if (options.recall) {
+    const auto table = state_->recall(lock, *options.recall, options.threads);
+    nprobe = nprobe_for(table->table, *options.recall, store.quantizer().nlist());
+  }
+  if (!nprobe) {
+    search_exact(store.view(), queries, options, matches.ids.view(), matches.distances.view());
+  } else {
+    search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(), *nprobe,
+                 queries, options, matches.ids.view(), matches.distances.view());
+  }
+  return matches;
+}
+
+// Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.
+RecallTable measure_recall_of(const PrototypeStore& store,
+                              const std::function<int(std::int8_t)>& value,
+                              const SearchTwo& search_two) {
+  const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
+  std::vector<std::int64_t> own;
+  for (const Row row : rows) own.push_back(store.id(store.owner(row)));
+  const std::vector<std::int8_t> codes = store.rounded(rows);
+  std::vector<std::int8_t> prototype(store.dim());
+  const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
+    std::uint32_t list = 0;
+    std::int32_t least = INT32_MAX;
+    for (const Row row : store.sorted_rows(store.at(id))) {
+      store.rounded(row, prototype.data());
+      std::int32_t distance = 0;
+      for (std::size_t d = 0; d < prototype.size(); ++d) {
+        const int difference = query[d] - value(prototype[d]);
+        distance += difference * difference;
+      }
+      if (distance >= least) continue;
+      least = distance;
+      list = store.lists().list_of(row);
+    }
+    return list;
+  };
+  return measure_recall({codes.data(), rows.size(), store.dim()}, own, store.quantizer(),
+                        search_two, list_of);
+}
+
+std::shared_ptr<const MeasuredRecall> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
+                                                       double recall, int threads) {
+  for (bool tried = false;; tried = true) {
+    check_recall(recall, store.quantizer().nlist(), kRemedy);
+    std::shared_ptr<const MeasuredRecall> known;
+    {
+      const std::scoped_lock reading(recall_mutex);
+      known = recall_table;
+    }
+    const bool of_these = known && known->lists_version == store.lists_version();
+    if (of_these && (tried || !is_stale(*known))) return known;
+    lock.unlock();
+    measure(threads, !of_these);
+    lock.lock();
+  }
+}
+
+bool MapState::is_stale(const MeasuredRecall& table) const {
+  return table.lists_version != store.lists_version() ||
+         (store.changes() - table.changes) * kStalePart >= store.prototype_count();
+}
+
+// Without `wait` only if nobody else measures or changes the map.
+void MapState::measure(int threads, bool wait) {
+  std::unique_lock one(measuring, std::defer_lock);
+  std::shared_lock still(changing, std::defer_lock);
+  if (wait) {
+    one.lock();
+    still.lock();
+  } else if (!one.try_lock() || !still.try_lock()) {
+    return;
+  }
+  if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
+  auto measured = std::make_shared<MeasuredRecall>();
+  measured->table = measure_recall_of(
+      store, [](std::int8_t code) { return int{code}; },
+      [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
+        SearchOptions options;
+        options.threads = threads;
+        search_exact(store.view(), queries, options, ids, distances);
+      });
+  measured->lists_version = store.lists_version();
+  measured->changes = store.changes();
+  const std::scoped_lock writing(recall_mutex);
+  recall_table = std::move(measured);
 }
 
 }  // namespace protomark

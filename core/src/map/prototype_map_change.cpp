@@ -3,12 +3,11 @@
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
-#include <stdexcept>
-#include <string>
 #include <unordered_map>
 
 #include "base/id_index.h"
 #include "base/parallel.h"
+#include "base/text.h"
 #include "map/map_state.h"
 
 namespace protomark {
@@ -20,25 +19,22 @@ constexpr std::size_t kEncodeChunk = 1 << 13;
 constexpr std::size_t kMinShare = 64, kMaxShare = 512;
 
 void check_pairs(std::size_t ids, std::size_t others, const char* what) {
-  if (ids == others) return;
-  throw std::invalid_argument(std::to_string(ids) + " landmark ids for " + std::to_string(others) +
-                              " " + what);
+  if (ids != others) invalid(ids, " landmark ids for ", others, " ", what);
 }
 
 void check_codes(Codes codes, std::size_t dim) {
   if (codes.columns != dim) {
-    throw std::invalid_argument("codes have " + std::to_string(codes.columns) +
-                                " dimensions, the map has " + std::to_string(dim));
+    invalid("codes have ", codes.columns, " dimensions, the map has ", dim);
   }
   const std::size_t n = codes.rows * codes.columns;
   if (n > 0 && std::memchr(codes.data, -128, n) != nullptr) {
-    throw std::invalid_argument("codes must be -127 to 127, one is -128");
+    invalid("codes must be -127 to 127, one is -128");
   }
 }
 
 void check_new_ids(std::span<const std::int64_t> ids) {
   for (const std::int64_t id : ids) {
-    if (id < 0) throw std::invalid_argument("landmark id " + std::to_string(id) + " is negative");
+    if (id < 0) invalid("landmark id ", id, " is negative");
   }
 }
 
@@ -151,13 +147,12 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
   std::unordered_map<std::uint32_t, std::size_t> of_row;
   std::vector<Difference> differences;
   const auto never_added = [](std::int64_t id) {
-    return std::invalid_argument("descriptors to be subtracted from landmark " +
-                                 std::to_string(id) + " were never added to it");
+    invalid("descriptors to be subtracted from landmark ", id, " were never added to it");
   };
   for (std::size_t i = 0; i < ids.size(); ++i) {
     const std::int64_t id = ids[i];
     const Row row = store.find_row(store.at(id), store.appearance_of(codes.row(i)));
-    if (row == kNoRow) throw never_added(id);
+    if (row == kNoRow) never_added(id);
     const auto [found, is_new] = of_row.emplace(row.value, differences.size());
     if (is_new) differences.push_back({id, store.appearance(row), 0, std::vector<int>(dim)});
     Difference& difference = differences[found->second];
@@ -169,33 +164,25 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
     const Difference& difference = differences[index];
     const int left = store.count(row) - difference.count;
     if (left < 0) {
-      throw std::invalid_argument("landmark " + std::to_string(difference.id) + " has " +
-                                  std::to_string(store.count(row)) + " observations" +
-                                  (store.several() ? " of one appearance" : "") + ", " +
-                                  std::to_string(difference.count) + " cannot be subtracted");
+      invalid("landmark ", difference.id, " has ", store.count(row), " observations",
+              store.several() ? " of one appearance" : "", ", ", difference.count,
+              " cannot be subtracted");
     }
     for (std::size_t d = 0; d < dim; ++d) {
-      if (std::abs(store.sum(row)[d] - difference.sum[d]) > 127 * left) {
-        throw never_added(difference.id);
-      }
+      if (std::abs(store.sum(row)[d] - difference.sum[d]) > 127 * left) never_added(difference.id);
     }
   }
-  for (const auto [begin, end] : change.pieces(differences.size())) {
-    for (std::size_t i = begin; i < end; ++i) {
-      const Difference& difference = differences[i];
-      const Row row = store.find_row(store.at(difference.id), difference.appearance);
-      if (store.count(row) == difference.count) {
-        store.erase_row(row);
-        continue;
-      }
-      std::int16_t* sum = store.sum(row);
-      for (std::size_t d = 0; d < dim; ++d) {
-        sum[d] = static_cast<std::int16_t>(sum[d] - difference.sum[d]);
-      }
-      store.set_count(row, store.count(row) - difference.count);
-      store.refresh(row);
+  change.in_pieces(differences.size(), [&](std::size_t i) {
+    const Difference& difference = differences[i];
+    const Row row = store.find_row(store.at(difference.id), difference.appearance);
+    if (store.count(row) == difference.count) return store.erase_row(row);
+    std::int16_t* sum = store.sum(row);
+    for (std::size_t d = 0; d < dim; ++d) {
+      sum[d] = static_cast<std::int16_t>(sum[d] - difference.sum[d]);
     }
-  }
+    store.set_count(row, store.count(row) - difference.count);
+    store.refresh(row);
+  });
 }
 
 void PrototypeMap::remove(std::span<const std::int64_t> ids) {
@@ -204,9 +191,7 @@ void PrototypeMap::remove(std::span<const std::int64_t> ids) {
   std::ranges::sort(sorted);
   sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
   for (const std::int64_t id : sorted) state_->store.at(id);
-  for (const auto [begin, end] : change.pieces(sorted.size())) {
-    for (std::size_t i = begin; i < end; ++i) state_->store.erase(sorted[i]);
-  }
+  change.in_pieces(sorted.size(), [&](std::size_t i) { state_->store.erase(sorted[i]); });
 }
 
 void PrototypeMap::merge_landmarks(std::span<const std::int64_t> into,
@@ -219,28 +204,16 @@ void PrototypeMap::merge_landmarks(std::span<const std::int64_t> into,
     for (const std::int64_t id : {into[i], source[i]}) {
       store.at(id);
       if (removed.contains(id)) {
-        throw std::invalid_argument("landmark " + std::to_string(id) +
-                                    " was merged into another earlier in the same call");
+        invalid("landmark ", id, " was merged into another earlier in the same call");
       }
     }
-    if (into[i] == source[i]) {
-      throw std::invalid_argument("landmark " + std::to_string(into[i]) +
-                                  " cannot be merged into itself");
-    }
+    if (into[i] == source[i]) invalid("landmark ", into[i], " cannot be merged into itself");
     removed.insert(source[i]);
   }
-  for (const auto [begin, end] : change.pieces(into.size())) {
-    for (std::size_t i = begin; i < end; ++i) {
-      const LandmarkIndex from = store.at(source[i]);
-      for (const Row row : store.rows(from)) {
-        const Row target = store.find_or_create_row(into[i], store.appearance(row));
-        store.merge(target, store.sum(row), store.count(row));  // sums may have moved
-      }
-      const LandmarkIndex to = store.at(into[i]);
-      if (!has_position(store.position(to))) store.set_position(to, store.position(from));
-      store.erase(source[i]);
-    }
-  }
+  change.in_pieces(into.size(), [&](std::size_t i) {
+    store.merge(into[i], store, store.at(source[i]));
+    store.erase(source[i]);
+  });
 }
 
 void PrototypeMap::set_metadata(Metadata metadata) {
@@ -257,17 +230,11 @@ void PrototypeMap::set_positions(std::span<const std::int64_t> ids,
     store.at(ids[i]);
     const Position& p = positions[i];
     const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
-    if (!finite && has_position(p)) {
-      throw std::invalid_argument("position of landmark " + std::to_string(ids[i]) +
-                                  " is not finite");
-    }
+    if (!finite && has_position(p)) invalid("position of landmark ", ids[i], " is not finite");
   }
   if (std::ranges::any_of(positions, has_position)) change.make_room_for_positions();
-  for (const auto [begin, end] : change.pieces(ids.size())) {
-    for (std::size_t i = begin; i < end; ++i) {
-      store.set_position(store.at(ids[i]), positions[i]);
-    }
-  }
+  change.in_pieces(ids.size(),
+                   [&](std::size_t i) { store.set_position(store.at(ids[i]), positions[i]); });
 }
 
 }  // namespace protomark

@@ -3,7 +3,6 @@
 #include <cmath>
 #include <cstdlib>
 #include <optional>
-#include <stdexcept>
 #include <string>
 #include <utility>
 
@@ -14,83 +13,65 @@
 namespace protomark {
 namespace {
 
-// Landmarks as the sections of a file, be it a whole map or a commit.
-class LandmarkSections {
- public:
-  // All landmarks of a store, which must not change as long as this is there.
-  explicit LandmarkSections(const PrototypeStore& store)
-      : store_(store),
-        landmark_count_(store.landmark_count()),
-        row_count_(store.prototype_count()),
-        positions_(store.any_position()) {}
-  // Some landmarks, by ascending id.
-  LandmarkSections(const PrototypeStore& store, std::vector<LandmarkIndex> landmarks)
-      : store_(store), some_(std::move(landmarks)), landmark_count_(some_->size()) {
-    for (const LandmarkIndex landmark : *some_) {
-      row_count_ += store.row_count(landmark);
-      positions_ = positions_ || has_position(store.position(landmark));
+// Adds the sections of all landmarks of a store, or of some by ascending id. The store must not
+// change until the file is written.
+void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
+                   const std::optional<std::vector<LandmarkIndex>>& some = {}) {
+  std::size_t n = store.landmark_count(), m = store.prototype_count();
+  // A map whose positions were all taken away equals one that never had any.
+  bool positions = !some && store.any_position();
+  if (some) {
+    n = some->size();
+    m = 0;
+    for (const LandmarkIndex landmark : *some) {
+      m += store.row_count(landmark);
+      positions = positions || has_position(store.position(landmark));
     }
   }
-
-  // Adds all sections to a file that is written as long as this is there.
-  void add_to(ContainerWriter& file) const {
-    const std::size_t n = landmark_count_, m = row_count_;
-    add_value(file, section::kShape, MapShape{n, store_.dim(), {}});
-    std::vector<ContainerWriter::Part> parts{{section::kIds, n * sizeof(std::int64_t)}};
-    if (store_.several()) {
-      add_value(file, section::kAppearanceBits,
-                static_cast<std::uint32_t>(store_.appearance_bits()));
-      parts.push_back({section::kRows, n * sizeof(std::uint32_t)});
-      parts.push_back({section::kAppearances, m * sizeof(std::uint16_t)});
-    }
-    parts.push_back({section::kCounts, m});
-    parts.push_back({section::kSums, m * store_.dim() * sizeof(std::int16_t)});
-    // A map whose positions were all taken away equals one that never had any.
-    if (positions_) parts.push_back({section::kPositions, n * sizeof(Position)});
-    file.add_together(std::move(parts), [this](Sinks sinks) {
-      const auto put = [&](std::span<const LandmarkIndex> landmarks) { put_all(sinks, landmarks); };
-      some_ ? put(*some_) : store_.visit_sorted_landmarks(put);
-    });
+  add_value(file, section::kShape, MapShape{n, store.dim(), {}});
+  std::vector<ContainerWriter::Part> parts{{section::kIds, n * sizeof(std::int64_t)}};
+  if (store.several()) {
+    add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(store.appearance_bits()));
+    parts.push_back({section::kRows, n * sizeof(std::uint32_t)});
+    parts.push_back({section::kAppearances, m * sizeof(std::uint16_t)});
   }
+  parts.push_back({section::kCounts, m});
+  parts.push_back({section::kSums, m * store.dim() * sizeof(std::int16_t)});
+  if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
 
- private:
-  using Sinks = std::span<const ContainerWriter::Sink>;
-
-  void put_all(Sinks sinks, std::span<const LandmarkIndex> landmarks) const {
-    constexpr std::size_t kRows = 1 << 13;  // at a time, and those of one landmark
-    for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
-      for (std::size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
-        rows += store_.row_count(landmarks[end]);
-      }
-      put_piece(sinks, landmarks.subspan(first, end - first));
-    }
-  }
-
-  void put_piece(Sinks sinks, std::span<const LandmarkIndex> landmarks) const {
-    const std::vector<Row> rows = store_.sorted_rows(landmarks);
-    const std::span<const Row> all(rows);
+  const auto put_piece = [&store, positions](std::span<const ContainerWriter::Sink> sinks,
+                                             std::span<const LandmarkIndex> landmarks) {
+    const std::vector<Row> sorted = store.sorted_rows(landmarks);
+    const std::span<const Row> rows(sorted);
     auto sink = sinks.begin();
-    put_each<std::int64_t>(*sink++, landmarks, [&](LandmarkIndex l) { return store_.id(l); });
-    if (store_.several()) {
+    put_each<std::int64_t>(*sink++, landmarks, [&](LandmarkIndex l) { return store.id(l); });
+    if (store.several()) {
       put_each<std::uint32_t>(*sink++, landmarks, [&](LandmarkIndex l) {
-        return static_cast<std::uint32_t>(store_.row_count(l));
+        return static_cast<std::uint32_t>(store.row_count(l));
       });
-      put_each<std::uint16_t>(*sink++, all, [&](Row row) { return store_.appearance(row); });
+      put_each<std::uint16_t>(*sink++, rows, [&](Row row) { return store.appearance(row); });
     }
-    put_each<std::uint8_t>(*sink++, all,
-                           [&](Row row) { return static_cast<std::uint8_t>(store_.count(row)); });
-    put_values<std::int16_t>(*sink++, rows.size(), store_.dim(), [&](std::size_t i, auto* to) {
-      std::copy_n(store_.sum(rows[i]), store_.dim(), to);
+    put_each<std::uint8_t>(*sink++, rows,
+                           [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
+    put_values<std::int16_t>(*sink++, rows.size(), store.dim(), [&](std::size_t i, auto* to) {
+      std::copy_n(store.sum(rows[i]), store.dim(), to);
     });
-    if (!positions_) return;
-    put_each<Position>(*sink, landmarks, [&](LandmarkIndex l) { return store_.position(l); });
-  }
-
-  const PrototypeStore& store_;
-  std::optional<std::vector<LandmarkIndex>> some_;  // nullopt: all
-  std::size_t landmark_count_, row_count_ = 0;
-  bool positions_ = false;
-};
+    if (!positions) return;
+    put_each<Position>(*sink, landmarks, [&](LandmarkIndex l) { return store.position(l); });
+  };
+  file.add_together(std::move(parts), [&store, some, put_piece](auto sinks) {
+    const auto put = [&](std::span<const LandmarkIndex> landmarks) {
+      constexpr std::size_t kRows = 1 << 13;  // at a time, and those of one landmark
+      for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
+        for (std::size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
+          rows += store.row_count(landmarks[end]);
+        }
+        put_piece(sinks, landmarks.subspan(first, end - first));
+      }
+    };
+    some ? put(*some) : store.visit_sorted_landmarks(put);
+  });
+}
 
 // The signs that tell appearances apart; 0 if the file has none.
 std::size_t read_appearance_bits(const ContainerReader& file, std::size_t dim) {
@@ -98,8 +79,7 @@ std::size_t read_appearance_bits(const ContainerReader& file, std::size_t dim) {
   const auto bits = read_value<std::uint32_t>(file, section::kAppearanceBits);
   const std::size_t limit = std::min(PrototypeMap::kMaxAppearanceBits, dim);
   if (bits == 0 || bits > limit) {
-    file.fail("its appearances have " + std::to_string(bits) + " bits, not 1 to " +
-              std::to_string(limit));
+    file.fail("its appearances have ", bits, " bits, not 1 to ", limit);
   }
   return bits;
 }
@@ -186,12 +166,10 @@ class Reading {
         const std::uint16_t appearance = several ? appearances[row] : 0;
         if (appearance >> store_.appearance_bits() != 0 ||
             (row > first && appearance <= appearances[row - 1])) {
-          file.fail("the appearances of landmark " + std::to_string(ids[i]) + " do not ascend");
+          file.fail("the appearances of landmark ", ids[i], " do not ascend");
         }
         if (!wanted) continue;
-        const Row to = row == first ? store_.create_landmark(ids[i], appearance)
-                                    : store_.create_row(landmark, appearance);
-        landmark = store_.owner(to);
+        const Row to = store_.create_row(ids[i], landmark, appearance);
         std::copy_n(sum, dim, store_.sum(to));
         store_.set_count(to, counts[row]);
         store_.refresh(to);
@@ -201,7 +179,7 @@ class Reading {
       const bool finite =
           std::ranges::all_of(positions[i], [](double x) { return std::isfinite(x); });
       if (!finite && has_position(positions[i])) {
-        file.fail("landmark " + std::to_string(ids[i]) + " has no finite position");
+        file.fail("landmark ", ids[i], " has no finite position");
       }
     }
     // After the landmarks, so that room for positions is made once.
@@ -214,7 +192,7 @@ class Reading {
                        int count) const {
     if (count == 0 ||
         std::any_of(sum, sum + store_.dim(), [&](int s) { return std::abs(s) > 127 * count; })) {
-      file.fail("landmark " + std::to_string(id) + " has an impossible prototype");
+      file.fail("landmark ", id, " has an impossible prototype");
     }
   }
 
@@ -236,7 +214,7 @@ std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalCon
   Reading reading(*state);
   const auto commits = journal.commits(file.identity());
   for (auto commit = commits.rbegin(); commit != commits.rend(); ++commit) {
-    const std::string name = journal.name() + ": record at byte " + std::to_string(commit->offset);
+    const std::string name = text(journal.name(), ": record at byte ", commit->offset);
     reading.read_commit(ContainerReader(commit->bytes, name));
   }
   reading.read_map(file);
@@ -268,14 +246,14 @@ std::unique_ptr<MapState> read_with_journal(const std::filesystem::path& path) {
   }
 }
 
-// The map as a file that is written as long as `landmarks` is there and the map does not change.
-ContainerWriter file_of(const MapState& state, const LandmarkSections& landmarks) {
+// The map as a file, which must be written before the map changes.
+ContainerWriter file_of(const MapState& state) {
   ContainerWriter file(FileKind::learning_map);
   file.add(section::kEncoder, state.encoder->serialize());
   add_metadata(file, state.metadata);
   const std::vector<std::int8_t>& centroids = state.store.quantizer().centroids();
   if (!centroids.empty()) file.add(section::kCentroids, std::as_bytes(std::span(centroids)));
-  landmarks.add_to(file);
+  add_landmarks(file, state.store);
   return file;
 }
 
@@ -287,14 +265,9 @@ std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
   std::vector<LandmarkIndex> existing;
   for (const std::int64_t id : ids) {
     const LandmarkIndex landmark = state.store.find(id);
-    if (landmark == kNoLandmark) {
-      removed.push_back(id);
-    } else {
-      existing.push_back(landmark);
-    }
+    landmark == kNoLandmark ? removed.push_back(id) : existing.push_back(landmark);
   }
-  const LandmarkSections landmarks(state.store, std::move(existing));
-  landmarks.add_to(record);
+  add_landmarks(record, state.store, std::move(existing));
   if (!removed.empty()) record.add(section::kRemoved, std::as_bytes(std::span(removed)));
   if (changes.metadata) {
     // An empty section says that there is none any more, an absent one that it did not change.
@@ -317,8 +290,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
     if (state_->journal) return state_->fold();
   }
   const std::shared_lock lock(state_->changing);
-  const LandmarkSections landmarks(state_->store);
-  write_guarded(file_of(*state_, landmarks), path);
+  write_guarded(file_of(*state_), path);
 }
 
 PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::string& name,
@@ -340,7 +312,7 @@ bool PrototypeMap::has_journal() const {
 
 Journal& MapState::need_journal() const {
   if (journal) return *journal;
-  throw std::invalid_argument("this map has no journal: open it with one to commit");
+  invalid("this map has no journal: open it with one to commit");
 }
 
 std::size_t PrototypeMap::commit() {
@@ -383,8 +355,7 @@ void MapState::fold() {
   std::string identity;
   {
     const std::shared_lock lock(changing);
-    const LandmarkSections landmarks(store);
-    file_of(*this, landmarks).write(own.map(), [&](const std::string& written) {
+    file_of(*this).write(own.map(), [&](const std::string& written) {
       own.fold(written);
       identity = written;
     });

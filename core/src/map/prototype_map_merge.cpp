@@ -3,11 +3,10 @@
 #include <array>
 #include <cmath>
 #include <functional>
-#include <stdexcept>
-#include <string>
 #include <unordered_map>
 #include <utility>
 
+#include "base/text.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
 
@@ -26,8 +25,7 @@ Cell cell_of(const Position& position, double size) {
     const double remainder = std::fmod(position[i], size);
     const double index = std::round((position[i] - remainder) / size) - (remainder < 0 ? 1 : 0);
     if (!(std::abs(index) <= kMaxCell)) {
-      throw std::invalid_argument("cells of " + std::to_string(size) +
-                                  " are too small for the extent of this map");
+      invalid("cells of ", size, " are too small for the extent of this map");
     }
     cell[i] = static_cast<std::int64_t>(index);
   }
@@ -36,16 +34,15 @@ Cell cell_of(const Position& position, double size) {
 
 void check_alike(const PrototypeMap& map, const PrototypeMap& other) {
   const auto describe = [](const PrototypeMap& m) {
-    return "'" + m.encoder()->info().name + "' with " + std::to_string(m.dim());
+    return text("'", m.encoder()->info().name, "' with ", m.dim());
   };
   if (other.encoder()->identity() != map.encoder()->identity() || other.dim() != map.dim()) {
-    throw std::invalid_argument("maps of different encoders or dimensions cannot be merged: " +
-                                describe(map) + ", " + describe(other));
+    invalid("maps of different encoders or dimensions cannot be merged: ", describe(map), ", ",
+            describe(other));
   }
   if (other.appearance_bits() != map.appearance_bits()) {
-    throw std::invalid_argument("maps of " + std::to_string(map.appearance_bits()) + " and " +
-                                std::to_string(other.appearance_bits()) +
-                                " appearance bits cannot be merged: build both with the same");
+    invalid("maps of ", map.appearance_bits(), " and ", other.appearance_bits(),
+            " appearance bits cannot be merged: build both with the same");
   }
 }
 
@@ -53,11 +50,10 @@ void check_alike(const PrototypeMap& map, const PrototypeMap& other) {
 
 void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int64_t> into,
                              std::span<const std::int64_t> source) {
-  if (&other == this) throw std::invalid_argument("a map cannot be merged into itself");
+  if (&other == this) invalid("a map cannot be merged into itself");
   check_alike(*this, other);
   if (into.size() != source.size()) {
-    throw std::invalid_argument(std::to_string(into.size()) + " landmark ids for " +
-                                std::to_string(source.size()) + " sources");
+    invalid(into.size(), " landmark ids for ", source.size(), " sources");
   }
   // Both wait for their turn, in one order for all pairs of maps, so that no two merges wait for
   // each other.
@@ -76,12 +72,9 @@ void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int
   std::unordered_map<std::uint32_t, std::int64_t> renamed;
   renamed.reserve(source.size());
   for (std::size_t i = 0; i < source.size(); ++i) {
-    if (into[i] < 0) {
-      throw std::invalid_argument("landmark id " + std::to_string(into[i]) + " is negative");
-    }
+    if (into[i] < 0) invalid("landmark id ", into[i], " is negative");
     if (!renamed.emplace(from.at(source[i]).value, into[i]).second) {
-      throw std::invalid_argument("landmark " + std::to_string(source[i]) +
-                                  " of the other map is named twice");
+      invalid("landmark ", source[i], " of the other map is named twice");
     }
   }
   Metadata metadata = merged(state_->metadata, other.state_->metadata);
@@ -100,15 +93,7 @@ void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int
     }
     change.make_room(new_landmarks, to.several() ? rows : new_landmarks, rows);
     const auto lock = change.write();
-    for (std::size_t i = 0; i < ids.size(); ++i) {
-      const LandmarkIndex theirs = landmarks[first + i];
-      for (const Row row : from.rows(theirs)) {
-        to.merge(to.find_or_create_row(ids[i], from.appearance(row)), from.sum(row),
-                 from.count(row));
-      }
-      const LandmarkIndex ours = to.at(ids[i]);
-      if (!has_position(to.position(ours))) to.set_position(ours, from.position(theirs));
-    }
+    for (std::size_t i = 0; i < ids.size(); ++i) to.merge(ids[i], from, landmarks[first + i]);
     to.reassign(1);
   }
   change.set_metadata(std::move(metadata));
@@ -124,10 +109,7 @@ PrototypeMap MapState::part(std::span<const LandmarkIndex> landmarks) const {
   for (const LandmarkIndex landmark : landmarks) {
     LandmarkIndex own = kNoLandmark;
     for (const Row row : store.sorted_rows(landmark)) {
-      const Row copy = own == kNoLandmark
-                           ? to.create_landmark(store.id(landmark), store.appearance(row))
-                           : to.create_row(own, store.appearance(row));
-      own = to.owner(copy);
+      const Row copy = to.create_row(store.id(landmark), own, store.appearance(row));
       to.merge(copy, store.sum(row), store.count(row));
     }
     to.set_position(own, store.position(landmark));
@@ -137,9 +119,7 @@ PrototypeMap MapState::part(std::span<const LandmarkIndex> landmarks) const {
 
 std::vector<PrototypeMap> PrototypeMap::split_by_id(
     std::span<const std::int64_t> boundaries) const {
-  if (!std::ranges::is_sorted(boundaries)) {
-    throw std::invalid_argument("boundaries of parts must ascend");
-  }
+  if (!std::ranges::is_sorted(boundaries)) invalid("boundaries of parts must ascend");
   const std::shared_lock lock(state_->changing);
   const std::vector<LandmarkIndex> landmarks = state_->store.sorted_landmarks();
   std::vector<PrototypeMap> parts;
@@ -159,7 +139,7 @@ std::vector<PrototypeMap> PrototypeMap::split_by_id(
 
 std::vector<MapPart> PrototypeMap::split_by_space(double cell_size) const {
   if (!(cell_size > 0) || std::isinf(cell_size)) {
-    throw std::invalid_argument("the edge of a cell must be above 0 and finite");
+    invalid("the edge of a cell must be above 0 and finite");
   }
   const std::shared_lock lock(state_->changing);
   const PrototypeStore& store = state_->store;

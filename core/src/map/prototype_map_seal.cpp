@@ -5,7 +5,6 @@
 #include <cstring>
 #include <optional>
 #include <span>
-#include <stdexcept>
 #include <string>
 #include <utility>
 #include <vector>
@@ -106,24 +105,24 @@ class SealedLandmarks {
 // for these.
 class RowWriter {
  public:
-  // `padding` is the owner of padding, and owners have so many bits.
-  RowWriter(const BlockPacker& packer, const Sink& prototypes, const Sink* owners = nullptr,
-            int bits = 0, std::size_t padding = 0)
-      : packer_(packer), prototypes_(prototypes), owners_(owners), bits_(bits), padding_(padding) {}
+  RowWriter(const BlockPacker& packer, std::size_t landmarks, const Sink& prototypes,
+            const Sink* owners = nullptr)
+      : packer_(packer), landmarks_(landmarks), prototypes_(prototypes), owners_(owners) {}
 
   void add(Row row, std::size_t owner = 0) {
     block_[filled_++] = row;
-    if (owners_ != nullptr) packed_owners_.add(owner, bits_);
+    if (owners_ != nullptr) packed_owners_.add(owner, owner_bits(landmarks_));
     if (filled_ == kPackedRows) end_block();
   }
   void end_list() {
-    while (filled_ != 0) add(kNoRow, padding_);
+    while (filled_ != 0) add(kNoRow, landmarks_);
   }
   // Returns the checksums of owners.
   std::vector<std::uint32_t> finish() {
     packed_owners_.align();
+    flush_owners(1);
     flush();
-    return checksums_.all();
+    return std::move(checksums_);
   }
 
  private:
@@ -134,59 +133,64 @@ class RowWriter {
     packer_.pack(block_.data(), packed_.data() + packed_.size() - packer_.size());
     filled_ = 0;
     if (packed_.size() >= kPiece) flush();
+    flush_owners(CheckedNumbers::kBlock);
   }
   void flush() {
     prototypes_(std::as_bytes(std::span(packed_)));
     packed_.clear();
-    if (owners_ == nullptr) return;
-    checksums_.add(packed_owners_.words());
-    (*owners_)(std::as_bytes(std::span(packed_owners_.words())));
-    packed_owners_.words().clear();
+  }
+  // Writes owners by blocks as long as there are so many words.
+  void flush_owners(std::size_t least) {
+    std::vector<std::uint64_t>& words = packed_owners_.words();
+    while (words.size() >= least) {
+      const auto end = words.begin() + std::min(words.size(), CheckedNumbers::kBlock);
+      const auto block = std::as_bytes(std::span(words.begin(), end));
+      checksums_.push_back(crc32(block));
+      (*owners_)(block);
+      words.erase(words.begin(), end);
+    }
   }
 
   const BlockPacker& packer_;
+  std::size_t landmarks_;
   const Sink& prototypes_;
   const Sink* owners_;
-  int bits_;
-  std::size_t padding_;
   std::array<Row, kPackedRows> block_{};
   std::size_t filled_ = 0;
   std::vector<std::uint8_t> packed_;
   BitPacker packed_owners_;
-  BlockChecksums checksums_;
+  std::vector<std::uint32_t> checksums_;
 };
 
-// Finds the two nearest landmarks of each query among the levels of 4-bit prototypes, piece by
+// Finds the two nearest landmarks of each query among prototypes as they are packed, piece by
 // piece.
-void search_levels(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
+void search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
                    MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
   // As much memory as is little beside the map.
   const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
-  const std::size_t dim = store.dim();
-  std::vector<CodeVector> packed(packed_size(size, dim) / sizeof(CodeVector));
-  auto* levels = reinterpret_cast<std::int8_t*>(packed.data());
+  std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
   std::vector<LandmarkIndex> own_index(size);  // several rows may have the same id
-  for (std::uint32_t i = 0; i < size; ++i) own_index[i].value = i;
+  for (std::size_t i = 0; i < size; ++i) own_index[i] = landmark_at(i);
   std::vector<std::int64_t> owners;
-  std::vector<std::int8_t> code(dim);
+  std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.places(2, {});
-  const auto search_piece = [&] {
-    PackedPrototypes piece{levels, owners.size(), dim};
+  for (std::size_t first = 0; first < store.row_end(); first += size) {
+    owners.clear();
+    auto* to = reinterpret_cast<std::uint8_t*>(packed.data());
+    for (std::size_t i = first; i < std::min(first + size, store.row_end()); ++i) {
+      const Row row = row_at(i);
+      block[i % kPackedRows] = store.is_row(row) ? row : kNoRow;
+      owners.push_back(store.is_row(row) ? store.id(store.owner(row)) : -1);
+      if (i % kPackedRows + 1 != kPackedRows) continue;
+      packer.pack(block.data(), to);
+      to += packer.size();
+    }
+    PackedPrototypes piece{packed.data(), owners.size(), store.dim(), packer.scale()};
     piece.landmarks.of_row = own_index.data();
     piece.landmarks.ids = owners.data();
     PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, owners.size()});
-    owners.clear();
-  };
-  store.each_row([&](Row row) {
-    store.rounded(row, code.data());
-    for (std::size_t d = 0; d < dim; ++d) {
-      levels[packed_index(owners.size(), d, dim)] = static_cast<std::int8_t>(packer.value(code[d]));
-    }
-    owners.push_back(store.id(store.owner(row)));
-    if (owners.size() == size) search_piece();
-  });
-  search_piece();
+  }
   write_answer(nearest, prepared.norms(), std::nullopt, std::nullopt, ids, distances);
 }
 
@@ -197,11 +201,7 @@ class SealedContent {
   // `store` has the prototypes, `map` everything else.
   SealedContent(const PrototypeStore& store, const PrototypeStore& map, const BlockPacker& packer,
                 const std::optional<PositionCodec>& codec)
-      : store_(store),
-        map_(map),
-        packer_(packer),
-        codec_(codec),
-        owner_bits_(owner_bits(map.landmark_count())) {
+      : store_(store), map_(map), packer_(packer), codec_(codec) {
     std::int64_t largest = -1;
     for (const std::int64_t id : store.ids()) largest = std::max(largest, id);
     ids_are_stored_ = !ids_are_indices(store.landmark_count(), largest);
@@ -222,7 +222,7 @@ class SealedContent {
     }
     file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
     if (nlist == 0) return;
-    const std::size_t words = packed_words(store_.row_end(), owner_bits_);
+    const std::size_t words = packed_words(store_.row_end(), owner_bits(n));
     file.add_together({prototypes, {section::kOwners, words * sizeof(std::uint64_t)}},
                       [this](Sinks sinks) { put_lists(sinks); });
     file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(std::uint32_t),
@@ -236,13 +236,7 @@ class SealedContent {
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
           store_, [this](std::int8_t code) { return packer_.value(code); },
-          [this](Codes queries, MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
-            if (packer_.scale() == 0) {
-              search_exact(store_.view(), queries, {}, ids, distances);
-            } else {
-              search_levels(store_, packer_, queries, ids, distances);
-            }
-          });
+          [this](auto... arguments) { search_packed(store_, packer_, arguments...); });
       sink(std::as_bytes(std::span(table)));
     });
   }
@@ -256,7 +250,9 @@ class SealedContent {
     const Sink* row_counts = has_row_counts() ? &*sink++ : nullptr;
     const Sink* positions = codec_ ? &*sink++ : nullptr;
     std::optional<RowWriter> prototypes;
-    if (store_.quantizer().nlist() == 0) prototypes.emplace(packer_, *sink++);
+    if (store_.quantizer().nlist() == 0) {
+      prototypes.emplace(packer_, store_.landmark_count(), *sink++);
+    }
     std::optional<IdBlockWriter> ids;
     if (ids_are_stored_) ids.emplace(sink[0], sink[1]);
     if (!prototypes && ids_are_stored_) landmarks_.emplace(store_);
@@ -295,7 +291,7 @@ class SealedContent {
   }
 
   void put_lists(Sinks sinks) {
-    RowWriter writer(packer_, sinks[0], &sinks[1], owner_bits_, store_.landmark_count());
+    RowWriter writer(packer_, store_.landmark_count(), sinks[0], &sinks[1]);
     for (std::uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
       store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
         for (const Row row : rows) {
@@ -313,7 +309,6 @@ class SealedContent {
   const PrototypeStore &store_, &map_;
   const BlockPacker& packer_;
   const std::optional<PositionCodec>& codec_;
-  int owner_bits_;
   bool ids_are_stored_;
   std::optional<SealedLandmarks> landmarks_;  // with an index, if ids are stored
   std::vector<std::uint32_t> owner_checksums_;
@@ -323,8 +318,7 @@ class SealedContent {
 
 void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& options) const {
   if (options.position_bits != 32 && options.position_bits != 16) {
-    throw std::invalid_argument("position_bits must be 32 or 16, not " +
-                                std::to_string(options.position_bits));
+    invalid("position_bits must be 32 or 16, not ", options.position_bits);
   }
   const std::shared_lock lock(state_->changing);
   const PrototypeStore& map = state_->store;

@@ -52,9 +52,9 @@ class PrototypeStore : private RowTable {
       : RowTable(appearance_bits != 0), dim_(dim), appearance_bits_(appearance_bits) {}
 
   using RowTable::any_position, RowTable::appearance, RowTable::at, RowTable::find,
-      RowTable::find_row, RowTable::first_row, RowTable::id, RowTable::ids, RowTable::next_row,
-      RowTable::owner, RowTable::position, RowTable::positions, RowTable::row_count, RowTable::rows,
-      RowTable::sorted_rows, RowTable::steps;
+      RowTable::find_row, RowTable::first_row, RowTable::id, RowTable::ids, RowTable::is_row,
+      RowTable::next_row, RowTable::owner, RowTable::position, RowTable::positions,
+      RowTable::row_count, RowTable::sorted_rows, RowTable::steps;
 
   std::size_t dim() const { return dim_; }
   std::size_t appearance_bits() const { return appearance_bits_; }
@@ -85,10 +85,9 @@ class PrototypeStore : private RowTable {
   // The row of a landmark's appearance, or a new one with a sum and count of zero. If memory runs
   // out nothing has changed.
   Row find_or_create_row(std::int64_t id, std::uint16_t appearance);
-  // The first row of an id that is not there yet, and another row for an appearance that its
-  // landmark does not have.
-  Row create_landmark(std::int64_t id, std::uint16_t appearance);
-  Row create_row(LandmarkIndex landmark, std::uint16_t appearance);
+  // A new row for an appearance that its landmark does not have; kNoLandmark, for an id that is not
+  // there yet, becomes a new landmark.
+  Row create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance);
   // A landmark goes with its last row.
   void erase_row(Row row);
   void erase(std::int64_t id);
@@ -132,6 +131,9 @@ class PrototypeStore : private RowTable {
   void add(std::span<const std::int64_t> ids, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const std::int16_t* sum, int count);
+  // Adds a landmark of a store, which may be this one, to the one with an id, there or not, which
+  // keeps its position if it has one.
+  void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark);
   // Makes the rounded prototype follow the sum and count.
   void refresh(Row row);
   // Puts rows that were created or refreshed into their lists; ends every change.

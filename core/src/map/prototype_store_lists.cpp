@@ -52,8 +52,7 @@ void PrototypeStore::reassign(int threads) {
 
 PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, int threads) const {
   const std::size_t nlist = std::max<std::size_t>(quantizer.nlist(), 1);
-  std::vector<Row> to(row_end(), kNoRow);  // for now the list of each row
-  std::vector<std::size_t> counts(nlist);
+  std::vector<Row> list_of_row(row_end(), kNoRow);
   std::vector<Row> rows;
   rows.reserve(std::min(prototype_count_, kAssignChunk));
   const auto assign = [&] {
@@ -62,10 +61,7 @@ PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, i
       const std::vector<std::int8_t> codes = rounded(rows);
       lists = quantizer.assign({codes.data(), rows.size(), dim_}, threads);
     }
-    for (std::size_t i = 0; i < rows.size(); ++i) {
-      to[rows[i].value].value = lists[i];
-      ++counts[lists[i]];
-    }
+    for (std::size_t i = 0; i < rows.size(); ++i) list_of_row[rows[i].value].value = lists[i];
     rows.clear();
   };
   each_row([&](Row row) {
@@ -73,17 +69,11 @@ PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, i
     if (rows.size() == kAssignChunk) assign();
   });
   assign();
-  Arrangement result{std::move(quantizer), ListBlocks(nlist), std::move(to)};
-  std::size_t blocks = 0;
-  for (const std::size_t n : counts) blocks += (n + kPackedRows - 1) / kPackedRows;
-  result.lists.reserve(blocks);
-  std::vector<std::uint32_t> next(nlist);  // row of each list
+  ListOrder order(std::move(list_of_row), nlist);
+  Arrangement result{std::move(quantizer), ListBlocks(nlist), std::move(order.new_rows)};
+  result.lists.reserve(order.first_blocks.back());
   for (std::uint32_t list = 0; list < nlist; ++list) {
-    next[list] = static_cast<std::uint32_t>(result.lists.blocks() * kPackedRows);
-    for (std::size_t i = 0; i < counts[list]; ++i) result.lists.append(list);
-  }
-  for (Row& row : result.to) {
-    if (row != kNoRow) row.value = next[row.value]++;
+    for (std::uint32_t i = 0; i < order.sizes[list]; ++i) result.lists.append(list);
   }
   return result;
 }
@@ -101,7 +91,7 @@ void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
   const std::size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
   relink(arrangement.to);
   resize(end + kPackedRows);
-  permute(arrangement.to, Row{static_cast<std::uint32_t>(end)});
+  permute(arrangement.to, row_at(end));
   for (std::uint32_t list = 0; list < lists.nlist(); ++list) {
     if (lists.rows(list) == 0) continue;
     for (Row row{lists.last(list).value + 1}; row.value % kPackedRows != 0; ++row.value)

@@ -18,7 +18,7 @@ LandmarkIndex RowTable::at(std::int64_t id) const {
 
 std::size_t RowTable::row_count(LandmarkIndex landmark) const {
   std::size_t n = 0;
-  for ([[maybe_unused]] const Row row : rows(landmark)) ++n;
+  for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) ++n;
   return n;
 }
 
@@ -31,7 +31,7 @@ std::vector<Row> RowTable::sorted_rows(std::span<const LandmarkIndex> landmarks)
   result.reserve(landmarks.size());
   for (const LandmarkIndex landmark : landmarks) {
     const auto first = static_cast<std::ptrdiff_t>(result.size());
-    for (const Row row : rows(landmark)) result.push_back(row);
+    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) result.push_back(row);
     if (several_) {
       std::sort(result.begin() + first, result.end(),
                 [&](Row a, Row b) { return appearance(a) < appearance(b); });
@@ -53,7 +53,7 @@ void RowTable::add_landmark(std::int64_t id, Row row, std::uint16_t appearance) 
     index_.insert(ids_, LandmarkIndex{row.value});
     return;
   }
-  const LandmarkIndex landmark{static_cast<std::uint32_t>(ids_.size())};
+  const LandmarkIndex landmark = landmark_at(ids_.size());
   for_each_array(1, 0, [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
   ids_.push_back(id);
   try {
@@ -89,16 +89,15 @@ void RowTable::remove_row(Row row) {
 
 // The last landmark takes the index of one that has no rows left.
 void RowTable::remove_landmark(LandmarkIndex landmark) {
-  const LandmarkIndex last{static_cast<std::uint32_t>(ids_.size() - 1)};
+  const LandmarkIndex last = landmark_at(ids_.size() - 1);
   index_.erase(ids_, id(landmark));
   if (landmark != last) {
     index_.move(ids_, id(last), landmark);
     ids_[landmark.value] = id(last);
     if (!positions_.empty()) positions_[landmark.value] = positions_[last.value];
     first_rows_[landmark.value] = first_row(last);
-    for (const Row row : rows(landmark)) {
+    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row), ++steps_) {
       owners_[row.value] = landmark;
-      ++steps_;
     }
   }
   ids_.pop_back();

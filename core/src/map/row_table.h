@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <iterator>
 #include <limits>
 #include <mutex>
 #include <span>
@@ -48,6 +47,7 @@ class RowTable {
     return several_ ? owners_[row.value] != kNoLandmark : ids_[row.value] >= 0;
   }
   std::uint16_t appearance(Row row) const { return several_ ? appearances_[row.value] : 0; }
+  // The rows of a landmark, in no order: one and the next, up to kNoRow.
   Row first_row(LandmarkIndex landmark) const {
     return several_ ? first_rows_[landmark.value] : Row{landmark.value};
   }
@@ -59,24 +59,6 @@ class RowTable {
     return row;
   }
 
-  // The rows of a landmark, in no order, for range-for.
-  class Rows {
-   public:
-    Rows(const RowTable& table, Row first) : table_(&table), row_(first) {}
-    Rows begin() const { return *this; }
-    std::default_sentinel_t end() const { return {}; }
-    Row operator*() const { return row_; }
-    Rows& operator++() {
-      row_ = table_->next_row(row_);
-      return *this;
-    }
-    bool operator==(std::default_sentinel_t) const { return row_ == kNoRow; }
-
-   private:
-    const RowTable* table_;
-    Row row_;
-  };
-  Rows rows(LandmarkIndex landmark) const { return {*this, first_row(landmark)}; }
   std::size_t row_count(LandmarkIndex landmark) const;
   // The rows of one landmark, by ascending appearance; or of several, in their order.
   std::vector<Row> sorted_rows(LandmarkIndex landmark) const;

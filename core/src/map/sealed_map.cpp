@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <mutex>
-#include <stdexcept>
 #include <utility>
 
 #include "base/packed_numbers.h"
@@ -22,10 +21,6 @@ namespace {
 
 constexpr char kRemedy[] = "call build_index before the map is sealed";
 
-constexpr LandmarkIndex landmark_at(std::size_t i) {
-  return LandmarkIndex{static_cast<std::uint32_t>(i)};
-}
-
 }  // namespace
 
 struct SealedMap::Content {
@@ -44,22 +39,20 @@ struct SealedMap::Content {
     if (file.has(section::kCentroids)) {
       read_index();
       prototypes.landmarks.look_up = [this](Row row) { return owner(row); };
-      prototypes.landmarks.end = LandmarkIndex{static_cast<std::uint32_t>(n)};
+      prototypes.landmarks.end = landmark_at(n);
     } else {
       prototypes.landmarks.row_counts = row_counts.empty() ? nullptr : row_counts.data();
     }
     if (file.has(section::kScale)) {
       const auto scale = read_value<std::uint32_t>(file, section::kScale);
       if (scale < 1 || scale > kMaxScale) {
-        file.fail("the scale of its prototypes is " + std::to_string(scale) + ", not 1 to " +
-                  std::to_string(kMaxScale));
+        file.fail("the scale of its prototypes is ", scale, ", not 1 to ", kMaxScale);
       }
       prototypes.scale = static_cast<int>(scale);
     }
     const std::size_t size = code_bits() == 4 ? packed4_size(prototypes.rows, shape.dim)
                                               : packed_size(prototypes.rows, shape.dim);
     prototypes.data = file.map<std::byte>(section::kPrototypes, size).data();
-    if (code_bits() == 4 && nlist() == 0) check_padding();
     counts = file.map<std::uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
     if (!file.has(section::kPositions)) return;
@@ -110,7 +103,7 @@ struct SealedMap::Content {
 
   int code_bits() const { return prototypes.scale == 0 ? 8 : 4; }
   // With an index. Throws FileError if the owners are broken there.
-  LandmarkIndex owner(Row row) const { return {static_cast<std::uint32_t>((*owners)[row.value])}; }
+  LandmarkIndex owner(Row row) const { return landmark_at((*owners)[row.value]); }
 
   std::size_t nlist() const { return list_rows.size(); }
 
@@ -130,7 +123,7 @@ struct SealedMap::Content {
   // The row of a prototype that is counted by id. With an index rows are looked up once, by the
   // owners of all.
   Row row_of(std::size_t prototype) const {
-    if (nlist() == 0) return {static_cast<std::uint32_t>(prototype)};
+    if (nlist() == 0) return row_at(prototype);
     std::call_once(rows_found, [&] {
       std::vector<Row> found(prototype_count);
       std::vector<std::uint32_t> taken(shape.landmarks, 0);
@@ -150,26 +143,11 @@ struct SealedMap::Content {
     return rows[prototype];
   }
 
-  // Checks the padding of the last block; other padding is never looked at.
-  void check_padding() const {
-    const std::size_t n = prototype_count, dim = shape.dim, padded_dim = (dim + 7) / 8 * 8;
-    const std::size_t end = (n + kPackedRows - 1) / kPackedRows * kPackedRows;
-    for (std::size_t row = n == 0 ? end : end - kPackedRows; row < end; ++row) {
-      for (std::size_t d = row < n ? dim : 0; d < padded_dim; ++d) {
-        if (value4(row, d) != 0) file.fail("the padding of its prototypes is not zero");
-      }
-    }
-  }
-
-  std::uint8_t value4(std::size_t row, std::size_t d) const {
-    const auto* data = static_cast<const std::uint8_t*>(prototypes.data);
-    const std::uint8_t byte = data[packed4_index(row, d, shape.dim)];
-    return static_cast<std::uint8_t>(packed4_high(d) ? byte >> 4 : byte & 15);
-  }
-
   int value(Row row, std::size_t d) const {
-    if (code_bits() == 4) return sq4_level(value4(row.value, d), prototypes.scale);
-    return static_cast<const std::int8_t*>(prototypes.data)[packed_index(row.value, d, shape.dim)];
+    const auto* data = static_cast<const std::int8_t*>(prototypes.data);
+    if (code_bits() == 8) return data[packed_index(row.value, d, shape.dim)];
+    const auto byte = static_cast<std::uint8_t>(data[packed4_index(row.value, d, shape.dim)]);
+    return sq4_level(packed4_high(d) ? byte >> 4 : byte & 15, prototypes.scale);
   }
 
   static constexpr std::size_t kFirstRowStep = 64;  // landmarks
@@ -209,7 +187,7 @@ SealedMap::SealedMap(const std::filesystem::path& path) {
 }
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
   if (reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment != 0) {
-    throw std::invalid_argument("the bytes of a map must stand at a multiple of 64");
+    invalid("the bytes of a map must stand at a multiple of 64");
   }
   content_ = std::make_unique<const Content>(bytes, name);
 }

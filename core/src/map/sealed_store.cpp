@@ -6,11 +6,10 @@
 #include <functional>
 #include <queue>
 #include <span>
-#include <stdexcept>
-#include <string>
 #include <utility>
 
 #include "base/rounded_mean.h"
+#include "base/text.h"
 #include "map/merge_cost.h"
 #include "protomark/prototype_map.h"
 
@@ -95,8 +94,8 @@ SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_
   if (!bytes_per_landmark) return {8, rows};
   const std::size_t smallest = sealed_bytes(1, 1, dim, 4);
   if (!(*bytes_per_landmark >= static_cast<double>(smallest))) {
-    throw std::invalid_argument("bytes_per_landmark must be at least " + std::to_string(smallest) +
-                                " for this map, which one prototype of 4 bits per number takes");
+    invalid("bytes_per_landmark must be at least ", smallest,
+            " for this map, which one prototype of 4 bits per number takes");
   }
   // What a product of doubles loses must not cost a prototype.
   const double budget = *bytes_per_landmark * static_cast<double>(n) * (1 + 1e-12);
@@ -132,10 +131,7 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std
     for (std::size_t from = 0; from < counts.size(); ++from) {
       if (counts[from] == 0) continue;
       const auto appearance = static_cast<std::uint16_t>(from);
-      const Row row = landmark == kNoLandmark
-                          ? result.create_landmark(store.id(landmarks[i]), appearance)
-                          : result.create_row(landmark, appearance);
-      landmark = result.owner(row);
+      const Row row = result.create_row(store.id(landmarks[i]), landmark, appearance);
       const bool fits_row = counts[from] <= PrototypeMap::kMaxCount;
       for (std::size_t d = 0; d < dim; ++d) {
         const std::int64_t sum = sums[from * dim + d];

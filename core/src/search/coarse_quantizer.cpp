@@ -97,10 +97,10 @@ std::vector<std::int8_t> k_means(Codes codes, std::size_t nlist, const Assign& a
 
 }  // namespace
 
-ListOrder::ListOrder(std::vector<std::uint32_t> list_of_row, std::size_t nlist)
-    : sizes(nlist, 0), first_blocks(nlist + 1, 0), new_rows(std::move(list_of_row)) {
-  for (const std::uint32_t list : new_rows) {
-    if (list != kNone) ++sizes[list];
+ListOrder::ListOrder(std::vector<Row> lists, std::size_t nlist)
+    : sizes(nlist, 0), first_blocks(nlist + 1, 0), new_rows(std::move(lists)) {
+  for (const Row list : new_rows) {
+    if (list != kNoRow) ++sizes[list.value];
   }
   std::vector<std::uint32_t> next(nlist);
   for (std::size_t c = 0; c < nlist; ++c) {
@@ -108,8 +108,8 @@ ListOrder::ListOrder(std::vector<std::uint32_t> list_of_row, std::size_t nlist)
     first_blocks[c + 1] =
         first_blocks[c] + static_cast<std::uint32_t>((sizes[c] + kPackedRows - 1) / kPackedRows);
   }
-  for (std::uint32_t& list_or_row : new_rows) {
-    if (list_or_row != kNone) list_or_row = next[list_or_row]++;
+  for (Row& list_or_row : new_rows) {
+    if (list_or_row != kNoRow) list_or_row.value = next[list_or_row.value]++;
   }
 }
 
@@ -128,7 +128,9 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
     });
   };
   const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
-  const ListOrder order(assign(group_centroids), groups);
+  std::vector<Row> group_of;
+  for (const std::uint32_t group : assign(group_centroids)) group_of.push_back({group});
+  const ListOrder order(std::move(group_of), groups);
   // Leave out groups that are nearest to no centroid, as a broken file may have them.
   std::vector<std::int8_t> used;
   for (std::size_t g = 0; g < groups; ++g) {
@@ -143,8 +145,8 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
   std::vector<std::int8_t> grouped(rows * dim_, 0);
   list_of_.assign(rows, kNoLandmark);
   for (std::uint32_t list = 0; list < n; ++list) {
-    std::copy_n(all.row(list), dim_, &grouped[order.new_rows[list] * dim_]);
-    list_of_[order.new_rows[list]] = {list};
+    std::copy_n(all.row(list), dim_, &grouped[order.new_rows[list].value * dim_]);
+    list_of_[order.new_rows[list].value] = {list};
   }
   grouped_ = pack_codes({grouped.data(), rows, dim_});
 }

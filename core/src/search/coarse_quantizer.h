@@ -54,15 +54,14 @@ class CoarseQuantizer {
 };
 
 // Where rows stand if lists follow each other, each from a new block on, rows in the order in which
-// they come. A row of list kNone stands nowhere: kNone.
+// they come. A row of no list, kNoRow, stands nowhere.
 struct ListOrder {
-  static constexpr std::uint32_t kNone = UINT32_MAX;
-
-  ListOrder(std::vector<std::uint32_t> list_of_row, std::size_t nlist);
+  // Takes the list of each row, as its value.
+  ListOrder(std::vector<Row> lists, std::size_t nlist);
 
   std::vector<std::uint32_t> sizes;         // of each list
   std::vector<std::uint32_t> first_blocks;  // of each list, and the end
-  std::vector<std::uint32_t> new_rows;      // of each row
+  std::vector<Row> new_rows;                // of each row
 };
 
 }  // namespace protomark
