@@ -6,6 +6,7 @@
 
 #include <cstdint>
 #include <span>
+#include <stdexcept>
 #include <string>
 #include <utility>
 #include <vector>
@@ -24,9 +25,7 @@ using Array2 = nb::ndarray<const T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 inline nb::object numpy(const char* name) { return nb::module_::import_("numpy").attr(name); }
 
-[[noreturn]] inline void type_error(const std::string& what) {
-  throw nb::type_error(what.c_str());
-}
+[[noreturn]] inline void type_error(const std::string& what) { throw nb::type_error(what.c_str()); }
 
 // As in "float64 (3, 2)", for error messages.
 inline std::string describe(nb::handle array) {
@@ -66,8 +65,7 @@ inline Array1<std::int64_t> landmark_ids(nb::handle object) {
   if (kind == "u" && !empty) {
     const auto largest = nb::cast<std::uint64_t>(array.attr("max")());
     if (largest > INT64_MAX) {
-      throw nb::value_error(
-          ("landmark id " + std::to_string(largest) + " is above 2**63 - 1").c_str());
+      throw std::invalid_argument("landmark id " + std::to_string(largest) + " is above 2**63 - 1");
     }
   }
   return nb::cast<Array1<std::int64_t>>(

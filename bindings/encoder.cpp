@@ -29,8 +29,7 @@ Layer to_layer(nb::dict d, bool last) {
     if (!last) throw nb::value_error("a hidden layer needs a table, only the last one has None");
     return layer;
   }
-  const auto bytes =
-      array_of<Array1<std::uint8_t>>(table, "uint8", 1, "table: a (256,) uint8");
+  const auto bytes = array_of<Array1<std::uint8_t>>(table, "uint8", 1, "table: a (256,) uint8");
   if (bytes.size() != layer.table.size()) {
     throw nb::value_error("a layer's table must have 256 entries");
   }
@@ -52,7 +51,7 @@ nb::dict from_layer(const Layer& layer, bool last) {
 }
 
 // A text of the encoder's info.
-auto info(std::string EncoderInfo::*text) {
+auto info(std::string EncoderInfo::* text) {
   return [text](const Encoder& encoder) { return encoder.info().*text; };
 }
 
@@ -99,10 +98,7 @@ Args:
 Raises:
     TypeError: an array is of another type.
     ValueError: layers do not fit together, or a note has such a key.)")
-      .def_static(
-          "load", [](const Path& path) { return without_gil([&] { return Encoder::load(path); }); },
-          "path"_a, nb::sig("def load(path: str | os.PathLike[str]) -> Encoder"),
-          "Load a model file. Raises FileError.")
+      .def_static("load", &Encoder::load, "path"_a, ReleaseGil(), "Load a model file.")
       .def("save", &Encoder::save, "path"_a, ReleaseGil(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
            "Write the model file, whole or not at all. Raises FileError.")

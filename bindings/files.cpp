@@ -24,34 +24,18 @@ void check_map(const Path& path, const Encoder* encoder,
 }  // namespace
 
 void bind_files(nb::module_& m) {
-  // What can commit is a learning map, which the first overload tells type checkers.
   m.def(
       "open",
       [](const Path& path, bool journal, const Encoder* encoder,
-         const std::optional<std::string>& descriptor) {
-        if (!journal) throw nb::next_overload();
-        check_map(path, encoder, descriptor);
-        return without_gil([&] { return PrototypeMap::load(path, true); });
-      },
-      "path"_a, nb::kw_only(), "journal"_a, "encoder"_a.none() = nb::none(),
-      "descriptor"_a = nb::none(),
-      nb::sig("def open(path: str | os.PathLike[str], *, journal: Literal[True], "
-              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap"));
-  m.def(
-      "open",
-      [](const Path& path, bool, const Encoder* encoder,
          const std::optional<std::string>& descriptor) -> nb::object {
         check_map(path, encoder, descriptor);
-        if (without_gil([&] { return map_kind(path); }) == MapKind::learning) {
-          return nb::cast(without_gil([&] { return PrototypeMap::load(path); }));
+        if (journal || without_gil([&] { return map_kind(path); }) == MapKind::learning) {
+          return nb::cast(without_gil([&] { return PrototypeMap::load(path, journal); }));
         }
         return nb::cast(without_gil([&] { return SealedMap(path); }));
       },
       "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),
       "descriptor"_a = nb::none(),
-      nb::sig("def open(path: str | os.PathLike[str], *, journal: bool = False, "
-              "encoder: Encoder | None = None, descriptor: str | None = None) -> PrototypeMap | "
-              "SealedMap"),
       R"(Open a map file: read a learning map, with what was committed to its journal, or map a
 sealed one.
 

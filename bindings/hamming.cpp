@@ -1,6 +1,6 @@
 // Hamming search.
-#include "module.h"
 #include "protomark/hamming.h"
+#include "module.h"
 
 namespace protomark::python {
 

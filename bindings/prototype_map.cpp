@@ -10,7 +10,7 @@
 namespace protomark::python {
 namespace {
 
-// Binds a function that takes ids and as many descriptors.
+// Bind a function that takes ids and as many descriptors, or codes.
 auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Descriptors, int)) {
   return [method](PrototypeMap& self, nb::object ids, nb::object array, int threads) {
     const auto l = landmark_ids(ids);
@@ -19,8 +19,6 @@ auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Descript
     (self.*method)(view(l), view(d), threads);
   };
 }
-
-// The same for codes.
 auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Codes)) {
   return [method](PrototypeMap& self, nb::object ids, nb::object array) {
     const auto l = landmark_ids(ids);
@@ -159,8 +157,7 @@ Args:
 Raises:
     ValueError: nlist is none of these, or the map is empty.
     MemoryError: memory ran out; the map is as before.)")
-      .def("drop_index", &PrototypeMap::drop_index, ReleaseGil(),
-           nb::sig("def drop_index(self) -> None"), "Drop the index.");
+      .def("drop_index", &PrototypeMap::drop_index, ReleaseGil(), "Drop the index.");
 }
 
 void bind_parts(nb::class_<PrototypeMap>& map) {
@@ -226,7 +223,7 @@ Raises:
         lost.)")
       .def_prop_ro("has_journal", &PrototypeMap::has_journal, ReleaseGil(),
                    "Whether the map was opened with a journal, and not closed since.")
-      .def("commit", &PrototypeMap::commit, ReleaseGil(), nb::sig("def commit(self) -> int"),
+      .def("commit", &PrototypeMap::commit, ReleaseGil(),
            R"(Make all changes so far durable, in the journal beside the map file.
 
 The cost grows with the number of landmarks that changed, not with the map. Once this has returned,
@@ -240,13 +237,13 @@ Raises:
     FileError: the journal cannot be written, for example on a full disk. The map in memory is as
         before, and a later commit takes everything.
     ValueError: the map has no journal (open(path, journal=True)).)")
-      .def("compact", &PrototypeMap::compact, ReleaseGil(), nb::sig("def compact(self) -> None"),
+      .def("compact", &PrototypeMap::compact, ReleaseGil(),
            "Write the map file anew, with all changes, and empty the journal. If it is "
            "interrupted, opening gives this map or the one of the last commit. Raises FileError if "
            "the map file cannot be written, and ValueError if the map has no journal. If only the "
            "journal cannot be emptied it returns: the map file holds everything, what is left in "
            "the journal no longer counts, and the next commit tries again.")
-      .def("close", &PrototypeMap::close, ReleaseGil(), nb::sig("def close(self) -> None"),
+      .def("close", &PrototypeMap::close, ReleaseGil(),
            "Release the journal, so that another map can be opened with it; the map stays in "
            "memory, without a journal. What was not committed is not in the file.")
       .def(
@@ -350,17 +347,12 @@ Raises:
     ValueError: "created" is no such time, or something is beyond the limits (docs/limits.md).)")
       .def_prop_ro("appearance_bits", &PrototypeMap::appearance_bits,
                    "Signs that tell the appearances of a landmark apart; 0: it has one prototype.")
-      .def(
-          "appearance_counts",
-          [](const PrototypeMap& m, std::int64_t id) {
-            return to_numpy(without_gil([&] { return m.appearance_counts(id); }));
-          },
-          "landmark_id"_a,
-          nb::sig("def appearance_counts(self, landmark_id: int) -> NDArray[numpy.uint32]"),
-          "Number of observations of each of a landmark's appearances, (r,) uint32. Raises "
-          "KeyError for an id that is not in the map.")
+      .def("appearance_counts", bind_of_landmark<PrototypeMap>(&PrototypeMap::appearance_counts),
+           "landmark_id"_a,
+           nb::sig("def appearance_counts(self, landmark_id: int) -> NDArray[numpy.uint32]"),
+           "Number of observations of each of a landmark's appearances, (r,) uint32. Raises "
+           "KeyError for an id that is not in the map.")
       .def("nprobe", &PrototypeMap::nprobe, "recall"_a, "threads"_a = 1, ReleaseGil(),
-           nb::sig("def nprobe(self, recall: float, threads: int = 1) -> int"),
            "Number of inverted lists that a search with this recall, in (0, 1], visits, as "
            "measured on the map: prototypes are searched for among those of other landmarks, and "
            "codes as far from them as observations are among all (docs/index.md). Measured once, "

@@ -25,7 +25,6 @@ void bind_sealed_map(nb::module_& m) {
       "memory.");
   bind_answers(map);
   map.def("nprobe", &SealedMap::nprobe, "recall"_a, ReleaseGil(),
-          nb::sig("def nprobe(self, recall: float) -> int"),
           "Number of inverted lists that a search with this recall, in (0, 1], visits, as measured "
           "when the map was sealed. Raises ValueError for another recall, and without an index.")
       .def_prop_ro(

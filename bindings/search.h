@@ -29,12 +29,19 @@ auto bind_search(Queries (*to_queries)(nb::handle), Search search) {
   };
 }
 
-// Binds a function from ids to something per landmark.
+// Bind a function from ids to something per landmark, or from one id to something of its
+// appearances.
 template <typename Map, typename Of>
 auto bind_of_landmarks(Of of) {
   return [of](const Map& map, nb::object ids) {
     const auto l = landmark_ids(ids);
     return to_numpy(without_gil([&] { return (map.*of)(view(l)); }));
+  };
+}
+template <typename Map, typename Of>
+auto bind_of_landmark(Of of) {
+  return [of](const Map& map, std::int64_t id) {
+    return to_numpy(without_gil([&] { return (map.*of)(id); }));
   };
 }
 
@@ -75,11 +82,7 @@ void bind_answers(nb::class_<Map>& map) {
            "Numbers of observations, over all appearances, (n,) uint32; a sealed map gives at most "
            "255. Raises KeyError for an id that is not in the map.")
       .def(
-          "appearances",
-          [](const Map& m, std::int64_t id) {
-            return to_numpy(without_gil([&] { return m.appearances(id); }));
-          },
-          "landmark_id"_a,
+          "appearances", bind_of_landmark<Map>(&Map::appearances), "landmark_id"_a,
           nb::sig("def appearances(self, landmark_id: int) -> NDArray[numpy.float32]"),
           "The prototypes of one landmark, one per appearance, (r, dim) float32, in code units; in "
           "a sealed map with an index they come in no particular order. Raises KeyError for an id "
