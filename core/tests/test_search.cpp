@@ -143,9 +143,9 @@ void check_codes(test::Random& random, std::size_t rows, std::size_t dim, std::s
 template <std::size_t kRows, std::size_t kQueries>
 void check_prefixes(test::Random& random) {
   constexpr std::size_t kDim = 32;
-  for (const auto& [prefix, rest] : {std::pair(100, 10), {0, 100}, {3, 3}}) {
+  for (const auto& spans : {std::pair(100, 10), {0, 100}, {3, 3}}) {
     const auto value = [&](std::size_t i) {
-      const int span = i % kDim < kDim / 2 ? prefix : rest;
+      const int span = i % kDim < kDim / 2 ? spans.first : spans.second;
       return static_cast<std::int8_t>(random.integer(-span, span));
     };
     std::vector<std::int8_t> codes(kRows * kDim), queries(kQueries * kDim);

@@ -49,13 +49,17 @@ void bit_sum(const std::int8_t* weights, const std::uint16_t* set, std::size_t c
              std::int16_t* sums) {
   using Sums16 = typename S::Sums16;
   constexpr std::size_t kParts = kOutputs / Sums16::kLanes;
-  Sums16 acc[kParts] = {};
+  Sums16 acc[kParts];
+#pragma GCC unroll 4
+  for (std::size_t p = 0; p < kParts; ++p) acc[p] = {};
   for (std::size_t i = 0; i < count; ++i) {
     const std::int8_t* row = weights + set[i] * kOutputs;
+#pragma GCC unroll 4
     for (std::size_t p = 0; p < kParts; ++p) {
       acc[p] = acc[p] + S::widen(row + p * Sums16::kLanes);
     }
   }
+#pragma GCC unroll 4
   for (std::size_t p = 0; p < kParts; ++p) store_pack(sums + p * Sums16::kLanes, acc[p]);
 }
 
