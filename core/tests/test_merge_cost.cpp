@@ -1,8 +1,11 @@
 #include "map/merge_cost.h"
 
+#include <algorithm>
+#include <map>
 #include <utility>
 
 #include "check.h"
+#include "map/sealed_store.h"
 #include "random.h"
 
 using namespace protomark;
@@ -53,9 +56,77 @@ std::vector<AppearanceMerge> plain_merges(const std::vector<std::int16_t>& sums,
   return merges;
 }
 
+// Merges the pair of least cost over the whole map, of equals that of the first rows of the
+// smallest id, until there are at most `limit` rows.
+std::map<std::int64_t, std::vector<Cluster>> plain_store(const PrototypeStore& store,
+                                                         std::size_t limit) {
+  std::map<std::int64_t, std::vector<Cluster>> landmarks;
+  for (const LandmarkIndex landmark : store.sorted_landmarks()) {
+    for (const Row row : store.sorted_rows(landmark)) {
+      landmarks[store.id(landmark)].push_back(
+          {{store.sum(row), store.sum(row) + store.dim()}, store.count(row)});
+    }
+  }
+  for (std::size_t rows = store.prototype_count(); rows > limit; --rows) {
+    std::vector<Cluster>* best = nullptr;
+    std::size_t best_i = 0, best_j = 0;
+    double least = -1;
+    for (auto& [id, clusters] : landmarks) {
+      for (std::size_t i = 0; i < clusters.size(); ++i) {
+        for (std::size_t j = i + 1; j < clusters.size(); ++j) {
+          const double c = cost(clusters[i], clusters[j]);
+          if (best != nullptr && c >= least) continue;
+          best = &clusters, best_i = i, best_j = j, least = c;
+        }
+      }
+    }
+    if (best == nullptr) break;
+    Cluster& into = (*best)[best_i];
+    for (std::size_t d = 0; d < store.dim(); ++d) into.sum[d] += (*best)[best_j].sum[d];
+    into.n += (*best)[best_j].n;
+    best->erase(best->begin() + static_cast<std::ptrdiff_t>(best_j));
+  }
+  return landmarks;
+}
+
+void merged_stores_equal_plain_ones() {
+  test::Random random(9);
+  for (int round = 0; round < 100; ++round) {
+    const auto dim = static_cast<std::size_t>(random.integer(1, 9));
+    PrototypeStore store(dim, 8);
+    // Small values make many costs equal, so that the order of rows decides.
+    const std::int64_t limit = round % 2 == 0 ? 1 : 127;
+    for (int i = 0; i < 60; ++i) {
+      const auto appearance = static_cast<std::uint16_t>(random.integer(0, 15));
+      const int n = static_cast<int>(random.integer(1, 3));
+      std::vector<std::int16_t> sum(dim);
+      for (auto& value : sum) value = static_cast<std::int16_t>(n * random.integer(-limit, limit));
+      store.merge(store.find_or_create_row(random.integer(0, 9) * 7, appearance), sum.data(), n);
+    }
+    for (const std::size_t wanted : {0, 10, 20, 35, 50}) {
+      const auto merged = merge_appearances(store, wanted);
+      CHECK(merged.has_value() == (wanted < store.prototype_count()));
+      if (!merged) continue;
+      const auto expected = plain_store(store, wanted);
+      CHECK(merged->landmark_count() == expected.size());
+      bool equal = true;
+      for (const auto& [id, clusters] : expected) {
+        const std::vector<Row> rows = merged->sorted_rows(merged->at(id));
+        equal = equal && rows.size() == clusters.size();
+        for (std::size_t i = 0; equal && i < rows.size(); ++i) {
+          equal = merged->count(rows[i]) == clusters[i].n &&
+                  std::equal(clusters[i].sum.begin(), clusters[i].sum.end(), merged->sum(rows[i]));
+        }
+      }
+      CHECK(equal);
+    }
+  }
+}
+
 }  // namespace
 
 int main() {
+  merged_stores_equal_plain_ones();
   test::Random random(8);
   for (int round = 0; round < 400; ++round) {
     const auto rows = static_cast<std::size_t>(random.integer(1, round < 390 ? 12 : 60));
