@@ -27,9 +27,9 @@ int main(int argc, char** argv) try {
   for (auto& byte : truth) byte = static_cast<std::uint8_t>(random());
   const auto observe = [&](std::size_t landmark, std::vector<std::uint8_t>& out) {
     for (std::size_t i = 0; i < bytes; ++i) {
-      std::uint8_t noise = 0;
+      int noise = 0;
       for (int bit = 0; bit < 8; ++bit) noise |= (random() % 10 == 0) << bit;
-      out.push_back(truth[landmark * bytes + i] ^ noise);
+      out.push_back(static_cast<std::uint8_t>(truth[landmark * bytes + i] ^ noise));
     }
   };
   std::vector<std::int64_t> ids;

@@ -28,8 +28,8 @@ using Histogram = std::array<std::uint64_t, 256>;
 inline int sq4_best_scale(const Histogram& histogram) {
   const auto error = [&](int scale) {
     std::uint64_t sum = 0;
-    for (int i = 0; i < 256; ++i) {
-      const int value = i - 128;
+    for (std::size_t i = 0; i < histogram.size(); ++i) {
+      const int value = static_cast<int>(i) - 128;
       const int difference = value - sq4_level(sq4_quantize(value, scale), scale);
       sum += static_cast<std::uint64_t>(difference * difference) * histogram[i];
     }

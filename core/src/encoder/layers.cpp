@@ -50,7 +50,9 @@ PackedActivation::PackedActivation(const Layer& layer, bool last)
       table_(layer.table),
       shift_(layer.shift) {
   if (!last) return;
-  for (int i = 0; i < 256; ++i) table_[i] = static_cast<std::uint8_t>(std::max(i - 128, -127));
+  for (std::size_t i = 0; i < table_.size(); ++i) {
+    table_[i] = static_cast<std::uint8_t>(std::max(static_cast<int>(i) - 128, -127));
+  }
 }
 
 BitLayer::BitLayer(const Layer& layer, bool last)

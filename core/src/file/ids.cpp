@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <bit>
-#include <ranges>
 
 #include "file/sections.h"
 #include "protomark/types.h"
@@ -102,12 +101,13 @@ LandmarkIndex LandmarkIds::find(std::int64_t id) const {
   }
   const auto next = std::ranges::upper_bound(blocks_, id, {}, &IdBlock::first_id);
   if (next == blocks_.begin()) throw UnknownLandmark(id);
-  const auto first = static_cast<std::size_t>(next - blocks_.begin() - 1) * kIdBlock;
-  const auto block = std::views::iota(first, std::min(n_, first + kIdBlock));
-  const auto id_at = [&](std::size_t i) { return (*this)[landmark_at(i)]; };
-  const auto found = std::ranges::lower_bound(block, id, {}, id_at);
-  if (found == block.end() || id_at(*found) != id) throw UnknownLandmark(id);
-  return landmark_at(*found);
+  std::size_t first = static_cast<std::size_t>(next - blocks_.begin() - 1) * kIdBlock;
+  for (std::size_t end = std::min(n_, first + kIdBlock); first < end;) {
+    const std::size_t half = first + (end - first) / 2;
+    (*this)[landmark_at(half)] < id ? first = half + 1 : end = half;
+  }
+  if (first == n_ || (*this)[landmark_at(first)] != id) throw UnknownLandmark(id);
+  return landmark_at(first);
 }
 
 std::vector<std::int64_t> LandmarkIds::all() const {

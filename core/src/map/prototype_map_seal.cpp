@@ -143,11 +143,11 @@ class RowWriter {
   void flush_owners(std::size_t least) {
     std::vector<std::uint64_t>& words = packed_owners_.words();
     while (words.size() >= least) {
-      const auto end = words.begin() + std::min(words.size(), CheckedNumbers::kBlock);
-      const auto block = std::as_bytes(std::span(words.begin(), end));
+      const std::size_t n = std::min(words.size(), CheckedNumbers::kBlock);
+      const auto block = std::as_bytes(std::span(words).first(n));
       checksums_.push_back(crc32(block));
       (*owners_)(block);
-      words.erase(words.begin(), end);
+      words.erase(words.begin(), words.begin() + static_cast<std::ptrdiff_t>(n));
     }
   }
 

@@ -165,7 +165,8 @@ std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t d
   // A sealed map stores the landmark of each row, the recall table, and for each list its centroid,
   // its number of rows and half a block of padding, somewhat rounded up.
   const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
-  const double sealed = (n * (kBytes - std::bit_width(prototypes) / 8.0) - table) / (9.5 * k + 4);
+  const double sealed =
+      (n * (kBytes - static_cast<double>(std::bit_width(prototypes)) / 8) - table) / (9.5 * k + 4);
   // A learning map keeps for each list its centroid three times, some numbers, half a block of rows
   // and half of the 12 bytes of a block.
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
