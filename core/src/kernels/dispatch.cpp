@@ -121,8 +121,4 @@ const Kernels& active() {
 
 }  // namespace protomark::kernels
 
-namespace protomark {
-
-const char* instruction_set() { return kernels::active().name; }
-
-}  // namespace protomark
+const char* protomark::instruction_set() { return kernels::active().name; }

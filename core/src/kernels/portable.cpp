@@ -61,8 +61,7 @@ struct Portable : ByPairs<Portable, 16> {
   using Words = Pack<Vector<std::uint64_t, 16>, 4>;
   static void add_bits(Words& counts, std::uint64_t query, const Words& row) {
     for (int i = 0; i < 4; ++i) {
-      // Compilers turn this form into vector code; std::popcount without -mpopcnt is a library
-      // call.
+      // No std::popcount: without -mpopcnt it is a library call, and not of vectors.
       auto x = row.v[i] ^ query;
       x -= (x >> 1) & 0x5555555555555555u;
       x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);

@@ -20,7 +20,6 @@ class ListBlocks {
 
   std::size_t nlist() const { return lists_.size(); }
   std::size_t blocks() const { return list_.size(); }
-  // Number of rows in a list.
   std::size_t rows(std::uint32_t list) const { return lists_[list].rows; }
   std::uint32_t list_of(Row row) const { return list_[row.value / kPackedRows]; }
   // The row that came last into a list, which must not be empty.
@@ -94,9 +93,7 @@ class ListBlocks {
   };
   std::vector<List> lists_;
   // Of each block: its list, and the blocks before and after it there.
-  std::vector<std::uint32_t> list_;
-  std::vector<std::uint32_t> previous_;
-  std::vector<std::uint32_t> next_;
+  std::vector<std::uint32_t> list_, previous_, next_;
 };
 
 }  // namespace protomark

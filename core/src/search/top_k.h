@@ -9,7 +9,6 @@
 
 namespace protomark {
 
-// A range of indices.
 struct Range {
   std::size_t begin;
   std::size_t end;
