@@ -46,7 +46,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """A new folder beside `folder` to fill; it takes the place of `folder` when the block ends well.
+    """A new folder beside `folder` to fill; it replaces `folder` when the block ends well.
 
     On an error, Ctrl-C included, what was there before stays.
     """

@@ -138,7 +138,7 @@ def draw_curves(axes: Axes, curves: Sequence[Curve], x: str, y: str, title: str 
 
 
 def _label_curves(axes: Axes, curves: Sequence[Curve]) -> None:
-    """Label ours to the left of their last point and others to the right, lowered if they overlap."""
+    """Label our curves left of their last point, others right of it, lowered where they overlap."""
     bottom, top = axes.get_ylim()
     room = 0.045 * (top - bottom)
     placed: list[tuple[float, float]] = []

@@ -192,7 +192,10 @@ def cases(large: int, seed: int) -> list[Case]:
         maps = [scene(large + i, 0, rng) for i in range(3)]
         return [
             Case(f"learning map, {large} landmarks", [m.save for m in maps]),
-            Case(f"sealed map, {large} landmarks", [partial(m.seal, bytes_per_landmark=9) for m in maps]),
+            Case(
+                f"sealed map, {large} landmarks",
+                [partial(m.seal, bytes_per_landmark=9) for m in maps],
+            ),
         ]
     small = [scene(100 + i, 0, rng) for i in range(3)]
     middle = [scene(20_000 + i, 4, rng) for i in range(3)]

@@ -21,8 +21,8 @@ def evaluate(
     encoder: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name or file of an encoder; may be repeated. By default the one that ships for the "
-            "descriptor. An upright encoder gets the keypoints' angles and sizes, too."
+            help="Name or file of an encoder; may be repeated. By default the one that ships for "
+            "the descriptor. An upright encoder gets the keypoints' angles and sizes, too."
         ),
     ] = None,
     methods: Annotated[

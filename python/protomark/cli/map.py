@@ -45,8 +45,8 @@ def map_(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="Given poses, for which only landmarks are made: COLMAP model folder or images.txt, "
-            "or a TUM trajectory."
+            help="Given poses, for which only landmarks are made: COLMAP model folder or "
+            "images.txt, or a TUM trajectory."
         ),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
@@ -80,9 +80,9 @@ def map_(
 ) -> None:
     r"""Map a scene from images or a video: structure from motion.
 
-    Frame by frame, each image is matched with the prototypes of the map and updates those it sees; only the last
-    few keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP model),
-    trajectory.txt (TUM format), report.html and report.json.
+    Frame by frame, each image is matched with the prototypes of the map and updates those it sees;
+    only the last few keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP
+    model), trajectory.txt (TUM format), report.html and report.json.
 
     protomark map walk.mp4 -o kitchen
 
@@ -158,8 +158,8 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
         f"{figures['descriptor_bytes'] / 1e6:.2f} MB, {ratio:.1f} times as much"
     )
     say(
-        f"  {figures['seconds_total']:.1f} s, {figures['frames_per_second']:.1f} frames per second; "
-        f"see {scene / 'report.html'}"
+        f"  {figures['seconds_total']:.1f} s, {figures['frames_per_second']:.1f} frames per "
+        f"second; see {scene / 'report.html'}"
     )
     for reason, names in figures["not_registered"].items():
         shown = ", ".join(names[:_NAMES_SHOWN])

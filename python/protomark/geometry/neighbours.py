@@ -21,8 +21,7 @@ def near_pairs(
     empty = np.zeros(0, np.int64)
     if not len(first) or not len(second):
         return empty, empty
-    # A square of five by five cells of half the radius holds fewer points than one of three by three
-    # cells of the radius.
+    # Five by five cells of half the radius hold fewer points than three by three of the radius.
     low = np.minimum(first.min(0), second.min(0))
     a, b = (np.floor((p - low) * (2 / radius)).astype(np.int64) + 2 for p in (first, second))
     columns = int(max(a[:, 0].max(), b[:, 0].max())) + 4

@@ -249,7 +249,7 @@ def match(first: Frame, second: Frame) -> Ids:
 def _rotated_share(rotation: Array, first: Array, second: Array, limit: float) -> float:
     """Share of ray pairs that a rotation alone explains.
 
-    The rotation is fitted robustly: starting with the given one, least squares over the better half.
+    The rotation is fitted robustly: least squares over the better half, from the given one on.
     """
     a = np.column_stack([first, np.ones(len(first))])
     b = np.column_stack([second, np.ones(len(second))])

@@ -145,7 +145,7 @@ class Mapper:
         self._insert(frame, found)
 
     def _insert(self, frame: Frame, found: TrackedPose) -> None:
-        """Let a frame with a pose update the landmarks it sees, and extend the map if a keyframe."""
+        """Let a frame with a pose update the landmarks it sees; a keyframe extends the map."""
         index = self._observe(frame, found)
         if self.structure.frames[index].keyframe:
             self._triangulate(index)
@@ -200,7 +200,7 @@ class Mapper:
         return found
 
     def _observe(self, frame: Frame, found: TrackedPose) -> int:
-        """Add a frame and its observations, from which prototypes learn (Eq. 2); returns its index."""
+        """Add a frame and its observations: prototypes learn (Eq. 2); return its index."""
         structure = self.structure
         frame = frame.at(found.pose)
         keyframes = structure.keyframes()

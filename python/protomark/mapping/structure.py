@@ -62,7 +62,7 @@ class Structure:
         cameras: camera id -> camera.
         frames: frames with a pose.
         positions: (l, 3) float64, NaN for an id that is not a landmark (any more).
-        directions: (l, 3) float64, sum of unit vectors from the landmark to the cameras that saw it.
+        directions: (l, 3) float64, sum of unit vectors from the landmark to its cameras.
         views: (l,) int64, number of these vectors.
         distances: (l, 2) float64, smallest and largest distance from which it was seen.
         born: (l,) int64, number of frames in the map when the landmark was made.

@@ -78,8 +78,8 @@ def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list
         return list(training), list(validation)
     if len(training) < 2:
         raise ValueError(
-            f"{training[0]}: one tracks file cannot serve for training and validation; give another "
-            "sequence with --validation"
+            f"{training[0]}: one tracks file cannot serve for training and validation; give "
+            "another sequence with --validation"
         )
     return list(training[:-1]), [training[-1]]
 
