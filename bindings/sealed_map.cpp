@@ -9,12 +9,13 @@ namespace protomark::python {
 nb::dict from_summary(const MapSummary& summary) {
   nb::dict result;
   result["observations"] = summary.observations;
-  const auto& counts = summary.landmarks_by_count;
+  const auto& counts = summary.count_histogram;
   result["count_histogram"] = to_numpy(std::vector<std::int64_t>(counts.begin(), counts.end()));
   result["landmarks_with_position"] = summary.landmarks_with_position;
-  result["extent"] = summary.landmarks_with_position == 0
-                         ? nb::none()
-                         : to_numpy(std::vector<Position>{summary.low, summary.high});
+  result["extent"] = nb::none();
+  if (const auto& extent = summary.extent) {
+    result["extent"] = to_numpy(std::vector<Position>(extent->begin(), extent->end()));
+  }
   return result;
 }
 

@@ -249,7 +249,7 @@ void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::pat
     CHECK(sealed.position_bits() == bits);
     CHECK(sealed.positions(Ids{1})[0] == far);
     CHECK(std::isnan(sealed.positions(Ids{2})[0][1]));
-    CHECK(sealed.summary().landmarks_with_position == 1 && sealed.summary().high == far);
+    CHECK(sealed.summary().landmarks_with_position == 1 && sealed.summary().extent->back() == far);
   }
   CHECK((SealedMap(path).position_error() == Position{0, 0, 0}));
   map.set_positions(Ids{1}, std::span(&none, 1));

@@ -1,4 +1,4 @@
-// Rounds means of codes to int8.
+// Rounded means of codes.
 #pragma once
 
 #include <cstddef>
@@ -7,15 +7,15 @@
 
 namespace protomark {
 
-// sum / n rounded to the nearest integer, halves away from zero.
+// Returns sum / n rounded to the nearest integer, halves away from zero.
 template <typename Integer>
 std::int8_t rounded_mean(Integer sum, Integer n) {
   const Integer magnitude = (2 * std::abs(sum) + n) / (2 * n);
   return static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
 }
 
-// The same for `dim` sums of a row, without divisions; n is 1 to 255 and no sum beyond 127 n. With
-// the half added, no quotient is nearer to an integer than its own error, 2^-23 of itself.
+// Computes the same for `dim` sums, without divisions; n is 1 to 255 and no sum beyond 127 n. With
+// 1/2 added, no quotient is nearer to an integer than its own error, 2^-23 of itself.
 inline void rounded_means(const std::int16_t* sums, int n, std::size_t dim, std::int8_t* means) {
   const float reciprocal = 1.0f / static_cast<float>(2 * n);
   for (std::size_t d = 0; d < dim; ++d) {

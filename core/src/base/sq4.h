@@ -1,4 +1,4 @@
-// Scalar quantization to 4 bits: u, 0 to 15, stands for the level scale * (2 u - 15).
+// Scalar quantization to 4 bits: u, 0 to 15, means the level scale * (2 u - 15).
 #pragma once
 
 #include <algorithm>
@@ -11,7 +11,7 @@ namespace protomark {
 
 inline constexpr int kMaxScale = 8;  // 15 * 8 is the last multiple of 15 that int8 holds
 
-// The u whose level is nearest to `value`; of two the one away from zero, for zero the one above.
+// Returns the u whose level is nearest to `value`, ties away from zero and for zero upwards.
 inline std::uint8_t sq4_quantize(int value, int scale) {
   // Levels are 2 * scale apart; the lowest that is not negative is `scale`.
   const int above_zero = std::min(std::abs(value) / (2 * scale), 7);
@@ -20,11 +20,11 @@ inline std::uint8_t sq4_quantize(int value, int scale) {
 
 constexpr int sq4_level(int u, int scale) { return scale * (2 * u - 15); }
 
-// How often each int8 value v occurs, at v + 128.
+// Counts each int8 value v at index v + 128.
 using Histogram = std::array<std::uint64_t, 256>;
 
-// The scale, 1 to kMaxScale, with the least sum of squared errors over all values; of equals the
-// smallest. For fewer than 2^49 values.
+// Returns the scale, 1 to kMaxScale, of least squared error over fewer than 2^49 values, ties to
+// the smaller.
 inline int sq4_best_scale(const Histogram& histogram) {
   const auto error = [&](int scale) {
     std::uint64_t sum = 0;

@@ -9,7 +9,7 @@ namespace {
 
 using kernels::kOutputs;
 
-// A table pays from this number of descriptors on.
+// From this number of descriptors on a table pays.
 constexpr std::size_t kMinTabulated = 20;
 // Sums of 256 weights, -128 to 127, stay within 16 bits.
 constexpr std::size_t kSafeWords = 256 / 64;
@@ -98,7 +98,7 @@ class BitLayer::Input {
   }
 
  private:
-  // Lists the set bits of each span, counted from its first bit, where its first word is.
+  // Lists the set bits of each span, counted from its first bit, at the index of its first word.
   void list_set_bits() {
     set_.resize(words_.size() * 64);
     counts_.resize(words_.size());
@@ -123,12 +123,12 @@ class BitLayer::Input {
 };
 
 void BitLayer::run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
-                   std::size_t wanted, LayerOutput next) const {
+                   std::size_t outputs, LayerOutput next) const {
   const Input input(*this, descriptors, n);
   const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
   const auto sums = std::make_unique_for_overwrite<std::int16_t[]>(n * kOutputs);
   std::vector<std::int32_t> wide(span_ < words_ ? n * kOutputs : 0);
-  for (std::size_t o = 0; o < wanted; o += kOutputs) {
+  for (std::size_t o = 0; o < outputs; o += kOutputs) {
     const std::int8_t* weights = &weights_[o * words_ * 64];
     if (wide.empty()) {
       input.sums(kernel, weights, 0, sums.get());
@@ -157,14 +157,14 @@ DenseLayer::DenseLayer(const Layer& layer, bool last)
 }
 
 void DenseLayer::run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride,
-                     std::size_t n, std::size_t wanted, LayerOutput next) const {
+                     std::size_t n, std::size_t outputs, LayerOutput next) const {
   const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
   std::vector<std::int32_t> sums(std::min(n, kDenseBatch) * kOutputs);
   for (std::size_t i = 0; i < n; i += kDenseBatch) {
     const std::size_t batch = std::min(kDenseBatch, n - i);
-    for (std::size_t o = 0; o < wanted; o += kOutputs) {
+    for (std::size_t o = 0; o < outputs; o += kOutputs) {
       kernel.dense(&weights_[o * inputs_], inputs_, x + i * stride, stride, batch,
-                   round_up(std::min(wanted - o, kOutputs), 16), sums.data());
+                   round_up(std::min(outputs - o, kOutputs), 16), sums.data());
       activate.activate32(activation_.block(o), sums.data(), batch, next.data + i * next.stride + o,
                           next.stride);
     }

@@ -19,13 +19,12 @@ struct LayerOutput {
   std::size_t stride;
 };
 
-// The least and the largest sum that the weights of an output may have.
+// Returns the least and the largest sum of an output's weights over any subset of its inputs.
 std::pair<std::int64_t, std::int64_t> sum_range(const Layer& layer, std::size_t output);
 
-// Turns sums into bytes.
+// Turns sums into bytes by a table, in a last layer, too.
 class PackedActivation {
  public:
-  // The codes of a last layer come from a table, too.
   PackedActivation(const Layer& layer, bool last);
 
   std::size_t outputs() const { return bias_.size(); }
@@ -42,17 +41,17 @@ class PackedActivation {
   int shift_;
 };
 
-// A first layer, whose inputs are bits. For many descriptors, the sums of all subsets of every 4
-// inputs are tabulated once per block of outputs: one load and one 16-bit addition then stand for 4
-// inputs ("four Russians"). For a few, the weights of the bits that are set are added.
+// A first layer, whose inputs are bits. For many descriptors it tabulates the sums of all subsets
+// of every 4 inputs per block of outputs, so that one load and one 16-bit addition serve 4 inputs
+// ("four Russians"). For fewer it adds the weights of the bits that are set.
 class BitLayer {
  public:
   BitLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // Computes the first `wanted` outputs of n descriptors (n x bytes).
+  // Computes the first `outputs` outputs of n descriptors (n x bytes).
   void run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
-           std::size_t wanted, LayerOutput next) const;
+           std::size_t outputs, LayerOutput next) const;
 
  private:
   class Input;
@@ -70,9 +69,9 @@ class DenseLayer {
   DenseLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // Computes the first `wanted` outputs of n inputs.
+  // Computes the first `outputs` outputs of n inputs.
   void run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride, std::size_t n,
-           std::size_t wanted, LayerOutput next) const;
+           std::size_t outputs, LayerOutput next) const;
 
  private:
   std::size_t inputs_;

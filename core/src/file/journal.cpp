@@ -5,15 +5,103 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include <algorithm>
+#include <array>
 #include <cerrno>
 #include <fstream>
+#include <new>
 #include <sstream>
+#include <utility>
 
 #include "file/sections.h"
 #include "protomark/types.h"
 
 namespace protomark {
 namespace {
+
+constexpr std::size_t kIdentitySize = 64;  // hexadecimal digits
+// Size of the container that a journal begins with: head and the section `base`.
+constexpr std::size_t kFirstSize = 128 + kIdentitySize;
+
+// The head that bytes begin with, if its checksum is right.
+std::optional<ContainerHead> intact_head(Bytes bytes) {
+  const auto head = ContainerHead::parse(bytes);
+  return head && head->has_right_checksum() ? head : std::nullopt;
+}
+
+// The container that bytes begin with; nullopt if it is broken or cut off.
+std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& name) {
+  const auto head = ContainerHead::parse(bytes);
+  if (!head) return std::nullopt;
+  const std::uint64_t size = head->header.file_size;
+  if (size > bytes.size() || size % kSectionAlignment != 0) return std::nullopt;
+  try {
+    ContainerReader result(bytes.first(size), name);
+    result.verify();
+    return result;
+  } catch (const FileError&) {
+    return std::nullopt;
+  }
+}
+
+// Throws FileError if bytes begin with a container that is whole and yet unreadable, such as one of
+// a later version: no power cut made it so.
+void check_known(Bytes bytes, const std::string& name) {
+  const auto head = intact_head(bytes);
+  if (!head || head->header.file_size > bytes.size()) return;
+  ContainerReader(bytes.first(head->header.file_size), name);
+}
+
+bool is_record(FileKind kind) { return kind == FileKind::commit || kind == FileKind::fold; }
+
+// The number of the record that bytes begin with; 0 if they begin with none.
+std::uint64_t record_number(Bytes bytes) {
+  const auto head = intact_head(bytes);
+  if (!head || head->header.file_size > bytes.size()) return 0;
+  try {
+    const ContainerReader file(bytes.first(head->header.file_size), "");
+    // The size first: to check many sections that overlap would take long.
+    if (!is_record(file.kind()) || file.map(section::kChain).size() != sizeof(ChainLink)) return 0;
+    return read_value<ChainLink>(file, section::kChain).record;
+  } catch (const FileError&) {
+    return 0;
+  }
+}
+
+// Where a container begins that was written after the record at `broken`, which is not whole; the
+// size of the bytes if there is none. Anything may stand within that record, even a text that is a
+// container. So the search begins behind it; if its head does not say where that is, only a record
+// with a number above those of the whole records counts.
+std::size_t find_later(Bytes bytes, std::size_t broken, std::uint64_t records) {
+  const auto head = intact_head(bytes.subspan(broken));
+  const std::uint64_t size = head ? head->header.file_size : kSectionAlignment;
+  if (size > bytes.size() - broken) return bytes.size();
+  const std::uint64_t aligned =
+      (size + kSectionAlignment - 1) / kSectionAlignment * kSectionAlignment;
+  for (std::size_t at = broken + aligned; at < bytes.size(); at += kSectionAlignment) {
+    const Bytes rest = bytes.subspan(at);
+    if (head ? intact_head(rest).has_value() : record_number(rest) > records) return at;
+  }
+  return bytes.size();
+}
+
+// Whether the creation of this journal was interrupted, so that nothing was committed to it yet.
+bool is_unfinished(Bytes bytes) {
+  return bytes.size() <= kFirstSize &&
+         (has_magic(bytes) || std::ranges::all_of(bytes, [](auto b) { return b == std::byte{0}; }));
+}
+
+// Throws FileError with what is wrong with the beginning of a journal.
+[[noreturn]] void refuse(Bytes bytes, const std::string& name) {
+  ContainerReader(bytes.first(std::min(bytes.size(), kFirstSize)), name).verify();
+  throw FileError(name + ": not a journal");
+}
+
+std::string read_base(const ContainerReader& file) {
+  const Bytes bytes = file.read(section::kBase);
+  if (bytes.size() != kIdentitySize) file.fail_size(section::kBase);
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
 
 constexpr char kSaveElsewhere[] = "; save to another path to keep what is in memory";
 // Openings of a journal that somebody else deletes at the same moment.
@@ -73,6 +161,117 @@ FileDescriptor guard(const std::filesystem::path& map) {
 }
 
 }  // namespace
+
+std::filesystem::path journal_path(const std::filesystem::path& map) {
+  return link_target(map).string() + ".journal";
+}
+
+std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path) {
+  const auto fail = [&](const std::string& why) {
+    throw FileError(path.string() + ": cannot be read: " + why);
+  };
+  struct stat status;
+  if (::fstat(file.get(), &status) != 0) fail(system_error());
+  if (!S_ISREG(status.st_mode)) throw FileError(path.string() + ": not a file");
+  const auto size = static_cast<std::size_t>(status.st_size);
+  const auto read = [&](std::span<std::byte> to) {
+    const auto bytes = file.read(to);
+    if (!bytes) fail(system_error());
+    return *bytes;
+  };
+  // A file that does not begin as a journal is not read, however large.
+  std::array<std::byte, kMaxHead> head_space;
+  const Bytes head = read(std::span(head_space).first(std::min(size, head_space.size())));
+  if (head.size() > kFirstSize && !intact_head(head)) refuse(head, path.string());
+  std::vector<std::byte> result;
+  try {
+    result.resize(size);
+  } catch (const std::bad_alloc&) {
+    fail(text("its ", size, " bytes do not fit into memory"));
+  }
+  result.resize(read(result).size());
+  return result;
+}
+
+std::string identity_of(const std::filesystem::path& path) {
+  const auto file = FileDescriptor::open_to_read(path);
+  std::array<std::byte, kMaxHead> space;
+  const auto bytes = file ? file.read(space) : std::nullopt;
+  const auto head = bytes ? ContainerHead::parse(*bytes) : std::nullopt;
+  return head ? head->identity() : "";
+}
+
+JournaledFile::JournaledFile(const std::filesystem::path& map) {
+  constexpr int kTries = 100;
+  const auto path = journal_path(map);
+  // The map may be compacted while the two are read, and again to an equal file whose journal was
+  // another in between. Not every file system gives a file the same inode each time.
+  for (int tries = 0;; ++tries) {
+    mapped_ = std::make_unique<MappedFile>(map);
+    file_.emplace(mapped_->bytes(), map.string());
+    const auto journal = FileDescriptor::open_to_read(path);
+    if (!journal && errno != ENOENT && errno != ENAMETOOLONG) {
+      throw FileError(path.string() + ": cannot be read: " + system_error());
+    }
+    bytes_ = journal ? read_journal(journal, path) : std::vector<std::byte>();
+    if (identity_of(map) == file_->identity() && (mapped_->is_at(map) || tries >= kTries)) break;
+  }
+  journal_ = JournalContent(bytes_, path.string());
+}
+
+JournalContent::JournalContent(Bytes bytes, std::string name)
+    : name_(std::move(name)), size_(bytes.size()) {
+  if (bytes.empty()) return;
+  const auto first = whole_container(bytes, name_);
+  if (!first) {
+    if (!is_unfinished(bytes)) refuse(bytes, name_);
+    check_known(bytes, name_);
+    return;
+  }
+  first->expect(FileKind::journal);
+  bases_.push_back({read_base(*first), 0});
+  last_.previous = first->checksum();
+  end_ = first->size();
+  while (end_ < size_) {
+    const std::string where = text(name_, ": record at byte ", end_);
+    const auto record = whole_container(bytes.subspan(end_), where);
+    if (!record) {
+      check_known(bytes.subspan(end_), where);
+      const std::size_t next = find_later(bytes, end_, last_.record);
+      if (next == size_) return;
+      throw FileError(text(where, " is broken, and there are others behind it, at byte ", next,
+                           ", which no power cut leaves; to keep the commits before it, cut the "
+                           "journal off (truncate --size=",
+                           end_, ")"));
+    }
+    if (!is_record(record->kind())) record->fail("it is ", describe(record->kind()));
+    const auto link = read_value<ChainLink>(*record, section::kChain);
+    if (link.record != last_.record + 1 || link.previous != last_.previous) {
+      record->fail("it does not follow the one before it");
+    }
+    if (record->kind() == FileKind::commit) {
+      commits_.push_back({bytes.subspan(end_, record->size()), end_});
+    } else {
+      bases_.push_back({read_base(*record), commits_.size()});
+    }
+    last_ = {link.record, record->checksum(), 0};
+    end_ += record->size();
+  }
+}
+
+std::span<const JournalContent::Commit> JournalContent::commits(const std::string& identity) const {
+  // The last base of this identity counts, as equal map files may come again.
+  for (auto base = bases_.rbegin(); base != bases_.rend(); ++base) {
+    if (base->identity == identity) return std::span(commits_).subspan(base->commits);
+  }
+  const std::size_t folded = bases_.empty() ? 0 : bases_.back().commits;
+  if (commits_.size() == folded) return {};
+  const std::string maybe =
+      folded == 0 ? "" : text(", of which the first ", folded, " may be in that file already");
+  throw FileError(text(name_, ": holds ", commits_.size(),
+                       " commits to another map file than the one beside it", maybe,
+                       ": bring that one back, or move the journal away to do without them"));
+}
 
 Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   std::error_code error;

@@ -6,7 +6,7 @@
 #include <string>
 #include <string_view>
 
-#include "base/utf8.h"
+#include "base/text.h"
 #include "file/sections.h"
 #include "search/coarse_quantizer.h"
 

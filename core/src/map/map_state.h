@@ -45,11 +45,10 @@ struct MapState {
   // not change once others have the map.
   std::filesystem::path journaled;
 
-  // Returns the recall table as measured on the map now, or earlier if little has changed since or
-  // others measure or change the map; with these centroids at any rate. `lock` holds `searching`,
-  // and is released while the table is measured.
-  std::shared_ptr<const MeasuredRecall> recall(std::shared_lock<FairSharedMutex>& lock,
-                                               double recall, int threads);
+  // Returns how many lists to search for this recall, as measured on the map now, or earlier if
+  // little has changed since or others measure or change the map. `lock` holds `searching`, and is
+  // released while the recall table is measured.
+  std::size_t nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads);
 
   // A map of some of the landmarks.
   PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;

@@ -9,28 +9,27 @@
 
 namespace protomark {
 
-void PositionBox::add(const Position& p) {
-  if (std::isnan(p[0])) return;
+void add_to_summary(MapSummary& summary, std::uint32_t observations, const Position& position) {
+  summary.observations += observations;
+  ++summary.count_histogram[std::min(observations, 255u)];
+  if (std::isnan(position[0])) return;
+  ++summary.landmarks_with_position;
+  if (!summary.extent) summary.extent = {position, position};
+  auto& [low, high] = *summary.extent;
   for (std::size_t i = 0; i < 3; ++i) {
-    low[i] = positions != 0 ? std::min(low[i], p[i]) : p[i];
-    high[i] = positions != 0 ? std::max(high[i], p[i]) : p[i];
+    low[i] = std::min(low[i], position[i]);
+    high[i] = std::max(high[i], position[i]);
   }
-  ++positions;
 }
 
-Position PositionBox::middle() const {
-  return {low[0] / 2 + high[0] / 2, low[1] / 2 + high[1] / 2, low[2] / 2 + high[2] / 2};
-}
-
-PositionCodec::PositionCodec(const PositionBox& box, int bits) : bits_(bits) {
-  const Position middle = box.middle();
-  origin_ = bits == 16 ? box.low : middle;
+PositionCodec::PositionCodec(const std::array<Position, 2>& extent, int bits) : bits_(bits) {
   for (std::size_t i = 0; i < 3; ++i) {
-    const double reach = std::max(box.high[i] - middle[i], middle[i] - box.low[i]);
-    if (reach > std::numeric_limits<float>::max()) {
+    const double low = extent[0][i], high = extent[1][i], middle = low / 2 + high / 2;
+    if (std::max(high - middle, middle - low) > std::numeric_limits<float>::max()) {
       invalid("positions are too far apart for a sealed map");
     }
-    if (bits == 16) step_[i] = (box.high[i] - box.low[i]) / kLast;
+    origin_[i] = bits == 16 ? low : middle;
+    if (bits == 16) step_[i] = (high - low) / kLast;
   }
 }
 
@@ -76,19 +75,6 @@ Position PositionCodec::decode(const std::byte* from) const {
       p[i] = steps[i] == kNone ? kNaN : p[i] + step_[i] * steps[i];
   }
   return std::ranges::all_of(p, [](double x) { return std::isfinite(x); }) ? p : kNoPosition;
-}
-
-void SummaryBuilder::add(std::uint32_t observations, const Position& position) {
-  summary_.observations += observations;
-  ++summary_.landmarks_by_count[std::min(observations, 255u)];
-  box_.add(position);
-}
-
-MapSummary SummaryBuilder::take() {
-  summary_.landmarks_with_position = box_.positions;
-  summary_.low = box_.low;
-  summary_.high = box_.high;
-  return summary_;
 }
 
 }  // namespace protomark

@@ -12,16 +12,8 @@
 
 namespace protomark {
 
-// A bounding box.
-struct PositionBox {
-  Position low{};
-  Position high{};
-  std::size_t positions = 0;  // in it; of none, low and high are zero
-
-  // Takes a position, or NaN for none.
-  void add(const Position& p);
-  Position middle() const;
-};
+// Adds a landmark to the summary of its map; NaN means that it has no position.
+void add_to_summary(MapSummary& summary, std::uint32_t observations, const Position& position);
 
 // Positions in 32 or 16 bits per coordinate. With 32 they are floats relative to an origin. With 16
 // they are steps of a grid over the bounding box, which has a step of its own along each axis:
@@ -29,8 +21,9 @@ struct PositionBox {
 class PositionCodec {
  public:
   PositionCodec() = default;
-  // Throws std::invalid_argument if positions are too far apart for floats.
-  PositionCodec(const PositionBox& box, int bits);
+  // For positions between these lowest and highest coordinates. Throws std::invalid_argument if
+  // they are too far apart for floats.
+  PositionCodec(const std::array<Position, 2>& extent, int bits);
   // Reads the steps, if the file has any; `origin` is that of its shape. Throws FileError.
   PositionCodec(const ContainerReader& file, const Position& origin);
 
@@ -52,17 +45,6 @@ class PositionCodec {
   int bits_ = 32;
   Position origin_{};
   Position step_{};
-};
-
-// Sums a map up.
-class SummaryBuilder {
- public:
-  void add(std::uint32_t observations, const Position& position);
-  MapSummary take();
-
- private:
-  MapSummary summary_;
-  PositionBox box_;
 };
 
 }  // namespace protomark

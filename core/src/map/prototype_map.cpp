@@ -85,19 +85,17 @@ Metadata PrototypeMap::metadata() const {
 
 std::vector<Position> PrototypeMap::positions(std::span<const std::int64_t> ids) const {
   const std::shared_lock lock(state_->searching);
-  std::vector<Position> result(ids.size());
   const PrototypeStore& store = state_->store;
-  std::ranges::transform(ids, result.begin(),
-                         [&](auto id) { return store.position(store.at(id)); });
+  std::vector<Position> result;
+  for (const std::int64_t id : ids) result.push_back(store.position(store.at(id)));
   return result;
 }
 
 std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> ids) const {
   const std::shared_lock lock(state_->searching);
-  std::vector<std::uint32_t> result(ids.size());
   const PrototypeStore& store = state_->store;
-  std::ranges::transform(ids, result.begin(),
-                         [&](auto id) { return store.observations(store.at(id)); });
+  std::vector<std::uint32_t> result;
+  for (const std::int64_t id : ids) result.push_back(store.observations(store.at(id)));
   return result;
 }
 
@@ -142,12 +140,8 @@ std::vector<std::uint32_t> PrototypeMap::appearance_counts(std::int64_t id) cons
 }
 
 MapSummary PrototypeMap::summary() const {
-  const PrototypeStore& store = state_->store;
   const std::shared_lock lock(state_->changing);
-  SummaryBuilder result;
-  store.each_landmark(
-      [&](LandmarkIndex l) { result.add(store.observations(l), store.position(l)); });
-  return result.take();
+  return state_->store.summary();
 }
 
 void PrototypeMap::build_index(const IndexOptions& options, int threads) {
@@ -191,8 +185,7 @@ std::size_t PrototypeMap::nlist() const {
 
 std::size_t PrototypeMap::nprobe(double recall, int threads) const {
   std::shared_lock lock(state_->searching);
-  const auto table = state_->recall(lock, recall, threads);
-  return nprobe_for(table->table, recall, state_->store.quantizer().nlist());
+  return state_->nprobe(lock, recall, threads);
 }
 
 Matches PrototypeMap::search(Descriptors queries, std::size_t k,
@@ -202,21 +195,13 @@ Matches PrototypeMap::search(Descriptors queries, std::size_t k,
 
 Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
                                    const SearchOptions& options) const {
-  Matches matches{{queries.rows, k}, {queries.rows, k}};
   std::shared_lock lock(state_->searching);
   const PrototypeStore& store = state_->store;
-  auto nprobe = requested_nprobe(options, store.quantizer().nlist(), kRemedy);
-  if (options.recall) {
-    const auto table = state_->recall(lock, *options.recall, options.threads);
-    nprobe = nprobe_for(table->table, *options.recall, store.quantizer().nlist());
-  }
-  if (!nprobe) {
-    search_exact(store.view(), queries, options, matches.ids.view(), matches.distances.view());
-  } else {
-    search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(), *nprobe,
-                 queries, options, matches.ids.view(), matches.distances.view());
-  }
-  return matches;
+  check_lists(options, store.quantizer().nlist(), kRemedy);
+  std::size_t nprobe = options.nprobe.value_or(SIZE_MAX);
+  if (options.recall) nprobe = state_->nprobe(lock, *options.recall, options.threads);
+  return search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(),
+                      nprobe, queries, k, options);
 }
 
 // Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.
@@ -248,17 +233,19 @@ RecallTable measure_recall_of(const PrototypeStore& store,
                         search_two, list_of);
 }
 
-std::shared_ptr<const MeasuredRecall> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
-                                                       double recall, int threads) {
+std::size_t MapState::nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads) {
   for (bool tried = false;; tried = true) {
-    check_recall(recall, store.quantizer().nlist(), kRemedy);
-    std::shared_ptr<const MeasuredRecall> known;
+    const std::size_t nlist = store.quantizer().nlist();
+    check_recall(recall, nlist, kRemedy);
+    std::shared_ptr<const MeasuredRecall> measured;
     {
       const std::scoped_lock reading(recall_mutex);
-      known = recall_table;
+      measured = recall_table;
     }
-    const bool of_these = known && known->lists_version == store.lists_version();
-    if (of_these && (tried || !is_stale(*known))) return known;
+    const bool of_these = measured && measured->lists_version == store.lists_version();
+    if (of_these && (tried || !is_stale(*measured))) {
+      return nprobe_for(measured->table, recall, nlist);
+    }
     lock.unlock();
     measure(threads, !of_these);
     lock.lock();
@@ -284,11 +271,7 @@ void MapState::measure(int threads, bool wait) {
   auto measured = std::make_shared<MeasuredRecall>();
   measured->table = measure_recall_of(
       store, [](std::int8_t code) { return int{code}; },
-      [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
-        SearchOptions options;
-        options.threads = threads;
-        search_exact(store.view(), queries, options, ids, distances);
-      });
+      [&](Codes queries) { return search_exact(store.view(), queries, 2, {.threads = threads}); });
   measured->lists_version = store.lists_version();
   measured->changes = store.changes();
   const std::scoped_lock writing(recall_mutex);

@@ -106,14 +106,7 @@ PrototypeMap MapState::part(std::span<const LandmarkIndex> landmarks) const {
   std::size_t rows = 0;
   for (const LandmarkIndex landmark : landmarks) rows += store.row_count(landmark);
   to.reserve(landmarks.size(), rows);
-  for (const LandmarkIndex landmark : landmarks) {
-    LandmarkIndex own = kNoLandmark;
-    for (const Row row : store.sorted_rows(landmark)) {
-      const Row copy = to.create_row(store.id(landmark), own, store.appearance(row));
-      to.merge(copy, store.sum(row), store.count(row));
-    }
-    to.set_position(own, store.position(landmark));
-  }
+  for (const LandmarkIndex landmark : landmarks) to.merge(store.id(landmark), store, landmark);
   return PrototypeMap(std::move(result));
 }
 

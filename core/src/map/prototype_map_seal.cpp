@@ -164,8 +164,7 @@ class RowWriter {
 
 // Finds the two nearest landmarks of each query among prototypes as they are packed, piece by
 // piece.
-void search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
-                   MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
+Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
   // As much memory as is little beside the map.
   const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
@@ -174,7 +173,7 @@ void search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes
   std::vector<std::int64_t> owners;
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.places(2, {});
+  Neighbours nearest = prepared.neighbours(2, {});
   for (std::size_t first = 0; first < store.row_end(); first += size) {
     owners.clear();
     auto* to = reinterpret_cast<std::uint8_t*>(packed.data());
@@ -191,7 +190,9 @@ void search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes
     piece.landmarks.ids = owners.data();
     PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, owners.size()});
   }
-  write_answer(nearest, prepared.norms(), std::nullopt, std::nullopt, ids, distances);
+  Matches matches{{queries.rows, 2}, {queries.rows, 2}};
+  write_answer(nearest, prepared.norms(), {}, 0, matches);
+  return matches;
 }
 
 // The sections that have something per landmark or row. They come into being in one pass over
@@ -236,7 +237,7 @@ class SealedContent {
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
           store_, [this](std::int8_t code) { return packer_.value(code); },
-          [this](auto... arguments) { search_packed(store_, packer_, arguments...); });
+          [this](Codes queries) { return search_packed(store_, packer_, queries); });
       sink(std::as_bytes(std::span(table)));
     });
   }
@@ -325,10 +326,8 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
   const SealFormat format = seal_format(map, options.bytes_per_landmark);
   const auto merged = merge_appearances(map, format.row_limit);
   const PrototypeStore& store = merged ? *merged : map;
-  PositionBox box;
-  for (const Position& position : map.positions()) box.add(position);
   std::optional<PositionCodec> codec;
-  if (box.positions != 0) codec.emplace(box, options.position_bits);
+  if (const auto extent = map.summary().extent) codec.emplace(*extent, options.position_bits);
   int scale = 0;
   if (format.bits == 4) {
     Histogram histogram{};

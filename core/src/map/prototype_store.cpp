@@ -9,6 +9,7 @@
 
 #include "base/rounded_mean.h"
 #include "base/sorted_pieces.h"
+#include "map/positions.h"
 #include "protomark/prototype_map.h"
 
 namespace protomark {
@@ -160,6 +161,12 @@ std::uint32_t PrototypeStore::observations(LandmarkIndex landmark) const {
   std::uint32_t n = 0;
   for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) n += counts_[row.value];
   return n;
+}
+
+MapSummary PrototypeStore::summary() const {
+  MapSummary result;
+  each_landmark([&](LandmarkIndex l) { add_to_summary(result, observations(l), position(l)); });
+  return result;
 }
 
 void PrototypeStore::rounded(Row row, std::int8_t* to) const {

@@ -46,15 +46,10 @@ class Uncommitted {
 
 // Rows stand in blocks by inverted list: all in one without an index, otherwise each in the list of
 // its rounded prototype. Padding fills the last block of a list.
-class PrototypeStore : private RowTable {
+class PrototypeStore : public RowTable {
  public:
   PrototypeStore(std::size_t dim, std::size_t appearance_bits)
       : RowTable(appearance_bits != 0), dim_(dim), appearance_bits_(appearance_bits) {}
-
-  using RowTable::any_position, RowTable::appearance, RowTable::at, RowTable::find,
-      RowTable::find_row, RowTable::first_row, RowTable::id, RowTable::ids, RowTable::is_row,
-      RowTable::next_row, RowTable::owner, RowTable::position, RowTable::positions,
-      RowTable::row_count, RowTable::sorted_rows, RowTable::steps;
 
   std::size_t dim() const { return dim_; }
   std::size_t appearance_bits() const { return appearance_bits_; }
@@ -93,6 +88,7 @@ class PrototypeStore : private RowTable {
   void erase(std::int64_t id);
 
   std::uint32_t observations(LandmarkIndex landmark) const;
+  MapSummary summary() const;
   std::int16_t* sum(Row row) { return &sums_[row.value * dim_]; }
   const std::int16_t* sum(Row row) const { return &sums_[row.value * dim_]; }
   int count(Row row) const { return counts_[row.value]; }

@@ -223,10 +223,10 @@ std::optional<Position> SealedMap::position_error() const {
 }
 
 std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> wanted) const {
-  std::vector<std::uint32_t> result(wanted.size());
-  std::ranges::transform(wanted, result.begin(), [&](std::int64_t id) {
-    return content_->counts[content_->ids.find(id).value];
-  });
+  std::vector<std::uint32_t> result;
+  for (const std::int64_t id : wanted) {
+    result.push_back(content_->counts[content_->ids.find(id).value]);
+  }
   return result;
 }
 
@@ -256,19 +256,19 @@ Matrix<float> SealedMap::appearances(std::int64_t id) const {
 }
 
 std::vector<Position> SealedMap::positions(std::span<const std::int64_t> wanted) const {
-  std::vector<Position> result(wanted.size());
-  std::ranges::transform(wanted, result.begin(), [&](std::int64_t id) {
-    return content_->position(content_->ids.find(id));
-  });
+  std::vector<Position> result;
+  for (const std::int64_t id : wanted) {
+    result.push_back(content_->position(content_->ids.find(id)));
+  }
   return result;
 }
 
 MapSummary SealedMap::summary() const {
-  SummaryBuilder result;
+  MapSummary result;
   for (std::size_t i = 0; i < size(); ++i) {
-    result.add(content_->counts[i], content_->position(landmark_at(i)));
+    add_to_summary(result, content_->counts[i], content_->position(landmark_at(i)));
   }
-  return result.take();
+  return result;
 }
 
 Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOptions& options) const {
@@ -277,16 +277,12 @@ Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOption
 
 Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
   const Content& c = *content_;
-  Matches matches{{queries.rows, k}, {queries.rows, k}};
-  auto lists = requested_nprobe(options, nlist(), kRemedy);
-  if (options.recall) lists = nprobe(*options.recall);
-  if (!lists) {
-    search_exact(c.prototypes, queries, options, matches.ids.view(), matches.distances.view());
-  } else {
-    const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
-    search_lists(c.prototypes, InvertedLists(c.list_rows, c.first_blocks), centroids, *lists,
-                 queries, options, matches.ids.view(), matches.distances.view());
-  }
+  check_lists(options, nlist(), kRemedy);
+  const std::size_t lists =
+      options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
+  const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
+  Matches matches = search_lists(c.prototypes, InvertedLists(c.list_rows, c.first_blocks),
+                                 centroids, lists, queries, k, options);
   // Search gives landmark indices. Ids ascend with them, so that ties went to the smaller id.
   if (c.ids.are_indices()) return matches;
   for (std::int64_t& id : matches.ids.data) {

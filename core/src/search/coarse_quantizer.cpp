@@ -19,19 +19,15 @@ constexpr std::size_t kGroupProbes = 4;
 // Codes that are assigned at a time.
 constexpr std::size_t kAssignChunk = 1 << 14;
 
-// Returns the id that find(codes, ids, distances) finds for each code.
-template <typename Find>
-std::vector<std::uint32_t> nearest_ids(Codes codes, const Find& find) {
-  std::vector<std::uint32_t> result(codes.rows);
-  std::vector<std::int64_t> ids(std::min(codes.rows, kAssignChunk));
-  std::vector<std::int32_t> distances(ids.size());
+// Returns the id that search(codes) finds for each code.
+template <typename Search>
+std::vector<std::uint32_t> nearest_ids(Codes codes, const Search& search) {
+  std::vector<std::uint32_t> result;
+  result.reserve(codes.rows);
   for (std::size_t first = 0; first < codes.rows; first += kAssignChunk) {
     const std::size_t n = std::min(kAssignChunk, codes.rows - first);
-    find(Codes{codes.row(first), n, codes.columns}, MatrixView<std::int64_t>{ids.data(), n, 1},
-         MatrixView<std::int32_t>{distances.data(), n, 1});
-    std::transform(ids.begin(), ids.begin() + static_cast<std::ptrdiff_t>(n),
-                   result.begin() + static_cast<std::ptrdiff_t>(first),
-                   [](std::int64_t id) { return static_cast<std::uint32_t>(id); });
+    const Matches nearest = search(Codes{codes.row(first), n, codes.columns});
+    for (const std::int64_t id : nearest.ids.data) result.push_back(static_cast<std::uint32_t>(id));
   }
   return result;
 }
@@ -123,9 +119,8 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
       std::min(n, static_cast<std::size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
   const auto assign = [&](const std::vector<std::int8_t>& to) {
     const std::vector<CodeVector> packed = pack_codes({to.data(), groups, dim_});
-    return nearest_ids(all, [&](Codes codes, auto ids, auto distances) {
-      search_exact(packed_view(packed, groups), codes, {}, ids, distances);
-    });
+    return nearest_ids(
+        all, [&](Codes codes) { return search_exact(packed_view(packed, groups), codes, 1, {}); });
   };
   const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
   std::vector<Row> group_of;
@@ -181,9 +176,9 @@ std::vector<std::uint32_t> CoarseQuantizer::assign(Codes codes, int threads) con
   const InvertedLists groups(group_sizes_, group_blocks_);
   SearchOptions options;
   options.threads = threads;
-  return nearest_ids(codes, [&](Codes some, auto ids, auto distances) {
-    search_lists(grouped, groups, packed_view(group_centroids_, group_sizes_.size()), kGroupProbes,
-                 some, options, ids, distances);
+  const PackedPrototypes centroids = packed_view(group_centroids_, group_sizes_.size());
+  return nearest_ids(codes, [&](Codes chunk) {
+    return search_lists(grouped, groups, centroids, kGroupProbes, chunk, 1, options);
   });
 }
 

@@ -8,10 +8,11 @@
 #include <mutex>
 #include <optional>
 #include <span>
-#include <stdexcept>
 
 #include "base/parallel.h"
+#include "base/text.h"
 #include "kernels/kernels.h"
+#include "protomark/search.h"
 #include "protomark/types.h"
 #include "search/top_k.h"
 
@@ -32,11 +33,11 @@ struct Division {
     const std::size_t work_ranges = std::min(divide_up(n, query_ranges), divide_up(rows, kRows));
     return {query_ranges, std::max<std::size_t>(work_ranges, 1)};
   }
-  // Divides only the probes, as all queries of a list share the reading of it.
-  static Division of_lists(int threads, std::size_t probes) {
-    constexpr std::size_t kProbes = 64;
+  // Divides only the visits to lists, as all queries that visit a list share the reading of it.
+  static Division of_lists(int threads, std::size_t visits) {
+    constexpr std::size_t kVisits = 64;
     if (threads <= 1) return {};
-    return {1, std::clamp<std::size_t>(divide_up(probes, kProbes), 1,
+    return {1, std::clamp<std::size_t>(divide_up(visits, kVisits), 1,
                                        4 * static_cast<std::size_t>(threads))};
   }
 
@@ -94,38 +95,33 @@ void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel&
   }
 }
 
-// Writes (queries x k) ids and distances. `norms`, if there are any, are added to the distances of
-// each query.
+// Writes the neighbours to rows of `matches`, from `first` on. `norms`, if there are any, are added
+// to the distances of each query.
 inline void write_answer(const Neighbours& nearest, std::span<const std::int32_t> norms,
-                         std::optional<std::int32_t> max_distance, std::optional<double> ratio,
-                         MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
-  const std::int32_t limit = max_distance.value_or(INT32_MAX);
+                         const SearchOptions& options, std::size_t first, Matches& matches) {
+  const std::int32_t limit = options.max_distance.value_or(INT32_MAX);
+  const std::optional<double> ratio = options.ratio;
   for (std::size_t q = 0; q < nearest.queries(); ++q) {
     const std::int32_t norm = norms.empty() ? 0 : norms[q];
     const std::int64_t* found = nearest.ids(q);
     const std::int32_t* found_at = nearest.distances(q);
     const bool accepted = !ratio || nearest.k() < 2 || found[1] < 0 ||
                           found_at[0] + norm < *ratio * *ratio * (found_at[1] + norm);
-    for (std::size_t j = 0; j < ids.columns; ++j) {
+    for (std::size_t j = 0; j < matches.ids.columns; ++j) {
       const bool reported = accepted && found[j] >= 0 && found_at[j] + norm <= limit;
-      ids.row(q)[j] = reported ? found[j] : -1;
-      distances.row(q)[j] = reported ? found_at[j] + norm : INT32_MAX;
+      matches.ids.row(first + q)[j] = reported ? found[j] : -1;
+      matches.distances.row(first + q)[j] = reported ? found_at[j] + norm : INT32_MAX;
     }
   }
 }
 
-// Throws std::invalid_argument if ids and distances are not (queries x k), k at least 1, or
-// max_distance is negative.
-inline void check_answer(std::size_t queries, std::optional<std::int32_t> max_distance,
-                         const MatrixView<std::int64_t>& ids,
-                         const MatrixView<std::int32_t>& distances) {
-  if (ids.columns == 0) throw std::invalid_argument("k must be at least 1");
-  if (ids.rows != queries || distances.rows != queries || ids.columns != distances.columns) {
-    throw std::invalid_argument("ids and distances must be queries x k");
-  }
-  if (max_distance && *max_distance < 0) {
-    throw std::invalid_argument("max_distance must not be negative");
-  }
+// Returns room for the answer of a search. Throws std::invalid_argument if k is 0 or max_distance
+// is negative.
+inline Matches room_for_answer(std::size_t queries, std::size_t k,
+                               std::optional<std::int32_t> max_distance) {
+  if (k == 0) invalid("k must be at least 1");
+  if (max_distance && *max_distance < 0) invalid("max_distance must not be negative");
+  return {{queries, k}, {queries, k}};
 }
 
 }  // namespace protomark

@@ -2,13 +2,9 @@
 
 #include <algorithm>
 #include <cstring>
-#include <stdexcept>
-#include <string>
 #include <vector>
 
-#include "kernels/kernels.h"
 #include "search/driver.h"
-#include "search/top_k.h"
 
 namespace protomark {
 namespace {
@@ -33,17 +29,15 @@ void pack(Descriptors database, Range rows, std::size_t words, std::uint64_t* pa
 
 void check(Descriptors queries, Descriptors database) {
   if (queries.columns != database.columns) {
-    throw std::invalid_argument("queries have " + std::to_string(queries.columns) +
-                                " bytes, the database has " + std::to_string(database.columns));
+    invalid("queries have ", queries.columns, " bytes, the database has ", database.columns);
   }
   if (queries.columns == 0 || queries.columns > 4096) {
-    throw std::invalid_argument("a descriptor has 1 to 4096 bytes, not " +
-                                std::to_string(queries.columns));
+    invalid("a descriptor has 1 to 4096 bytes, not ", queries.columns);
   }
-  if (database.rows > UINT32_MAX) throw std::invalid_argument("the database has over 2^32 rows");
+  if (database.rows > UINT32_MAX) invalid("the database has over 2^32 rows");
 }
 
-// Compares queries with some rows, and calls offer(places of a query, distance, row).
+// Compares queries with some rows, and calls offer(neighbours of a query, distance, row).
 template <typename Offer>
 void scan(Descriptors queries, Descriptors database, Range rows, Neighbours& nearest,
           const Offer& offer) {
@@ -79,8 +73,7 @@ template <typename Offer>
 Matches search(Descriptors queries, Descriptors database, std::size_t k,
                const HammingOptions& options, const Offer& offer) {
   check(queries, database);
-  Matches matches{{queries.rows, k}, {queries.rows, k}};
-  check_answer(queries.rows, options.max_distance, matches.ids.view(), matches.distances.view());
+  Matches matches = room_for_answer(queries.rows, k, options.max_distance);
   const auto bits = static_cast<std::int32_t>(8 * queries.columns);
   const std::vector<std::int32_t> limits(queries.rows,
                                          std::min(bits, options.max_distance.value_or(bits)));
@@ -90,8 +83,7 @@ Matches search(Descriptors queries, Descriptors database, std::size_t k,
                scan({queries.row(some.begin), some.size(), queries.columns}, database, rows, part,
                     offer);
              });
-  write_answer(nearest, {}, std::nullopt, std::nullopt, matches.ids.view(),
-               matches.distances.view());
+  write_answer(nearest, {}, {}, 0, matches);
   return matches;
 }
 
@@ -109,11 +101,10 @@ Matches hamming_search(Descriptors queries, Descriptors database,
                        std::span<const std::int64_t> landmarks, std::size_t k,
                        const HammingOptions& options) {
   if (landmarks.size() != database.rows) {
-    throw std::invalid_argument("the database has " + std::to_string(database.rows) +
-                                " rows, landmarks has " + std::to_string(landmarks.size()));
+    invalid("the database has ", database.rows, " rows, landmarks has ", landmarks.size());
   }
   for (const std::int64_t id : landmarks) {
-    if (id < 0) throw std::invalid_argument("landmark ids must not be negative");
+    if (id < 0) invalid("landmark ids must not be negative");
   }
   return search(queries, database, k, options,
                 [&](TopK best, std::int32_t distance, std::size_t row) {

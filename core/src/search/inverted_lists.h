@@ -39,10 +39,10 @@ std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
                                          int threads);
 
 // Searches as search_exact does, but only in the `nprobe` lists (at least 1) nearest to each query,
-// ties to the smaller list. Prototype i of `centroids` is the centroid of list i.
-void search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
-                  const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
-                  const SearchOptions& options, MatrixView<std::int64_t> ids,
-                  MatrixView<std::int32_t> distances);
+// ties to the smaller list; in all prototypes if there are no more lists than that. Prototype i of
+// `centroids` is the centroid of list i.
+Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
+                     const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
+                     std::size_t k, const SearchOptions& options);
 
 }  // namespace protomark

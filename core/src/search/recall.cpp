@@ -2,8 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <stdexcept>
-#include <string>
 
 #include "search/scan.h"
 
@@ -30,16 +28,14 @@ template <typename Owner>
 RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& quantizer,
                     const SearchTwo& search_two, const ListOf& list_of) {
   const std::size_t n = queries.rows, dim = queries.columns;
-  std::vector<std::int64_t> ids(2 * n);
-  std::vector<std::int32_t> distances(2 * n);
-  search_two(queries, {ids.data(), n, 2}, {distances.data(), n, 2});
+  const Matrix<std::int64_t> ids = search_two(queries).ids;
   // The list of the landmark that a query looks for, and how far away its centroid is.
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
   std::vector<std::int32_t> limits(n, INT32_MIN);
   for (std::size_t q = 0; q < n; ++q) {
     // If others are as near, the owner may come second, or not at all.
-    const std::int64_t nearest = ids[2 * q] == owner(q) ? ids[2 * q + 1] : ids[2 * q];
+    const std::int64_t nearest = ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0];
     if (nearest < 0) continue;
     lists[q] = list_of(nearest, queries.row(q));
     const std::int8_t* centroid = &quantizer.centroids()[lists[q] * dim];
@@ -99,26 +95,17 @@ std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlis
   return table[static_cast<std::size_t>(std::ceil(enough)) - 1];
 }
 
-std::optional<std::size_t> requested_nprobe(const SearchOptions& options, std::size_t nlist,
-                                            const char* remedy) {
-  if (!options.recall && !options.nprobe) return std::nullopt;
-  if (options.recall && options.nprobe) {
-    throw std::invalid_argument("recall and nprobe exclude each other");
-  }
-  if (options.recall) {
-    check_recall(*options.recall, nlist, remedy);
-    return 0;
-  }
-  if (nlist == 0) throw std::invalid_argument(std::string("nprobe needs an index: ") + remedy);
-  if (*options.nprobe == 0) throw std::invalid_argument("nprobe must be at least 1");
-  return std::min(*options.nprobe, nlist);
+void check_recall(double recall, std::size_t nlist, const char* remedy) {
+  if (!(recall > 0 && recall <= 1)) invalid("recall must be above 0 and at most 1");
+  if (nlist == 0) invalid("recall needs an index: ", remedy);
 }
 
-void check_recall(double recall, std::size_t nlist, const char* remedy) {
-  if (!(recall > 0 && recall <= 1)) {
-    throw std::invalid_argument("recall must be above 0 and at most 1");
-  }
-  if (nlist == 0) throw std::invalid_argument(std::string("recall needs an index: ") + remedy);
+void check_lists(const SearchOptions& options, std::size_t nlist, const char* remedy) {
+  if (options.recall && options.nprobe) invalid("recall and nprobe exclude each other");
+  if (options.recall) check_recall(*options.recall, nlist, remedy);
+  if (!options.nprobe) return;
+  if (nlist == 0) invalid("nprobe needs an index: ", remedy);
+  if (*options.nprobe == 0) invalid("nprobe must be at least 1");
 }
 
 }  // namespace protomark

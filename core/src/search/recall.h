@@ -28,7 +28,7 @@ inline constexpr std::size_t kTestQueries = 2048;
 std::vector<std::size_t> test_rows(std::size_t rows);
 
 // Finds the two nearest landmarks of each query exactly.
-using SearchTwo = std::function<void(Codes, MatrixView<std::int64_t>, MatrixView<std::int32_t>)>;
+using SearchTwo = std::function<Matches(Codes)>;
 // The list of the prototype of a landmark that is nearest to a query.
 using ListOf = std::function<std::uint32_t(std::int64_t landmark, const std::int8_t* query)>;
 
@@ -43,11 +43,9 @@ RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& ow
 // Returns how many lists to search for a recall above 0 and at most 1; all of them for 1.
 std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlist);
 
-// Checks `recall` and `nprobe` of a search in a map of `nlist` lists. Returns nullopt for an exact
-// search, else the number of lists to search, 0 if it depends on options.recall. `remedy` says what
-// to do if there are no lists. Throws std::invalid_argument.
-std::optional<std::size_t> requested_nprobe(const SearchOptions& options, std::size_t nlist,
-                                            const char* remedy);
+// Throws std::invalid_argument unless a map of `nlist` lists can be searched with this recall, or
+// with these options. `remedy` says what to do if there are no lists.
 void check_recall(double recall, std::size_t nlist, const char* remedy);
+void check_lists(const SearchOptions& options, std::size_t nlist, const char* remedy);
 
 }  // namespace protomark

@@ -1,8 +1,6 @@
 #include "search/scan.h"
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
 
 namespace protomark {
 namespace {
@@ -26,7 +24,7 @@ PreparedCodes::PreparedCodes(Codes codes)
   }
 }
 
-Neighbours PreparedCodes::places(std::size_t k, const SearchOptions& options) const {
+Neighbours PreparedCodes::neighbours(std::size_t k, const SearchOptions& options) const {
   std::vector<std::int32_t> limits(queries(), CodeScan::kNoLimit);
   // With the ratio test, the second nearest counts at any distance.
   if (options.max_distance && !options.ratio) {
@@ -116,31 +114,27 @@ void PrototypeScan::scan(std::span<const std::uint32_t> queries,
   }
 }
 
-void search_exact(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
-                  MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
-  check_search(prototypes.dim, queries, options, ids, distances);
+Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::size_t k,
+                     const SearchOptions& options) {
+  Matches matches = check_search(prototypes.dim, queries, k, options);
   const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.places(ids.columns, options);
+  Neighbours nearest = prepared.neighbours(k, options);
   run_search(options.threads, Division::of_rows(options.threads, queries.rows, prototypes.rows),
              prototypes.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
                PrototypeScan(prototypes, prepared, some, part).scan(rows);
              });
-  write_answer(nearest, prepared.norms(), options.max_distance, options.ratio, ids, distances);
+  write_answer(nearest, prepared.norms(), options, 0, matches);
+  return matches;
 }
 
-void check_search(std::size_t dim, Codes queries, const SearchOptions& options,
-                  const MatrixView<std::int64_t>& ids, const MatrixView<std::int32_t>& distances) {
+Matches check_search(std::size_t dim, Codes queries, std::size_t k, const SearchOptions& options) {
   if (queries.columns != dim) {
-    throw std::invalid_argument("queries have " + std::to_string(queries.columns) +
-                                " dimensions, prototypes " + std::to_string(dim));
+    invalid("queries have ", queries.columns, " dimensions, prototypes ", dim);
   }
-  if (dim == 0 || dim > 256) {
-    throw std::invalid_argument("a code has 1 to 256 dimensions, not " + std::to_string(dim));
-  }
-  check_answer(queries.rows, options.max_distance, ids, distances);
   if (options.ratio && !(*options.ratio > 0 && *options.ratio <= 1)) {
-    throw std::invalid_argument("ratio must be above 0 and at most 1");
+    invalid("ratio must be above 0 and at most 1");
   }
+  return room_for_answer(queries.rows, k, options.max_distance);
 }
 
 }  // namespace protomark

@@ -25,8 +25,8 @@ class PreparedCodes {
   // Squared norms, which the distances of kernels lack.
   const std::vector<std::int32_t>& norms() const { return norms_; }
 
-  // Places for the k nearest of each query, two if the ratio test needs them.
-  Neighbours places(std::size_t k, const SearchOptions& options) const;
+  // Returns room for the k nearest of each query, for two if the ratio test needs them.
+  Neighbours neighbours(std::size_t k, const SearchOptions& options) const;
 
  private:
   std::size_t dim_;
@@ -169,11 +169,11 @@ class PrototypeScan {
 
 // Finds the nearest landmarks among all prototypes (protomark/search.h), whatever options.recall
 // and options.nprobe say. Throws std::invalid_argument if the arguments do not fit.
-void search_exact(const PackedPrototypes& prototypes, Codes queries, const SearchOptions& options,
-                  MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances);
+Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::size_t k,
+                     const SearchOptions& options);
 
-// Throws std::invalid_argument if the arguments of a search do not fit.
-void check_search(std::size_t dim, Codes queries, const SearchOptions& options,
-                  const MatrixView<std::int64_t>& ids, const MatrixView<std::int32_t>& distances);
+// Returns room for the answer of a search. Throws std::invalid_argument if its arguments do not
+// fit.
+Matches check_search(std::size_t dim, Codes queries, std::size_t k, const SearchOptions& options);
 
 }  // namespace protomark
