@@ -13,14 +13,41 @@ namespace protomark::python {
 
 nb::dict from_summary(const MapSummary& summary);
 
+// The ids of some landmarks, given as such or as a mask over all ids in ascending order.
+template <typename Map>
+std::vector<std::int64_t> ids_or_mask(const Map& map, nb::handle among) {
+  const nb::object array = numpy("asarray")(among);
+  if (nb::cast<std::string>(array.attr("dtype").attr("kind")) != "b") {
+    const auto ids = landmark_ids(array);
+    return {ids.data(), ids.data() + ids.size()};
+  }
+  const auto mask = nb::cast<Array1<bool>>(numpy("ascontiguousarray")(array));
+  const std::vector<std::int64_t> ids = without_gil([&] { return map.ids(); });
+  if (mask.size() != ids.size()) {
+    throw std::invalid_argument("among: a mask of " + std::to_string(mask.size()) +
+                                " landmarks does not fit a map of " + std::to_string(ids.size()));
+  }
+  std::vector<std::int64_t> result;
+  for (std::size_t i = 0; i < ids.size(); ++i) {
+    if (mask.data()[i]) result.push_back(ids[i]);
+  }
+  return result;
+}
+
 // Binds Map::search or Map::search_codes, whose queries are of type `Queries`.
 template <typename Map, typename Queries, typename Search>
 auto bind_search(Queries (*to_queries)(nb::handle), Search search) {
   return [=](const Map& map, nb::object queries, std::size_t k,
              std::optional<std::int64_t> max_distance, std::optional<double> ratio, int threads,
-             std::optional<double> recall, std::optional<std::size_t> nprobe) {
+             std::optional<double> recall, std::optional<std::size_t> nprobe,
+             std::optional<nb::object> among) {
     const auto q = to_queries(queries);
-    SearchOptions options{recall, nprobe, std::nullopt, ratio, threads};
+    SearchOptions options{recall, nprobe, std::nullopt, ratio, std::nullopt, threads};
+    std::vector<std::int64_t> searched;
+    if (among) {
+      searched = ids_or_mask(map, *among);
+      options.among = searched;
+    }
     if (max_distance) {
       options.max_distance =
           static_cast<std::int32_t>(std::clamp<std::int64_t>(*max_distance, -1, INT32_MAX));
@@ -101,10 +128,11 @@ Returns:
     extent: (2, 3) float64, the lowest and highest coordinates; None if no landmark has a position.)")
       .def("search", bind_search<Map>(&descriptors, &Map::search), "descriptors"_a, "k"_a = 2,
            "max_distance"_a = nb::none(), "ratio"_a = nb::none(), "threads"_a = 1,
-           "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+           "recall"_a = nb::none(), "nprobe"_a = nb::none(), "among"_a = nb::none(),
            nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
                    "max_distance: int | None = None, ratio: float | None = None, "
-                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None) -> "
+                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None, "
+                   "among: ArrayLike | None = None) -> "
                    "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
            R"(Find the k nearest landmarks of each descriptor; ties go to the smaller id.
 
@@ -119,6 +147,9 @@ Args:
     recall: in (0, 1]: an approximate search in a map with an index that finds the nearest landmark
         of this part of the queries, as measured on the map (nprobe()). None: an exact search.
     nprobe: instead of recall, the number of inverted lists to search.
+    among: the landmarks to search: ids (n,), or a mask (landmarks,) bool in the order of `ids`.
+        Neighbours are those that a map of these landmarks alone would give, at a cost that follows
+        their number. None: all.
 
 Returns:
     ids (q, k) int64, nearest first, -1 where there is none, and squared Euclidean distances
@@ -126,15 +157,18 @@ Returns:
 
 Raises:
     TypeError: descriptors are not (q, bits / 8) uint8.
+    KeyError: `among` has an id that is not in the map.
     ValueError: descriptors are of another size than the encoder's; k, threads or nprobe is below 1;
+        a mask is of another length than the map;
         max_distance is negative; ratio or recall is out of its range; recall and nprobe are both
         given, or one of them and the map has no index (PrototypeMap.build_index).)")
       .def("search_codes", bind_search<Map>(&codes, &Map::search_codes), "codes"_a, "k"_a = 2,
            "max_distance"_a = nb::none(), "ratio"_a = nb::none(), "threads"_a = 1,
-           "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+           "recall"_a = nb::none(), "nprobe"_a = nb::none(), "among"_a = nb::none(),
            nb::sig("def search_codes(self, codes: NDArray[numpy.int8], k: int = 2, "
                    "max_distance: int | None = None, ratio: float | None = None, "
-                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None) -> "
+                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None, "
+                   "among: ArrayLike | None = None) -> "
                    "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
            "Like search, for descriptors that are encoded already: (q, dim) int8. Raises "
            "ValueError if they have another length.");

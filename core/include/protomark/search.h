@@ -4,6 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <optional>
+#include <span>
 
 namespace protomark {
 
@@ -23,6 +24,11 @@ struct SearchOptions {
   // Lowe's ratio test, in (0, 1]: a query keeps its neighbours only if there is one landmark, or if
   // the squared distances fulfil nearest < ratio * ratio * second, in doubles from left to right.
   std::optional<double> ratio = std::nullopt;
+  // Searches only these landmarks, as a map that held no others would answer; empty: none. In an
+  // approximate search `recall` is then the aim, not a measured share: as many lists are searched
+  // as hold as many of these landmarks as `nprobe` lists hold of all, or all of them if that is
+  // less work. std::out_of_range names an id that is not in the map.
+  std::optional<std::span<const std::int64_t>> among = std::nullopt;
   int threads = 1;
 };
 

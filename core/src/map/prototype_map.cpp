@@ -7,6 +7,7 @@
 #include "base/text.h"
 #include "map/map_state.h"
 #include "map/positions.h"
+#include "search/among.h"
 #include "search/inverted_lists.h"
 
 namespace protomark {
@@ -200,8 +201,20 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
   check_lists(options, store.quantizer().nlist(), kRemedy);
   std::size_t nprobe = options.nprobe.value_or(SIZE_MAX);
   if (options.recall) nprobe = state_->nprobe(lock, *options.recall, options.threads);
-  return search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(),
-                      nprobe, queries, k, options);
+  const InvertedLists lists(store.lists());
+  const PackedPrototypes centroids = store.quantizer().packed();
+  if (!options.among) {
+    return search_lists(store.view(), lists, centroids, nprobe, queries, k, options);
+  }
+  Selection selection{{}, store.ids().size(), [&](LandmarkIndex landmark, std::vector<Row>& rows) {
+                        for (Row row = store.first_row(landmark); row != kNoRow;
+                             row = store.next_row(row)) {
+                          rows.push_back(row);
+                        }
+                      }};
+  for (const std::int64_t id : *options.among) selection.landmarks.push_back(store.at(id));
+  sort_unique(selection.landmarks);
+  return search_among(selection, store.view(), lists, centroids, nprobe, queries, k, options);
 }
 
 // Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.

@@ -12,6 +12,7 @@
 #include "map/map_sections.h"
 #include "map/positions.h"
 #include "map/sealed_store.h"
+#include "search/among.h"
 #include "search/coarse_quantizer.h"
 #include "search/inverted_lists.h"
 #include "search/recall.h"
@@ -281,8 +282,20 @@ Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOption
   const std::size_t lists =
       options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
   const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
-  Matches matches = search_lists(c.prototypes, InvertedLists(c.list_rows, c.first_blocks),
-                                 centroids, lists, queries, k, options);
+  const InvertedLists inverted(c.list_rows, c.first_blocks);
+  Matches matches;
+  if (options.among) {
+    Selection selection{{}, size(), [&](LandmarkIndex landmark, std::vector<Row>& rows) {
+                          const auto [first, end] = c.prototypes_of(landmark);
+                          for (std::size_t p = first; p < end; ++p) rows.push_back(c.row_of(p));
+                        }};
+    for (const std::int64_t id : *options.among) selection.landmarks.push_back(c.ids.find(id));
+    sort_unique(selection.landmarks);
+    matches =
+        search_among(selection, c.prototypes, inverted, centroids, lists, queries, k, options);
+  } else {
+    matches = search_lists(c.prototypes, inverted, centroids, lists, queries, k, options);
+  }
   // Search gives landmark indices. Ids ascend with them, so that ties went to the smaller id.
   if (c.ids.are_indices()) return matches;
   for (std::int64_t& id : matches.ids.data) {

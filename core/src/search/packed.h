@@ -61,6 +61,8 @@ struct RowLandmarks {
   LandmarkIndex end = kNoLandmark;
   // The id of each landmark, negative if its rows are padding. nullptr: ids are indices.
   const std::int64_t* ids = nullptr;
+  // Which landmarks to search; nullptr: all.
+  const std::vector<bool>* among = nullptr;
 };
 
 struct PackedPrototypes {

@@ -114,15 +114,20 @@ void PrototypeScan::scan(std::span<const std::uint32_t> queries,
   }
 }
 
+void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
+              Neighbours& nearest) {
+  run_search(threads, Division::of_rows(threads, queries.queries(), prototypes.rows),
+             prototypes.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
+               PrototypeScan(prototypes, queries, some, part).scan(rows);
+             });
+}
+
 Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::size_t k,
                      const SearchOptions& options) {
   Matches matches = check_search(prototypes.dim, queries, k, options);
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.neighbours(k, options);
-  run_search(options.threads, Division::of_rows(options.threads, queries.rows, prototypes.rows),
-             prototypes.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
-               PrototypeScan(prototypes, prepared, some, part).scan(rows);
-             });
+  scan_all(prototypes, prepared, options.threads, nearest);
   write_answer(nearest, prepared.norms(), options, 0, matches);
   return matches;
 }

@@ -98,10 +98,11 @@ class LandmarkReader {
     of_chunk_.clear();
   }
 
-  // Does nothing if the row is padding. A filter of landmarks would stand here, too.
+  // Does nothing if the row is padding or its landmark not searched.
   void offer(TopK best, std::int32_t distance, Row row) {
     const LandmarkIndex landmark = landmark_of(row);
     if (landmark >= landmarks_.end) return;
+    if (landmarks_.among != nullptr && !(*landmarks_.among)[landmark.value]) return;
     const std::int64_t id =
         landmarks_.ids != nullptr ? landmarks_.ids[landmark.value] : std::int64_t{landmark.value};
     if (id < 0) return;
@@ -166,6 +167,10 @@ class PrototypeScan {
   CodeScan scan_;
   Neighbours& nearest_;
 };
+
+// Compares all queries with all prototypes.
+void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
+              Neighbours& nearest);
 
 // Finds the nearest landmarks among all prototypes (protomark/search.h), whatever options.recall
 // and options.nprobe say. Throws std::invalid_argument if the arguments do not fit.

@@ -23,7 +23,6 @@ from protomark.localization.solve import CANDIDATES, Candidates, Localization, s
 from protomark.maps.open import open_map
 from protomark.match_calibration import MatchCalibration
 from protomark.matching import MIN_PROBABILITY
-from protomark.subset import Subset
 
 
 class Localizer:
@@ -145,10 +144,12 @@ class Localizer:
         with _timed(stages, "encode"):
             codes = self.scene.encoder.encode(descriptors, self.scene.dim, self.threads)
         with _timed(stages, "search"):
-            searched: pm.PrototypeMap | pm.SealedMap | Subset = self.scene
+            among = None
             if prior is not None:
-                searched = Subset(self.scene, self._ids[visible(prior, camera, self._positions)])
-            ids, distances = searched.search_codes(codes, k=CANDIDATES, threads=self.threads)
+                among = self._ids[visible(prior, camera, self._positions)]
+            ids, distances = self.scene.search_codes(
+                codes, k=CANDIDATES, threads=self.threads, among=among
+            )
         with _timed(stages, "pose"):
             candidates = Candidates(
                 np.asarray(keypoints, np.float64).reshape(-1, 2),

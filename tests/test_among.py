@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from conftest import NO_DISTANCE, balanced_encoder, random_descriptors
-from protomark.subset import Subset
 from sealing import four_bits
 
 LANDMARKS = 300
@@ -39,7 +38,7 @@ def filtered(
 @pytest.mark.parametrize(
     "kind", ["learning", "8", "4", "appearances", "sealed appearances", "appearances 4", "index"]
 )
-@pytest.mark.parametrize("size", [0, 1, 2, 40])
+@pytest.mark.parametrize("size", [0, 1, 2, 40, 250])
 def test_equals_the_answers_of_the_whole_map_without_the_others(
     kind: str, size: int, tmp_path: Path
 ) -> None:
@@ -54,12 +53,31 @@ def test_equals_the_answers_of_the_whole_map_without_the_others(
     ids = rng.choice(scene.ids, size, replace=False)
     codes = scene.encoder.encode(random_descriptors(60, seed=2))
     for k in (1, 2, 3):
-        found, distances = Subset(scene, ids).search_codes(codes, k=k)
         expected, away = filtered(scene, ids, codes, k)
-        assert found.tolist() == expected
-        assert distances.tolist() == away
+        for among in (ids, np.repeat(ids, 2), np.isin(scene.ids, ids)):
+            found, distances = scene.search_codes(codes, k=k, among=among, threads=2)
+            assert found.tolist() == expected
+            assert distances.tolist() == away
+    if kind == "index":
+        everywhere = scene.search_codes(codes, k=3, among=ids, nprobe=scene.nlist)
+        assert everywhere[0].tolist() == expected
+        near = scene.search_codes(codes, k=3, among=ids, nprobe=1)[0]
+        assert np.isin(near, [-1, *ids]).all()
 
 
-def test_unknown_landmarks_are_named() -> None:
+def test_the_ratio_test_is_among_the_same_landmarks() -> None:
+    scene = observed(0)
+    ids = scene.ids[::7]
+    codes = scene.encoder.encode(random_descriptors(60, seed=2))
+    (nearest, second), ratio = np.sqrt(scene.search_codes(codes, among=ids)[1].T), 0.9
+    found, _ = scene.search_codes(codes, among=ids, ratio=ratio)
+    assert ((found[:, 0] >= 0) == (nearest < ratio * second)).all()
+
+
+def test_what_does_not_fit_is_named() -> None:
+    scene = observed(0)
+    codes = np.zeros((1, scene.dim), np.int8)
     with pytest.raises(KeyError, match="1"):
-        Subset(observed(0), [3, 1])
+        scene.search_codes(codes, among=[3, 1])
+    with pytest.raises(ValueError, match=f"mask of 2 landmarks does not fit a map of {len(scene)}"):
+        scene.search_codes(codes, among=[True, False])
