@@ -116,9 +116,9 @@ def names(workspace: Path) -> dict[str, Any]:
 
     toy = sample.load()
     seen = toy.observations
-    frames = [np.intersect1d(np.arange(s.start, s.stop), seen) for s in map(
-        toy.keypoints_of, range(3)
-    )]
+    frames = [
+        np.intersect1d(np.arange(s.start, s.stop), seen) for s in map(toy.keypoints_of, range(3))
+    ]
     return {
         "pm": pm,
         "encoder": pm.Encoder.load("freak"),
