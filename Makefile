@@ -123,8 +123,7 @@ torture: .venv/installed
 
 # Strict: dead links and anchors, pages out of the navigation and absent snippets are errors.
 docs: .venv-check/installed
-	NO_MKDOCS_2_WARNING=1 .venv-check/bin/mkdocs build --quiet
-	@echo "build/site/index.html"
+	NO_MKDOCS_2_WARNING=1 .venv-check/bin/mkdocs build --strict
 
 check: .venv-check/installed docs
 	.venv-check/bin/ruff format --check
