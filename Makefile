@@ -124,6 +124,7 @@ torture: .venv/installed
 # Strict: dead links and anchors, pages out of the navigation and absent snippets are errors.
 docs: .venv-check/installed
 	NO_MKDOCS_2_WARNING=1 .venv-check/bin/mkdocs build --strict
+	.venv-check/bin/python -m pytest --quiet tests/test_docs.py -k links
 
 check: .venv-check/installed docs
 	.venv-check/bin/ruff format --check

@@ -223,6 +223,14 @@ def test_every_header_is_on_the_page() -> None:
     assert [name for name in headers if f'"{name}"' not in page and name != "protomark.h"] == []
 
 
+def test_every_section_is_in_the_formats() -> None:
+    page = (ROOT / "docs" / "format.md").read_text(encoding="utf-8")
+    header = (ROOT / "core" / "src" / "file" / "sections.h").read_text(encoding="utf-8")
+    names = re.findall(r'constexpr char k\w+\[\] = "(\w+)"', header)
+    assert len(names) > 20
+    assert [name for name in names if f"`{name}`" not in page] == []
+
+
 def test_every_public_name_is_in_the_glossary() -> None:
     page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
     names = [name for name in pm.__all__ if name[0] != "_"]
