@@ -7,11 +7,10 @@ import numpy as np
 from protomark.geometry.pose import relative_pose
 from protomark.geometry.triangulation import depth_of_first, pixel_errors, refine_points
 from protomark.mapping.frame import Frame, Ids
+from protomark.mapping.initialisation import RATIO
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
 from protomark.tracks.matching import View, match
-
-RATIO = 0.8
 
 
 def triangulate(
