@@ -8,6 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+
+class Interrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
+    """Ctrl-C ended long work between two steps; the message says how to continue."""
+
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

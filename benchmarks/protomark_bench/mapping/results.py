@@ -432,7 +432,7 @@ def draw_ratios(results: MappingResults) -> Figure:
 
 def draw_trajectories(results: MappingResults) -> Figure:
     """Camera centres of all memories, aligned, on the true ones, from above."""
-    from protomark.geometry.similarity import trajectory_error
+    from protomark_bench.trajectory import trajectory_error
 
     panels = []
     for s in results.sequences:

@@ -13,8 +13,8 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.colmap import find_model, read_model
 from protomark.geometry.pose import camera_centers
-from protomark.geometry.similarity import trajectory_error
 from protomark.mapping.source import ImageFolder
+from protomark_bench.trajectory import trajectory_error
 
 # Of the project's own sequences, those whose poses a device measured, in metres; the others' poses
 # come from an incremental reconstruction of the same images.

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from protomark._core import hamming_search
 from protomark.baselines.method import Method
-from protomark.baselines.support import Support, unpack
+from protomark.baselines.support import Support
+from protomark.features.descriptors import unpack_bits
 
 # The medoids of landmarks with equally many observations are computed together, as many at a time
 # as have this many bits.
@@ -97,7 +98,7 @@ def medoid(support: Support) -> HammingMap:
 def _least_median(groups: NDArray[np.uint8]) -> NDArray[np.int64]:
     """(g, n, bytes) uint8 -> (g,) which of the n has the least median distance."""
     many, size, width = groups.shape
-    bits = unpack(groups.reshape(-1, width)).astype(np.float32).reshape(many, size, -1)
+    bits = unpack_bits(groups.reshape(-1, width)).astype(np.float32).reshape(many, size, -1)
     set_bits = bits.sum(axis=2)
     # Sums of at most a few thousand ones: exact in float32.
     distances = set_bits[:, :, None] + set_bits[:, None, :] - 2 * bits @ bits.transpose(0, 2, 1)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.baselines.method import Method
-from protomark.baselines.support import Moments, Support, unpack
+from protomark.baselines.support import Moments, Support
+from protomark.features.descriptors import unpack_bits
 from protomark.threads import one_blas_thread
 
 # One block of distances, 2 MB, stays in the cache.
@@ -60,7 +61,7 @@ class EuclideanMap(Method):
 
     def project(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(q, bits / 8) uint8 -> (q, k) float32, in steps of the stored vectors."""
-        values = unpack(descriptors).astype(np.float32)
+        values = unpack_bits(descriptors).astype(np.float32)
         if self.projection is not None:
             values = values @ self.projection
         if self.offset is not None:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from protomark.features.descriptors import unpack_bits
 
 # Unpacked bits are handled in pieces of about this many rows, to bound the memory.
 _CHUNK = 1 << 15
@@ -63,7 +67,7 @@ class Support:
         sums = np.empty((len(self.ids), self.bits), dtype=np.int32)
         for first, last in self.pieces():
             start, end = self.starts[first], self.starts[last - 1] + self.counts[last - 1]
-            bits = unpack(self.descriptors[start:end])
+            bits = unpack_bits(self.descriptors[start:end])
             np.add.reduceat(
                 bits, self.starts[first:last] - start, axis=0, dtype=np.int32, out=sums[first:last]
             )
@@ -80,6 +84,7 @@ class Support:
         return Moments.of(self)
 
 
+@dataclass(frozen=True, eq=False)
 class Moments:
     """Mean and covariances of descriptor bits, what linear projections are learned from.
 
@@ -90,14 +95,11 @@ class Moments:
     """
 
     # A quarter of a million numbers are estimated well by far fewer than this many rows.
-    MAX_ROWS = 100_000
+    MAX_ROWS: ClassVar = 100_000
 
-    def __init__(
-        self, mean: NDArray[np.float64], total: NDArray[np.float64], within: NDArray[np.float64]
-    ) -> None:
-        self.mean = mean
-        self.total = total
-        self.within = within
+    mean: NDArray[np.float64]
+    total: NDArray[np.float64]
+    within: NDArray[np.float64]
 
     @classmethod
     def of(cls, support: Support) -> Moments:
@@ -114,7 +116,7 @@ class Moments:
         # A piece sums up fewer than 2^24 products of 0 and 1: exact in float32.
         second = np.zeros((support.bits, support.bits))
         for at in range(0, len(rows), _CHUNK):
-            bits = unpack(support.descriptors[rows[at : at + _CHUNK]]).astype(np.float32)
+            bits = unpack_bits(support.descriptors[rows[at : at + _CHUNK]]).astype(np.float32)
             second += bits.T @ bits
         between = np.zeros_like(second)
         for at in range(0, len(sums), _CHUNK):
@@ -125,8 +127,3 @@ class Moments:
         total = second / len(rows) - np.outer(mean, mean)
         within = (second - between) / max(len(rows) - len(counts), 1)
         return cls(mean, total, within)
-
-
-def unpack(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, bytes) uint8 -> (n, bits) of 0 and 1, least significant bit of each byte first."""
-    return np.unpackbits(descriptors, axis=1, bitorder="little")

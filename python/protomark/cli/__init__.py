@@ -75,8 +75,15 @@ def main() -> None:
     130.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    from protomark.interrupt import Interrupted
+
     try:
         app(prog_name="protomark")
+    except Interrupted as stop:
+        from protomark.cli.terminal import note
+
+        note(str(stop))
+        raise SystemExit(130) from None
     except KeyboardInterrupt:
         _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:

@@ -117,14 +117,16 @@ def table_of(*columns: str, title: str = "", left: int = 1) -> Table:
     return table
 
 
-def facts_table(rows: list[tuple[str, str]]) -> Table:
-    """A table of names and values, without head or rules."""
+def print_facts(rows: list[tuple[str, str]]) -> None:
+    """Print names and values as a table without head or rules."""
     from rich.markup import escape
 
     table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")
     for row in rows:
         table.add_row(*(escape(printable(cell)) for cell in row))
-    return table
+    console.print(table)
 
 
 def readable_size(count: float) -> str:
@@ -163,4 +165,4 @@ def comma_separated_numbers(option: str, text: str) -> tuple[int, ...]:
     try:
         return tuple(int(number) for number in comma_separated(text))
     except ValueError:
-        raise ValueError(f"{option} {text}: not numbers with commas between them") from None
+        raise ValueError(f"{option} {text!r} is not a list of numbers such as 8,16,32") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -108,10 +108,6 @@ class DemoResult:
     files: dict[str, int]
     encoder_bytes: int
     seconds: float
-
-    def as_dict(self) -> dict[str, object]:
-        """As JSON values."""
-        return asdict(self)
 
 
 def run_demo(
@@ -265,29 +261,13 @@ def _draw(rows: list[DemoRow], shown: DemoRow, scene: ScenePicture, path: Path) 
         f"From above: {shown.found} of {shown.frames} queries found, "
         f"{shown.bytes_per_landmark:.0f} bytes per landmark",
     )
-    draw_curves(
-        right,
-        precision_curves([_summary(row) for row in rows]),
-        "bytes per landmark (log)",
-        "precision",
-        "Is the nearest landmark the right one?",
-    )
+    points = [
+        MethodSummary(row.name, row.label, row.family, row.bytes_per_landmark, row.precision)
+        for row in rows
+    ]
+    title = "Is the nearest landmark the right one?"
+    draw_curves(right, precision_curves(points), "bytes per landmark (log)", "precision", title)
     save_figure(figure, path, made_by=_MADE_BY)
-
-
-def _summary(row: DemoRow) -> MethodSummary:
-    return MethodSummary(
-        name=row.name,
-        label=row.label,
-        family=row.family,
-        bytes_per_landmark=row.bytes_per_landmark,
-        precision=row.precision,
-        spread=None,
-        ratio=None,
-        pose_recall=None,
-        right_share=None,
-        search_ms=row.ms_per_frame,
-    )
 
 
 def _check_output(output: Path) -> None:
@@ -295,8 +275,10 @@ def _check_output(output: Path) -> None:
     if output.exists() and not output.is_dir():
         raise FileExistsError(f"{output} is not a folder: name another one with --output")
     picture = output / PICTURE
-    if _is_demo_picture(picture):
-        return
+    if picture.is_file():
+        with picture.open("rb") as file:
+            if _MADE_BY.encode() in file.read(4096):
+                return
     # A map does not say who made it, so without the picture it counts as somebody else's.
     for path in (picture, output / LEARNING_MAP, output / SEALED_MAP):
         if path.exists():
@@ -304,10 +286,3 @@ def _check_output(output: Path) -> None:
                 f"{path} was not written by `protomark demo` and would be replaced: "
                 "name another folder with --output"
             )
-
-
-def _is_demo_picture(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return _MADE_BY.encode() in file.read(4096)

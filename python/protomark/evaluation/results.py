@@ -84,7 +84,6 @@ class MethodResult:
             bytes_per_landmark=float(np.mean(self.bytes_per_landmark)),
             precision=float(np.mean(self.precision)),
             spread=spread,
-            ratio=None,
             pose_recall=self.found / self.frames if self.frames else None,
             right_share=self.right / self.selected if self.selected else None,
             # Other work on the machine only ever adds.
@@ -108,11 +107,11 @@ class MethodSummary:
     family: str
     bytes_per_landmark: float
     precision: float
-    spread: float | None
-    ratio: float | None
-    pose_recall: float | None
-    right_share: float | None
-    search_ms: float
+    spread: float | None = None
+    ratio: float | None = None
+    pose_recall: float | None = None
+    right_share: float | None = None
+    search_ms: float = 0.0
 
 
 @dataclass
@@ -160,22 +159,12 @@ def mean_rows(results: Sequence[SequenceResult]) -> list[MethodSummary]:
         if not all(name in table for table in tables):
             continue
         same = [table[name] for table in tables]
-        means = {
+        means: dict[str, Any] = {
             key: _mean([getattr(row, key) for row in same])
-            for key in ("ratio", "pose_recall", "right_share")
+            for key in ("bytes_per_landmark", "precision", "ratio", "pose_recall", "right_share")
         }
-        rows.append(
-            MethodSummary(
-                name=name,
-                label=first.label,
-                family=first.family,
-                bytes_per_landmark=float(np.mean([row.bytes_per_landmark for row in same])),
-                precision=float(np.mean([row.precision for row in same])),
-                spread=None,
-                search_ms=float(np.mean([row.search_ms for row in same])),
-                **means,
-            )
-        )
+        search_ms = float(np.mean([row.search_ms for row in same]))
+        rows.append(MethodSummary(name, first.label, first.family, **means, search_ms=search_ms))
     return rows
 
 
@@ -237,11 +226,18 @@ def table_row(row: MethodSummary) -> list[str]:
     ]
 
 
+def group_by_descriptor(results: Sequence[SequenceResult]) -> dict[str, list[SequenceResult]]:
+    """The results for each descriptor, in their order."""
+    groups: dict[str, list[SequenceResult]] = {}
+    for result in results:
+        groups.setdefault(result.descriptor, []).append(result)
+    return groups
+
+
 def evaluation_markdown(results: Sequence[SequenceResult]) -> str:
     """All tables, and their mean where there are several, one descriptor after the other."""
     parts = []
-    for descriptor in dict.fromkeys(result.descriptor for result in results):
-        same = [result for result in results if result.descriptor == descriptor]
+    for descriptor, same in group_by_descriptor(results).items():
         if len(same) > 1:
             names = ", ".join(result.sequence for result in same)
             parts.append(f"#### {descriptor.upper()}: mean of {names}\n")

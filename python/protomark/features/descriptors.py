@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True)
 class DescriptorKind:
@@ -52,3 +55,8 @@ def descriptor_kind(name: str) -> DescriptorKind:
         raise ValueError(
             f"{name}: unknown descriptor, choose one of {', '.join(DESCRIPTORS)}"
         ) from None
+
+
+def unpack_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(n, B) uint8 -> (n, 8 B) uint8 of 0 and 1: bit i is bit i % 8 of byte i / 8, lowest first."""
+    return np.unpackbits(descriptors, axis=1, bitorder="little")

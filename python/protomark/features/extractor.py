@@ -21,6 +21,9 @@ MIN_DISTANCE = 4.0
 _AKAZE_THRESHOLDS = (1e-3, 1e-4)  # strict first, then for images with little contrast
 
 
+FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
+
+
 @dataclass
 class Features:
     """n keypoints of one image with their descriptors.
@@ -43,6 +46,10 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def where(self, rows: NDArray[Any]) -> Features:
+        """The keypoints at these rows (k,), or for which `rows` (n,) is true."""
+        return Features(*(getattr(self, name)[rows] for name in FEATURE_ARRAYS))
 
 
 class Extractor:
@@ -111,14 +118,8 @@ class Extractor:
         angles[angles >= 360] = 0
         # Some descriptors sort keypoints by pyramid level.
         order = np.lexsort((octaves, xy[:, 0], xy[:, 1], -responses))
-        return Features(
-            xy[order] + np.float32(0.5),
-            sizes[order],
-            angles[order],
-            responses[order],
-            octaves[order],
-            descriptors[order],
-        )
+        xy += np.float32(0.5)
+        return Features(xy, sizes, angles, responses, octaves, descriptors).where(order)
 
     def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
         """The selected keypoints, and their descriptors."""

@@ -14,7 +14,7 @@ import contextlib
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,6 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 
 pycolmap = optional("pycolmap")
-
-__all__ = ["ColmapModel", "find_model", "pycolmap", "quiet", "read_model", "read_reconstruction"]
 
 _FILES = ("cameras", "images")
 
@@ -138,6 +136,75 @@ def read_reconstruction(path: Path) -> Any:
             raise ValueError(
                 f"{path}: broken COLMAP model ({reason}), export it anew from COLMAP"
             ) from None
+
+
+def new_reconstruction(
+    cameras: Mapping[int, Camera],
+    images: Iterable[tuple[int, str, int, NDArray[Any], NDArray[np.float64]]],
+) -> Any:
+    """A `pycolmap.Reconstruction` of cameras and posed images, without points.
+
+    Args:
+        cameras: cameras by id.
+        images: id, name, camera id, keypoints (n, 2) in pixels and cam_from_world of each image.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    for camera_id, camera in cameras.items():
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera({**camera.as_dict(), "camera_id": camera_id})
+        )
+    for image_id, name, camera_id, keypoints, pose in images:
+        image = pycolmap.Image(
+            name=name,
+            camera_id=camera_id,
+            image_id=image_id,
+            keypoints=np.asarray(keypoints, np.float64).reshape(-1, 2),
+        )
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    return reconstruction
+
+
+def bundle_adjust(
+    reconstruction: Any,
+    image_ids: Iterable[int],
+    fixed: Sequence[int] = (),
+    *,
+    iterations: int = 30,
+    loss_scale: float = 1.0,
+    intrinsics: bool = False,
+    threads: int = 1,
+) -> bool:
+    """Move poses and points to the least (Cauchy) reprojection error; returns whether that worked.
+
+    Args:
+        reconstruction: a `pycolmap.Reconstruction`; changed.
+        image_ids: images that take part.
+        fixed: those of them whose poses stay; with fewer than two, two cameras fix the gauge.
+        iterations: limit on the solver's steps.
+        loss_scale: pixels beyond which an error counts less.
+        intrinsics: whether focal length and distortion move, too.
+        threads: threads of the solver; their number changes the last digits.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = intrinsics
+    options.refine_principal_point = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_scale
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.function_tolerance = 1e-4
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in image_ids:
+        config.add_image(image_id)
+    for image_id in fixed:
+        config.set_constant_rig_from_world_pose(image_id)
+    if len(fixed) < 2:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    with quiet():
+        return bool(adjuster.solve().is_solution_usable())
 
 
 def read_model(folder: Path) -> ColmapModel:

@@ -44,9 +44,6 @@ def near_pairs(
 
 def runs(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Start and length of each run of equal entries in a sorted array."""
-    starts = (
-        np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
-        if len(values)
-        else (np.zeros(0, np.int64))
-    )
+    changes = np.concatenate([[True], values[1:] != values[:-1]])
+    starts = np.flatnonzero(changes[: len(values)])
     return starts, np.diff(np.append(starts, len(values)))

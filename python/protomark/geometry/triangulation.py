@@ -52,6 +52,20 @@ def reprojection_residuals(points: Array, poses: Array, rays: Array) -> tuple[Ar
     return local[:, :2] / safe[:, None] - rays, depth
 
 
+def pixel_errors(points: Array, poses: Array, rays: Array, focal: Array | float) -> Array:
+    """Reprojection errors (n,) in pixels of the undistorted image, infinite behind the camera.
+
+    Args:
+        points: (n, 3) positions.
+        poses: (n, 3, 4) cam_from_world.
+        rays: (n, 2) undistorted rays.
+        focal: (n,) focal lengths in pixels, or one for all.
+    """
+    difference, depth = reprojection_residuals(points, poses, rays)
+    error = np.linalg.norm(difference, axis=1) * focal
+    return np.where((depth > 0) & np.isfinite(error), error, np.inf)
+
+
 def refine_points(
     points: Array,
     landmark: NDArray[np.int64],

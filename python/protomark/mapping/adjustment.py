@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from protomark.geometry.camera import Camera
-from protomark.geometry.colmap import pycolmap, quiet
+from protomark.geometry.colmap import bundle_adjust
 from protomark.geometry.triangulation import refine_points
 from protomark.mapping.frame import Array, Ids
+from protomark.mapping.reconstruction import to_reconstruction
 from protomark.mapping.structure import Observations, Structure
 
 # The most-seen points of a frame take part in the adjustment; more cost time and do not lower the
@@ -92,8 +93,17 @@ def adjust(
     if moving:
         used = seen.where(np.isin(seen.landmarks, _most_seen(seen, counts, set(moving))))
         before = {i: structure.frames[i].pose for i in moving}
-        reconstruction = _problem(structure, used)
-        _solve(reconstruction, used, moving, fixed, iterations, loss_scale, intrinsics, threads)
+        present = set(np.unique(used.frames).tolist())
+        reconstruction = to_reconstruction(structure, sorted(present), used)
+        bundle_adjust(
+            reconstruction,
+            [i + 1 for i in present],
+            [i + 1 for i in fixed if i in present],
+            iterations=iterations,
+            loss_scale=loss_scale,
+            intrinsics=intrinsics,
+            threads=threads,
+        )
         _read_back(structure, reconstruction, used, moving, intrinsics)
         _move_with_frames(structure, np.setdiff1d(seen.landmarks, used.landmarks), before)
     seen = structure.observations(sorted({*moving, *fixed}))
@@ -117,75 +127,6 @@ def _most_seen(seen: Observations, counts: Ids, moving: set[int]) -> Ids:
             for i in frames:
                 have[i] += 1
     return np.array(out, np.int64)
-
-
-def _problem(structure: Structure, seen: Observations) -> Any:
-    """A pycolmap.Reconstruction of these observations; image ids are frame indices plus one."""
-    reconstruction = pycolmap.Reconstruction()
-    places = np.unique(seen.frames).tolist()
-    for camera_id in sorted({structure.frames[i].camera_id for i in places}):
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera({**structure.cameras[camera_id].as_dict(), "camera_id": camera_id})
-        )
-    index = np.empty(len(seen.frames), np.int64)
-    for i in places:
-        frame, mine = structure.frames[i], np.flatnonzero(seen.frames == i)
-        index[mine] = np.arange(len(mine))
-        image = pycolmap.Image(
-            name=frame.name,
-            camera_id=frame.camera_id,
-            image_id=i + 1,
-            keypoints=frame.keypoints[seen.rows[mine]].astype(np.float64),
-        )
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.pose))
-    # Access through the reconstruction takes longer than all else that an observation needs.
-    images = {i + 1: reconstruction.images[i + 1] for i in places}
-    order = np.argsort(seen.landmarks, kind="stable")
-    ids, starts = np.unique(seen.landmarks[order], return_index=True)
-    frames, index = (seen.frames[order] + 1).tolist(), index[order].tolist()
-    ends = [*starts[1:].tolist(), len(frames)]
-    for point, a, b in zip(ids.tolist(), starts.tolist(), ends, strict=True):
-        track = pycolmap.Track([pycolmap.TrackElement(frames[k], index[k]) for k in range(a, b)])
-        reconstruction.add_point3D_with_id(
-            point, pycolmap.Point3D(xyz=structure.positions[point], track=track)
-        )
-        for k in range(a, b):
-            images[frames[k]].set_point3D_for_point2D(index[k], point)
-    return reconstruction
-
-
-def _solve(
-    reconstruction: Any,
-    seen: Observations,
-    moving: list[int],
-    fixed: list[int],
-    iterations: int,
-    loss_scale: float,
-    intrinsics: bool,
-    threads: int,
-) -> None:
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = intrinsics
-    options.refine_principal_point = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_scale
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.max_num_iterations = iterations
-    options.ceres.solver_options.function_tolerance = 1e-4
-    config = pycolmap.BundleAdjustmentConfig()
-    present = set(np.unique(seen.frames).tolist())
-    for i in present:
-        config.add_image(i + 1)
-    held = [i for i in fixed if i in present]
-    for i in held:
-        config.set_constant_rig_from_world_pose(i + 1)
-    if len(held) < 2:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # pycolmap.bundle_adjustment would write to the terminal.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    with quiet():
-        adjuster.solve()
 
 
 def _read_back(

@@ -63,29 +63,16 @@ def remove_weak(structure: Structure, memory: Memory, ids: Ids, min_angle: float
     """Remove landmarks that one keyframe sees, that were never confirmed, or with narrow rays."""
     counts = structure.counts()
     weak = counts[ids] < 2
-    old = structure.born[ids] <= _window_start(structure)
-    weak |= old & (counts[ids] < _MIN_CONFIRMED)
-    angles = _angles(structure, ids)
-    weak |= angles < np.radians(_ANGLE_SHARE * min_angle)
-    _remove_landmarks(structure, memory, ids[weak])
-    return int(weak.sum())
-
-
-def _remove_landmarks(structure: Structure, memory: Memory, ids: Ids) -> None:
-    """Remove landmarks from structure and memory."""
-    ids = ids[structure.existing[ids]]
-    if len(ids):
+    frames = structure.frames
+    window_start = next((i for i, frame in enumerate(frames) if frame.in_window), len(frames))
+    weak |= (structure.born[ids] <= window_start) & (counts[ids] < _MIN_CONFIRMED)
+    weak |= _angles(structure, ids) < np.radians(_ANGLE_SHARE * min_angle)
+    removed = ids[weak & structure.existing[ids]]
+    if len(removed):
         # A landmark whose observations were all subtracted has left the memory already.
-        memory.remove(ids[memory.contains(ids)])
-        structure.remove(ids)
-
-
-def _window_start(structure: Structure) -> int:
-    """Index of the first frame in the window, the number of frames if it is empty."""
-    for index, frame in enumerate(structure.frames):
-        if frame.in_window:
-            return index
-    return len(structure.frames)
+        memory.remove(removed[memory.contains(removed)])
+        structure.remove(removed)
+    return int(weak.sum())
 
 
 def _angles(structure: Structure, ids: Ids) -> NDArray[np.float64]:

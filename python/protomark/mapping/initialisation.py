@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark._core import hamming_search
 from protomark.extras import optional
 from protomark.geometry.absolute_pose import (
     MAX_ITERATIONS,
@@ -18,6 +17,7 @@ from protomark.geometry.absolute_pose import (
 from protomark.geometry.camera import Camera
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 from protomark.mapping.frame import Array, Frame, Ids
+from protomark.tracks.matching import mutual, nearest_matches
 
 RATIO = 0.8
 # Fewest matches that must agree with the relative pose.
@@ -236,14 +236,9 @@ def match(first: Frame, second: Frame) -> Ids:
     """Mutual nearest neighbours (k, 2) that pass the ratio test."""
     assert first.descriptors is not None
     assert second.descriptors is not None
-    if len(first.descriptors) < 2 or len(second.descriptors) < 2:
-        return np.zeros((0, 2), np.int64)
-    index, distance = hamming_search(first.descriptors, second.descriptors, k=2)
-    rows = np.flatnonzero(distance[:, 0] < RATIO * distance[:, 1])
-    target = index[rows, 0]
-    back, _ = hamming_search(second.descriptors[target], first.descriptors, k=1)
-    mutual = back[:, 0] == rows
-    return np.column_stack([rows[mutual], target[mutual]]).astype(np.int64)
+    rows, target, _ = nearest_matches(first.descriptors, second.descriptors, RATIO)
+    pairs = np.column_stack([rows, target])
+    return pairs[mutual(first.descriptors, second.descriptors, rows, target)]
 
 
 def _rotated_share(rotation: Array, first: Array, second: Array, limit: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.triangulation import refine_points, reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors, refine_points
 from protomark.mapping.frame import Ids
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
@@ -89,10 +89,9 @@ def _joint_positions(
     weight = (counts[into] / np.maximum(counts[into] + counts[source], 1))[:, None]
     start = weight * structure.positions[into] + (1 - weight) * structure.positions[source]
     joint = refine_points(start, which, seen.poses, seen.rays, seen.focal)
-    difference, depth = reprojection_residuals(joint[which], seen.poses, seen.rays)
+    errors = pixel_errors(joint[which], seen.poses, seen.rays, seen.focal)
     limit = np.array([structure.tolerance(f.camera_id, max_error) for f in structure.frames])
-    fits = np.linalg.norm(difference, axis=1) * seen.focal <= limit[seen.frames]
-    fits &= depth > 0
+    fits = errors <= limit[seen.frames]
     total = np.bincount(which, minlength=len(into))
     share = np.bincount(which, fits, minlength=len(into)) / np.maximum(total, 1)
     return joint, share >= _FITTING

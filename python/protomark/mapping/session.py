@@ -11,7 +11,7 @@ from typing import Any
 
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.pose_files import read_poses
-from protomark.interrupt import deferred_interrupt
+from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.mapping.initialisation import MIN_PARALLAX
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
@@ -59,10 +59,6 @@ class MapRequest:
     threads: int = 1
 
 
-class MappingInterrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
-    """Ctrl-C was pressed; the map so far is written, and `resume` continues it."""
-
-
 def make_map(
     request: MapRequest,
     progress: Progress = silent,
@@ -79,7 +75,7 @@ def make_map(
         Its figures, see `protomark.mapping.summary.summarise`.
 
     Raises:
-        MappingInterrupted: Ctrl-C was pressed.
+        Interrupted: Ctrl-C was pressed; the map so far is written.
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
@@ -97,7 +93,10 @@ def make_map(
     figures = write_outputs(mapper, request.output, source.path.name, finished)
     session.close()
     if not finished:
-        raise MappingInterrupted
+        raise Interrupted(
+            f"stopped: the map so far is in {request.output}; the same command with --resume "
+            "continues it"
+        )
     save_state(mapper, request.output / STATE, session.facts)
     shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
     return figures

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.errors import FileError
+from protomark._core import FileError
 from protomark.extras import optional
 from protomark.files import replacing, replacing_folder
 from protomark.geometry.camera import Camera, cameras_from_json

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
-from protomark.geometry.triangulation import reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors
 from protomark.mapping.frame import Array, Frame, Ids
 
 # A landmark is searched for in views at most this angle off the mean of the directions that it was
@@ -226,11 +226,7 @@ class Structure:
 
     def errors(self, seen: Observations) -> Array:
         """Reprojection errors in pixels of the undistorted image, infinite behind a camera."""
-        difference, depth = reprojection_residuals(
-            self.positions[seen.landmarks], seen.poses, seen.rays
-        )
-        error = np.linalg.norm(difference, axis=1) * seen.focal
-        return np.where((depth > 0) & np.isfinite(error), error, np.inf)
+        return pixel_errors(self.positions[seen.landmarks], seen.poses, seen.rays, seen.focal)
 
     def counts(self, keyframes_only: bool = True) -> Ids:
         """Number (l,) of frames, or of keyframes, that see each id."""

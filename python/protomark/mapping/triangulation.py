@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from protomark.geometry.pose import relative_pose
-from protomark.geometry.triangulation import depth_of_first, refine_points, reprojection_residuals
+from protomark.geometry.triangulation import depth_of_first, pixel_errors, refine_points
 from protomark.mapping.frame import Frame, Ids
+from protomark.mapping.initialisation import RATIO
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
 from protomark.tracks.matching import View, match
-
-RATIO = 0.8
 
 
 def triangulate(
@@ -98,10 +97,9 @@ def _create(
     seen = np.concatenate([old.rays[a], new.rays[b]])
     focal = np.repeat([structure.focal(f.camera_id) for f in (old, new)], count)
     points = refine_points(points, np.tile(np.arange(count), 2), poses, seen, focal, iterations=2)
-    difference, depth = reprojection_residuals(np.tile(points, (2, 1)), poses, seen)
-    error = np.linalg.norm(difference, axis=1) * focal
+    errors = pixel_errors(np.tile(points, (2, 1)), poses, seen, focal)
     limits = np.repeat([structure.tolerance(f.camera_id, max_error) for f in (old, new)], count)
-    fits = ((error <= limits) & (depth > 0)).reshape(2, count).all(0)
+    fits = (errors <= limits).reshape(2, count).all(0)
     a, b = a[fits], b[fits]
     ids = structure.create(points[fits])
     for frame, rows in ((old, a), (new, b)):
@@ -115,12 +113,11 @@ def _extend(
     """Let keypoints observe landmarks that project to them and that the frame does not see yet."""
     if not len(rows):
         return
-    difference, depth = reprojection_residuals(
-        structure.positions[ids], np.repeat(frame.pose[None], len(ids), axis=0), frame.rays[rows]
-    )
-    error = np.linalg.norm(difference, axis=1) * structure.focal(frame.camera_id)
-    # Landmarks may have been made, and keypoints taken, since the match.
-    fits = (depth > 0) & (error <= limit) & (frame.landmarks[rows] < 0)
+    poses = np.repeat(frame.pose[None], len(ids), axis=0)
+    focal = structure.focal(frame.camera_id)
+    errors = pixel_errors(structure.positions[ids], poses, frame.rays[rows], focal)
+    # Landmarks may have been created, and keypoints assigned, since the match.
+    fits = (errors <= limit) & (frame.landmarks[rows] < 0)
     fits &= ~np.isin(ids, frame.seen)
     rows, ids = rows[fits], ids[fits]
     _, first = np.unique(ids, return_index=True)

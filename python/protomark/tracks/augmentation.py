@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import FEATURE_ARRAYS, Extractor, Features
 from protomark.features.images import read_gray
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
@@ -116,8 +116,7 @@ def add_augmentations(
     def joined(name: str) -> Any:
         return np.concatenate([getattr(plain, name), *(getattr(f, name) for _, _, f, _ in flat)])
 
-    arrays = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
-    values: dict[str, Any] = {name: joined(name) for name in arrays}
+    values: dict[str, Any] = {name: joined(name) for name in FEATURE_ARRAYS}
     return replace(
         plain,
         **values,
@@ -147,7 +146,7 @@ def _copy(
     copy, homography, scale, angle = augment(image, rng)
     features = extractor(copy)
     if not len(features) or not len(keypoints):
-        return _where(features, np.zeros(len(features), bool)), np.zeros(0, np.int64)
+        return features.where(np.zeros(0, np.int64)), np.zeros(0, np.int64)
     # In OpenCV the centre of the first pixel is (0, 0), in COLMAP (0.5, 0.5).
     there = np.column_stack([features.keypoints - 0.5, np.ones(len(features))])
     back = there @ np.linalg.inv(homography).T
@@ -165,7 +164,7 @@ def _copy(
     known = features.angles >= 0
     features.angles[known] = np.mod(features.angles[known] - np.float32(angle), 360)
     features.angles[features.angles >= 360] = 0
-    return _where(features, keep), landmarks[nearest[keep]]
+    return features.where(keep), landmarks[nearest[keep]]
 
 
 def _nearest(
@@ -180,14 +179,3 @@ def _nearest(
         nearest[rows] = distances.argmin(1)
         gap[rows] = distances.min(1)
     return nearest, gap
-
-
-def _where(features: Features, keep: NDArray[np.bool_]) -> Features:
-    return Features(
-        features.keypoints[keep],
-        features.sizes[keep],
-        features.angles[keep],
-        features.responses[keep],
-        features.octaves[keep],
-        features.descriptors[keep],
-    )

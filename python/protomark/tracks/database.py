@@ -25,11 +25,14 @@ class _Image:
     descriptors: NDArray[np.uint8]
 
 
-def digest_of(database: Path, model: Path) -> str:
-    """Digest of the content of the database and of the model's files.
+def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
+    """What the tracks are made from and how, for their `info`: equal for equal tracks.
+
+    The input is a digest of the content of the database and of the model's files.
 
     Raises:
         FileNotFoundError: the database is missing.
+        ValueError: there is no such descriptor.
     """
     if not database.is_file():
         raise FileNotFoundError(f"{database}: no such COLMAP database")
@@ -39,7 +42,8 @@ def digest_of(database: Path, model: Path) -> str:
         with path.open("rb") as file:
             while block := file.read(1 << 20):
                 digest.update(block)
-    return digest.hexdigest()
+    options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
+    return {"options": options, "input": digest.hexdigest()}
 
 
 def tracks_from_database(
@@ -105,32 +109,13 @@ def tracks_from_database(
     keep = np.flatnonzero(count >= 2)
     number = np.full(len(positions) + 1, -1, np.int64)
     number[keep] = np.arange(len(keep))
-    tracks = Tracks(
-        descriptor=kind.name,
-        cameras=model.cameras,
-        keyframe_names=model.names,
-        keyframe_camera=model.camera_ids,
-        cam_from_world=model.cam_from_world,
-        offsets=np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64),
-        keypoints=np.concatenate([f.keypoints for f in features]),
-        sizes=np.concatenate([f.sizes for f in features]),
-        angles=np.concatenate([f.angles for f in features]),
-        responses=np.concatenate([f.responses for f in features]),
-        octaves=np.concatenate([f.octaves for f in features]),
-        descriptors=np.concatenate([f.descriptors for f in features]),
-        landmark_of_keypoint=number[label],
-        landmark_ids=np.arange(len(keep), dtype=np.int64),
-        landmark_positions=positions[keep],
-        info={
-            "sequence": name,
-            "options": {"descriptor": kind.name, "database": True},
-            "input": digest_of(database, model_path),
-            "images_without_pose": model.unposed,
-            "poses_refined": False,
-        },
-    )
-    tracks.check()
-    return tracks
+    info = {
+        "sequence": name,
+        **provenance(database, model_path, descriptor),
+        "images_without_pose": model.unposed,
+        "poses_refined": False,
+    }
+    return Tracks.from_features(kind.name, model, features, number[label], positions[keep], info)
 
 
 def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
@@ -234,13 +219,3 @@ def _features(image: _Image) -> Features:
         np.zeros(n, np.int32),
         np.ascontiguousarray(image.descriptors),
     )
-
-
-def is_up_to_date(path: Path, database: Path, model: Path, descriptor: str) -> bool:
-    """Whether `path` holds the tracks of this very database and model."""
-    try:
-        info: dict[str, Any] = Tracks.load(path).info
-    except (ValueError, OSError):
-        return False
-    options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
-    return info.get("options") == options and info.get("input") == digest_of(database, model)

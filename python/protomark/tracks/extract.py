@@ -119,23 +119,18 @@ def find_sequence(
     return SequenceFolder(folder.resolve().name, images, model or colmap.find_model(folder))
 
 
-def read_posed_model(folder: Path) -> colmap.ColmapModel:
-    """A model whose poses landmarks can be triangulated from.
+def provenance(
+    sequence: SequenceFolder, options: TracksOptions, model: colmap.ColmapModel | None = None
+) -> dict[str, Any]:
+    """What the tracks are made from and how, for their `info`: equal for equal tracks.
+
+    The input is a digest of cameras, poses, image names and file sizes.
 
     Raises:
-        FileNotFoundError, ValueError: as `colmap.read_model`, or the model holds too little.
+        FileNotFoundError: the model, or an image that it names, is missing.
+        ValueError: the model is broken, or no landmark can be triangulated from its poses.
     """
-    model = colmap.read_model(folder)
-    model.check_for_triangulation(folder)
-    return model
-
-
-def fingerprint(sequence: SequenceFolder, model: colmap.ColmapModel) -> str:
-    """Digest of what the tracks are made from: cameras, poses, image names and file sizes.
-
-    Raises:
-        FileNotFoundError: an image that the model names is missing.
-    """
+    model = model or _read_posed_model(sequence.model)
     digest = hashlib.sha256(model.cam_from_world.tobytes())
     digest.update(repr((sorted(model.cameras.items()), model.camera_ids.tolist())).encode())
     for name in model.names:
@@ -145,19 +140,13 @@ def fingerprint(sequence: SequenceFolder, model: colmap.ColmapModel) -> str:
                 f"{path}: image is missing, though the model {sequence.model} has a pose for it"
             )
         digest.update(f"{name}\0{path.stat().st_size}\0".encode())
-    return digest.hexdigest()
+    return {"method": _METHOD, "options": asdict(options), "input": digest.hexdigest()}
 
 
-def is_up_to_date(path: Path, options: TracksOptions, sequence: SequenceFolder) -> bool:
-    """Whether `path` holds tracks made with these options from this very input."""
-    try:
-        info = Tracks.load(path).info
-        made_with = TracksOptions(**info.get("options", {}))
-    except (ValueError, OSError, TypeError):
-        return False
-    if info.get("method") != _METHOD or made_with != options:
-        return False
-    return info.get("input") == fingerprint(sequence, read_posed_model(sequence.model))
+def _read_posed_model(folder: Path) -> colmap.ColmapModel:
+    model = colmap.read_model(folder)
+    model.check_for_triangulation(folder)
+    return model
 
 
 def extract(
@@ -178,8 +167,8 @@ def extract(
         FileNotFoundError: an image or the model is missing.
         ValueError: an image or the model is broken, or nothing could be triangulated.
     """
-    given = read_posed_model(sequence.model)
-    digest = fingerprint(sequence, given)
+    given = _read_posed_model(sequence.model)
+    made_from = provenance(sequence, options, given)
     features = _detect(sequence, given, options, threads, progress)
     work = _Matching(given, features, options, threads, progress)
     overlap = work.match_covisible()
@@ -209,9 +198,7 @@ def extract(
     shift = np.linalg.norm(given.centers - work.model.centers, axis=1)
     info: dict[str, Any] = {
         "sequence": sequence.name,
-        "method": _METHOD,
-        "options": asdict(options),
-        "input": digest,
+        **made_from,
         "epipolar_error": round(error, 3),
         "poses_refined": refine,
         "pose_shift_median": float(np.median(shift)),
@@ -224,7 +211,9 @@ def extract(
         "max_descriptor_distance": max_distance,
         "software": _versions(),
     }
-    tracks = tracks_from_scene(scene, features, options.descriptor, info)
+    tracks = Tracks.from_features(
+        options.descriptor, scene.model, features, scene.labels, scene.positions, info
+    )
     if options.max_unlabelled is not None:
         tracks = tracks.where(_labelled_or_strong(tracks, options.max_unlabelled))
     return tracks
@@ -352,33 +341,6 @@ def _nothing_triangulated(sequence: SequenceFolder) -> ValueError:
         f"{sequence.name}: no landmark could be triangulated; "
         "do images and poses belong together, and does the camera move?"
     )
-
-
-def tracks_from_scene(
-    scene: Scene, features: list[Features], descriptor: str, info: dict[str, Any]
-) -> Tracks:
-    """Put a labelled scene and its features into a Tracks."""
-    model = scene.model
-    tracks = Tracks(
-        descriptor=descriptor,
-        cameras=model.cameras,
-        keyframe_names=model.names,
-        keyframe_camera=model.camera_ids,
-        cam_from_world=np.ascontiguousarray(model.cam_from_world),
-        offsets=scene.offsets,
-        keypoints=scene.keypoints,
-        sizes=np.concatenate([f.sizes for f in features]),
-        angles=np.concatenate([f.angles for f in features]),
-        responses=np.concatenate([f.responses for f in features]),
-        octaves=np.concatenate([f.octaves for f in features]),
-        descriptors=scene.descriptors,
-        landmark_of_keypoint=scene.labels,
-        landmark_ids=np.arange(len(scene.positions), dtype=np.int64),
-        landmark_positions=scene.positions,
-        info=info,
-    )
-    tracks.check()
-    return tracks
 
 
 def _detect(

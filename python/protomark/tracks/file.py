@@ -10,17 +10,22 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
+from protomark.features.extractor import FEATURE_ARRAYS, Features
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.files import replacing
 from protomark.geometry.camera import Camera, cameras_from_json
+
+if TYPE_CHECKING:
+    from protomark.geometry.colmap import ColmapModel
 
 FORMAT = "protomark-tracks"
 VERSION = 1
@@ -84,6 +89,42 @@ class Tracks:
     landmark_ids: NDArray[np.int64]
     landmark_positions: NDArray[np.float64]
     info: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_features(
+        cls,
+        descriptor: str,
+        model: ColmapModel,
+        features: Sequence[Features],
+        landmark_of_keypoint: NDArray[np.int64],
+        positions: NDArray[np.float64],
+        info: dict[str, Any],
+    ) -> Tracks:
+        """The tracks of a model's images.
+
+        Args:
+            descriptor: name of the descriptor.
+            model: cameras and m poses.
+            features: m keyframes' keypoints.
+            landmark_of_keypoint: (n,) rows of `positions`, -1 where there is none.
+            positions: (l, 3) landmarks, whose ids are 0 to l - 1.
+            info: where the tracks come from and how they were made.
+        """
+        tracks = cls(
+            descriptor=descriptor,
+            cameras=model.cameras,
+            keyframe_names=model.names,
+            keyframe_camera=model.camera_ids,
+            cam_from_world=np.ascontiguousarray(model.cam_from_world),
+            offsets=np.cumsum([0, *map(len, features)], dtype=np.int64),
+            **{k: np.concatenate([getattr(f, k) for f in features]) for k in FEATURE_ARRAYS},
+            landmark_of_keypoint=landmark_of_keypoint,
+            landmark_ids=np.arange(len(positions), dtype=np.int64),
+            landmark_positions=positions,
+            info=info,
+        )
+        tracks.check()
+        return tracks
 
     @property
     def bits(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from protomark.geometry.colmap import find_model
 from protomark.progress import Progress, silent
 from protomark.tracks import database
 from protomark.tracks.augmentation import METHOD, add_augmentations
-from protomark.tracks.extract import TracksOptions, extract, find_sequence, is_up_to_date
+from protomark.tracks.extract import TracksOptions, extract, find_sequence, provenance
 from protomark.tracks.file import Tracks
 from protomark.tracks.summary import summarise
 
@@ -47,19 +48,18 @@ class TracksFile:
         path: the file.
         tracks: what it holds.
         skipped: whether it was there already, made from the same input with the same options.
-        augmentations: copies of each keyframe that it holds, 0 for plain tracks.
     """
 
     path: Path
     tracks: Tracks
     skipped: bool
-    augmentations: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON values."""
         facts = {"file": str(self.path), **summarise(self.tracks)}
         facts |= {"seconds": self.tracks.info.get("seconds"), "skipped": self.skipped}
-        return facts | ({"augmentations": self.augmentations} if self.augmentations else {})
+        count = self.tracks.info.get("augmentations")
+        return facts | ({"augmentations": count} if count else {})
 
 
 def make_tracks(
@@ -85,7 +85,6 @@ def make_tracks(
         FileNotFoundError, ValueError: something is missing, broken, or gives no landmark.
     """
     path = output / f"{source.name}.{options.descriptor}.safetensors"
-    make: Callable[[], Tracks]
     if source.database is not None:
         if not source.folder.is_dir():
             raise FileNotFoundError(f"{source.folder}: no such folder")
@@ -93,18 +92,13 @@ def make_tracks(
         if not model.is_dir():
             raise FileNotFoundError(f"{model}: no such folder of a COLMAP model")
         inputs = (source.database, model, options.descriptor)
-        current = not force and database.is_up_to_date(path, *inputs)
-        make = lambda: database.tracks_from_database(*inputs, source.name)  # noqa: E731
+        made_from = partial(database.provenance, *inputs)
+        make = partial(database.tracks_from_database, *inputs, source.name)
     else:
         sequence = find_sequence(source.folder, source.images, source.model)
-        current = not force and is_up_to_date(path, options, sequence)
-        make = lambda: extract(sequence, options, threads, progress)  # noqa: E731
-    if current:
-        return TracksFile(path, Tracks.load(path), skipped=True)
-    tracks = _timed(make)
-    output.mkdir(parents=True, exist_ok=True)
-    tracks.save(path)
-    return TracksFile(path, tracks, skipped=False)
+        made_from = partial(provenance, sequence, options)
+        make = partial(extract, sequence, options, threads, progress)
+    return _make_unless_current(path, made_from, make, force)
 
 
 def make_augmented_tracks(
@@ -126,19 +120,10 @@ def make_augmented_tracks(
         threads: keyframes to work on at a time.
         progress: called with each keyframe.
     """
-    path = augmented_path(plain.path)
-    expected: dict[str, Any] = {"augmentations": count, "augmentation_method": METHOD}
-    expected |= {key: plain.tracks.info.get(key) for key in ("method", "options", "input")}
-    if path.is_file() and not force:
-        try:
-            existing = Tracks.load(path)
-            if all(existing.info.get(key) == value for key, value in expected.items()):
-                return TracksFile(path, existing, skipped=True, augmentations=count)
-        except (ValueError, OSError):
-            pass
-    tracks = _timed(lambda: add_augmentations(plain.tracks, images, count, threads, progress))
-    tracks.save(path)
-    return TracksFile(path, tracks, skipped=False, augmentations=count)
+    made_from: dict[str, Any] = {"augmentations": count, "augmentation_method": METHOD}
+    made_from |= {key: plain.tracks.info.get(key) for key in ("method", "options", "input")}
+    make = partial(add_augmentations, plain.tracks, images, count, threads, progress)
+    return _make_unless_current(augmented_path(plain.path), lambda: made_from, make, force)
 
 
 def augmented_path(plain: Path) -> Path:
@@ -146,8 +131,23 @@ def augmented_path(plain: Path) -> Path:
     return plain.with_name(f"{plain.stem}.augmented.safetensors")
 
 
-def _timed(make: Callable[[], Tracks]) -> Tracks:
+def _make_unless_current(
+    path: Path, made_from: Callable[[], dict[str, Any]], make: Callable[[], Tracks], force: bool
+) -> TracksFile:
+    """Make and save tracks unless the file holds tracks that were made from the same."""
+    existing = None if force else _load(path)
+    if existing and all(existing.info.get(k) == v for k, v in made_from().items()):
+        return TracksFile(path, existing, skipped=True)
     begin = time.perf_counter()
     tracks = make()
     tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
-    return tracks
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tracks.save(path)
+    return TracksFile(path, tracks, skipped=False)
+
+
+def _load(path: Path) -> Tracks | None:
+    try:
+        return Tracks.load(path)
+    except (ValueError, OSError):
+        return None

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.neighbours import runs
-from protomark.geometry.triangulation import refine_points, reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors, refine_points, reprojection_residuals
 from protomark.tracks.scene import Scene
 
 # Landmarks this close (pixels) are one, though detection found two keypoints in some keyframe.
@@ -76,8 +76,7 @@ def _round(
         return into, refused
     poses, seen, focal = scene.model.cam_from_world[keyframes], scene.rays[rows], scene.focal[rows]
     moved = refine_points(scene.positions, after, poses, seen, focal)
-    difference, depth = reprojection_residuals(moved[after], poses, seen)
-    error = np.where(depth > 0, np.linalg.norm(difference, axis=1) * focal, np.inf)
+    error = pixel_errors(moved[after], poses, seen, focal)
     # Of two keypoints in one keyframe the better one counts, the other loses its landmark.
     order = np.lexsort((error, keyframes, after))
     again = (np.diff(after[order], prepend=-1) == 0) & (np.diff(keyframes[order], prepend=-1) == 0)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.colmap import ColmapModel
-from protomark.geometry.triangulation import reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors
 
 
 @dataclass
@@ -43,14 +43,10 @@ class Scene:
         return rows[np.argsort(self.labels[rows], kind="stable")]
 
     def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Reprojection error in pixels of observations, infinite behind the camera.
-
-        Measured in the undistorted image, scaled by the focal length.
-        """
-        difference, depth = reprojection_residuals(
+        """Reprojection errors (n,) of observations in pixels of the undistorted image."""
+        return pixel_errors(
             self.positions[self.labels[rows]],
             self.model.cam_from_world[self.keyframe[rows]],
             self.rays[rows],
+            self.focal[rows],
         )
-        error = np.linalg.norm(difference, axis=1) * self.focal[rows]
-        return np.where((depth > 0) & np.isfinite(error), error, np.inf)

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.colmap import ColmapModel, pycolmap, quiet
+from protomark.geometry.colmap import (
+    ColmapModel,
+    bundle_adjust,
+    new_reconstruction,
+    pycolmap,
+    quiet,
+)
 from protomark.tracks.matching import VerifiedMatches
 
 _SEED = 0
@@ -68,21 +74,9 @@ def triangulate(
 
 
 def _posed(model: ColmapModel, keypoints: list[NDArray[np.float32]]) -> Any:
-    reconstruction = pycolmap.Reconstruction()
-    for camera_id, camera in model.cameras.items():
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera({**camera.as_dict(), "camera_id": camera_id})
-        )
-    for i, name in enumerate(model.names):
-        image = pycolmap.Image(
-            name=name,
-            camera_id=int(model.camera_ids[i]),
-            image_id=i + 1,
-            keypoints=np.asarray(keypoints[i], np.float64).reshape(-1, 2),
-        )
-        pose = pycolmap.Rigid3d(model.cam_from_world[i])
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    return reconstruction
+    parts = zip(model.names, model.camera_ids, keypoints, model.cam_from_world, strict=True)
+    numbered = [(i, name, int(camera), *rest) for i, (name, camera, *rest) in enumerate(parts, 1)]
+    return new_reconstruction(model.cameras, numbered)
 
 
 def _write_database(
@@ -148,25 +142,7 @@ def refine_poses(model: ColmapModel, reconstruction: Any) -> ColmapModel:
     refined cameras closest to the given ones. Points that poses do not need are deleted.
     """
     _thin(reconstruction)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = False
-    options.refine_principal_point = False
-    options.refine_extra_params = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 1.0
-    options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = 30
-    options.ceres.solver_options.function_tolerance = 1e-4
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.images:
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not pycolmap.bundle_adjustment, which writes to the terminal.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    with quiet():
-        summary = adjuster.solve()
-    if not summary.is_solution_usable():
+    if not bundle_adjust(reconstruction, list(reconstruction.images)):
         raise ValueError("bundle adjustment failed; try --refine-poses no")
     poses = np.array(
         [reconstruction.images[i + 1].cam_from_world().matrix() for i in range(len(model.names))]

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from protomark.report import markdown_table
 from protomark.training.data import TrainingSource
+
+_DATA_HEAD = ("sequence", "used for", "keyframes", "landmarks", "observations", "licence")
+_PRECISION_HEAD = (
+    *("sequence", "splits", "unaggregated", "medoid", "majority", "dim", "bytes per landmark"),
+    *("float", "integer", "ratio to unaggregated"),
+)
 
 
 @dataclass(frozen=True)
@@ -114,17 +121,14 @@ class EncoderCard:
             "",
             "## Data",
             "",
-            "| sequence | used for | keyframes | landmarks | observations | licence |",
-            "|---|---|---|---|---|---|",
         ]
+        data = []
         for role, sources in (("training", self.sources), ("validation", self.validation)):
-            lines += [
-                f"| {s.name} | {role} | {s.keyframes} | {s.landmarks} | {s.observations} "
-                f"| {s.licence or 'not stated'} |"
-                for s in sources
-            ]
+            for s in sources:
+                counts = map(str, (s.keyframes, s.landmarks, s.observations))
+                data.append([s.name, role, *counts, s.licence or "not stated"])
         lines += [
-            "",
+            markdown_table(_DATA_HEAD, data, left=len(_DATA_HEAD)),
             "## Precision",
             "",
             "Share of queries whose nearest prototype is their own landmark's: 90 % of the "
@@ -133,21 +137,28 @@ class EncoderCard:
             "landmark; *float*: the network before rounding, *integer*: the encoder in this file "
             "with int8 prototypes.",
             "",
-            "| sequence | splits | unaggregated | medoid | majority | dim | bytes per landmark "
-            "| float | integer | ratio to unaggregated |",
-            "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+            markdown_table(_PRECISION_HEAD, self.figure_rows()),
         ]
-        for f in self.figures:
-            for d in self.dims:
-                lines.append(
-                    f"| {f.sequence} ({f.role}) | {f.seeds} | {f.unaggregated:.4f} "
-                    f"| {f.medoid:.4f} | {f.majority:.4f} | {d} | {d + 1} "
-                    f"| {f.float_precision[d]:.4f} | {f.integer_precision[d]:.4f} "
-                    f"| {f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f} |"
-                )
         if self.plot:
-            lines += ["", "## Training", "", f"![loss and validation precision]({self.plot})"]
-        return "\n".join(lines) + "\n"
+            lines += ["## Training", "", f"![loss and validation precision]({self.plot})", ""]
+        return "\n".join(lines)
+
+    def figure_rows(self) -> list[list[str]]:
+        """The precision on each sequence by code length, as text for a table."""
+        return [
+            [
+                f"{f.sequence} ({f.role})",
+                str(f.seeds),
+                *(f"{share:.4f}" for share in (f.unaggregated, f.medoid, f.majority)),
+                str(d),
+                str(d + 1),
+                f"{f.float_precision[d]:.4f}",
+                f"{f.integer_precision[d]:.4f}",
+                f"{f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f}",
+            ]
+            for f in self.figures
+            for d in self.dims
+        ]
 
 
 def _duration(seconds: float) -> str:

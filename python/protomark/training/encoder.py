@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 import protomark as pm
-from protomark._core import hamming_search
-from protomark.baselines.binary import majority, medoid
+from protomark.baselines import binary
 from protomark.baselines.support import Support
 from protomark.files import write_text
 from protomark.match_calibration import SOURCE_KEY
@@ -145,7 +144,7 @@ def train_encoder(
     Raises:
         FileNotFoundError: a tracks file, the output's folder, or the checkpoint is missing.
         ValueError: tracks, outputs, options, device or checkpoint do not fit.
-        TrainingInterrupted: Ctrl-C; `resume` continues.
+        Interrupted: Ctrl-C was pressed; `resume` continues.
     """
     request.check()
     keep_freed_memory()
@@ -318,35 +317,28 @@ def _measure(
     plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if request.upright else trials
     floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
     integers = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
-    binary = [
-        _binary_precision(t, seed, threads) for t, seed in zip(plain, REPORT_SEEDS, strict=True)
-    ]
+    shares = [binary_precision(t, threads) for t in plain]
+    unaggregated, medoid, majority = np.mean(shares, axis=0).tolist()
     return SequencePrecision(
         sequence_name(path),
         role,
         len(trials),
-        float(np.mean([unaggregated_precision(t, threads) for t in plain])),
-        float(np.mean([b["medoid"] for b in binary])),
-        float(np.mean([b["majority"] for b in binary])),
+        unaggregated,
+        medoid,
+        majority,
         {d: float(np.mean([p[d] for p in floats])) for d in dims},
         {d: float(np.mean([p[d] for p in integers])) for d in dims},
     )
 
 
-def _binary_precision(trial: Trial, seed: int, threads: int) -> dict[str, float]:
-    """Precision of maps with one binary descriptor per landmark."""
-    support = Support(trial.landmarks, trial.support, seed)
-    found = {}
-    for name, method in (("medoid", medoid(support)), ("majority", majority(support))):
-        nearest, _ = method.match(trial.queries, threads=threads)
-        found[name] = float((nearest[:, 0] == trial.targets).mean())
-    return found
-
-
-def unaggregated_precision(trial: Trial, threads: int = 1) -> float:
-    """Share of queries whose nearest raw descriptor is one of their own landmark's."""
-    found, _ = hamming_search(trial.queries, trial.support, k=1, threads=threads)
-    return float((trial.landmarks[found[:, 0]] == trial.targets).mean())
+def binary_precision(trial: Trial, threads: int = 1) -> list[float]:
+    """Precision of all raw descriptors, of medoids and of majorities, one each per landmark."""
+    support = Support(trial.landmarks, trial.support)
+    shares = []
+    for method in (binary.unaggregated, binary.medoid, binary.majority):
+        nearest, _ = method(support).match(trial.queries, threads=threads)
+        shares.append(float((nearest[:, 0] == trial.targets).mean()))
+    return shares
 
 
 def encode_nanoseconds(encoder: pm.Encoder) -> float:

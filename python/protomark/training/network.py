@@ -13,6 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from protomark.features.descriptors import unpack_bits
+
 MAX_WEIGHT_BYTES = 600_000
 """An encoder that ships is at most this large; one int8 weight is one byte."""
 
@@ -35,11 +37,6 @@ def default_hidden(bits: int, dim: int) -> tuple[int, ...]:
     while weight_bytes(bits, (width,), dim) > MAX_WEIGHT_BYTES:
         width -= 32
     return (width,)
-
-
-def unpack_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, B) uint8 -> (n, 8 B) uint8 of 0 and 1; bit i is byte i / 8, bit i % 8, low bit first."""
-    return np.unpackbits(descriptors, axis=1, bitorder="little")
 
 
 class EncoderNetwork(nn.Module):

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from protomark.training.network import EncoderNetwork, unpack_bits
+from protomark.features.descriptors import unpack_bits
+from protomark.training.network import EncoderNetwork
 
 _QUANTILE = 0.9999  # ranges cover this share of what the calibration descriptors give
 _FLAT = -5.0  # SELU is flat below; a wider range would only waste steps

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from protomark.files import replacing
-from protomark.interrupt import deferred_interrupt
+from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.training.loss import PrototypeLoss
 from protomark.training.network import EncoderNetwork, embed, to_signs
 from protomark.training.quantization import QuantizedNetwork
@@ -129,14 +129,6 @@ class ValidationStep:
         return sum(self.precision.values()) / len(self.precision)
 
 
-class TrainingInterrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
-    """Training was stopped by Ctrl-C after a whole step; the checkpoint is written."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__(f"stopped after step {step}")
-        self.step = step
-
-
 class Trainer:
     """Trains one encoder.
 
@@ -207,7 +199,7 @@ class Trainer:
                 validation ran.
 
         Raises:
-            TrainingInterrupted: Ctrl-C was pressed.
+            Interrupted: Ctrl-C was pressed; the checkpoint is written.
             ValueError: the loss is no longer finite.
         """
         options = self.options
@@ -227,7 +219,10 @@ class Trainer:
                 report(self.step, loss, progress)
                 if interrupted() and self.step < options.steps:
                     self.save_checkpoint()
-                    raise TrainingInterrupted(self.step)
+                    raise Interrupted(
+                        f"stopped after step {self.step}; the same command with --resume "
+                        f"continues ({self.checkpoint})"
+                    )
         self.quantized.load_state_dict(self.best_state)
 
     def _train_step(self) -> float:

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from protomark.geometry.similarity import align, trajectory_error
+from protomark_bench.trajectory import align, trajectory_error
 
 
 def random_similarity(rng):
