@@ -162,14 +162,49 @@ Raises:
 
 void bind_parts(nb::class_<PrototypeMap>& map) {
   map.def(
-         "split_by_id",
+      "distances",
+      [](const PrototypeMap& self, nb::object ids, nb::object array) {
+        const auto l = landmark_ids(ids);
+        const auto c = codes(array);
+        return to_numpy(without_gil([&] { return self.distances(view(l), view(c)); }));
+      },
+      "landmark_ids"_a, "codes"_a,
+      nb::sig("def distances(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> "
+              "NDArray[numpy.int32]"),
+      R"(Squared distance of each code to one landmark, as search measures it.
+
+For guided matching, which knows near which landmarks a keypoint is.
+
+Args:
+    landmark_ids: (n,) int64.
+    codes: (n, dim) int8.
+
+Returns:
+    (n,) int32.
+
+Raises:
+    KeyError: a landmark is not in the map.
+    ValueError: there are not as many codes as landmarks, or they are of another length.)");
+  map.def(
+         "part",
          [](const PrototypeMap& self, nb::object ids) {
-           const auto boundaries = landmark_ids(ids);
-           return without_gil([&] { return self.split_by_id(view(boundaries)); });
+           const auto l = landmark_ids(ids);
+           return without_gil([&] { return self.part(view(l)); });
          },
-         "boundaries"_a,
-         nb::sig("def split_by_id(self, boundaries: ArrayLike) -> list[PrototypeMap]"),
-         R"(Return parts by id, as learning maps of their own.
+         "landmark_ids"_a, nb::sig("def part(self, landmark_ids: ArrayLike) -> PrototypeMap"),
+         R"(Return a learning map of some landmarks, with all that this one knows of them.
+
+Raises:
+    KeyError: a landmark is not in the map.)")
+      .def(
+          "split_by_id",
+          [](const PrototypeMap& self, nb::object ids) {
+            const auto boundaries = landmark_ids(ids);
+            return without_gil([&] { return self.split_by_id(view(boundaries)); });
+          },
+          "boundaries"_a,
+          nb::sig("def split_by_id(self, boundaries: ArrayLike) -> list[PrototypeMap]"),
+          R"(Return parts by id, as learning maps of their own.
 
 Args:
     boundaries: ascending ids at which a new part begins: `split_by_id([10, 20])` gives the
@@ -285,13 +320,13 @@ Args:
         observations to their prototypes (Ward's criterion), until they fit.
     position_bits: bits per coordinate. With 32, positions are floats relative to the middle of the
         map; with 16 they take half the bytes, as steps of a grid over their bounding box, 65534
-        from end to end along each axis (position_error).
+        from end to end along each axis (position_error); with 0 they are left out.
 
 Raises:
     FileError: the file cannot be written, or the journal beside it is in use or holds commits,
         which would be lost.
-    ValueError: bytes_per_landmark is less than one 4-bit prototype takes, position_bits is neither
-        32 nor 16, or positions are further than 3.4e38 from their middle.)");
+    ValueError: bytes_per_landmark is less than one 4-bit prototype takes, position_bits is not 32,
+        16 or 0, or positions are further than 3.4e38 from their middle.)");
 }
 
 }  // namespace

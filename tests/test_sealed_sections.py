@@ -105,7 +105,7 @@ def test_positions_of_16_bits(encoder: pm.Encoder, scale: list[float], tmp_path:
     np.testing.assert_allclose([low, high], [positions.min(0), positions.max(0)], rtol=1e-14)
     sizes = [dict(pm.file_sections(tmp_path / name))["position"] for name in ("16.pmk", "32.pmk")]
     assert sizes == [3000 * 6, 3000 * 12]
-    with pytest.raises(ValueError, match="position_bits must be 32 or 16, not 8"):
+    with pytest.raises(ValueError, match="position_bits must be 32, 16 or 0, not 8"):
         built.seal(tmp_path / "8.pmk", position_bits=8)
     assert not (tmp_path / "8.pmk").exists()
 

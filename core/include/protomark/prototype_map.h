@@ -37,7 +37,7 @@ struct SealOptions {
   // observations to their prototypes), until they fit.
   std::optional<double> bytes_per_landmark = std::nullopt;
   // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
-  // bounding box, 65534 from end to end along each axis.
+  // bounding box, 65534 from end to end along each axis. 0: no positions.
   int position_bits = 32;
 };
 
@@ -110,6 +110,8 @@ class PROTOMARK_API PrototypeMap {
   // Return parts of this map, without an index. All parts merged into an empty map, in any order,
   // equal this map without its index.
   //
+  // Some landmarks, in any order. Throws UnknownLandmark.
+  PrototypeMap part(std::span<const std::int64_t> ids) const;
   // By id: the landmarks below boundaries[0], those from there to below boundaries[1] and so on.
   // Throws std::invalid_argument unless boundaries ascend.
   std::vector<PrototypeMap> split_by_id(std::span<const std::int64_t> boundaries) const;
@@ -151,6 +153,11 @@ class PROTOMARK_API PrototypeMap {
   // the map (docs/index.md), and again when a tenth of it has changed. Throws std::invalid_argument
   // for another recall, and without an index.
   std::size_t nprobe(double recall, int threads = 1) const;
+
+  // Returns the squared distance of each code to one landmark, as a search measures it: what guided
+  // matching needs, which knows near which landmarks a keypoint is. Throws UnknownLandmark, and
+  // std::invalid_argument unless there is a code of `dim()` numbers per id.
+  std::vector<std::int32_t> distances(std::span<const std::int64_t> ids, Codes codes) const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).
   Matches search(Descriptors queries, std::size_t k = 2, const SearchOptions& options = {}) const;

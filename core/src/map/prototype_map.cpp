@@ -130,6 +130,30 @@ Matrix<float> PrototypeMap::appearances(std::int64_t id) const {
   return means;
 }
 
+std::vector<std::int32_t> PrototypeMap::distances(std::span<const std::int64_t> ids,
+                                                  Codes codes) const {
+  if (codes.rows != ids.size() || codes.columns != dim()) {
+    invalid(ids.size(), " landmarks need as many codes of ", dim(), " numbers, not ", codes.rows,
+            " of ", codes.columns);
+  }
+  const PrototypeStore& store = state_->store;
+  std::vector<std::int32_t> result(ids.size(), INT32_MAX);
+  std::vector<std::int8_t> prototype(dim());
+  const std::shared_lock lock(state_->searching);
+  for (std::size_t i = 0; i < ids.size(); ++i) {
+    for (Row row = store.first_row(store.at(ids[i])); row != kNoRow; row = store.next_row(row)) {
+      store.rounded(row, prototype.data());
+      std::int32_t distance = 0;
+      for (std::size_t d = 0; d < prototype.size(); ++d) {
+        const int difference = codes.row(i)[d] - prototype[d];
+        distance += difference * difference;
+      }
+      result[i] = std::min(result[i], distance);
+    }
+  }
+  return result;
+}
+
 std::vector<std::uint32_t> PrototypeMap::appearance_counts(std::int64_t id) const {
   const PrototypeStore& store = state_->store;
   const std::shared_lock lock(state_->searching);

@@ -9,6 +9,7 @@
 #include "base/text.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
+#include "search/among.h"
 
 namespace protomark {
 namespace {
@@ -108,6 +109,15 @@ PrototypeMap MapState::part(std::span<const LandmarkIndex> landmarks) const {
   to.reserve(landmarks.size(), rows);
   for (const LandmarkIndex landmark : landmarks) to.merge(store.id(landmark), store, landmark);
   return PrototypeMap(std::move(result));
+}
+
+PrototypeMap PrototypeMap::part(std::span<const std::int64_t> ids) const {
+  const std::shared_lock lock(state_->changing);
+  std::vector<LandmarkIndex> landmarks;
+  landmarks.reserve(ids.size());
+  for (const std::int64_t id : ids) landmarks.push_back(state_->store.at(id));
+  sort_unique(landmarks);
+  return state_->part(landmarks);
 }
 
 std::vector<PrototypeMap> PrototypeMap::split_by_id(

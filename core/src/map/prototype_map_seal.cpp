@@ -318,8 +318,8 @@ class SealedContent {
 }  // namespace
 
 void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& options) const {
-  if (options.position_bits != 32 && options.position_bits != 16) {
-    invalid("position_bits must be 32 or 16, not ", options.position_bits);
+  if (options.position_bits != 32 && options.position_bits != 16 && options.position_bits != 0) {
+    invalid("position_bits must be 32, 16 or 0, not ", options.position_bits);
   }
   const std::shared_lock lock(state_->changing);
   const PrototypeStore& map = state_->store;
@@ -327,7 +327,9 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
   const auto merged = merge_appearances(map, format.row_limit);
   const PrototypeStore& store = merged ? *merged : map;
   std::optional<PositionCodec> codec;
-  if (const auto extent = map.summary().extent) codec.emplace(*extent, options.position_bits);
+  if (options.position_bits != 0) {
+    if (const auto extent = map.summary().extent) codec.emplace(*extent, options.position_bits);
+  }
   int scale = 0;
   if (format.bits == 4) {
     Histogram histogram{};

@@ -17,6 +17,7 @@ from protomark.cli.localize import localize
 from protomark.cli.map import map_
 from protomark.cli.merge import merge
 from protomark.cli.plugins import CommandGroup
+from protomark.cli.seal import seal
 from protomark.cli.split import split
 from protomark.cli.tracks import tracks
 from protomark.cli.train import train
@@ -36,6 +37,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "localize": localize,
     "tracks": tracks,
     "build": build,
+    "seal": seal,
     "merge": merge,
     "split": split,
     "info": info,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import CameraText, JsonFile, MaxKeypoints, Threads
+from protomark.cli.options import JsonFile, MaxKeypoints, Threads
 
 if TYPE_CHECKING:
     from protomark.localization.batch import LocalizationBatch
@@ -29,7 +29,15 @@ def localize(
             "--output", "-o", help="Folder for images.txt, cameras.txt (COLMAP) and poses.csv."
         ),
     ] = Path("localized"),
-    camera: CameraText = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CAMERA",
+            help="COLMAP's cameras.txt, a folder with a COLMAP model, or a camera written out: "
+            "PINHOLE:525,525,320,240. Without it: the camera that the map was made with, for "
+            "images of its size. 'estimate', and for other images: by EXIF data and matches.",
+        ),
+    ] = None,
     refine_focal_length: Annotated[
         bool,
         typer.Option(
@@ -65,7 +73,14 @@ def localize(
         ),
     ] = 0.9,
     max_keypoints: MaxKeypoints = 2000,
-    threads: Threads = 1,
+    recall: Annotated[
+        float | None,
+        typer.Option(
+            help="Search a map with an index approximately: share of nearest landmarks that are "
+            "found, for example 0.98. Without it the search is exact."
+        ),
+    ] = None,
+    threads: Threads = 0,
     json_file: JsonFile = None,
 ) -> None:
     """Find where images were taken in a map, and how sure that is.
@@ -91,6 +106,7 @@ def localize(
         prior_degrees=prior_degrees,
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
+        recall=recall,
         threads=threads or available_threads(),
     )
     with progress_bar() as progress:

@@ -36,6 +36,8 @@ POSE_MODELS = (
 _LOSS_SHARE = 0.5
 _MAX_LOSS = 20.0
 _REFINE_STEPS = 30
+# Normal equations of a larger condition do not determine a pose.
+_MAX_CONDITION = 1e12
 
 
 @dataclass(frozen=True)
@@ -190,14 +192,8 @@ def _minimise(pose: Array, positions: Array, rays: Array, weights: Array, scale:
     pose, damping = np.ascontiguousarray(pose), 1e-4
     residual, square, cost = evaluate(pose)
     for _ in range(_REFINE_STEPS):
-        x, y, z = transform(pose, positions).T
         in_front = square < np.inf
-        z = np.where(in_front, z, 1.0)
-        u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
-        # Derivatives by a small rotation, then by a small translation, in camera coordinates.
-        by_rotation = np.array([[-u * v, one + u * u, -v], [-one - v * v, u * v, u]])
-        by_translation = np.array([[one, zero, -u], [zero, one, -v]]) / z
-        jacobian = np.concatenate([by_rotation, by_translation], axis=1).transpose(2, 0, 1)
+        jacobian = _jacobian(pose, positions, in_front)
         finite = np.where(in_front, square, 0.0)
         robust = np.where(in_front, weights / (scale + weights * finite), 0.0)
         gradient = np.einsum("n,nij,ni->j", robust, jacobian, residual)
@@ -215,6 +211,52 @@ def _minimise(pose: Array, positions: Array, rays: Array, weights: Array, scale:
         if converged:
             break
     return pose
+
+
+def _jacobian(pose: Array, positions: Array, in_front: NDArray[np.bool_]) -> Array:
+    """Derivatives (n, 2, 6) of rays by a small rotation, then a small translation of the camera."""
+    x, y, z = transform(pose, positions).T
+    z = np.where(in_front, z, 1.0)
+    u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
+    by_rotation = np.array([[-u * v, one + u * u, -v], [-one - v * v, u * v, u]])
+    by_translation = np.array([[one, zero, -u], [zero, one, -v]]) / z
+    return np.concatenate([by_rotation, by_translation], axis=1).transpose(2, 0, 1)
+
+
+def pose_covariance(
+    cam_from_world: Array, pixels: Array, positions: Array, camera: Camera
+) -> Array | None:
+    """How uncertain a refined pose is: s^2 (J^T J)^-1 over its inliers.
+
+    s^2 is the mean square of their residuals, per degree of freedom (Hartley and Zisserman,
+    Multiple View Geometry, 5.2). Landmarks and camera count as exact.
+
+    Args:
+        cam_from_world: (3, 4) float64, the refined pose.
+        pixels: (n, 2) float64, the inliers.
+        positions: (n, 3) float64, their landmarks in the world.
+        camera: the camera.
+
+    Returns:
+        (6, 6) float64 of (rotation, translation), as COLMAP has it: a small rotation vector in
+        radians that is applied after the pose, in camera coordinates, and the translation of
+        `cam_from_world` in world units. None for fewer than four inliers, or if they leave a
+        direction open.
+    """
+    if len(pixels) < 4:
+        return None
+    poses = np.broadcast_to(cam_from_world, (len(positions), 3, 4))
+    residual, depth = reprojection_residuals(positions, poses, camera.rays(pixels))
+    jacobian = _jacobian(cam_from_world, positions, depth > 0).reshape(-1, 6)
+    variance = (residual**2).sum() / (2 * len(pixels) - 6)
+    # Rotations and translations differ in unit: without scales their condition means nothing.
+    scale = np.linalg.norm(jacobian, axis=0)
+    if not (np.isfinite(variance) and (scale > 0).all()):
+        return None
+    normal = (jacobian / scale).T @ (jacobian / scale)
+    if np.linalg.cond(normal) > _MAX_CONDITION:
+        return None
+    return np.asarray(variance * np.linalg.inv(normal) / np.outer(scale, scale))
 
 
 def reprojection_error(

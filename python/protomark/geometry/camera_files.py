@@ -21,6 +21,11 @@ class CameraSet:
     cameras: tuple[Camera, ...] = ()
     by_image: Mapping[str, Camera] = field(default_factory=dict)
 
+    def of_size(self, width: int, height: int) -> list[Camera]:
+        """The different cameras that images of this size may come from."""
+        sized = {c if c.width else replace(c, width=width, height=height) for c in self.cameras}
+        return [c for c in sized if (c.width, c.height) == (width, height)]
+
     def find(self, name: str, width: int, height: int) -> Camera:
         """The camera of an image: by its name, else the only one of its size.
 
@@ -31,7 +36,7 @@ class CameraSet:
             if key in self.by_image:
                 return self.by_image[key]
         sized = {c if c.width else replace(c, width=width, height=height) for c in self.cameras}
-        fitting = [c for c in sized if (c.width, c.height) == (width, height)]
+        fitting = self.of_size(width, height)
         if len(fitting) == 1:
             return fitting[0]
         if fitting:

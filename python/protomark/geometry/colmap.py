@@ -138,6 +138,37 @@ def read_reconstruction(path: Path) -> Any:
             ) from None
 
 
+def read_observations(
+    path: Path,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The observations of a sparse model, o of them.
+
+    Returns:
+        (o,) int64 point ids; (o,) int64 which image, from 0 on; (o, 2) float64 pixels; and (o, 2)
+        float64 width and height of the image.
+
+    Raises:
+        FileNotFoundError, ValueError: see `read_reconstruction`.
+    """
+    reconstruction = read_reconstruction(path)
+    ids, images, pixels, sizes = [], [], [], []
+    for number, image in enumerate(reconstruction.images.values()):
+        seen = [(p.point3D_id, *p.xy) for p in image.points2D if p.has_point3D()]
+        table = np.array(seen, np.float64).reshape(-1, 3)
+        camera = reconstruction.cameras[image.camera_id]
+        ids.append(np.array([row[0] for row in seen], np.int64))
+        images.append(np.full(len(seen), number, np.int64))
+        pixels.append(table[:, 1:])
+        sizes.append(np.full((len(seen), 2), (camera.width, camera.height), np.float64))
+    empty = [np.zeros((0, 2))]
+    return (
+        np.concatenate([*ids, np.zeros(0, np.int64)]),
+        np.concatenate([*images, np.zeros(0, np.int64)]),
+        np.concatenate(pixels + empty),
+        np.concatenate(sizes + empty),
+    )
+
+
 def new_reconstruction(
     cameras: Mapping[int, Camera],
     images: Iterable[tuple[int, str, int, NDArray[Any], NDArray[np.float64]]],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,10 @@ from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_ca
 from protomark.geometry.pose import camera_centers, pose_error
 from protomark.geometry.pose_files import PoseSet, images_txt, read_poses
 from protomark.interrupt import deferred_interrupt
-from protomark.localization.localizer import Localizer
+from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
 from protomark.localization.solve import Localization
-from protomark.progress import Progress, silent
+from protomark.progress import Progress, silent, tracked
 
 POSES, CAMERAS, POINTS, TABLE = "images.txt", "cameras.txt", "points3D.txt", "poses.csv"
 # Distance in world units (metres where the map is metric) and degrees, as hloc reports them.
@@ -38,8 +39,9 @@ class LocalizationRequest:
     Attributes:
         scene: a map file, or the folder that `protomark map` wrote.
         images: image files, and folders of them.
-        camera: a cameras.txt, a folder with a COLMAP model, or a camera written out; None: focal
-            lengths come from EXIF data and matches.
+        camera: a cameras.txt, a folder with a COLMAP model, or a camera written out. None: those
+            that the map was made with, for images of their size; "estimate", and for other images:
+            focal lengths come from EXIF data and matches.
         refine_focal_length: whether focal lengths of given cameras are refined for each image.
         true_poses: poses to measure against; None: nothing is measured.
         priors: rough poses; None: the whole map is searched.
@@ -47,7 +49,8 @@ class LocalizationRequest:
         prior_degrees: the priors' error.
         min_confidence: poses at least so likely to be right are written.
         max_keypoints: the most keypoints to keep in an image.
-        threads: threads to encode and search on.
+        recall: see `Localizer`.
+        threads: images to localize at a time.
     """
 
     scene: Path
@@ -60,6 +63,7 @@ class LocalizationRequest:
     prior_degrees: float = 15.0
     min_confidence: float = 0.9
     max_keypoints: int = 2000
+    recall: float | None = None
     threads: int = 1
 
 
@@ -236,34 +240,32 @@ def localize_files(
             f"{output} holds a COLMAP model that `protomark localize` did not write: name another "
             "folder with -o"
         )
-    localizer = Localizer(
-        request.scene, max_keypoints=request.max_keypoints, threads=request.threads
-    )
-    cameras = read_cameras(request.camera) if request.camera else None
+    localizer = Localizer(request.scene, max_keypoints=request.max_keypoints, recall=request.recall)
+    given = request.camera is not None and request.camera != ESTIMATE
+    cameras = read_cameras(request.camera) if given and request.camera else None
     for camera in cameras.cameras if cameras else ():
         check_pose_model(camera)
     true_poses = _poses_of(request.true_poses, images)
     priors = _poses_of(request.priors, images)
     output.mkdir(parents=True, exist_ok=True)
+
+    def localize(image: tuple[str, Path]) -> ImageResult:
+        name, path = image
+        rough = priors.find(name)
+        prior = rough is not None and PosePrior(
+            rough, request.prior_distance, request.prior_degrees
+        )
+        return _localize_file(
+            localizer, name, path, cameras, request, prior or None, true_poses.find(name)
+        )
+
     results: list[ImageResult] = []
-    with deferred_interrupt() as interrupted:
-        for name, path in images:
-            progress("localize", len(results), len(images))
-            prior = priors.find(name)
-            results.append(
-                _localize_file(
-                    localizer,
-                    name,
-                    path,
-                    cameras,
-                    request,
-                    None
-                    if prior is None
-                    else PosePrior(prior, request.prior_distance, request.prior_degrees),
-                    true_poses.find(name),
-                )
-            )
+    with deferred_interrupt() as interrupted, ThreadPoolExecutor(request.threads) as pool:
+        futures = [pool.submit(localize, image) for image in images]
+        for future in tracked(futures, progress, "localize"):
+            results.append(future.result())
             if interrupted():
+                pool.shutdown(wait=False, cancel_futures=True)
                 break
         stopped = interrupted() and len(results) < len(images)
     if all(result.found is None for result in results):
@@ -326,11 +328,14 @@ def _localize_file(
     lost = None if true_pose is None else (np.inf, np.inf)
     try:
         image = read_gray(path)
+        height, width = image.shape
         if cameras is None:
-            camera, focal_length = camera_from_exif(path), "rough"
+            camera = None if request.camera else localizer.map_camera(width, height)
+            if camera is None:
+                camera, focal_length = camera_from_exif(path), "rough"
         else:
-            camera = cameras.find(name, image.shape[1], image.shape[0])
-        found = localizer.localize(image, camera, prior, focal_length=focal_length)
+            camera = cameras.find(name, width, height)
+        found = localizer.localize(image, camera or ESTIMATE, prior, focal_length=focal_length)
     except (OSError, ValueError) as error:
         return ImageResult(name, None, str(error), lost)
     if true_pose is None or found.cam_from_world is None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -20,30 +22,39 @@ from protomark.geometry.absolute_pose import FocalLength, check_pose_model
 from protomark.geometry.camera import Camera
 from protomark.localization.prior import PosePrior, visible
 from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
+from protomark.maps.cameras import map_cameras
 from protomark.maps.open import open_map
 from protomark.match_calibration import MatchCalibration
 from protomark.matching import MIN_PROBABILITY
+from protomark.threads import available_threads, parallel_map
+
+# In place of a camera: have it estimated, although the map has one.
+ESTIMATE = "estimate"
 
 
 class Localizer:
     """Finds where images were taken.
 
-        localizer = pm.Localizer("scene.pmk")
-        result = localizer.localize("frame.jpg", "PINHOLE:525,525,320,240")
-        result.cam_from_world, result.inliers, result.confidence, result.seconds
+        localizer = pm.Localizer("kitchen")
+        result = localizer.localize("frame.jpg")
+        result.cam_from_world, result.covariance, result.inliers, result.confidence
 
-    Each thread needs a localizer of its own, as OpenCV's detectors are not safe to share.
+    Of a sealed map it reads what a search touches, and the positions of what was found. Threads
+    may share a localizer.
 
     Args:
         scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
             that `protomark map` wrote.
         max_keypoints: the most keypoints to keep in an image.
         min_probability: a match is accepted if it is at least so likely to be right.
+        recall: in (0, 1], of a map with an index: an approximate search that finds the nearest
+            landmark of this share of the keypoints; None: an exact one.
         threads: threads to encode and search on.
 
     Raises:
         FileError: the file is not a map.
-        ValueError: no landmark of the map has a position, or its encoder was not calibrated.
+        ValueError: no landmark of the map has a position, its encoder was not calibrated, or
+            `recall` does not fit the map.
     """
 
     def __init__(
@@ -52,21 +63,24 @@ class Localizer:
         *,
         max_keypoints: int = 2000,
         min_probability: float = MIN_PROBABILITY,
+        recall: float | None = None,
         threads: int = 1,
     ) -> None:
         self.scene = open_map(scene) if isinstance(scene, (str, Path)) else scene
         self.max_keypoints = max_keypoints
         self.min_probability = min_probability
+        self.recall = recall
         self.threads = threads
-        self._ids = self.scene.ids
-        self._positions = self.scene.positions(self._ids)
-        if not np.isfinite(self._positions).all(axis=1).any():
+        if not _has_positions(self.scene):
             raise ValueError(
-                f"none of the map's {len(self._ids)} landmarks has a position, so no pose can be "
+                f"none of the map's {len(self.scene)} landmarks has a position, so no pose can be "
                 "found in it: set them with `set_positions`, or build the map from tracks"
             )
+        if recall is not None:
+            self.scene.nprobe(recall)  # an error here names what does not fit
+        self.cameras = map_cameras(self.scene)
         self.calibration = MatchCalibration.of(self.scene.encoder, self.scene.dim)
-        self._extractor: Extractor | None = None
+        self._extractors = threading.local()
 
     def localize(
         self,
@@ -80,8 +94,9 @@ class Localizer:
 
         Args:
             image: a file, or (height, width) grey or (height, width, 3) BGR uint8.
-            camera: its camera, or the camera written out as "MODEL:PARAMETERS"; None: a pinhole
-                whose focal length is estimated.
+            camera: its camera, or the camera written out as "MODEL:PARAMETERS". None: the one that
+                the map was made with, if that has the image's size. "estimate", or None where the
+                map has no such camera: a pinhole whose focal length is estimated.
             prior: a rough pose: only landmarks that it makes visible are searched.
             focal_length: "rough" to have the camera's refined, "unknown" to have it estimated.
 
@@ -92,8 +107,10 @@ class Localizer:
         began = time.perf_counter()
         gray = read_gray(Path(image)) if isinstance(image, (str, Path)) else to_gray(image)
         height, width = gray.shape
-        if isinstance(camera, str):
-            camera = Camera.parse(camera)
+        if camera is None:
+            camera = self.map_camera(width, height)
+        elif isinstance(camera, str):
+            camera = None if camera == ESTIMATE else Camera.parse(camera)
         if camera is None:
             camera, focal_length = Camera.guess(width, height), "unknown"
         elif not camera.width:
@@ -112,6 +129,36 @@ class Localizer:
             focal_length=focal_length,
             seconds={"features": time.perf_counter() - began},
         )
+
+    def localize_many(
+        self,
+        images: Iterable[str | Path | NDArray[np.uint8]],
+        camera: Camera | str | None = None,
+        *,
+        focal_length: FocalLength = "known",
+        threads: int = 0,
+    ) -> list[Localization]:
+        """The poses of several images, as `localize` finds each, on several threads.
+
+        Args:
+            images: files or arrays.
+            camera: the camera of all of them, see `localize`.
+            focal_length: see `localize`.
+            threads: images at a time; 0: one per core.
+
+        Raises:
+            FileNotFoundError, ValueError: see `localize`; the first image with an error ends it.
+        """
+        return parallel_map(
+            lambda image: self.localize(image, camera, focal_length=focal_length),
+            list(images),
+            threads or available_threads(),
+        )
+
+    def map_camera(self, width: int, height: int) -> Camera | None:
+        """The camera that the map was made with, if it has one of this size and no other."""
+        fitting = self.cameras.of_size(width, height)
+        return fitting[0] if len(fitting) == 1 else None
 
     def localize_features(
         self,
@@ -146,9 +193,10 @@ class Localizer:
         with _timed(stages, "search"):
             among = None
             if prior is not None:
-                among = self._ids[visible(prior, camera, self._positions)]
+                landmarks, positions = self._all_positions
+                among = landmarks[visible(prior, camera, positions)]
             ids, distances = self.scene.search_codes(
-                codes, k=CANDIDATES, threads=self.threads, among=among
+                codes, k=CANDIDATES, threads=self.threads, recall=self.recall, among=among
             )
         with _timed(stages, "pose"):
             candidates = Candidates(
@@ -160,26 +208,43 @@ class Localizer:
             result = solve_pose(candidates, camera, self.min_probability, focal_length)
         return replace(result, seconds={**stages, "total": sum(stages.values())})
 
+    @cached_property
+    def _all_positions(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Ids and positions of all landmarks, which only a prior needs."""
+        ids = self.scene.ids
+        return ids, self.scene.positions(ids)
+
     def _positions_of(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Positions (..., 3) of ids (...), NaN where the id is -1 or has no position."""
-        where = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
-        return np.where((ids >= 0)[..., None], self._positions[where], np.nan)
+        positions = np.full((*ids.shape, 3), np.nan)
+        found = ids >= 0
+        positions[found] = self.scene.positions(ids[found])
+        return positions
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:
         descriptor = self.scene.encoder.descriptor
-        if self._extractor is None:
-            if descriptor.removesuffix(SUFFIX) not in DESCRIPTORS:
-                raise ValueError(
-                    f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
-                    "compute: describe the keypoints yourself and call localize_features"
-                )
-            self._extractor = Extractor(descriptor.removesuffix(SUFFIX), self.max_keypoints)
-        features = self._extractor(image)
+        plain = descriptor.removesuffix(SUFFIX)
+        if plain not in DESCRIPTORS:
+            raise ValueError(
+                f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
+                "compute: describe the keypoints yourself and call localize_features"
+            )
+        # OpenCV's detectors are not safe to share between threads.
+        if not hasattr(self._extractors, "of_thread"):
+            self._extractors.of_thread = Extractor(plain, self.max_keypoints)
+        features: Features = self._extractors.of_thread(image)
         if descriptor.endswith(SUFFIX):
             features.descriptors = upright_descriptors(
                 features.descriptors, features.angles, features.sizes
             )
         return features
+
+
+def _has_positions(scene: pm.PrototypeMap | pm.SealedMap) -> bool:
+    # To look at all of a sealed map would read it whole; its landmarks have positions or none does.
+    if isinstance(scene, pm.SealedMap):
+        return scene.position_bits > 0
+    return bool(scene.summary()["landmarks_with_position"])
 
 
 @contextmanager

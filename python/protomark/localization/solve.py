@@ -7,7 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.absolute_pose import AbsolutePose, FocalLength, estimate_pose, refine_pose
+from protomark.geometry.absolute_pose import (
+    AbsolutePose,
+    FocalLength,
+    estimate_pose,
+    pose_covariance,
+    refine_pose,
+)
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import transform
 from protomark.localization.confidence import Evidence, confidence
@@ -28,6 +34,9 @@ class Localization:
     Attributes:
         camera: the frame's camera, with another focal length where that was estimated.
         cam_from_world: (3, 4) float64, or None where no pose was found.
+        covariance: (6, 6) float64 of a pose: rotation in radians, then translation, see
+            `protomark.geometry.absolute_pose.pose_covariance`; None without a pose, or if its
+            inliers leave a direction open.
         keypoints: (i,) int64, rows of the keypoints that agree with the pose.
         pixels: (i, 2) float64, where they are in the image.
         landmarks: (i,) int64, ids of the landmarks that they see.
@@ -46,6 +55,7 @@ class Localization:
     confidence: float = 0.0
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
+    covariance: NDArray[np.float64] | None = None
 
     @property
     def inliers(self) -> int:
@@ -121,6 +131,7 @@ def solve_pose(
         landmarks[rows, columns],
         evidence,
         confidence(evidence),
+        covariance=pose_covariance(pose, keypoints[rows], positions[rows, columns], found.camera),
     )
 
 

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 import protomark as pm
 from protomark.features.descriptors import descriptor_kind
 from protomark.mapping.options import MappingOptions
+from protomark.maps.info import matching_bytes
 from protomark.match_calibration import NO_DISTANCE, MatchCalibration
 from protomark.matching import MIN_PROBABILITY
-
-_CHUNK = 256
-_PAIRS = 4096
 
 
 class Memory(ABC):
@@ -103,16 +101,16 @@ def clearest_rows(
 
 
 class Prototypes(Memory):
-    """One prototype per landmark, and no descriptors (the paper's method)."""
+    """Prototypes of landmarks, and no descriptors (the paper's method)."""
 
-    def __init__(self, encoder: pm.Encoder, dim: int) -> None:
+    def __init__(self, encoder: pm.Encoder, dim: int, appearance_bits: int = 0) -> None:
         if dim not in encoder.dims:
             raise ValueError(
                 f"--dim {dim}: encoder '{encoder.name}' has codes of "
                 f"{', '.join(map(str, encoder.dims))} dimensions"
             )
         self.encoder, self.dim = encoder, dim
-        self.map = pm.PrototypeMap(encoder, dim)
+        self.map = pm.PrototypeMap(encoder, dim, appearance_bits)
         self.calibration: MatchCalibration | None = None
         with contextlib.suppress(ValueError):
             self.calibration = MatchCalibration.of(encoder, dim)
@@ -146,58 +144,22 @@ class Prototypes(Memory):
         self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """See `Memory.search`."""
-        if among is None:
-            return self.map.search_codes(encoded, k=2, threads=threads)
-        # Sums of integers far below 2^24: exact in float32.
-        codes, places = encoded.astype(np.float32), self._rounded(among)
-        ids = np.full((len(codes), 2), -1, np.int64)
-        distances = np.full((len(codes), 2), NO_DISTANCE, np.int32)
-        if not len(among):
-            return ids, distances
-        lengths = (places * places).sum(1)
-        for at in range(0, len(codes), _CHUNK):
-            some = codes[at : at + _CHUNK]
-            squares = (some * some).sum(1)[:, None] + lengths - 2 * some @ places.T
-            for k in range(min(2, len(among))):
-                best = np.argmin(squares, axis=1)
-                rows = np.arange(len(some))
-                ids[at : at + _CHUNK, k] = among[best]
-                distances[at : at + _CHUNK, k] = squares[rows, best]
-                squares[rows, best] = np.inf
-        return ids, distances
+        return self.map.search_codes(encoded, k=2, threads=threads, among=among)
 
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> NDArray[np.float32]:
         """See `Memory.distances`."""
-        if not len(rows):
-            return np.zeros(0, np.float32)
-        at = np.zeros(int(ids.max()) + 1, np.int64)
-        at[ids] = 1
-        known = np.flatnonzero(at)
-        at[known] = np.arange(len(known))
-        codes, places = encoded.astype(np.float32), self._rounded(known)
-        squares = np.empty(len(rows), np.float32)
-        # Pieces that fit into the cache are several times faster.
-        for a in range(0, len(rows), _PAIRS):
-            b = a + _PAIRS
-            difference = places[at[ids[a:b]]] - codes[rows[a:b]]
-            squares[a:b] = np.einsum("pd,pd->p", difference, difference)
-        return np.sqrt(squares)
+        return np.sqrt(self.map.distances(ids, encoded[rows]).astype(np.float32))
 
     def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """See `Memory.contains`."""
         return np.isin(ids, self.map.ids)
 
-    def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Prototypes as search compares them: to integers, halves away from zero."""
-        means = self.map.prototypes(ids)
-        return np.sign(means) * np.floor(np.abs(means) + np.float32(0.5))
-
     @property
     def bytes(self) -> int:
-        """As in a sealed map: one byte per dimension and one for the count."""
-        return len(self.map) * (self.dim + 1)
+        """As in a sealed map without loss."""
+        return round(matching_bytes(self.map) * len(self.map))
 
     def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
         """See `Memory.accepted`; the probability decides if the encoder was calibrated."""
@@ -230,4 +192,4 @@ def prototypes_for(options: MappingOptions) -> Prototypes:
             f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, "
             f"not for {kind.name}"
         )
-    return Prototypes(encoder, options.dim)
+    return Prototypes(encoder, options.dim, options.appearance_bits)

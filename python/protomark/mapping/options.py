@@ -16,6 +16,7 @@ class MappingOptions:
         max_keypoints: the most keypoints to keep in a frame.
         encoder: name or file of the encoder; empty: the one that ships for the descriptor.
         dim: dimensions of a prototype.
+        appearance_bits: signs of a code that tell the appearances of a landmark apart.
         window: number of latest keyframes that keep their descriptors, to triangulate landmarks.
         max_error: largest reprojection error of an observation, as a share of the longer side.
         min_angle: smallest angle between two rays of a landmark, degrees.
@@ -28,6 +29,7 @@ class MappingOptions:
     max_keypoints: int = 2000
     encoder: str = ""
     dim: int = 32
+    appearance_bits: int = 0
     window: int = 8
     max_error: float = 0.005
     min_angle: float = 1.0

@@ -13,6 +13,7 @@ from protomark.geometry.pose_files import tum_trajectory
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.reconstruction import write_model
 from protomark.mapping.summary import map_pictures, summarise
+from protomark.maps import cameras
 from protomark.maps.open import SCENE_MAP
 from protomark.report import map_page
 
@@ -32,6 +33,8 @@ def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> d
     figures = {"input": source, "finished": finished, **summarise(mapper)}
     ids = mapper.scene.ids
     mapper.scene.set_positions(ids, structure.positions[ids])
+    used = {structure.cameras[frame.camera_id] for frame in structure.frames}
+    mapper.scene.metadata = {**mapper.scene.metadata, cameras.KEY: cameras.cameras_text(used)}
     mapper.scene.save(scene / SCENE_MAP)
     write_model(structure, scene / MODEL)
     frames = sorted(structure.frames, key=lambda f: (f.time, f.name))
