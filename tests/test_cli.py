@@ -7,12 +7,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import protomark as pm
 from conftest import balanced_encoder, protomark, random_descriptors, random_layers
+from protomark import sample
 from protomark.geometry.camera import Camera
 from protomark.maps.build import build_map
 from protomark.tracks.file import Tracks
@@ -123,52 +125,62 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert protomark("info", model).returncode == 0
     assert protomark("info", tmp_path / "t.safetensors").returncode == 0
 
+    sealed = pm.open(tmp_path / "scene.sealed.pmk")
+    assert isinstance(sealed, pm.SealedMap)
+    assert sealed.metadata["cameras"] == f"1 {tracks.cameras[1]}\n"
     done = protomark(
-        "build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model, "--sealed"
+        "build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model, "--no-seal"
     )
     assert done.returncode == 0, done.stderr
-    assert isinstance(pm.open(scene), pm.SealedMap)
-    assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "19.00"
 
-    build = ["build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model]
-    done = protomark(
-        *build, "--sealed", "--bytes-per-landmark", 9, "--json", tmp_path / "facts.json"
-    )
-    assert done.returncode == 0, done.stderr
-    facts = json.loads((tmp_path / "facts.json").read_text())
+
+def test_seal_to_a_size(tracks: Tracks, model: Path, tmp_path: Path) -> None:
+    balanced_encoder().save(model)
+    tracks.save(tmp_path / "t.safetensors")
+    scene, sealed, facts_file = tmp_path / "s.pmk", tmp_path / "out.pmk", tmp_path / "facts.json"
+    build = ("build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model, "--no-seal")
+    assert protomark(*build).returncode == 0
+    assert not (tmp_path / "s.sealed.pmk").exists()
+
+    def facts_of(*options: object) -> dict[str, Any]:
+        done = protomark("seal", scene, "-o", sealed, "--json", facts_file, *options)
+        assert done.returncode == 0, done.stderr
+        return dict(json.loads(facts_file.read_text()))
+
     # 12 dimensions in two words of 8, a count, and ids, which are 0, 1, 2 and 7: a block of 16
     # bytes and a word of 8 for all four.
+    facts = facts_of("--bytes", 9)
     assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 24 / 4)
-    assert row(done.stdout, "code bits").split()[-1] == "4"
-    done = protomark(*build, "--bytes-per-landmark", 9)
-    assert (done.returncode, done.stderr.strip()) == (
-        1,
-        "error: --bytes-per-landmark is for sealed maps: add --sealed",
-    )
-
-    balanced_encoder().save(model)
-    done = protomark(*build, "--appearance-bits", 12, "--json", tmp_path / "facts.json")
-    assert done.returncode == 0, done.stderr
-    opened = pm.open(scene)
-    facts = json.loads((tmp_path / "facts.json").read_text())
-    assert (facts["appearance_bits"], facts["prototypes"]) == (12, opened.prototype_count)
-    assert opened.prototype_count == 16
-    appearances = ["--appearance-bits", 12, "--sealed", "--bytes-per-landmark", 14]
-    done = protomark(*build, *appearances, "--json", tmp_path / "facts.json")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads((tmp_path / "facts.json").read_text())
-    assert (facts["prototypes"], facts["prototypes_per_landmark"]) == (6, 1.5)
-    assert facts["bytes_per_landmark_for_matching"] == 1.5 * 8 + 2 + 6
-    assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
+    assert (facts["position_bits"], facts["landmarks"], facts["chosen_by"]) == (16, 4, None)
+    learning = pm.open(scene)
+    assert learning.prototype_count > len(learning)
+    assert facts_of("--bytes", 0)["prototypes"] == learning.prototype_count
+    facts = facts_of("--landmarks", 2, "--index", "yes", "--position-bits", 32)
+    assert (facts["landmarks"], facts["chosen_by"]) == (2, "space")
+    assert (facts["position_bits"], facts["nlist"]) == (32, 1)
+    assert facts_of("--no-positions")["position_bits"] is None
     for options, message in (
-        (["--bytes-per-landmark", 2], "is for sealed maps: add --sealed"),
-        (["--bytes-per-landmark", 5, *appearances[:3]], "bytes_per_landmark must be at least 9"),
-        (["--appearance-bits", 13], "appearance_bits must be 0 to 12, not 13"),
-        (["--appearance-bits", -1], "Invalid value for '--appearance-bits'"),
+        (["--bytes", 5], "bytes_per_landmark must be at least 9"),
+        (["--landmarks", 5], "5 landmarks cannot be kept: the map has 4"),
+        (["--megabytes", 0.001], "0.001 MB are too few: 4 landmarks and the encoder take 0.0"),
     ):
-        done = protomark(*build, *options)
-        assert done.returncode in (1, 2)
-        assert message in done.stderr
+        done = protomark("seal", scene, "-o", sealed, *options)
+        assert (done.returncode, message in done.stderr) == (1, True), done.stderr
+    done = protomark("seal", sealed, "-o", tmp_path / "again.pmk")
+    assert "is a sealed map, which keeps no sums" in done.stderr
+
+
+def test_megabytes_keep_the_landmarks_that_cover_the_images(tmp_path: Path) -> None:
+    sealed = tmp_path / "small.pmk"
+    done = protomark("seal", sample.path(), "-o", sealed, "--megabytes", 0.5)
+    assert done.returncode == 0, done.stderr
+    assert "landmarks were kept, those that cover the images best" in done.stderr
+    assert 0.99 * 0.5e6 <= sealed.stat().st_size <= 0.5e6
+    tracks = sample.load()
+    kept = np.isin(tracks.landmark_of_keypoint, pm.open(sealed).ids)
+    seen = np.bincount(tracks.keyframe_of_keypoint[kept], minlength=len(tracks.keyframe_names))
+    # As evenly as that: a random choice leaves some images with a third of this.
+    assert seen.min() > 0.5 * np.median(seen)
 
 
 def row(output: str, name: str) -> str:

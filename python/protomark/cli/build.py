@@ -18,46 +18,11 @@ def build(
     encoder: EncoderName = None,
     dim: Annotated[
         int | None,
-        typer.Option(help="Numbers per prototype; by default as many as the encoder has."),
+        typer.Option(help="Numbers per prototype; by default 48."),
     ] = None,
     min_observations: Annotated[
         int, typer.Option(help="Leave out landmarks with fewer observations.")
     ] = 2,
-    sealed: Annotated[
-        bool,
-        typer.Option("--sealed", help="Write a sealed map: small, mapped from disk, read-only."),
-    ] = False,
-    bytes_per_landmark: Annotated[
-        float | None,
-        typer.Option(
-            help="Limit on a sealed map's bytes per landmark for prototypes and count, on average, "
-            "for example 33. Without it the sealed map answers exactly as the learning map.",
-        ),
-    ] = None,
-    appearance_bits: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Keep up to 2^N appearances per landmark (from several sides, in other light), "
-            "each as a prototype of its own: more precise, more bytes. 10 suits most maps, 0 keeps "
-            "one prototype per landmark.",
-        ),
-    ] = 0,
-    index: Annotated[
-        bool,
-        typer.Option(
-            "--index",
-            help="Add an index for fast approximate search in large maps, for at most 4 more bytes "
-            "per landmark.",
-        ),
-    ] = False,
-    position_bits: Annotated[
-        int,
-        typer.Option(
-            help="Bits per coordinate of a sealed map's positions: 32, or 16, which halves their "
-            "bytes and moves them by at most a 131,068th of the map's extent."
-        ),
-    ] = 32,
     frame: Annotated[
         str | None,
         typer.Option(
@@ -73,35 +38,34 @@ def build(
             "that of SOURCE_DATE_EPOCH.",
         ),
     ] = None,
+    no_seal: Annotated[
+        bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
+    ] = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
     """Build a map from tracks.
 
-    Reads one tracks file and writes one map file with the prototypes and the position of each
-    landmark: a learning map, or with --sealed a sealed one.
+    Reads one tracks file and writes a learning map with the prototypes and the position of each
+    landmark, and a sealed one beside it, scene.sealed.pmk: what ships, 33 bytes per landmark and
+    its position (`protomark seal` makes other sizes).
 
     protomark build kitchen.freak.safetensors -o kitchen.pmk
-
-    protomark build kitchen.freak.safetensors -o kitchen.sealed.pmk --sealed --appearance-bits 10
-    --bytes-per-landmark 33
     """
     from protomark import Encoder
     from protomark.cli.info import show
     from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.maps import cameras
     from protomark.maps.build import build_map
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
+    from protomark.maps.seal import SealOptions, seal_map, sealed_path
+    from protomark.maps.selection import Views
     from protomark.threads import available_threads
     from protomark.tracks.file import Tracks
 
-    check_outputs(output, json_file)
-    for option, given in (
-        ("--bytes-per-landmark", bytes_per_landmark is not None),
-        ("--position-bits", position_bits != 32),
-    ):
-        if given and not sealed:
-            raise ValueError(f"{option} is for sealed maps: add --sealed")
+    sealed = None if no_seal else sealed_path(output)
+    check_outputs(output, json_file, sealed)
     texts = command_metadata(frame, metadata or [])
     threads = threads or available_threads()
     with progress_bar() as progress:
@@ -113,18 +77,16 @@ def build(
             Encoder.load(encoder or observed.descriptor),
             dim,
             min_observations=min_observations,
-            appearance_bits=appearance_bits,
             threads=threads,
         )
-        scene.metadata = texts
-        if index:
-            progress("build the index", 0, 0)
-            scene.build_index(threads=threads, in_place=True)  # nobody searches the map yet
+        scene.metadata = {cameras.KEY: cameras.cameras_text(observed.cameras.values()), **texts}
         progress("write the map", 0, 0)
+        scene.save(output)
         if sealed:
-            scene.seal(output, bytes_per_landmark=bytes_per_landmark, position_bits=position_bits)
-        else:
-            scene.save(output)
+            options = SealOptions(threads=threads)
+            seal_map(scene, sealed, options, lambda: Views.of_tracks(observed), progress)
         facts = describe(output)
+        if sealed:
+            facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}
     write_json(json_file, facts)
     show(facts)

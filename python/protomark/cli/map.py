@@ -62,14 +62,18 @@ def map_(
     view: Annotated[
         bool, typer.Option("--view", help="Also write recording.rrd for the Rerun viewer.")
     ] = False,
+    no_seal: Annotated[
+        bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
+    ] = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
     """Map a scene from images or a video: structure from motion.
 
     Matches frame by frame with the prototypes of the map, which learn from each match; only the
-    latest keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP model),
-    trajectory.txt (TUM format), report.html and report.json.
+    latest keyframes keep descriptors. OUTPUT gets scene.pmk (the map, which learns),
+    scene.sealed.pmk (what ships: 33 bytes per landmark and its position), sparse/ (a COLMAP
+    model), trajectory.txt (TUM format), report.html and report.json.
 
     protomark map walk.mp4 -o kitchen
 
@@ -111,6 +115,7 @@ def map_(
         extend=into is not None,
         force=force,
         record=view,
+        seal=not no_seal,
         threads=threads or available_threads(),
     )
     with progress_bar() as progress:
@@ -140,6 +145,8 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
         f"{figures['bytes_per_landmark']:.0f} bytes per landmark; all descriptors: "
         f"{figures['descriptor_bytes'] / 1e6:.2f} MB, {ratio:.1f} times as much"
     )
+    if "sealed_bytes" in figures:
+        say(f"  sealed map: {figures['sealed_bytes'] / 1e6:.2f} MB, with encoder and positions")
     say(
         f"  {figures['seconds_total']:.1f} s, {figures['frames_per_second']:.1f} frames per "
         f"second; see {scene / 'report.html'}"

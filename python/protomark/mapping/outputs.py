@@ -14,13 +14,16 @@ from protomark.mapping.mapper import Mapper
 from protomark.mapping.reconstruction import write_model
 from protomark.mapping.summary import map_pictures, summarise
 from protomark.maps import cameras
-from protomark.maps.open import SCENE_MAP
+from protomark.maps.open import SCENE_MAP, SEALED_MAP
+from protomark.maps.seal import seal_map
 from protomark.report import map_page
 
 MODEL, TRAJECTORY, REPORT, FIGURES = "sparse", "trajectory.txt", "report.html", "report.json"
 
 
-def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> dict[str, Any]:
+def write_outputs(
+    mapper: Mapper, scene: Path, source: str, finished: bool, seal: bool = True
+) -> dict[str, Any]:
     """Write all outputs of a map; returns its figures.
 
     Args:
@@ -28,6 +31,7 @@ def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> d
         scene: folder to write to.
         source: name of the input.
         finished: whether all frames of the input were added.
+        seal: whether to write a sealed map, too.
     """
     structure = mapper.structure
     figures = {"input": source, "finished": finished, **summarise(mapper)}
@@ -35,7 +39,11 @@ def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> d
     mapper.scene.set_positions(ids, structure.positions[ids])
     used = {structure.cameras[frame.camera_id] for frame in structure.frames}
     mapper.scene.metadata = {**mapper.scene.metadata, cameras.KEY: cameras.cameras_text(used)}
+    (scene / SEALED_MAP).unlink(missing_ok=True)  # it would not be of this map
     mapper.scene.save(scene / SCENE_MAP)
+    if seal and finished:
+        sealed = seal_map(mapper.scene, scene / SEALED_MAP)
+        figures |= {"sealed_bytes": sealed["bytes"]}
     write_model(structure, scene / MODEL)
     frames = sorted(structure.frames, key=lambda f: (f.time, f.name))
     times = np.array([frame.time for frame in frames])

@@ -42,6 +42,7 @@ class MapRequest:
         extend: the output is a map that the images are added to.
         force: make a new map where there is one.
         record: also write a Rerun recording.
+        seal: also write a sealed map.
         threads: threads to search and adjust on.
     """
 
@@ -56,6 +57,7 @@ class MapRequest:
     extend: bool = False
     force: bool = False
     record: bool = False
+    seal: bool = True
     threads: int = 1
 
 
@@ -90,7 +92,7 @@ def make_map(
         if not mapper.structure.frames:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
             raise ValueError(_no_map(mapper, source))
-    figures = write_outputs(mapper, request.output, source.path.name, finished)
+    figures = write_outputs(mapper, request.output, source.path.name, finished, request.seal)
     session.close()
     if not finished:
         raise Interrupted(

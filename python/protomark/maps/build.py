@@ -8,6 +8,16 @@ from protomark import Encoder, PrototypeMap
 from protomark.features.upright import SUFFIX
 from protomark.tracks.file import Tracks
 
+# Prototypes of more numbers leave room for fewer appearances in as many bytes; 5 signs tell
+# appearances apart almost as well as 10 and take half the memory (docs/sealing.md).
+DIM = 48
+APPEARANCE_BITS = 5
+
+
+def default_dim(encoder: Encoder) -> int:
+    """Dimensions of a prototype unless the user asks for others: `DIM`, or what comes nearest."""
+    return max((dim for dim in encoder.dims if dim <= DIM), default=min(encoder.dims))
+
 
 def build_map(
     tracks: Tracks,
@@ -15,7 +25,7 @@ def build_map(
     dim: int | None = None,
     *,
     min_observations: int = 2,
-    appearance_bits: int = 0,
+    appearance_bits: int | None = None,
     threads: int = 1,
 ) -> PrototypeMap:
     """A learning map with the prototypes and the position of every landmark of `tracks`.
@@ -23,10 +33,10 @@ def build_map(
     Args:
         tracks: the observations.
         encoder: an encoder for their descriptor, or for its upright form.
-        dim: dimensions of a prototype, one of `encoder.dims`; None: all.
+        dim: dimensions of a prototype, one of `encoder.dims`; None: `default_dim`.
         min_observations: landmarks with fewer are left out.
         appearance_bits: signs of a code that tell the appearances of a landmark apart; 0: each
-            landmark has one prototype.
+            landmark has one prototype; None: `APPEARANCE_BITS`.
         threads: threads to encode on.
 
     Raises:
@@ -42,6 +52,9 @@ def build_map(
         raise ValueError(
             f"no landmark has {min_observations} observations: there is no map to build"
         )
+    dim = default_dim(encoder) if dim is None else dim
+    if appearance_bits is None:
+        appearance_bits = min(APPEARANCE_BITS, dim)
     scene = PrototypeMap(encoder, dim, appearance_bits)
     scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
     ids = ids[counts >= min_observations]

@@ -6,12 +6,16 @@ from pathlib import Path
 
 import protomark as pm
 
-# The map in the folder that `protomark map` writes.
+# The maps in the folder that `protomark map` writes: the one that learns, and the one that ships.
 SCENE_MAP = "scene.pmk"
+SEALED_MAP = "scene.sealed.pmk"
 
 
 def map_path(path: str | Path) -> Path:
     """The map file at a path, which may be the folder that `protomark map` wrote.
+
+    Of a folder it is the sealed map, which the mapper removes when the learning map has changed, or
+    else the learning map.
 
     Raises:
         FileNotFoundError: the folder holds no map.
@@ -19,9 +23,10 @@ def map_path(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_dir():
         return path
-    if not (path / SCENE_MAP).is_file():
-        raise FileNotFoundError(f"{path}: no {SCENE_MAP} in this folder; name a map file")
-    return path / SCENE_MAP
+    for name in (SEALED_MAP, SCENE_MAP):
+        if (path / name).is_file():
+            return path / name
+    raise FileNotFoundError(f"{path}: no {SCENE_MAP} in this folder; name a map file")
 
 
 def open_map(path: str | Path) -> pm.PrototypeMap | pm.SealedMap:

@@ -99,11 +99,11 @@ def seal(
 def seal_map(
     scene: pm.PrototypeMap,
     output: Path,
-    options: SealOptions,
+    options: SealOptions | None = None,
     views: Callable[[], Views] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Seal a learning map, which stays as it is.
+    """Seal a learning map, which stays as it is but for its index.
 
     Args:
         scene: the map.
@@ -119,6 +119,7 @@ def seal_map(
     Raises:
         FileError, ValueError: see `seal`.
     """
+    options = options or SealOptions()
     total = len(scene)
     limit = total if options.landmarks is None else options.landmarks
     if not 0 < limit <= max(total, 1):
