@@ -20,8 +20,8 @@ from protomark.mapping.triangulation import update_prototypes
 RECENT = 20
 _MIN_INLIERS = 30
 _MIN_SHARE = 0.25
-# Drift is corrected if, under the pose that the old landmarks give, the tracked ones are off by more
-# than this multiple of the largest error.
+# Drift is corrected if the tracked landmarks are off by more than this multiple of the largest
+# error under the pose that the old landmarks give.
 _DRIFT = 3.0
 
 

@@ -1,4 +1,4 @@
-"""Counts, track lengths and reprojection errors of tracks."""
+"""Summarises tracks: counts, track lengths and reprojection errors."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def track_figures(lengths: NDArray[np.int64], errors: NDArray[np.float64]) -> di
 
 
 def length_histogram(lengths: NDArray[np.int64]) -> dict[str, int]:
-    """Number of tracks by their number of observations, for example {"2": 17, "4-5": 9}."""
+    """Number of landmarks by number of observations, such as {"2": 17, "4-5": 9}."""
     edges = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
     histogram = {}
     for low, end in zip(edges, (*edges[1:], None), strict=True):
