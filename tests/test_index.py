@@ -387,7 +387,7 @@ def test_all_instruction_sets_learn_the_same_lists(coder: pm.Encoder, tmp_path: 
 @pytest.mark.parametrize("bits", [8, 4])
 def test_info_shows_the_index(tmp_path: Path, bits: int) -> None:
     path = tmp_path / "s.pmk"
-    scene = build_map(sample.load(), pm.Encoder.load("freak"), 32)
+    scene = build_map(sample.load(), pm.Encoder.load("freak"), 32, appearance_bits=0)
     size = None if bits == 8 else four_bits(scene)
     scene.seal(path, bytes_per_landmark=size)
     assert describe(path)["nlist"] is None

@@ -306,7 +306,7 @@ def test_refusals(images: Path, finished: Path, tmp_path: Path) -> None:
     fails(run(images, "-o", finished), "holds a map already", "--into", "--force")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("important")
-    fails(run(images, "-o", tmp_path / "mine"), "not empty, and not a map")
+    fails(run(images, "-o", tmp_path / "mine"), "holds other files")
     fails(run(images), "-o", "--into")
     fails(run(tmp_path / "nothing", "-o", tmp_path / "x"), "no such folder of images or video")
     fails(run(images, "--into", tmp_path / "mine"), "is this the folder of a map?")

@@ -1,4 +1,4 @@
-"""CPU threads: how many there are, work shared among them, and how many BLAS may use."""
+"""CPU threads: their number, work shared among them, and BLAS on one of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 def available_threads() -> int:
-    """Processors that this process may run on."""
+    """Number of processors that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

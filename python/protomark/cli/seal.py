@@ -48,7 +48,7 @@ def seal(
     index: Annotated[
         IndexChoice,
         typer.Option(
-            help="Index for approximate search, at most 4 bytes per landmark; auto: from 100,000 "
+            help="Index for approximate search, at most 4 bytes per prototype; auto: from 100,000 "
             "prototypes on."
         ),
     ] = IndexChoice.auto,

@@ -149,23 +149,23 @@ def tracks(
 
 
 def _check(sources: list[TracksInput], output: Path, augmentations: int) -> None:
-    """Raise before any work if options do not fit together."""
+    """Raise before any work if options conflict."""
     first = sources[0]
     if augmentations < 0:
         raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
     if augmentations and first.database:
-        raise ValueError("--augmentations needs the images, and --database does not read them")
+        raise ValueError("--augmentations needs images, which --database does not read: drop one")
     if len(sources) > 1 and (first.images or first.model or first.database):
-        raise ValueError("--images, --model and --database go with one FOLDER, give one at a time")
+        raise ValueError("--images, --model and --database are for one FOLDER: give only one")
     names = [source.name for source in sources]
     double = sorted({n for n in names if names.count(n) > 1})
     if double:
         raise ValueError(
-            f"two folders are named {double[0]} and would write the same file; run them apart, "
-            "each with its own -o"
+            f"two folders are named {double[0]} and would write the same file: run the command for "
+            "each, with its own -o"
         )
     if output.exists() and not output.is_dir():
-        raise NotADirectoryError(f"{output}: not a folder, name one for the tracks with -o")
+        raise NotADirectoryError(f"{output} is not a folder: name one for the tracks with -o")
 
 
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
@@ -190,16 +190,16 @@ def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
             + ("refined by bundle adjustment" if refined else "kept as they are")
         )
         if error > 1 and not refined:
-            note("  hint: these poses are only roughly right, --refine-poses auto refines them")
+            note("  these poses are only roughly right: --refine-poses auto refines them")
     without = info.get("images_without_pose") or []
     if without:
         more = f" and {len(without) - 3} more" if len(without) > 3 else ""
-        say(f"  left out, as they have no pose: {escape(', '.join(without[:3]))}{more}")
+        say(f"  left out without a pose: {escape(', '.join(without[:3]))}{more}")
     say("  observations per landmark:")
-    most = max(facts["track_length_histogram"].values(), default=0) or 1
+    top = max(facts["track_length_histogram"].values(), default=0) or 1
     for label, count in facts["track_length_histogram"].items():
         if count:
-            bar = "█" * max(1, round(_BAR * count / most))
+            bar = "█" * max(1, round(_BAR * count / top))
             say(f"  {label:>7} {bar:<{_BAR}} {count}")
 
 

@@ -1,8 +1,8 @@
-"""COLMAP sparse models; the only module that imports pycolmap.
+"""Reads COLMAP models; the only module that imports pycolmap.
 
-Everything else that needs pycolmap imports it from here: `from protomark.geometry.colmap import
-pycolmap`. pycolmap carries a zlib of its own, and Python's `zlib` breaks for the whole process if
-it is first imported after pycolmap, so the order of the two imports below matters.
+Other modules import it from here: `from protomark.geometry.colmap import pycolmap`. pycolmap
+contains a zlib of its own, and Python's `zlib` fails in the whole process if it is first imported
+after pycolmap, so the order of the two imports below matters.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class ColmapModel:
     """Cameras of a sparse model, and its images that have a pose, in natural order of their names.
 
     Attributes:
-        cameras: COLMAP camera id -> camera.
+        cameras: cameras by COLMAP's id.
         names: m image names (img2 comes before img10).
         image_ids: (m,) int64, COLMAP image ids.
         camera_ids: (m,) int32, camera of each image.
         cam_from_world: (m, 3, 4) float64.
-        unposed: names of images in the model that have no pose.
+        unposed: names of the images without a pose.
     """
 
     cameras: dict[int, Camera]
@@ -58,21 +58,22 @@ class ColmapModel:
         return camera_centers(self.cam_from_world)
 
     def check_for_triangulation(self, path: Path) -> None:
-        """Raise ValueError unless two images have poses at different places."""
+        """Raise ValueError unless two images have poses at different positions."""
         if len(self.names) < 2:
             raise ValueError(
-                f"{path}: {len(self.names)} image(s) with a pose, at least two are needed; "
-                "is this the right model?"
+                f"{path}: {len(self.names)} image(s) have a pose, but triangulation needs two: "
+                "give the right model"
             )
         if np.ptp(self.centers, axis=0).max() <= 1e-9 * max(1.0, np.abs(self.centers).max()):
             raise ValueError(
-                f"{path}: all cameras stand at the same place, so no landmark can be triangulated"
+                f"{path}: all cameras have the same position, so no landmark can be triangulated: "
+                "give images of a moving camera"
             )
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep COLMAP's log off the terminal; failures reach the caller as exceptions."""
+    """Silence COLMAP's log; failures still raise exceptions."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
@@ -82,7 +83,7 @@ def quiet() -> Iterator[None]:
 
 
 def find_model(folder: Path) -> Path:
-    """The sparse model of a sequence folder: sparse/, sparse/0/ or the folder itself.
+    """The sparse model in a sequence folder: sparse/, sparse/0/ or the folder itself.
 
     Raises:
         FileNotFoundError: none of them holds a model.
@@ -91,8 +92,8 @@ def find_model(folder: Path) -> Path:
         if _suffix(candidate):
             return candidate
     raise FileNotFoundError(
-        f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/, "
-        "name it with --model"
+        f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/: "
+        "name its folder with --model"
     )
 
 
@@ -116,7 +117,7 @@ def read_reconstruction(path: Path) -> Any:
     suffix = _suffix(path)
     if suffix is None:
         raise FileNotFoundError(
-            f"{path}: no COLMAP model here (it needs cameras and images, .bin or .txt)"
+            f"{path} holds no COLMAP model: name a folder with cameras and images, .bin or .txt"
         )
     for name in _FILES:
         if (path / f"{name}{suffix}").stat().st_size == 0:
@@ -249,7 +250,7 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def model_from_reconstruction(reconstruction: Any, path: Path) -> ColmapModel:
-    """The cameras and poses of a pycolmap reconstruction that was read from `path`.
+    """The cameras and poses of a `pycolmap.Reconstruction` that was read from `path`.
 
     Raises:
         ValueError: a camera or a pose is broken.

@@ -1,4 +1,4 @@
-"""The localizer: an image in, its pose in a map out."""
+"""Localizes an image in a map: the image goes in, its pose comes out."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ ESTIMATE = "estimate"
 
 
 class Localizer:
-    """Finds where images were taken.
+    """Finds where images were taken in a map.
 
         localizer = pm.Localizer("kitchen")
-        result = localizer.localize("frame.jpg")
-        result.cam_from_world, result.covariance, result.inliers, result.confidence
+        pose = localizer.localize("frame.jpg")
+        pose.cam_from_world, pose.covariance, pose.inliers, pose.confidence
 
-    Of a sealed map it reads what a search touches, and the positions of what was found. Threads
-    may share a localizer.
+    A sealed map stays on disk: a search reads what it touches, and the positions of what it found.
+    Threads may share a localizer.
 
     Args:
         scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
             that `protomark map` wrote.
-        max_keypoints: the most keypoints to keep in an image.
-        min_probability: a match is accepted if it is at least so likely to be right.
-        recall: in (0, 1], of a map with an index: an approximate search that finds the nearest
-            landmark of this share of the keypoints; None: an exact one.
+        max_keypoints: limit on keypoints per image: the strongest, spread over the image.
+        min_probability: smallest probability of an accepted match, in [0, 1].
+        recall: in a map with an index, the share of nearest landmarks that an approximate search
+            finds, in (0, 1]; None: the search is exact.
         threads: threads to encode and search on.
 
     Raises:
-        FileError: the file is not a map.
+        FileNotFoundError, FileError: there is no such map, or it is broken.
         ValueError: no landmark of the map has a position, its encoder was not calibrated, or
             `recall` does not fit the map.
     """
@@ -73,8 +73,8 @@ class Localizer:
         self.threads = threads
         if not _has_positions(self.scene):
             raise ValueError(
-                f"none of the map's {len(self.scene)} landmarks has a position, so no pose can be "
-                "found in it: set them with `set_positions`, or build the map from tracks"
+                f"none of the map's {len(self.scene)} landmarks has a position, so images cannot "
+                "be localized in it: set positions with `set_positions`, or build the map from tracks"
             )
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
@@ -90,18 +90,21 @@ class Localizer:
         *,
         focal_length: FocalLength = "known",
     ) -> Localization:
-        """The pose of one image.
+        """Find the pose of an image.
 
         Args:
-            image: a file, or (height, width) grey or (height, width, 3) BGR uint8.
-            camera: its camera, or the camera written out as "MODEL:PARAMETERS". None: the one that
-                the map was made with, if that has the image's size. "estimate", or None where the
-                map has no such camera: a pinhole whose focal length is estimated.
-            prior: a rough pose: only landmarks that it makes visible are searched.
-            focal_length: "rough" to have the camera's refined, "unknown" to have it estimated.
+            image: a file, or a (height, width) grey or (height, width, 3) BGR uint8 array.
+            camera: its camera, or the camera written out as "MODEL:PARAMETERS". None: the camera
+                that the map was made with, if that has the image's size. "estimate", or None if the
+                map has no such camera: a pinhole camera whose focal length is estimated.
+            prior: a rough pose; only landmarks that are visible from near it are searched.
+            focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
+
+        Returns:
+            The pose, with its covariance, confidence and inliers, or the reason why there is none.
 
         Raises:
-            FileNotFoundError, ValueError: the image cannot be read, is not of the camera's size,
+            FileNotFoundError, ValueError: the image cannot be read or is not of the camera's size,
                 or OpenCV does not compute the map's descriptor.
         """
         began = time.perf_counter()
@@ -117,7 +120,7 @@ class Localizer:
             camera = replace(camera, width=width, height=height)
         elif (camera.width, camera.height) != (width, height):
             raise ValueError(
-                f"the image has {width} x {height} pixels, its camera {camera.width} x "
+                f"the image has {width} x {height} pixels, but its camera {camera.width} x "
                 f"{camera.height}: scale one of them"
             )
         features = self._extract(gray)
@@ -170,19 +173,22 @@ class Localizer:
         focal_length: FocalLength = "known",
         seconds: dict[str, float] | None = None,
     ) -> Localization:
-        """The pose of a frame whose keypoints are described already.
+        """Find the pose of a frame from its keypoints and descriptors.
 
         Args:
-            keypoints: (n, 2), pixels; the centre of the upper left pixel is (0.5, 0.5).
-            descriptors: (n, bits / 8) uint8, those that the map's encoder takes.
+            keypoints: (n, 2) pixels; the centre of the upper left pixel is (0.5, 0.5).
+            descriptors: (n, bits / 8) uint8, of the kind that the map's encoder takes.
             camera: the frame's camera.
             prior: see `localize`.
             focal_length: see `localize`.
-            seconds: time of earlier stages, by name.
+            seconds: seconds of earlier stages by name, to be included in the result.
+
+        Returns:
+            See `localize`.
 
         Raises:
-            ValueError: lengths differ, descriptors are not the encoder's, or poses cannot be
-                estimated for cameras of this model.
+            ValueError: the lengths differ, the encoder takes other descriptors, or poses cannot be
+                estimated for this camera model.
         """
         check_pose_model(camera)
         if len(keypoints) != len(descriptors):

@@ -1,4 +1,4 @@
-"""What a map keeps of its landmarks' descriptors, and how frames are matched with it."""
+"""What a map in the making keeps of descriptors, and how frames are matched with it."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from protomark.matching import MIN_PROBABILITY
 class Memory(ABC):
     """What a map keeps of descriptors, and how a frame is matched with it.
 
-    Descriptors are encoded once per frame; all other calls take the encoded form. Prototypes are
-    the memory of every map that Protomark makes; `protomark evaluate-mapping` compares others.
+    Descriptors are encoded once per frame; all other calls take the encoded form. Protomark's maps
+    have `Prototypes` for a memory; `protomark evaluate-mapping` compares it with others.
 
     Attributes:
-        ratio: largest ratio of what `search` gives for the nearest and second nearest landmark,
-            for a memory without calibration.
-        guided_ratio: largest ratio of `distances` among landmarks that project near the keypoint.
-        max_distance: largest distance among landmarks that project near the keypoint, as a share of
-            the median distance between keypoints and landmarks elsewhere.
+        ratio: limit on the ratio of the two distances that `search` returns, for a memory without
+            calibration.
+        guided_ratio: limit on the ratio of the two smallest `distances` to landmarks that project
+            near the keypoint.
+        max_distance: limit on the distance to a landmark that projects near the keypoint, as a
+            share of the median distance between keypoints and other landmarks.
     """
 
     ratio = 0.85**2
@@ -37,15 +38,15 @@ class Memory(ABC):
 
     @abstractmethod
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
-        """Encode descriptors (n, bytes) uint8 as (n, width), the form that is compared."""
+        """Encode descriptors (n, B) uint8 as (n, width), the form that is compared."""
 
     @abstractmethod
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Add observations: unknown ids are new landmarks."""
+        """Add observations; new ids are new landmarks."""
 
     @abstractmethod
     def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Take back observations that were added before, exactly."""
+        """Remove observations that were added before, exactly."""
 
     @abstractmethod
     def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
@@ -61,28 +62,28 @@ class Memory(ABC):
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """The two nearest landmarks of each descriptor, exactly: ids and distances (q, 2).
 
-        Without one, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
+        If there is none, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
 
         Args:
             encoded: (q, width).
             threads: threads to search on; the result is the same.
-            among: landmarks to search, ascending; None: all.
+            among: ids of the landmarks to search, ascending; None: all.
         """
 
     @abstractmethod
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Distances (p,) between row `rows[i]` of `encoded` and landmark `ids[i]`."""
+        """Distance (p,) of each row `rows[i]` of `encoded` from landmark `ids[i]`."""
 
     @abstractmethod
     def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of these landmarks the memory holds."""
+        """Whether the memory holds each landmark."""
 
     @property
     @abstractmethod
     def bytes(self) -> int:
-        """Bytes that matching needs for all landmarks, positions apart."""
+        """Bytes that matching needs for all landmarks, without positions."""
 
     def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
         """Rows of distances (q, 2) whose nearest landmark is accepted, the clearest first."""
@@ -93,11 +94,11 @@ class Memory(ABC):
 
 
 def clearest_rows(
-    nearest: NDArray[np.int32], doubt: NDArray[np.floating], limit: float
+    nearest: NDArray[np.int32], ambiguity: NDArray[np.floating], limit: float
 ) -> NDArray[np.int64]:
-    """Rows (k,) of `doubt` (q,) below a limit, by doubt and then by distance."""
-    rows = np.flatnonzero((nearest < NO_DISTANCE) & (doubt < limit))
-    return rows[np.lexsort((nearest[rows], doubt[rows]))]
+    """Rows (k,) whose ambiguity (q,) is below a limit, by ambiguity and then by distance."""
+    rows = np.flatnonzero((nearest < NO_DISTANCE) & (ambiguity < limit))
+    return rows[np.lexsort((nearest[rows], ambiguity[rows]))]
 
 
 class Prototypes(Memory):
@@ -120,11 +121,11 @@ class Prototypes(Memory):
         return self.encoder.encode(descriptors, self.dim)
 
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Eq. 1 and Eq. 2 of the paper."""
+        """See `Memory.add`: Eq. 1 and Eq. 2 of the paper."""
         self.map.add_codes(ids, encoded)
 
     def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.subtract`; a landmark halved at 255 observations may keep its share."""
+        """See `Memory.subtract`; landmarks whose sums were halved keep what they lack."""
         try:
             self.map.subtract_codes(ids, encoded)
         except ValueError:
@@ -158,18 +159,18 @@ class Prototypes(Memory):
 
     @property
     def bytes(self) -> int:
-        """As in a sealed map without loss."""
+        """See `Memory.bytes`: as in a sealed map without loss."""
         return round(matching_bytes(self.map) * len(self.map))
 
     def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
         """See `Memory.accepted`; the probability decides if the encoder was calibrated."""
         if self.calibration is None:
             return super().accepted(distances)
-        doubt = 1 - self.calibration.probability(distances)
-        return clearest_rows(distances[:, 0], doubt, 1 - MIN_PROBABILITY)
+        ambiguity = 1 - self.calibration.probability(distances)
+        return clearest_rows(distances[:, 0], ambiguity, 1 - MIN_PROBABILITY)
 
     def use(self, scene: pm.PrototypeMap) -> None:
-        """Continue with a map that was saved.
+        """Continue with a saved map.
 
         Raises:
             ValueError: it was made with another encoder or other dimensions.

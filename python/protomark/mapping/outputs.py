@@ -1,4 +1,4 @@
-"""Writes what a map leaves for others: a map file, a COLMAP model, a trajectory, a report."""
+"""Writes the files of a map: the map itself, a COLMAP model, a trajectory and a report."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MODEL, TRAJECTORY, REPORT, FIGURES = "sparse", "trajectory.txt", "report.html", 
 def write_outputs(
     mapper: Mapper, scene: Path, source: str, finished: bool, seal: bool = True
 ) -> dict[str, Any]:
-    """Write all outputs of a map; returns its figures.
+    """Write all files of a map to the folder `scene`; returns its figures.
 
     Args:
         mapper: the map.

@@ -1,4 +1,4 @@
-"""Makes new landmarks from the descriptors of the window."""
+"""Triangulates landmarks from the descriptors of the window."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def triangulate(
     max_error: float,
     min_angle: float,
 ) -> list[tuple[int, int]]:
-    """Match a frame with those of the window, make landmarks, and extend existing ones.
+    """Match a frame with those of the window, create landmarks, and continue existing tracks.
 
     Matches are mutual nearest neighbours in Hamming distance that pass the ratio test and lie near
-    the epipolar line. Two keypoints without a landmark make one if the angle of their rays is wide
-    enough and the landmark projects back to both. If one of the two sees a landmark already, the
-    other observes it, too, if it projects there.
+    the epipolar line. Two keypoints without a landmark create one if the angle of their rays is
+    wide enough and the landmark projects back to both. If one of them observes a landmark already,
+    the other observes it, too, provided that it projects there.
 
     Args:
         structure: frames and landmarks.
@@ -34,10 +34,10 @@ def triangulate(
         newest: index of the frame, which is in the window.
         window: indices of the other frames of the window.
         max_error: largest reprojection error, as a share of the image's longer side.
-        min_angle: smallest angle between the two rays, degrees.
+        min_angle: smallest triangulation angle, degrees.
 
     Returns:
-        Pairs of landmarks that are duplicates by a match.
+        Pairs of landmarks whose keypoints match, so that they may be duplicates.
     """
     frame = structure.frames[newest]
     duplicates: list[tuple[int, int]] = []
@@ -60,21 +60,21 @@ def _pair(
     a, b = rows[:, 0], rows[:, 1]
     landmark_a, landmark_b = old.landmarks[a], new.landmarks[b]
     fresh = (landmark_a < 0) & (landmark_b < 0)
-    _create(structure, memory, old, new, a[fresh], b[fresh], max_error, min_angle)
+    _create_landmarks(structure, memory, old, new, a[fresh], b[fresh], max_error, min_angle)
     only_a, only_b = (landmark_a >= 0) & (landmark_b < 0), (landmark_a < 0) & (landmark_b >= 0)
-    _extend(structure, memory, new, b[only_a], landmark_a[only_a], limit)
-    _extend(structure, memory, old, a[only_b], landmark_b[only_b], limit)
+    _continue_tracks(structure, memory, new, b[only_a], landmark_a[only_a], limit)
+    _continue_tracks(structure, memory, old, a[only_b], landmark_b[only_b], limit)
     both = (landmark_a >= 0) & (landmark_b >= 0) & (landmark_a != landmark_b)
     return list(zip(landmark_a[both].tolist(), landmark_b[both].tolist(), strict=True))
 
 
 def _view(structure: Structure, frame: Frame) -> View:
     if frame.descriptors is None:
-        raise ValueError(f"{frame.name}: no descriptors, it has left the window")
+        raise ValueError(f"{frame.name}: the frame has left the window and has no descriptors")
     return View(frame.descriptors, frame.rays, frame.pose, structure.focal(frame.camera_id))
 
 
-def _create(
+def _create_landmarks(
     structure: Structure,
     memory: Memory,
     old: Frame,
@@ -104,13 +104,13 @@ def _create(
     ids = structure.create(points[fits])
     for frame, rows in ((old, a), (new, b)):
         structure.observe(frame, rows, ids)
-        remember(memory, frame, rows)
+        update_prototypes(memory, frame, rows)
 
 
-def _extend(
+def _continue_tracks(
     structure: Structure, memory: Memory, frame: Frame, rows: Ids, ids: Ids, limit: float
 ) -> None:
-    """Let keypoints observe landmarks that project to them and that the frame does not see yet."""
+    """Let keypoints observe landmarks that project to them and are new to the frame."""
     if not len(rows):
         return
     poses = np.repeat(frame.pose[None], len(ids), axis=0)
@@ -123,10 +123,10 @@ def _extend(
     _, first = np.unique(ids, return_index=True)
     rows, ids = rows[first], ids[first]
     structure.observe(frame, rows, ids)
-    remember(memory, frame, rows)
+    update_prototypes(memory, frame, rows)
 
 
-def remember(memory: Memory, frame: Frame, rows: Ids) -> None:
-    """Add the codes of keypoints to the landmarks that they see (Eq. 2)."""
+def update_prototypes(memory: Memory, frame: Frame, rows: Ids) -> None:
+    """Add the codes of keypoints to the prototypes of their landmarks (Eq. 1 and 2)."""
     if len(rows) and frame.encoded is not None:
         memory.add(frame.landmarks[rows], frame.encoded[rows])

@@ -12,7 +12,7 @@ SEALED_MAP = "scene.sealed.pmk"
 
 
 def map_path(path: str | Path) -> Path:
-    """The map file at a path, which may be the folder that `protomark map` wrote.
+    """The map file at a path: the path itself, or the map in a folder of `protomark map`.
 
     Of a folder it is the sealed map, which the mapper removes when the learning map has changed, or
     else the learning map.
@@ -26,11 +26,11 @@ def map_path(path: str | Path) -> Path:
     for name in (SEALED_MAP, SCENE_MAP):
         if (path / name).is_file():
             return path / name
-    raise FileNotFoundError(f"{path}: no {SCENE_MAP} in this folder; name a map file")
+    raise FileNotFoundError(f"{path} holds no {SCENE_MAP}: name a map file")
 
 
 def open_map(path: str | Path) -> pm.PrototypeMap | pm.SealedMap:
-    """Open a map.
+    """Open a map file, or the map in a folder of `protomark map`.
 
     Raises:
         FileNotFoundError, FileError: there is no map at the path, or it is broken.

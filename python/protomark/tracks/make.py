@@ -1,4 +1,4 @@
-"""Makes tracks files, and keeps those that are up to date."""
+"""Makes tracks files, unless they are up to date."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from protomark.tracks.summary import summarise
 
 @dataclass(frozen=True)
 class TracksInput:
-    """Where tracks are made from.
+    """What to make tracks from.
 
     Attributes:
-        folder: a sequence, which holds images/ and a COLMAP model in sparse/ or sparse/0/.
+        folder: a sequence, with images/ and a COLMAP model in sparse/ or sparse/0/.
         images: folder of the images, if it is another one.
         model: folder of the COLMAP model, if it is another one.
-        database: a COLMAP database that already holds binary descriptors; images are not read then.
+        database: a COLMAP database with binary descriptors, which are read in place of the images.
     """
 
     folder: Path
@@ -46,8 +46,8 @@ class TracksFile:
 
     Attributes:
         path: the file.
-        tracks: what it holds.
-        skipped: whether it was there already, made from the same input with the same options.
+        tracks: its content.
+        skipped: whether it was up to date: made from the same input with the same options.
     """
 
     path: Path
@@ -74,15 +74,15 @@ def make_tracks(
     """Make the tracks of a sequence and save them as NAME.DESCRIPTOR.safetensors.
 
     Args:
-        source: where to make them from.
+        source: what to make them from.
         options: how to make them.
-        output: folder for the file; it is made if it does not exist.
-        force: make the file anew even if it is up to date.
+        output: folder of the file, created if it does not exist.
+        force: whether to make the file anew even if it is up to date.
         threads: threads for detection and matching.
         progress: called with each stage.
 
     Raises:
-        FileNotFoundError, ValueError: something is missing, broken, or gives no landmark.
+        FileNotFoundError, ValueError: an input is missing or broken, or yields no landmark.
     """
     path = output / f"{source.name}.{options.descriptor}.safetensors"
     if source.database is not None:
@@ -116,7 +116,7 @@ def make_augmented_tracks(
         plain: tracks that were made from images.
         images: folder of these images.
         count: copies of each keyframe.
-        force: make the file anew even if it is up to date.
+        force: whether to make the file anew even if it is up to date.
         threads: keyframes to work on at a time.
         progress: called with each keyframe.
     """
@@ -127,7 +127,7 @@ def make_augmented_tracks(
 
 
 def augmented_path(plain: Path) -> Path:
-    """Where augmented tracks go: toy.freak.augmented.safetensors for toy.freak.safetensors."""
+    """The path of augmented tracks: toy.freak.augmented.safetensors for toy.freak.safetensors."""
     return plain.with_name(f"{plain.stem}.augmented.safetensors")
 
 

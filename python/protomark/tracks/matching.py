@@ -1,4 +1,4 @@
-"""Matches the descriptors of two keyframes and verifies them against their known poses."""
+"""Matches the descriptors of two keyframes, and verifies the matches by their poses."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from protomark.geometry.triangulation import epipolar_error
 
 @dataclass
 class View:
-    """What matching needs of one keyframe.
+    """The data of a keyframe that matching needs.
 
     Attributes:
         descriptors: (n, bits / 8) uint8.
-        rays: (n, 2) float64, undistorted x / z and y / z, NaN where undistortion failed.
+        rays: (n, 2) float64, undistorted x / z and y / z, NaN where undistortion fails.
         pose: (3, 4) float64, cam_from_world.
         focal: focal length in pixels.
     """
@@ -34,7 +34,7 @@ class VerifiedMatches:
     """k matches between two keyframes.
 
     Attributes:
-        rows: (k, 2) int64, keypoint of the first and of the second keyframe.
+        rows: (k, 2) int64, rows of the keypoints in the first and the second keyframe.
         distances: (k,) int32, Hamming distance in bits.
         errors: (k,) float64, epipolar (Sampson) error in pixels.
     """
@@ -80,12 +80,12 @@ def mutual(
 
 
 def match(first: View, second: View, ratio: float, max_error: float) -> VerifiedMatches:
-    """Mutual nearest neighbours that pass the ratio test and lie on each other's epipolar lines.
+    """Mutual nearest neighbours that pass the ratio test and lie near the epipolar lines.
 
     Args:
-        first: keyframe whose keypoints look for a match.
-        second: keyframe in which they look.
-        ratio: the nearest distance must be below this share of the second nearest; in (0, 1].
+        first: keyframe of the queries.
+        second: keyframe to search.
+        ratio: limit on the ratio of the nearest to the second nearest distance, in (0, 1].
         max_error: largest epipolar error in pixels.
     """
     rows, target, distance = nearest_matches(first.descriptors, second.descriptors, ratio)

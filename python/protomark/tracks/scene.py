@@ -1,4 +1,4 @@
-"""All keypoints of a sequence while their landmarks are being found."""
+"""The keypoints of a sequence while their landmarks are being determined."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Scene:
         offsets: (m + 1,) int64, rows of each keyframe.
         keyframe: (n,) int64, keyframe of each keypoint.
         keypoints: (n, 2) float32, pixels.
-        rays: (n, 2) float64, undistorted, NaN where that failed.
+        rays: (n, 2) float64, undistorted, NaN where undistortion fails.
         focal: (n,) float64, focal length in pixels.
         descriptors: (n, bits / 8) uint8.
-        labels: (n,) int64, row in positions, -1 where none.
+        labels: (n,) int64, row of the landmark in positions, -1 for none.
         positions: (l, 3) float64.
     """
 

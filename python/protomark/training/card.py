@@ -1,4 +1,4 @@
-"""The card beside a model: what it was trained on, how, and how precise it is."""
+"""The card beside a model: its data, training and precision."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class SequencePrecision:
     """Precision on one sequence, averaged over splits.
 
     Attributes:
-        sequence: its name.
+        sequence: name of the sequence.
         role: "validation" or "report".
-        seeds: how many splits.
-        unaggregated: of the raw descriptors on the same queries.
-        medoid: of one descriptor per landmark, the one closest to its others.
-        majority: of the quantised mean, each bit as most of the landmark's descriptors have it.
-        float_precision: of the float network, by dimension.
-        integer_precision: of the integer encoder with int8 prototypes, by dimension.
+        seeds: number of splits.
+        unaggregated: precision of all raw descriptors.
+        medoid: precision of one descriptor per landmark, the one closest to the others.
+        majority: precision of the quantised mean of each landmark's descriptors.
+        float_precision: precision of the float network, by code length.
+        integer_precision: precision of the integer encoder with int8 prototypes, by code length.
     """
 
     sequence: str
@@ -44,25 +44,25 @@ class SequencePrecision:
 
 @dataclass(frozen=True)
 class EncoderCard:
-    """Everything a card says; also what `protomark train --json` writes.
+    """The content of a card, which `protomark train --json` writes, too.
 
     Attributes:
-        name: of the encoder.
-        descriptor: that it encodes.
-        bits: length of a descriptor.
-        widths: units of each layer, input and output included.
-        dims: prefixes that may be used alone.
+        name: name of the encoder.
+        descriptor: descriptor that it encodes.
+        bits: length of the descriptor.
+        widths: units per layer, including input and output.
+        dims: prefixes that maps may use alone.
         bytes: size of the model file.
         encode_ns: nanoseconds to encode one descriptor on one thread.
-        licence: of the weights.
+        licence: licence of the weights.
         sources: training sequences.
         validation: validation sequences.
-        command: that trains it again.
-        seconds: that training took.
+        command: command that trains the encoder again.
+        seconds: duration of the training.
         machine: processor or accelerator, threads and arithmetic of the training.
-        steps: batches in all.
-        best_step: the one whose weights were kept.
-        figures: precision, by sequence.
+        steps: number of batches.
+        best_step: step whose weights the encoder has.
+        figures: precision by sequence.
         history: (step, loss, mean validation precision) of each validation.
         plot: file name of the picture of the training, beside the card, or "".
         calibrated_on: sequences that the match calibration was fitted to, or "".
@@ -94,7 +94,7 @@ class EncoderCard:
         return sum(a * b for a, b in pairwise(self.widths))
 
     def markdown(self) -> str:
-        """The card as it stands beside the model."""
+        """The card as Markdown."""
         dims = ", ".join(map(str, self.dims))
         lines = [
             f"# Encoder `{self.name}`",
@@ -167,5 +167,5 @@ def _duration(seconds: float) -> str:
 
 
 def describe_data(sources: Sequence[TrainingSource]) -> str:
-    """One line for the model file: the sequences and their licences."""
+    """The sequences and their licences, in one line for the model file."""
     return "; ".join(f"{s.name} ({s.licence})" if s.licence else s.name for s in sources)
