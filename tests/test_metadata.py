@@ -167,6 +167,7 @@ def test_build_says_when_and_what(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "created": "2023-11-14T22:13:20Z",
         "frame": "ENU, metres",
         "robot": "atlas=2",
+        "cameras": f"1 {sample.load().cameras[1]}\n",
     }
     assert pm.open(tmp_path / "a.pmk").metadata == expected
     assert json.loads((tmp_path / "facts.json").read_text())["metadata"] == expected
