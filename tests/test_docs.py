@@ -32,7 +32,7 @@ PAGES = [
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`protomark ([^`]+)`")
 # Quick on the sample; all other commands are only parsed.
-QUICK = {"build", "info", "localize", "merge", "split"}
+QUICK = {"build", "info", "localize", "merge", "seal", "split"}
 # Commands of protomark-bench, which need not be installed here.
 BENCH = {"bench", "evaluate-mapping", "reproduce"}
 # What the fragments of C++ may use.
