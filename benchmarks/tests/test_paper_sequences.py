@@ -36,7 +36,7 @@ def test_what_holds_no_sequence_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"holds no \*\.freak\.safetensors"):
         find([tmp_path], "freak")
     make(tmp_path, "x/a.freak.safetensors", "y/a.freak.safetensors")
-    with pytest.raises(ValueError, match="same sequence a; give one"):
+    with pytest.raises(ValueError, match="sequence a: give one"):
         find([tmp_path / "x", tmp_path / "y"], "freak")
 
 
