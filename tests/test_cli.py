@@ -131,17 +131,19 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert row(done.stdout, "bytes per landmark for matching").split()[-1] == "19.00"
 
     build = ["build", tmp_path / "t.safetensors", "-o", scene, "--encoder", model]
-    done = protomark(*build, "--sealed", "--bytes", 9, "--json", tmp_path / "facts.json")
+    done = protomark(
+        *build, "--sealed", "--bytes-per-landmark", 9, "--json", tmp_path / "facts.json"
+    )
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
     # 12 dimensions in two words of 8, a count, and ids, which are 0, 1, 2 and 7: a block of 16
     # bytes and a word of 8 for all four.
     assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 24 / 4)
     assert row(done.stdout, "code bits").split()[-1] == "4"
-    done = protomark(*build, "--bytes", 9)
+    done = protomark(*build, "--bytes-per-landmark", 9)
     assert (done.returncode, done.stderr.strip()) == (
         1,
-        "error: --bytes is for sealed maps: add --sealed",
+        "error: --bytes-per-landmark is for sealed maps: add --sealed",
     )
 
     balanced_encoder().save(model)
@@ -151,7 +153,7 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert (facts["appearance_bits"], facts["prototypes"]) == (12, opened.prototype_count)
     assert opened.prototype_count == 16
-    appearances = ["--appearance-bits", 12, "--sealed", "--bytes", 14]
+    appearances = ["--appearance-bits", 12, "--sealed", "--bytes-per-landmark", 14]
     done = protomark(*build, *appearances, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "facts.json").read_text())
@@ -159,8 +161,8 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert facts["bytes_per_landmark_for_matching"] == 1.5 * 8 + 2 + 6
     assert row(done.stdout, "prototypes per landmark").split()[-1] == "1.50"
     for options, message in (
-        (["--bytes", 2], "is for sealed maps: add --sealed"),
-        (["--bytes", 5, *appearances[:3]], "bytes_per_landmark must be at least 9"),
+        (["--bytes-per-landmark", 2], "is for sealed maps: add --sealed"),
+        (["--bytes-per-landmark", 5, *appearances[:3]], "bytes_per_landmark must be at least 9"),
         (["--appearance-bits", 13], "appearance_bits must be 0 to 12, not 13"),
         (["--appearance-bits", -1], "Invalid value for '--appearance-bits'"),
     ):

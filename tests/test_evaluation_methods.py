@@ -31,8 +31,9 @@ from protomark.baselines.linear import (
     principal_components,
     projected_mean,
 )
-from protomark.baselines.support import Moments, Support, unpack
+from protomark.baselines.support import Moments, Support
 from protomark.evaluation.methods import choose_methods, method_choices, prototype_map
+from protomark.features.descriptors import unpack_bits
 
 Observations = tuple[NDArray[np.int64], NDArray[np.uint8]]
 
@@ -60,7 +61,7 @@ def test_support_groups_and_counts(data: Observations, rows: int) -> None:
         start, count = support.starts[i], support.counts[i]
         assert support.ids[i] == landmark
         assert np.array_equal(support.descriptors[start : start + count], descriptors)
-        assert np.array_equal(support.bit_sums[i], unpack(descriptors).astype(int).sum(axis=0))
+        assert np.array_equal(support.bit_sums[i], unpack_bits(descriptors).astype(int).sum(axis=0))
     pieces = list(support.pieces(rows))
     assert [first for first, _ in pieces] == [0, *[last for _, last in pieces[:-1]]]
     assert pieces[-1][1] == len(support.ids)
@@ -108,7 +109,7 @@ def test_medoid_of_many_observations() -> None:
     kept = as_dict(medoid(Support(landmarks, descriptors)))
     assert all(kept[i] == descriptors[2 * i].tolist() for i in range(3000))
     for i in (3000, 3001):
-        own = unpack(descriptors[landmarks == i]).astype(int)
+        own = unpack_bits(descriptors[landmarks == i]).astype(int)
         distances = np.sort([(own != one).sum(axis=1) for one in own], axis=1)
         best = np.argmin(distances[:, 149])
         assert kept[i] == descriptors[landmarks == i][best].tolist()
@@ -148,9 +149,9 @@ def test_unaggregated_finds_distinct_landmarks(data: Observations, seed: int) ->
 @given(observations(), st.integers(0, 2**32 - 1), st.integers(1, 2))
 def test_mean_of_bits_finds_the_nearest_means(data: Observations, seed: int, threads: int) -> None:
     queries = random_descriptors(5, bits=16, seed=seed)
-    own = {i: unpack(d).mean(axis=0, dtype=np.float64) for i, d in groups(data).items()}
+    own = {i: unpack_bits(d).mean(axis=0, dtype=np.float64) for i, d in groups(data).items()}
     ids, distances = mean_of_bits(Support(*data)).match(queries, threads=threads)
-    for query, row, far in zip(unpack(queries).astype(float), ids, distances, strict=True):
+    for query, row, far in zip(unpack_bits(queries).astype(float), ids, distances, strict=True):
         every = {i: float(np.linalg.norm(query - own[i])) for i in own}
         expected = sorted(every.values())[:2]
         assert far[: len(expected)] == pytest.approx(expected, abs=2e-3)
@@ -197,7 +198,7 @@ def structured(seed: int = 0, landmarks: int = 300, count: int = 6) -> Observati
 def test_moments_are_the_covariances() -> None:
     landmarks, descriptors = structured()
     moments = Support(landmarks, descriptors).moments
-    bits = unpack(descriptors).astype(float)
+    bits = unpack_bits(descriptors).astype(float)
     assert moments.mean == pytest.approx(bits.mean(axis=0))
     assert moments.total == pytest.approx(np.cov(bits.T, bias=True), abs=1e-6)
     pairs = [
@@ -213,7 +214,7 @@ def test_moments_are_the_covariances() -> None:
 def test_principal_components_against_singular_vectors() -> None:
     support = Support(*structured())
     matrix = principal_components(support.moments).truncated(5).matrix
-    bits = unpack(support.descriptors).astype(float)
+    bits = unpack_bits(support.descriptors).astype(float)
     _, _, expected = np.linalg.svd(bits - bits.mean(axis=0), full_matrices=False)
     assert np.abs(np.diag(expected[:5] @ matrix)) == pytest.approx(np.ones(5), abs=1e-4)
     assert matrix.T @ matrix == pytest.approx(np.eye(5), abs=1e-5)
@@ -238,7 +239,7 @@ def test_projected_means(learned: object) -> None:
     support = Support(*structured())
     projection = learned(support.moments).truncated(16)
     queries = random_descriptors(20)
-    centred = unpack(queries).astype(float) - support.moments.mean
+    centred = unpack_bits(queries).astype(float) - support.moments.mean
     means = (support.means - support.moments.mean) @ projection.matrix.astype(float)
     every = np.linalg.norm((centred @ projection.matrix)[:, None] - means[None], axis=2)
     exact = projected_mean(support, projection, rounded=False)

@@ -12,13 +12,13 @@ from mapping_scene import walk
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.pose import camera_centers, transform
 from protomark.mapping import loop, merging
-from protomark.mapping.adjustment import adjust, adjust_global
+from protomark.mapping.adjustment import adjust, adjust_global_bundle
 from protomark.mapping.culling import cull
 from protomark.mapping.frame import Frame
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Structure
-from protomark.mapping.triangulation import remember
+from protomark.mapping.triangulation import update_prototypes
 from tracks_scene import PINHOLE
 
 ENCODER = pm.Encoder(
@@ -53,7 +53,7 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Prototypes]:
         )
         structure.frames.append(frame)
         structure.observe(frame, np.arange(POINTS), ids)
-        remember(memory, frame, np.arange(POINTS))
+        update_prototypes(memory, frame, np.arange(POINTS))
     return structure, memory
 
 
@@ -124,7 +124,7 @@ def test_merging_joins_what_no_frame_tells_apart_and_one_position_fits() -> None
             memory.subtract(frame.landmarks[[row]], frame.encoded[[row]])
             frame.landmarks[row] = -1
             structure.observe(frame, np.array([row]), np.array([new]))
-            remember(memory, frame, np.array([row]))
+            update_prototypes(memory, frame, np.array([row]))
     a, b = double.tolist()
     pairs = [(3, a), (b, 5), (10, 11), (20, 20)]
     assert merging.merge_duplicates(structure, memory, pairs, MAX_ERROR) == 2
@@ -160,7 +160,7 @@ def test_fixed_poses_move_landmarks_only() -> None:
     structure, _ = scene()
     true = structure.positions.copy()
     structure.positions[1:] += 0.02
-    adjust_global(structure, poses=False)
+    adjust_global_bundle(structure, poses=False)
     np.testing.assert_allclose(structure.positions[1:], true[1:], atol=1e-4)
     for frame, pose in zip(structure.frames, walk(8), strict=True):
         np.testing.assert_array_equal(frame.pose, pose)
@@ -183,7 +183,7 @@ def test_drift_is_spread_over_the_frames_since_the_place_was_seen() -> None:
         np.linalg.norm(camera_centers(f.pose) - camera_centers(true[f.index]))
         for f in structure.frames
     ]
-    loop._distribute_drift(structure, 7, true[7], np.arange(20), old)
+    loop._correct_drift(structure, 7, true[7], np.arange(20), old)
     np.testing.assert_allclose(newest.pose, true[7], atol=1e-9)
     for frame in structure.frames[:3]:
         np.testing.assert_array_equal(frame.pose, true[frame.index])

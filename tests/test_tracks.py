@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,9 +17,10 @@ from protomark.tracks.extract import (
     TracksOptions,
     extract,
     find_sequence,
-    is_up_to_date,
+    provenance,
 )
 from protomark.tracks.file import Tracks
+from protomark.tracks.make import TracksInput, make_tracks
 from protomark.tracks.summary import reprojection_errors, summarise
 from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
@@ -197,16 +199,18 @@ def test_summary_counts_add_up(orb: Tracks) -> None:
 def test_done_only_with_same_settings_and_input(
     sequence: Path, orb: Tracks, tmp_path: Path
 ) -> None:
-    path = tmp_path / "t.safetensors"
     source, options = find_sequence(sequence), TracksOptions("orb", max_keypoints=600)
-    assert not is_up_to_date(path, options, source)
-    orb.save(path)
-    assert is_up_to_date(path, options, source)
-    assert not is_up_to_date(path, TracksOptions("orb", max_keypoints=601), source)
+    made = make_tracks(TracksInput(sequence), options, tmp_path)
+    assert not made.skipped
+    path = made.path
+    assert make_tracks(TracksInput(sequence), options, tmp_path).skipped
+    expected = provenance(source, options)
+    assert expected == {key: orb.info[key] for key in expected}
+    assert provenance(source, replace(options, max_keypoints=601)) != expected
     rough = poses(8)
     rough[3, 0, 3] += 1e-6
     write_model(tmp_path / "moved", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
     moved = SequenceFolder("plane", source.images, tmp_path / "moved")
-    assert not is_up_to_date(path, options, moved)
+    assert provenance(moved, options) != expected
     path.write_bytes(path.read_bytes()[:-100])
-    assert not is_up_to_date(path, options, source)
+    assert not make_tracks(TracksInput(sequence), options, tmp_path).skipped

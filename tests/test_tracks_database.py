@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from protomark.geometry.colmap import pycolmap, read_model
-from protomark.tracks.database import is_up_to_date, tracks_from_database
+from protomark.tracks.database import provenance, tracks_from_database
 from protomark.tracks.extract import TracksOptions, extract, find_sequence
 from protomark.tracks.file import Tracks
 from protomark.tracks.triangulation import _posed, _write_database
@@ -65,10 +65,10 @@ def test_same_tracks_as_went_in(scene: tuple[Path, Tracks], tmp_path: Path) -> N
     assert np.allclose(found.sizes, tracks.sizes, rtol=1e-6)
     assert np.allclose(found.angles, tracks.angles, atol=1e-3)
     assert found.keyframe_names == tracks.keyframe_names
-    found.save(tmp_path / "t.safetensors")
-    inputs = (tmp_path / "t.safetensors", folder / "database.db", folder / "points")
-    assert is_up_to_date(*inputs, "orb")
-    assert not is_up_to_date(*inputs, "latch")
+    inputs = (folder / "database.db", folder / "points")
+    expected = provenance(*inputs, "orb")
+    assert expected != provenance(*inputs, "latch")
+    assert {key: found.info[key] for key in expected} == expected
 
 
 def change(scene: tuple[Path, Tracks], tmp_path: Path, sql: str) -> Path:
@@ -106,7 +106,7 @@ def test_database_of_another_model(scene: tuple[Path, Tracks], tmp_path: Path) -
     connection.execute(sql.format("descriptors"))
     connection.commit()
     connection.close()
-    with pytest.raises(ValueError, match=r"img1.png has 0 keypoints.*the model's database"):
+    with pytest.raises(ValueError, match=r"img1.png has 0 keypoints.*the database of this model"):
         tracks_from_database(path, scene[0] / "points", "orb")
 
 

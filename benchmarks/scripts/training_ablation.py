@@ -24,7 +24,7 @@ import protomark as pm
 from protomark.cli.terminal import progress_bar
 from protomark.files import write_text
 from protomark.tracks.file import Tracks, sequence_name
-from protomark.training.encoder import unaggregated_precision
+from protomark.training.encoder import binary_precision
 from protomark.training.network import embed
 from protomark.training.sampling import Views
 from protomark.training.train import (
@@ -130,7 +130,7 @@ def train(change: RecipeChange, steps: int, tracks: dict[str, Tracks]) -> dict[s
         codes = embed(trainer.quantized, np.concatenate([trial.support, trial.queries]))
         by_dim = precision(trial, encoder.encode, dims)
         found[trial.name] = {
-            "unaggregated": unaggregated_precision(raw),
+            "unaggregated": binary_precision(raw)[0],
             "prototypes": {str(dim): by_dim[dim] for dim in dims},
             "all codes": precision_of_all_codes(trial, codes),
         }

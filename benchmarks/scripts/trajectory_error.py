@@ -18,8 +18,8 @@ from protomark.geometry.colmap import (
     read_model,
     read_reconstruction,
 )
-from protomark.geometry.similarity import trajectory_error
 from protomark_bench.report import ReportTable
+from protomark_bench.trajectory import trajectory_error
 
 HEADS = (
     *("sequence", "frames registered", "RMSE", "median", "path", "landmarks"),

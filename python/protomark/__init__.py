@@ -13,6 +13,7 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
 from protomark._core import (
+    FileError,
     PrototypeMap,
     SealedMap,
     file_journal,
@@ -23,7 +24,6 @@ from protomark._core import (
     verify_file,
 )
 from protomark.encoders import Encoder
-from protomark.errors import FileError
 
 if TYPE_CHECKING:
     from protomark.features.upright import upright_descriptors as upright_descriptors

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def main() -> None:
-    """Run the command, or say how to install what it needs."""
+    """Run the command, or tell how to install what it needs."""
     try:
         from protomark.cli import main as run
     except ModuleNotFoundError as error:

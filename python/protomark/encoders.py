@@ -1,4 +1,4 @@
-"""What encoders have beyond the core: models that ship, and match calibration."""
+"""Encoder methods beyond the core: loading bundled models, and match calibration."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _load_file = Encoder.load
 
 
 def load(source: str | os.PathLike[str]) -> Encoder:
-    """Load an encoder by the name of one that ships ("freak", "orb") or the path of a model file.
+    """Load an encoder: one that ships, by its name such as "freak", or a model file, by its path.
 
     Raises:
         FileNotFoundError: there is no such model.
-        FileError: the file is not a model.
+        FileError: the file is not a model, or it is broken.
     """
     return _load_file(resolve(source))
 
 
 def match_calibration(self: Encoder, dim: int | None = None) -> MatchCalibration:
-    """How likely a match is right, by the distances to the two nearest landmarks.
+    """The calibration that turns distances to the two nearest landmarks into a probability.
 
     Args:
         self: the encoder.
@@ -39,6 +39,6 @@ def match_calibration(self: Encoder, dim: int | None = None) -> MatchCalibration
     return MatchCalibration.of(self, dim)
 
 
-# The stub of the core declares them (bindings/stub_patterns.txt).
+# The stub of the core declares both methods (bindings/stub_patterns.txt).
 setattr(Encoder, "load", staticmethod(load))  # noqa: B010
 setattr(Encoder, "match_calibration", match_calibration)  # noqa: B010

@@ -1,4 +1,4 @@
-"""Optional dependencies: imported when they are first needed, and named by the error if absent."""
+"""Optional dependencies: imported on first use; the error names an absent one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 from urllib.parse import unquote, urlparse
 
-# Module -> what people call it, and the extra of this package that brings it.
+# Module -> its name, and the extra of this package that installs it.
 _EXTRAS = {
     "cv2": ("OpenCV (opencv-contrib-python-headless)", "localize"),
     "cv2.xfeatures2d": ("OpenCV's contrib modules (opencv-contrib-python-headless)", "localize"),
@@ -24,7 +24,7 @@ _EXTRAS = {
 
 
 def optional(module: str) -> Any:
-    """Import a module that one of the package's extras brings.
+    """Import a module that one of the package's extras installs.
 
     Raises:
         ModuleNotFoundError: the module is absent; the error says how to install it.
@@ -47,9 +47,9 @@ def missing(module: str) -> ModuleNotFoundError:
 
 
 def install_command(extra: str) -> str:
-    """The pip command that installs an extra: from the clone Protomark came from, else the index.
+    """The pip command that installs an extra, from the same clone as Protomark or from the index.
 
-    pip records where it installed a package from (PEP 610, direct_url.json).
+    pip records in direct_url.json where a package came from (PEP 610).
     """
     source = "protomark"
     try:

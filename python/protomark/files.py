@@ -1,4 +1,4 @@
-"""Writes files whole or not at all, and sorts their names."""
+"""Writes files atomically, and sorts their names."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from typing import BinaryIO
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A file beside `path` to write into; it takes the place of `path` when the block ends well.
+    """Yield a new file that replaces `path` when the block ends without an error.
 
-    On an error, Ctrl-C included, what was there before stays and nothing else is left. After the
-    block the new file survives a power cut. A process that is killed may leave `.<name>.<random>`,
-    which nobody reads. The permission bits of a replaced file are kept.
+    On an error, Ctrl-C included, the old file stays and nothing else is left. After the block the
+    new file survives a power cut and has the permission bits of the old one. A killed process may
+    leave `.<name>.<random>`, which nothing reads.
     """
     target = Path(path).absolute()
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    # Not tempfile, whose files only their owner may read.
+    # Not tempfile: only the owner may read its files.
     mode = _permissions(target)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     handle = os.open(temporary, flags, 0o666 if mode is None else mode)
     try:
         with os.fdopen(handle, "wb") as file:
             if mode is not None:
-                # What the umask took away; where that fails, fewer may read the file, never more.
+                # The umask may have removed bits. If this fails, fewer users may read the file.
                 with suppress(OSError):
                     os.fchmod(handle, mode)
             yield file
@@ -46,9 +46,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """A new folder beside `folder` to fill; it replaces `folder` when the block ends well.
+    """Yield a new folder that replaces `folder` when the block ends without an error.
 
-    On an error, Ctrl-C included, what was there before stays.
+    On an error, Ctrl-C included, the old folder stays.
     """
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     temporary.chmod(0o755)
@@ -65,7 +65,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
 
 
 def _permissions(path: Path) -> int | None:
-    """Who may read and write a file; None where there is none."""
+    """The permission bits of a file, None if it does not exist."""
     try:
         return path.stat().st_mode & 0o777
     except OSError:
@@ -73,10 +73,10 @@ def _permissions(path: Path) -> int | None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Without this a power cut may bring the old name back."""
+    """Make a rename survive a power cut."""
     try:
         handle = os.open(folder, os.O_RDONLY)
-    except PermissionError:  # a folder may be writable and yet not readable
+    except PermissionError:  # the folder is writable but not readable
         return
     try:
         os.fsync(handle)
@@ -88,7 +88,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a UTF-8 text file, whole or not at all."""
+    """Write a UTF-8 text file atomically."""
     with replacing(path) as file:
         file.write(text.encode())
 

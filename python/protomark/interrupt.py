@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at a moment that suits long work: between two steps of it."""
+"""Defers Ctrl-C and SIGTERM until long work is between two steps."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+
+class Interrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
+    """Ctrl-C ended long work between two steps; the message says how to continue."""
+
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
 def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Within the context the first Ctrl-C or SIGTERM only sets the flag that this yields.
+    """Yield a function that tells whether Ctrl-C or SIGTERM has asked the work to stop.
 
-    The work reads the flag between two steps, and stops. A second signal raises KeyboardInterrupt
-    at once. Outside of the main thread, where Python takes no signals, the flag is never set.
+    The work calls it between two steps. A second signal raises KeyboardInterrupt at once. Outside
+    of the main thread, where Python handles no signals, the function always returns False.
 
     Args:
-        notify: called when the flag is set, to tell the user that the work is about to stop.
+        notify: called on the first signal, to tell the user that the work is about to stop.
     """
     requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -1,10 +1,9 @@
-"""How likely the nearest landmark of a keypoint is the right one, given the two nearest distances.
+"""The probability that a keypoint's nearest landmark is right, given the two nearest distances.
 
 Many keypoints of a real frame have no landmark in the map, and their nearest one is wrong however
-good the descriptor is. A fixed ratio test (Lowe, IJCV 2004) keeps another share of right matches
-for each encoder and each code length. So the probability is fitted to data
-(`protomark.training.match_calibration`) for each encoder and code length, and the model file keeps
-it in its `info` (docs/format.md).
+good the descriptor is. A fixed ratio test (Lowe, IJCV 2004) accepts a different share of right
+matches for each encoder and code length. Therefore the probability is fitted to data for each of
+them (`protomark.training.match_calibration`), and the model file stores the fit in its `info`.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ import protomark as pm
 
 KEY = "match_calibration"
 SOURCE_KEY = "match_calibration_data"
-# The squared distance that search gives where there is no landmark.
+# The squared distance that search returns where there is no landmark.
 NO_DISTANCE = np.iinfo(np.int32).max
 _WEIGHTS = 3
-# Keeps weights finite where the features tell right from wrong without exception.
+# Keeps weights finite if the features separate right from wrong completely.
 _RIDGE = 1e-4
 _STEPS = 50
 
@@ -33,9 +32,8 @@ class MatchCalibration:
 
     d and s are the distances to the nearest and to the second nearest landmark, in code units.
     Training makes exp(-distance^2 / T) the likelihood of a landmark (Snell et al., Prototypical
-    Networks, NeurIPS 2017), so the margin between two of them is a difference of squares; d itself
-    says whether the keypoint's landmark is in the map at all. Where there is no second landmark, s
-    is taken for 2 d.
+    Networks, NeurIPS 2017), so the margin between two landmarks is a difference of squares, while d
+    alone tells whether the keypoint's landmark is in the map. Without a second landmark s is 2 d.
 
     Attributes:
         weights: w0, w1, w2.
@@ -44,10 +42,10 @@ class MatchCalibration:
     weights: tuple[float, ...]
 
     def probability(self, distances: ArrayLike) -> NDArray[np.float64]:
-        """Probabilities (n,) that the nearest landmarks are right, 0 where there is none.
+        """Probabilities (n,) float64 that the nearest landmarks are right, 0 where there is none.
 
         Args:
-            distances: (n, 2 or more) squared distances, as `search` gives them.
+            distances: (n, k) squared distances with k >= 2, as `search` returns them.
         """
         nearest, second = np.asarray(distances, np.float64)[:, :2].T
         present = nearest < NO_DISTANCE
@@ -56,9 +54,9 @@ class MatchCalibration:
 
     @classmethod
     def of(cls, encoder: pm.Encoder, dim: int | None = None) -> MatchCalibration:
-        """The calibration that an encoder's model file has for codes of `dim` numbers (None: all).
+        """The calibration in an encoder's model file for codes of `dim` numbers (None: all).
 
-        An encoder without one that equals an encoder that ships takes over that one's.
+        An encoder without a calibration has that of the bundled encoder with the same identity.
 
         Raises:
             ValueError: the encoder was never calibrated for codes of this length.
@@ -76,15 +74,15 @@ class MatchCalibration:
 def calibration_features(
     nearest: NDArray[np.float64], second: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Squared distances (n,) and (n,) to (n, 2) features: d^2 and s^2 - d^2."""
+    """Features (n, 2) of squared distances (n,): d^2 and s^2 - d^2."""
     return np.column_stack([nearest, np.where(second < NO_DISTANCE, second, 4 * nearest) - nearest])
 
 
 def parse(note: str) -> dict[int, MatchCalibration]:
-    """Read the note in a model file: one line per code length, the length and the weights.
+    """Read the note in a model file, whose lines hold a code length and the weights.
 
     Raises:
-        ValueError: the note is something else.
+        ValueError: the note is broken.
     """
     fitted = {}
     for line in note.splitlines():
@@ -95,19 +93,21 @@ def parse(note: str) -> dict[int, MatchCalibration]:
                 raise ValueError
             fitted[int(dim)] = MatchCalibration(values)
         except ValueError:
-            raise ValueError(f"the model's note on {KEY} is broken: {line[:80]!r}") from None
+            raise ValueError(
+                f"the model's note on {KEY} is broken, calibrate it anew: {line[:80]!r}"
+            ) from None
     return fitted
 
 
 def with_calibration(
     encoder: pm.Encoder, fitted: Mapping[int, MatchCalibration], source: str
 ) -> pm.Encoder:
-    """The same encoder with these notes; its identity, and so its codes, are the same.
+    """A copy of an encoder with a calibration; identity and codes are the same.
 
     Args:
         encoder: the encoder.
         fitted: the calibration for each code length.
-        source: the sequences that it was fitted to.
+        source: the sequences that the calibration was fitted to.
     """
     lines = [
         " ".join([str(dim), *(f"{w:.6g}" for w in fitted[dim].weights)]) for dim in sorted(fitted)
@@ -136,12 +136,12 @@ def _bundled_note(encoder: pm.Encoder) -> str:
 def fit_logistic(
     features: NDArray[np.float64], labels: NDArray[np.bool_], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Logistic regression by Newton's method: w of P(yes) = sigmoid(w0 + w1 x1 + w2 x2 ...).
+    """Weights w of P(label) = sigmoid(w0 + w1 x1 + w2 x2 ...), by Newton's method.
 
     Args:
         features: (n, f) float64, x.
-        labels: (n,) bool, yes or no.
-        weights: (n,) float64, how much each row counts.
+        labels: (n,) bool.
+        weights: (n,) float64, weight of each row.
 
     Returns:
         (f + 1,) float64, the constant first.
@@ -150,7 +150,10 @@ def fit_logistic(
         ValueError: all labels are the same.
     """
     if not labels.any() or labels.all():
-        raise ValueError(f"{int(labels.sum())} of {len(labels)} are right: nothing to tell apart")
+        raise ValueError(
+            f"{int(labels.sum())} of {len(labels)} matches are right, but a fit needs right and "
+            "wrong ones: give more tracks"
+        )
     share = weights / weights.sum()
     mean = share @ features
     spread = np.maximum(np.sqrt(share @ (features - mean) ** 2), 1e-12)
@@ -163,7 +166,7 @@ def fit_logistic(
         gradient = x.T @ (share * (p - labels)) + penalty * w
         hessian = (x * (share * p * (1 - p))[:, None]).T @ x + np.diag(penalty + 1e-12)
         step = np.linalg.solve(hessian, gradient)
-        # A long step overshoots where the classes are far apart.
+        # A long step overshoots if the classes are far apart.
         w -= step * min(1.0, 4.0 / max(float(np.abs(step).max()), 1e-12))
         if np.abs(step).max() < 1e-8:
             break

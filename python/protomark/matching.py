@@ -1,4 +1,4 @@
-"""Matches of one frame with a map, each with the probability that it is right."""
+"""Matches of a frame with a map, each with the probability that it is right."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from numpy.typing import NDArray
 
 import protomark as pm
 
-# Less likely matches are not accepted. Chosen on the training and validation sequences
-# (docs/localization.md).
+# Smallest probability of an accepted match, chosen on the training and validation sequences.
 MIN_PROBABILITY = 0.2
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Accepted matches of one frame, the likeliest first.
+    """a accepted matches of one frame, the likeliest first.
 
     Attributes:
         keypoints: (a,) int64, rows of the descriptors, each at most once.
-        landmarks: (a,) int64, ids, each at most once.
-        probabilities: (a,) float64, that the match is right.
+        landmarks: (a,) int64, landmark ids, each at most once.
+        probabilities: (a,) float64, the probability that each match is right.
     """
 
     keypoints: NDArray[np.int64]
@@ -40,17 +39,20 @@ def match(
     threads: int = 1,
     recall: float | None = None,
 ) -> Matches:
-    """The landmarks that the keypoints of a frame see.
+    """Match the keypoints of a frame with the landmarks of a map.
 
     Args:
-        scene: a map, whose encoder says how likely a match is (`Encoder.match_calibration`).
+        scene: a learning or a sealed map whose encoder has a match calibration.
         descriptors: (n, bits / 8) uint8.
-        min_probability: of an accepted match.
+        min_probability: smallest probability of an accepted match, in [0, 1].
         threads: threads to encode and search on.
-        recall: see `search`.
+        recall: share of nearest landmarks to find by approximate search; None: exact search.
+
+    Returns:
+        The accepted matches: each landmark has the likeliest of its keypoints only.
 
     Raises:
-        ValueError: the map's encoder was not calibrated, or the descriptors are not its own.
+        ValueError: the map's encoder was not calibrated, or takes other descriptors.
     """
     calibration = scene.encoder.match_calibration(scene.dim)
     ids, distances = scene.search(descriptors, k=2, threads=threads, recall=recall)
@@ -62,15 +64,15 @@ def accept(
     probabilities: NDArray[np.float64],
     min_probability: float = MIN_PROBABILITY,
 ) -> Matches:
-    """Matches that are likely enough; a landmark keeps its likeliest keypoint.
+    """Accept the matches that are likely enough; a landmark keeps its likeliest keypoint.
 
     Args:
         nearest: (n,) int64, the nearest landmark of each keypoint, -1 where there is none.
-        probabilities: (n,) float64, that it is the right one.
-        min_probability: of an accepted match.
+        probabilities: (n,) float64, the probability that it is right.
+        min_probability: smallest probability of an accepted match.
     """
     order = np.argsort(-probabilities, kind="stable")
     order = order[(nearest[order] >= 0) & (probabilities[order] >= min_probability)]
     _, best = np.unique(nearest[order], return_index=True)
-    kept = order[np.sort(best)]
-    return Matches(kept, nearest[kept], probabilities[kept])
+    rows = order[np.sort(best)]
+    return Matches(rows, nearest[rows], probabilities[rows])

@@ -1,4 +1,4 @@
-"""All pictures that Protomark draws, with matplotlib."""
+"""All pictures that Protomark draws, by matplotlib."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ INK, MUTED, GRID, OURS = "#1f2430", "#6b7280", "#e5e7eb", "#0f766e"
 RED, AMBER = "#dc2626", "#b45309"
 SERIES = (OURS, "#0369a1", "#4d7c0f", AMBER, "#7c3aed", "#be123c", "#9ca3af")
 _LANDMARK = "#c3c9d3"
-# Share of landmarks that a picture leaves outside on every side: reconstructions have stray points.
+# Share of landmarks beyond each side of a picture, as reconstructions have stray points.
 _STRAY = 0.03
 _MAX_LANDMARKS = 20_000
 _MAX_OBSERVATIONS = 20
 
 
 def new_figure(width: float, height: float, **padding: float) -> Figure:
-    """A figure of so many inches, independent of any window; `padding` as constrained layout."""
+    """A figure of this size in inches, without a window, in a constrained layout."""
     engine = optional("matplotlib.layout_engine").ConstrainedLayoutEngine(**padding)
     figure: Figure = optional("matplotlib.figure").Figure(figsize=(width, height), layout=engine)
     return figure
 
 
 def style_axes(axes: Axes, x: str, y: str, title: str = "") -> None:
-    """Give axes the labels, grid and frame that all plots have."""
+    """Give axes the labels, grid and frame of all plots."""
     axes.set_xlabel(x, color=INK)
     axes.set_ylabel(y, color=INK)
     axes.grid(color=GRID, linewidth=0.8)
@@ -59,22 +59,16 @@ def add_title(axes: Axes, title: str) -> None:
 def check_suffix(path: str | os.PathLike[str]) -> None:
     """Raise ValueError unless the path ends in .png, .svg or .pdf."""
     if Path(path).suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise ValueError(f"{path}: a picture's name must end in .png, .svg or .pdf")
+        raise ValueError(f"{path}: name a picture that ends in .png, .svg or .pdf")
 
 
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], made_by: str = "protomark", dpi: int = 160
 ) -> None:
-    """Write a figure, whole or not at all.
-
-    Args:
-        figure: the figure.
-        path: PNG, SVG or PDF, by its suffix.
-        made_by: what the file says of its origin.
-        dpi: dots per inch.
+    """Write a figure as PNG, SVG or PDF atomically, with its origin in the file's metadata.
 
     Raises:
-        ValueError: the suffix is another one.
+        ValueError: the path has another suffix.
     """
     path = Path(path)
     check_suffix(path)
@@ -88,7 +82,7 @@ def save_figure(
 
 
 def svg_text(figure: Figure) -> str:
-    """The figure as an SVG element for an HTML page; equal figures give equal texts."""
+    """The figure as an SVG element for an HTML page, the same for equal figures."""
     text = io.StringIO()
     with optional("matplotlib").rc_context({"svg.hashsalt": "protomark", "svg.fonttype": "none"}):
         figure.savefig(text, format="svg", metadata={"Date": None})
@@ -98,15 +92,15 @@ def svg_text(figure: Figure) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points of one method at several sizes, joined by a line.
+    """Values of one method at several sizes, drawn as a line.
 
     Attributes:
-        label: what stands beside the line.
+        label: text beside the line.
         x: (n,) sizes, ascending.
         y: (n,) values.
         spread: (n,) standard deviations, 0 where unknown.
-        colour: of the line.
-        ours: whether it is one of Protomark's, which stand out.
+        colour: colour of the line.
+        ours: whether the method is Protomark's, which stands out.
     """
 
     label: str
@@ -118,7 +112,7 @@ class Curve:
 
 
 def draw_curves(axes: Axes, curves: Sequence[Curve], x: str, y: str, title: str = "") -> None:
-    """Draw curves over sizes, on a log scale, each with its label beside its last point."""
+    """Draw curves over sizes on a log scale, with labels beside their last points."""
     for curve in curves:
         axes.errorbar(
             curve.x,
@@ -138,7 +132,7 @@ def draw_curves(axes: Axes, curves: Sequence[Curve], x: str, y: str, title: str 
 
 
 def _label_curves(axes: Axes, curves: Sequence[Curve]) -> None:
-    """Label our curves left of their last point, others right of it, lowered where they overlap."""
+    """Label our curves left of their last points, others right of them, without overlap."""
     bottom, top = axes.get_ylim()
     room = 0.045 * (top - bottom)
     placed: list[tuple[float, float]] = []
@@ -165,14 +159,14 @@ def _label_curves(axes: Axes, curves: Sequence[Curve]) -> None:
 
 @dataclass(frozen=True)
 class ScenePicture:
-    """A map from above, with frames that were localized in it.
+    """The data of a map from above, with frames that were localized in it.
 
     Attributes:
-        landmarks: (l, 3) positions of the map.
-        matched: (n, 3) positions that support some query's pose.
+        landmarks: (l, 3) positions of the landmarks.
+        matched: (n, 3) positions of the landmarks that support a query's pose.
         support: (s, 3, 4) poses of the keyframes that built the map.
         true: (q, 3, 4) true poses of the query keyframes.
-        estimated: one (3, 4) pose per query keyframe, None where none was found.
+        estimated: (3, 4) pose of each query keyframe, None if none was found.
     """
 
     landmarks: NDArray[np.float64]
@@ -234,8 +228,8 @@ def draw_scene(axes: Axes, picture: ScenePicture, title: str = "") -> None:
 def ground_plane(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Axes (2, 3) of the ground plane, x along the widest spread of cameras, from poses (n, 3, 4).
 
-    Up is the mean of the images' up. If cameras mostly look one way, and move less along it than
-    along that up, they look down, and up is the opposite of their view.
+    The up direction is the mean of the images' up directions. Cameras that mostly look one way, and
+    move less along it than along up, look down: then up is the opposite of their view.
     """
     centers = camera_centers(poses)
     spread = centers - centers.mean(axis=0)
@@ -244,7 +238,7 @@ def ground_plane(poses: NDArray[np.float64]) -> NDArray[np.float64]:
         up = back
     up = up / (np.linalg.norm(up) or 1.0)
     spread = spread - np.outer(spread @ up, up)
-    # Without any spread the first right-singular vector is arbitrary and may have a share of `up`.
+    # Without any spread the first right-singular vector is arbitrary and may contain `up`.
     across = np.linalg.svd(spread, full_matrices=False)[2][0]
     across = across - (across @ up) * up
     if np.linalg.norm(across) < 1e-9:
@@ -267,16 +261,15 @@ def _frame_picture(
 
 @dataclass(frozen=True)
 class MapPictures:
-    """What the pictures of a map's report show.
+    """The data of the pictures in a map's report.
 
     Attributes:
-        positions: (l, 3) landmarks.
-        counts: (l,) int64, observations of each.
-        poses: (f, 3, 4) frames, in the order in which the camera went.
+        positions: (l, 3) positions of the landmarks.
+        counts: (l,) int64, observations per landmark.
+        poses: (f, 3, 4) poses of the frames, along the camera's path.
         errors: (o,) reprojection errors, pixels.
-        track_lengths: landmarks by number of observations.
-        frames: one dict per frame of the input: `registered`, `inliers`, bytes, and seconds by
-            stage.
+        track_lengths: number of landmarks by number of observations.
+        frames: for each frame of the input `registered`, `inliers`, bytes, and seconds by stage.
         stages: names of the stages.
     """
 
@@ -290,7 +283,7 @@ class MapPictures:
 
 
 def map_figures(pictures: MapPictures) -> list[Figure]:
-    """The map from above, how it grew, and how good it is."""
+    """The map from above, its memory and matches over time, and its quality."""
     return [_map_from_above(pictures), _map_growth(pictures), _map_quality(pictures)]
 
 
@@ -383,7 +376,7 @@ def training_figure(
         losses: (v,) mean training losses.
         precision: (v,) precisions by number of dimensions.
         quantized_from: first of the steps with quantisation in the loop, None if there is none.
-        title: above the figure.
+        title: title of the figure.
     """
     figure = new_figure(8, 3.4)
     left, right = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""How library functions report progress: they call a function, and commands draw a bar."""
+"""Progress of library functions: they call a function, for which commands draw a bar."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-# Called with the name of a stage, the steps done and the steps in all (0: unknown).
+# Called with the name of a stage, the number of finished steps, and that of all (0: unknown).
 Progress = Callable[[str, int, int], None]
 
 
@@ -18,14 +18,7 @@ def silent(stage: str, done: int, total: int) -> None:
 def tracked(
     items: Iterable[T], progress: Progress, stage: str, total: int | None = None
 ) -> Iterator[T]:
-    """Iterate over items and report each as a step of a stage.
-
-    Args:
-        items: what to iterate over.
-        progress: called before the first item and after each.
-        stage: name of the stage.
-        total: number of items; None: `len(items)`, or unknown.
-    """
+    """Iterate over items and report each as a step of a stage; `total` is `len(items)` if None."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else 0
     progress(stage, 0, total)

@@ -34,13 +34,9 @@ def markdown_table(
     bold: Sequence[bool] = (),
     left: int = 1,
 ) -> str:
-    """A GitHub table; columns after the first `left` are aligned right.
+    """A GitHub table of rows of texts; columns after the first `left` align right.
 
-    Args:
-        head: names of the columns.
-        rows: one text per column.
-        bold: which rows stand out.
-        left: columns that are aligned left.
+    `bold` tells which rows are bold.
     """
     lines = [
         "| " + " | ".join(head) + " |",
@@ -53,17 +49,17 @@ def markdown_table(
 
 
 def percent(share: float | None) -> str:
-    """A share in percent, or a dash."""
+    """A share in percent, a dash for None."""
     return "–" if share is None else f"{100 * share:.1f}%"
 
 
 def map_page(facts: Mapping[str, Any], pictures: MapPictures, title: str) -> str:
-    """The report of a map: one HTML page that holds its plots.
+    """The report of a map as one HTML page with its plots.
 
     Args:
-        facts: see `protomark.mapping.summary.summarise`.
-        pictures: what the plots show.
-        title: heading.
+        facts: figures of `protomark.mapping.summary.summarise`.
+        pictures: data of the plots.
+        title: heading of the page.
     """
     events = "".join(f"<li>{escape(event)}" for event in facts["events"])
     return _PAGE.format(

@@ -1,4 +1,4 @@
-"""CPU threads: how many there are, work shared among them, and how many BLAS may use."""
+"""CPU threads: their number, work shared among them, and BLAS on one of them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import TypeVar
 
-from protomark.progress import Progress, silent
+from protomark.progress import Progress, silent, tracked
 
 S = TypeVar("S")
 T = TypeVar("T")
 
 
 def available_threads() -> int:
-    """Processors that this process may run on."""
+    """Number of processors that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -30,33 +30,18 @@ def parallel_map(
 ) -> list[T]:
     """`[function(item) for item in items]` on several threads.
 
-    Worth it where the function spends its time without the GIL, as OpenCV and the core do. An
-    exception cancels what has not begun.
-
-    Args:
-        function: called once per item.
-        items: its arguments.
-        threads: threads to call it on.
-        progress: told of each result.
-        stage: name of the stage, for `progress`.
+    Several threads help functions that run without the GIL, as OpenCV and the core do. An exception
+    cancels the calls that have not begun. Each result is a step of `stage` for `progress`.
     """
-    results = []
-    progress(stage, 0, len(items))
     if threads <= 1:
-        for item in items:
-            results.append(function(item))
-            progress(stage, len(results), len(items))
-        return results
+        return [function(item) for item in tracked(items, progress, stage)]
     with ThreadPoolExecutor(threads) as pool:
         futures = [pool.submit(function, item) for item in items]
         try:
-            for future in futures:
-                results.append(future.result())
-                progress(stage, len(results), len(items))
+            return [future.result() for future in tracked(futures, progress, stage)]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return results
 
 
 def one_blas_thread() -> AbstractContextManager[object]:

@@ -1,1 +1,1 @@
-"""What maps keep of a landmark's descriptors without Protomark: the methods to compare with."""
+"""Other ways to keep a landmark's descriptors, to compare Protomark with."""

@@ -7,15 +7,16 @@ from numpy.typing import NDArray
 
 from protomark._core import hamming_search
 from protomark.baselines.method import Method
-from protomark.baselines.support import Support, unpack
+from protomark.baselines.support import Support
+from protomark.features.descriptors import unpack_bits
 
-# The medoids of landmarks with equally many observations are computed together, as many at a time
-# as have this many bits.
+# Medoids of landmarks with the same number of observations are computed together, up to this many
+# bits at a time.
 _BITS = 1 << 24
 
 
 class HammingMap(Method):
-    """Descriptors, each of a landmark, sorted by landmark id."""
+    """Descriptors of landmarks, sorted by landmark id."""
 
     def __init__(
         self,
@@ -38,10 +39,9 @@ class HammingMap(Method):
 
 
 def unaggregated(support: Support) -> HammingMap:
-    """Every descriptor; a landmark costs its mean number of descriptors and one byte for it.
+    """Every descriptor, and one byte per landmark for their number.
 
-    The byte says how many descriptors follow, which is the least that leads from a descriptor back
-    to its landmark.
+    With the number of its descriptors, a landmark is found from any of them.
     """
     observations = len(support.descriptors) / len(support.ids)
     return HammingMap(
@@ -62,7 +62,7 @@ def random_sample(support: Support) -> HammingMap:
 
 
 def majority(support: Support) -> HammingMap:
-    """The mean of each bit, quantised at 0.5; a bit set in exactly half of them is set.
+    """The mean of each bit, quantised at 0.5: a bit that half of the descriptors set is set.
 
     Other rules for ties (clear, as in the first descriptor, at random) change the precision by
     less than its spread over seeds.
@@ -72,34 +72,34 @@ def majority(support: Support) -> HammingMap:
 
 
 def bitwise_and(support: Support) -> HammingMap:
-    """A bit is set where every observation has it set."""
+    """The bits that all of a landmark's descriptors set."""
     return _one_each(support, np.bitwise_and.reduceat(support.descriptors, support.starts, axis=0))
 
 
 def medoid(support: Support) -> HammingMap:
-    """What ORB-SLAM (Mur-Artal et al. 2015) and stella_vslam keep of a landmark.
+    """The descriptor that ORB-SLAM (Mur-Artal et al. 2015) and stella_vslam keep of a landmark.
 
-    Of each descriptor, the median of its Hamming distances to all of the landmark's descriptors,
-    itself included (the lower one of two middle values); the least median wins, on a tie the
-    first. This is `MapPoint::ComputeDistinctiveDescriptors` of ORB-SLAM.
+    It has the least median Hamming distance to all of the landmark's descriptors, itself included
+    (of two middle values the lower one counts); ties go to the first descriptor. This is
+    `MapPoint::ComputeDistinctiveDescriptors` of ORB-SLAM.
     """
     chosen = support.starts.copy()
     for size in np.unique(support.counts):
         same = np.flatnonzero(support.counts == size)
         step = max(1, _BITS // (int(size) * support.bits))
-        for at in range(0, len(same), step):
-            some = same[at : at + step]
-            rows = support.starts[some][:, None] + np.arange(size)
-            chosen[some] += _least_median(support.descriptors[rows])
-    return HammingMap(support.descriptors[chosen], support.ids, support.descriptors.shape[1])
+        for start in range(0, len(same), step):
+            chunk = same[start : start + step]
+            rows = support.starts[chunk][:, None] + np.arange(size)
+            chosen[chunk] += _least_median(support.descriptors[rows])
+    return _one_each(support, support.descriptors[chosen])
 
 
 def _least_median(groups: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """(g, n, bytes) uint8 -> (g,) which of the n has the least median distance."""
-    many, size, width = groups.shape
-    bits = unpack(groups.reshape(-1, width)).astype(np.float32).reshape(many, size, -1)
+    """Index (g,) of the descriptor with the least median distance in each group (g, n, B)."""
+    count, size, width = groups.shape
+    bits = unpack_bits(groups.reshape(-1, width)).astype(np.float32).reshape(count, size, -1)
     set_bits = bits.sum(axis=2)
-    # Sums of at most a few thousand ones: exact in float32.
+    # Sums of at most a few thousand ones are exact in float32.
     distances = set_bits[:, :, None] + set_bits[:, None, :] - 2 * bits @ bits.transpose(0, 2, 1)
     middle = (size - 1) // 2
     medians = np.partition(distances, middle, axis=2)[:, :, middle]

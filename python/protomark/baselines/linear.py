@@ -1,6 +1,6 @@
-"""Linear baselines: real vectors, one per landmark, searched by Euclidean distance.
+"""Linear baselines: one real vector per landmark, searched by Euclidean distance.
 
-The mean of the bits themselves, principal components, and linear discriminants.
+The vectors are means of bits, of principal components, or of linear discriminants.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.baselines.method import Method
-from protomark.baselines.support import Moments, Support, unpack
+from protomark.baselines.support import Moments, Support
+from protomark.features.descriptors import unpack_bits
 from protomark.threads import one_blas_thread
 
-# One block of distances, 2 MB, stays in the cache.
+# One block of distances takes 2 MB and stays in the cache.
 _QUERIES = 256
 _VECTORS = 2048
 
-# Chosen on the validation sequence from 1e-4 to 10. With 1e-3 the discriminants are weaker than the
-# principal components.
+# Chosen on the validation sequence between 1e-4 and 10. With 1e-3 the discriminants are less
+# precise than the principal components.
 RIDGE = 1.0
 
 
 class EuclideanMap(Method):
-    """Vectors of a linear projection of the bits, one a landmark, ascending by landmark id.
+    """One vector per landmark, of a linear projection of the bits.
 
     Args:
-        vectors: (l, k) float32 or int8, stored vectors; `vectors * scale` lie where queries do.
+        vectors: (l, k) float32 or int8, which times `scale` compare with projected queries.
         landmarks: (l,) int64, strictly ascending.
         bytes_per_landmark: all that matching needs.
         projection: (bits, k) float32, or None for the bits themselves.
@@ -52,15 +53,15 @@ class EuclideanMap(Method):
         self.projection = projection
         self.offset = offset
         self.scale = scale
-        # With half of |p|^2 as one more dimension, one product gives |p|^2 / 2 - p.q, which orders
-        # as the distance does.
+        # With |p|^2 / 2 as one more dimension, one product computes |p|^2 / 2 - p.q, which has the
+        # order of the distance.
         values = np.asarray(vectors, dtype=np.float32)
         norms = np.einsum("ij,ij->i", values, values)
         self._extended = np.concatenate([values, norms[:, None] / 2], axis=1)
 
     def project(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(q, bits / 8) uint8 -> (q, k) float32, in steps of the stored vectors."""
-        values = unpack(descriptors).astype(np.float32)
+        """Project descriptors (q, bits / 8) uint8 to (q, k) float32, in steps of the vectors."""
+        values = unpack_bits(descriptors).astype(np.float32)
         if self.projection is not None:
             values = values @ self.projection
         if self.offset is not None:
@@ -73,7 +74,7 @@ class EuclideanMap(Method):
         """See `Method.match`."""
         queries = self.project(descriptors)
         pieces = [queries[at : at + _QUERIES] for at in range(0, len(queries), _QUERIES)]
-        # Threads over pieces rather than within BLAS: so the selection runs on all of them too.
+        # Threads share pieces rather than BLAS calls, so that selection is parallel, too.
         with one_blas_thread(), ThreadPoolExecutor(threads) as pool:
             found = list(pool.map(self._nearest, pieces))
         rows = np.concatenate([row for row, _ in found] or [np.empty((0, 2), dtype=np.int64)])
@@ -89,8 +90,8 @@ class EuclideanMap(Method):
     def _nearest(
         self, queries: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Rows of the two nearest vectors, -1 where there is none, and |p|^2 / 2 - p.q of each."""
-        every = np.arange(len(queries))
+        """Rows of the two nearest vectors, -1 if there is none, and their |p|^2 / 2 - p.q."""
+        all_rows = np.arange(len(queries))
         extended = np.concatenate([-queries, np.ones_like(queries[:, :1])], axis=1)
         rows = np.full((len(queries), 2), -1, dtype=np.int64)
         values = np.full((len(queries), 2), np.inf, dtype=np.float32)
@@ -98,25 +99,25 @@ class EuclideanMap(Method):
             block = extended @ self._extended[start : start + _VECTORS].T
             for _ in range(min(2, block.shape[1])):
                 row = block.argmin(axis=1)
-                value = block[every, row]
-                # Blocks come in order of id, so on a tie what stands already has the smaller one.
+                value = block[all_rows, row]
+                # Blocks come in order of id, so that ties keep the smaller id.
                 first, second = value < values[:, 0], value < values[:, 1]
-                for kept, new in ((rows, row + start), (values, value)):
-                    kept[:, 1] = np.where(first, kept[:, 0], np.where(second, new, kept[:, 1]))
-                    kept[:, 0] = np.where(first, new, kept[:, 0])
-                block[every, row] = np.inf
+                for best, new in ((rows, row + start), (values, value)):
+                    best[:, 1] = np.where(first, best[:, 0], np.where(second, new, best[:, 1]))
+                    best[:, 0] = np.where(first, new, best[:, 0])
+                block[all_rows, row] = np.inf
         return rows, values
 
 
 @dataclass(frozen=True)
 class Projection:
-    """x -> (x - mean) @ matrix, with (bits,) mean and (bits, k) matrix, both float32."""
+    """The projection (x - mean) @ matrix, with (bits,) mean and (bits, k) matrix, float32."""
 
     mean: NDArray[np.float32]
     matrix: NDArray[np.float32]
 
     def truncated(self, dim: int) -> Projection:
-        """Only the first `dim` outputs."""
+        """The projection to the first `dim` outputs."""
         return Projection(self.mean, np.ascontiguousarray(self.matrix[:, :dim]))
 
 
@@ -131,15 +132,15 @@ def principal_components(moments: Moments) -> Projection:
 def linear_discriminants(moments: Moments) -> Projection:
     """All linear discriminants, the most discriminative first, in the manner of maplab.
 
-    Lynen et al., "Get Out of My Lab" (RSS 2015), after Bosse and Zlot (2009): in the space where
-    differences of matching descriptors are white, the principal components of differences of
-    descriptors that do not match. Differences of random pairs have twice the covariance of the
-    descriptors, those within a landmark twice the pooled covariance within landmarks, so both
-    follow from `Moments` without drawing pairs. `RIDGE` times the mean variance is added to the
-    covariance within.
+    They are, in the space where differences of matching descriptors are white, the principal
+    components of differences of descriptors that do not match (Lynen et al., "Get Out of My Lab",
+    RSS 2015, after Bosse and Zlot, 2009). Differences of random pairs have twice the covariance of
+    the descriptors, and those within a landmark twice the pooled covariance within landmarks, so
+    both follow from `Moments` without drawing pairs. `RIDGE` times the mean variance is added to
+    the covariance within.
     """
     ridge = RIDGE * float(np.trace(moments.within)) / len(moments.within)
-    # Tracks without any change within a landmark leave nothing to whiten by.
+    # Without any variance within landmarks the ridge alone whitens.
     ridge = ridge if ridge > 0 else 1.0
     variances, axes = np.linalg.eigh(moments.within)
     whiten = axes / np.sqrt(np.maximum(variances, 0) + ridge)
@@ -148,10 +149,10 @@ def linear_discriminants(moments: Moments) -> Projection:
 
 
 def projected_mean(support: Support, projection: Projection, *, rounded: bool) -> EuclideanMap:
-    """The mean of each landmark's projected descriptors: k bytes and one for the count.
+    """The mean of each landmark's projected descriptors, and one byte for the count.
 
-    With `rounded` the means are stored in int8, at one step for all dimensions, such that the
-    largest number is 127; queries are not rounded. Without it they are float32.
+    With `rounded` the means are int8 with one step for all dimensions, whose largest number is 127;
+    queries are not rounded. Otherwise the means are float32.
     """
     means = (support.means - projection.mean) @ projection.matrix
     offset = projection.mean @ projection.matrix

@@ -1,4 +1,4 @@
-"""What every compared method can do once its map is built."""
+"""The interface of compared methods."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 
 class Method(ABC):
-    """A map that was built in one way or another, and answers which landmark a descriptor is of.
+    """A map that finds the landmarks of descriptors.
 
     Attributes:
-        bytes_per_landmark: all that matching needs, the count included, the 3D position not.
+        bytes_per_landmark: all that matching needs, including the count, without the position.
     """
 
     bytes_per_landmark: float
@@ -25,11 +25,10 @@ class Method(ABC):
 
         Args:
             descriptors: (q, bits / 8) uint8.
-            threads: how many threads may search.
+            threads: threads to search on.
 
         Returns:
-            (q, 2) int64 landmark ids, nearest first, ties to the smaller id, -1 where there is
-            none, and (q, 2) float32 distances, infinite where there is none. Distances are
-            Hamming or Euclidean, whichever the method searches by: they order and compare
-            within one method only.
+            Landmark ids (q, 2) int64, nearest first, ties to the smaller id, -1 where there is
+            none, and distances (q, 2) float32, infinite where there is none. Distances are those
+            that the method searches by, Hamming or Euclidean, and compare within one method only.
         """

@@ -25,7 +25,7 @@ _SUMMARY = "Visual maps that keep a few small integer prototypes per landmark."
 
 app = typer.Typer(
     cls=CommandGroup,
-    rich_markup_mode=None,  # drawing help with Rich takes as long as all else together
+    rich_markup_mode=None,  # Rich would double the time of --help
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -65,18 +65,25 @@ def options(
         ),
     ] = False,
 ) -> None:
-    """Take the options that stand before a command."""
+    """Handle the options before a command."""
 
 
 def main() -> None:
     """Run the command.
 
-    An expected error becomes one sentence on stderr and exit code 1; Ctrl-C and SIGTERM exit with
+    An expected error prints one sentence to stderr and exits with 1; Ctrl-C and SIGTERM exit with
     130.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    from protomark.interrupt import Interrupted
+
     try:
         app(prog_name="protomark")
+    except Interrupted as stop:
+        from protomark.cli.terminal import note
+
+        note(str(stop))
+        raise SystemExit(130) from None
     except KeyboardInterrupt:
         _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:

@@ -7,28 +7,35 @@ from typing import Annotated
 
 import typer
 
+from protomark.cli.options import JsonFile, Threads
+
 
 def calibrate(
-    model: Annotated[Path, typer.Argument(help="Model file (.pme) that `protomark train` wrote.")],
+    model: Annotated[
+        Path,
+        typer.Argument(metavar="MODEL", help="Model file (.pme) that `protomark train` wrote."),
+    ],
     tracks: Annotated[
-        list[Path], typer.Argument(help="Tracks files, one a sequence, of the model's descriptor.")
+        list[Path],
+        typer.Argument(
+            metavar="TRACKS", help="Tracks files of the model's descriptor, one per sequence."
+        ),
     ],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Model file to write; by default MODEL itself."),
     ] = None,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file.")
-    ] = None,
+    threads: Threads = 1,
+    json_file: JsonFile = None,
 ) -> None:
-    """Fit how likely matches are right, for an encoder.
+    """Fit how likely an encoder's matches are right.
 
-    From frames whose landmarks are known.
-    `protomark train` does this by itself. The probability that a match is right, given the
-    distances to the two nearest landmarks, is fitted for each code length and written into the
-    model file; the network stays the same, and so do maps made with it. docs/localization.md says
-    more.
+    Reads a model and tracks, whose landmarks are known. Fits, for each code length, the
+    probability that a match is right, given the distances to the two nearest landmarks, and writes
+    the fit into the model file. Codes and maps stay the same. `protomark train` does this by
+    itself.
+
+    protomark calibrate freak.pme tracks/*.freak.safetensors
     """
     from protomark import Encoder
     from protomark.cli.terminal import (
@@ -40,19 +47,22 @@ def calibrate(
         write_json,
     )
     from protomark.matching import MIN_PROBABILITY
+    from protomark.threads import available_threads
     from protomark.training.match_calibration import calibrate as fit
 
     check_outputs(output or model, json_file)
     with progress_bar() as progress:
-        encoder, quality = fit(Encoder.load(model), tracks, threads, progress)
+        encoder, quality = fit(
+            Encoder.load(model), tracks, threads or available_threads(), progress
+        )
     encoder.save(output or model)
-    write_json(json_file, {"figures": [one.as_dict() for one in quality]})
+    write_json(json_file, {"figures": [vars(one) for one in quality]})
     table = table_of("sequence", "dim", "right of all", "precision", "expected", "recall")
     for one in quality:
         shares = (one.right, one.precision, one.expected, one.recall)
         table.add_row(one.sequence, str(one.dim), *(f"{share:.3f}" for share in shares))
     console.print(table)
     say(
-        f"Matches with a probability of {MIN_PROBABILITY:g} or more; each sequence by a fit to the "
-        "others."
+        f"Matches with a probability of {MIN_PROBABILITY:g} or more. Each sequence is measured "
+        "with a fit to the others."
     )

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from protomark.cli.options import JsonFile
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -16,52 +18,57 @@ if TYPE_CHECKING:
 
 def evaluate(
     tracks: Annotated[
-        list[Path], typer.Argument(help="Tracks files that `protomark tracks` wrote.")
+        list[Path],
+        typer.Argument(metavar="TRACKS", help="Tracks files that `protomark tracks` wrote."),
     ],
     encoder: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name or file of an encoder; may be repeated. By default the one that ships for "
-            "the descriptor. An upright encoder gets the keypoints' angles and sizes, too."
+            metavar="NAME|FILE",
+            help="Encoder that ships, or a model file (.pme); may be repeated. By default the one "
+            "for the descriptor. An upright encoder gets the keypoints' angles and sizes, too.",
         ),
     ] = None,
     methods: Annotated[
         str,
         typer.Option(
-            help="Methods to compare, for example unaggregated,medoid,pca,protomark; "
-            "by default all except those in -float."
+            help="Methods to compare, for example unaggregated,medoid,pca,protomark. By default "
+            "all except those that end in -float."
         ),
     ] = "",
-    seeds: Annotated[int, typer.Option(min=1, help="Random splits, with seeds 0, 1, ...")] = 3,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Number of random splits into map and queries.")
+    ] = 3,
     pose_frames: Annotated[
-        int, typer.Option(min=0, help="Query keyframes to localize at each seed, at most.")
+        int, typer.Option(min=0, help="Limit on query keyframes to localize per split.")
     ] = 20,
     discriminant_from: Annotated[
         list[Path] | None,
         typer.Option(
             help="Tracks file to learn the linear discriminants from; may be repeated. "
-            "By default they are learned from the support."
+            "By default they are learned from the map's own observations."
         ),
     ] = None,
     threads: Annotated[
-        int, typer.Option(min=0, help="CPU threads, 0 for all; search is timed on one.")
+        int,
+        typer.Option(min=0, help="CPU threads, 0 for one per core; search is timed on one."),
     ] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file.")
-    ] = None,
+    json_file: JsonFile = None,
     markdown_file: Annotated[
-        Path | None, typer.Option("--markdown", help="Write the tables to this file.")
+        Path | None, typer.Option("--markdown", help="Write the tables to this Markdown file, too.")
     ] = None,
     plot_file: Annotated[
         Path | None,
-        typer.Option("--plot", help="Draw precision over bytes to this file (.png, .svg, .pdf)."),
+        typer.Option("--plot", help="Plot precision over bytes to this file (.png, .svg, .pdf)."),
     ] = None,
 ) -> None:
     """Compare Protomark with other ways to keep descriptors.
 
-    By precision, poses found, bytes per landmark and search time.
-    The protocol is the paper's: a random 90 % of the keyframes build the map, and descriptors of
-    the others query it. docs/evaluation.md describes it, and every method.
+    Reads tracks and prints, for each method, the precision of search, the share of poses found,
+    bytes per landmark and search time. The protocol is the paper's: a random 90 % of the keyframes
+    build the map, and the descriptors of the others query it.
+
+    protomark evaluate kitchen.freak.safetensors --plot precision.png
     """
     from protomark.cli.terminal import (
         check_outputs,
@@ -73,6 +80,7 @@ def evaluate(
     from protomark.evaluation.results import (
         caption,
         evaluation_markdown,
+        group_by_descriptor,
         mean_rows,
         save_json,
         save_precision_plot,
@@ -99,10 +107,8 @@ def evaluate(
             results.append(result)
             console.print(_table(caption(result), result.rows()))
             if not any(method.family.startswith("protomark") for method in result.methods):
-                note(f"note: no encoder for {result.descriptor}: train one with `protomark train`")
-    by_descriptor: dict[str, list[SequenceResult]] = {}
-    for result in results:
-        by_descriptor.setdefault(result.descriptor, []).append(result)
+                note(f"no encoder for {result.descriptor}: train one with `protomark train`")
+    by_descriptor = group_by_descriptor(results)
     for descriptor, same in by_descriptor.items():
         if len(same) > 1:
             title = f"{descriptor.upper()}: mean of {len(same)} sequences"

@@ -8,22 +8,27 @@ from typing import Annotated, Any
 
 import typer
 
+from protomark.cli.options import JsonFile
+
 _BARS = "▁▂▃▄▅▆▇█"
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="A map, an encoder or a tracks file.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A map, an encoder or a tracks file.")
+    ],
     verify: Annotated[
         bool,
         typer.Option(
             "--verify", help="Check every checksum of a map or an encoder; tracks have none."
         ),
     ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the facts to this file.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
-    """Describe what a file holds."""
+    """Describe what a file holds, and what its bytes are spent on.
+
+    protomark info kitchen/scene.pmk --verify
+    """
     from protomark import verify_file
     from protomark.cli.terminal import check_outputs, error_console, write_json
     from protomark.maps.info import describe, is_tracks
@@ -42,21 +47,12 @@ def info(
 
 def show(facts: dict[str, Any]) -> None:
     """Print what `protomark.maps.info.describe` returned."""
-    from rich.table import Table
+    from protomark.cli.terminal import print_facts
 
-    from protomark.cli.terminal import console
-
-    table = Table.grid(padding=(0, 2))
-    table.add_column()
-    table.add_column(overflow="fold")
-    for name, text in _rows(facts):
-        table.add_row(name, text)
-    console.print(table)
+    print_facts(list(_rows(facts)))
 
 
 def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    from rich.markup import escape
-
     for key, value in facts.items():
         name = key.replace("_", " ")
         if value is None or key == "bytes_per_landmark_by_section":
@@ -70,12 +66,11 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         elif key == "bytes_by_section":
             for section, size in value.items():
                 each = facts["bytes_per_landmark_by_section"][section]
-                yield escape(_text(f"bytes: {section}")), f"{size:,}  {each:,.2f} per landmark"
+                yield _text(f"bytes: {section}"), f"{size:,}  {each:,.2f} per landmark"
         elif isinstance(value, dict):
-            for label, text in _nested_rows(name, value):
-                yield escape(label), escape(text)
+            yield from _nested_rows(name, value)
         else:
-            yield name, escape(_text(value))
+            yield name, _text(value)
 
 
 def _nested_rows(name: str, values: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -89,7 +84,7 @@ def _nested_rows(name: str, values: dict[str, Any]) -> Iterator[tuple[str, str]]
 
 
 def _bars(histogram: list[int]) -> str:
-    """A histogram of counts 1, 2, ... as one line of bars, with 16 and more in the last one."""
+    """Numbers of landmarks with 1, 2, ..., 16 and more observations, as one line of bars."""
     bins = [*histogram[1:16], sum(histogram[16:])]
     top = max(max(bins), 1)
     return "".join(_BARS[int(v / top * (len(_BARS) - 1))] if v else " " for v in bins)

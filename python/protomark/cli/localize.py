@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from protomark.cli.options import CameraText, JsonFile, MaxKeypoints, Threads
+
 if TYPE_CHECKING:
     from protomark.localization.batch import LocalizationBatch
 
@@ -15,25 +17,19 @@ def localize(
     scene: Annotated[
         Path,
         typer.Argument(
-            help="Map file (.pmk) whose landmarks have positions, or the folder that `protomark "
-            "map` wrote."
+            metavar="MAP", help="Map file (.pmk) with positions, or a folder of `protomark map`."
         ),
     ],
-    images: Annotated[list[Path], typer.Argument(help="Images, or folders of images.")],
+    images: Annotated[
+        list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders of images.")
+    ],
     output: Annotated[
         Path,
         typer.Option(
             "--output", "-o", help="Folder for images.txt, cameras.txt (COLMAP) and poses.csv."
         ),
     ] = Path("localized"),
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            help="A COLMAP cameras.txt, a folder with a COLMAP model, or a camera written out: "
-            "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'. By default the focal "
-            "length comes from EXIF data, or is estimated from matches."
-        ),
-    ] = None,
+    camera: CameraText = None,
     refine_focal_length: Annotated[
         bool,
         typer.Option(
@@ -50,41 +46,38 @@ def localize(
     priors: Annotated[
         Path | None,
         typer.Option(
-            help="Rough poses, in the same formats: only landmarks that are visible from them are "
+            help="Rough poses in the same formats: only landmarks that are visible from them are "
             "searched."
         ),
     ] = None,
     prior_distance: Annotated[
-        float, typer.Option(help="Largest error of a rough pose, in the map's units.")
+        float, typer.Option(help="Largest error of a rough position, in the map's unit.")
     ] = 1.0,
     prior_degrees: Annotated[
-        float, typer.Option(help="Largest error of its orientation, degrees.")
+        float, typer.Option(help="Largest error of a rough orientation, degrees.")
     ] = 15.0,
     min_confidence: Annotated[
         float,
         typer.Option(
             min=0,
             max=1,
-            help="Poses that are less likely to be right are listed in poses.csv only.",
+            help="Smallest probability of a pose in images.txt; poses.csv lists every image.",
         ),
     ] = 0.9,
-    max_keypoints: Annotated[
-        int, typer.Option(min=4, help="Keypoints kept in an image, strongest first.")
-    ] = 2000,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads to encode and search.")] = 1,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file.")
-    ] = None,
+    max_keypoints: MaxKeypoints = 2000,
+    threads: Threads = 1,
+    json_file: JsonFile = None,
 ) -> None:
     """Find where images were taken in a map, and how sure that is.
 
-    The map may be a learning map or a sealed one. An image that cannot be read or was taken
-    elsewhere does not end the run. docs/localization.md says more.
+    Reads a learning map or a sealed one, and images. Writes their poses, each with the probability
+    that it is right. An image that cannot be read, or was taken elsewhere, does not end the run.
 
     protomark localize kitchen new-photos/
     """
     from protomark.cli.terminal import check_outputs, progress_bar, write_json
     from protomark.localization.batch import LocalizationRequest, localize_files
+    from protomark.threads import available_threads
 
     check_outputs(json_file)
     request = LocalizationRequest(
@@ -98,7 +91,7 @@ def localize(
         prior_degrees=prior_degrees,
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
-        threads=threads,
+        threads=threads or available_threads(),
     )
     with progress_bar() as progress:
         batch = localize_files(request, output, progress)
@@ -109,8 +102,7 @@ def localize(
 
 
 def _show(batch: LocalizationBatch, output: Path) -> None:
-    """Print the summary."""
-    from protomark.cli.terminal import console, facts_table, printable
+    from protomark.cli.terminal import console, print_facts, printable
     from protomark.localization.batch import CAMERAS, POSES, TABLE
 
     facts = batch.summary()
@@ -133,7 +125,7 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
     if facts["median_position_error"] is not None:
         text = f"{facts['median_position_error']:.4g}, {facts['median_angle_error']:.3g} degrees"
         rows.append(("median error of localized", text))
-    console.print(facts_table(rows))
+    print_facts(rows)
     failed = [image for image in batch.images if image.error]
     for image in failed[:5]:
         line = printable(f"{image.name}: {image.error}")

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, Threads
+
 _NAMES_SHOWN = 3
 
 
@@ -18,8 +20,7 @@ def map_(
         Path | None, typer.Option("--output", "-o", help="Folder for the new map.")
     ] = None,
     into: Annotated[
-        Path | None,
-        typer.Option("--into", help="A map that `protomark map` made: extend it, in place."),
+        Path | None, typer.Option("--into", help="Folder of an existing map to extend in place.")
     ] = None,
     descriptor: Annotated[
         str,
@@ -27,42 +28,31 @@ def map_(
             "--descriptor", "-d", help="freak, orb, brisk, akaze, latch, beblid or teblid."
         ),
     ] = "akaze",
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            help="A COLMAP cameras.txt, a folder with a COLMAP model, or a camera written out: "
-            "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'. By default it is "
-            "calibrated while mapping."
-        ),
-    ] = None,
+    camera: CameraText = None,
     focal: Annotated[
         float | None,
         typer.Option(
-            help="Focal length to begin with, pixels; by default EXIF's, else 1.2 times the longer "
-            "side."
+            help="Focal length to start calibration with, pixels; by default that of EXIF data, "
+            "else 1.2 times the longer side of the image."
         ),
     ] = None,
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="Given poses, for which only landmarks are made: COLMAP model folder or "
-            "images.txt, or a TUM trajectory."
+            help="Known poses, which are not adjusted: a COLMAP model folder or images.txt, or a "
+            "TUM trajectory."
         ),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
     window: Annotated[
         int,
         typer.Option(
-            help="Number of latest keyframes that keep their descriptors, to make landmarks."
+            help="Number of latest keyframes that keep their descriptors, to triangulate landmarks."
         ),
     ] = 8,
-    dim: Annotated[int, typer.Option(help="Dimensions of a prototype.")] = 32,
-    encoder: Annotated[
-        str, typer.Option(help="Name or file of the encoder; by default the descriptor's own.")
-    ] = "",
-    max_keypoints: Annotated[
-        int, typer.Option(help="Keypoints kept in a frame, strongest first, spread over it.")
-    ] = 2000,
+    dim: Annotated[int, typer.Option(help="Numbers per prototype, one byte each.")] = 32,
+    encoder: EncoderName = None,
+    max_keypoints: MaxKeypoints = 2000,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue a map that Ctrl-C or a crash ended.")
     ] = False,
@@ -70,19 +60,16 @@ def map_(
         bool, typer.Option("--force", help="Make the map anew even if OUTPUT holds one.")
     ] = False,
     view: Annotated[
-        bool,
-        typer.Option("--view", help="Also write recording.rrd for the Rerun viewer."),
+        bool, typer.Option("--view", help="Also write recording.rrd for the Rerun viewer.")
     ] = False,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads to search and adjust on.")] = 1,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file.")
-    ] = None,
+    threads: Threads = 1,
+    json_file: JsonFile = None,
 ) -> None:
-    r"""Map a scene from images or a video: structure from motion.
+    """Map a scene from images or a video: structure from motion.
 
-    Frame by frame, each image is matched with the prototypes of the map and updates those it sees;
-    only the last few keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP
-    model), trajectory.txt (TUM format), report.html and report.json.
+    Matches frame by frame with the prototypes of the map, which learn from each match; only the
+    latest keyframes keep descriptors. OUTPUT gets scene.pmk (the map), sparse/ (a COLMAP model),
+    trajectory.txt (TUM format), report.html and report.json.
 
     protomark map walk.mp4 -o kitchen
 
@@ -90,18 +77,18 @@ def map_(
 
     protomark localize kitchen new-images/
 
-    Ctrl-C writes the map so far, and the same command with --resume continues it. docs/mapping.md
-    explains the pipeline.
+    Ctrl-C writes the map so far, and the same command with --resume continues it.
     """
     from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
     from protomark.extras import optional
     from protomark.mapping.options import MappingOptions
-    from protomark.mapping.session import MappingInterrupted, MapRequest, make_map
+    from protomark.mapping.session import MapRequest, make_map
+    from protomark.threads import available_threads
 
     scene = output or into
     if scene is None or (output is not None and into is not None):
         raise ValueError(
-            "name either a folder for the new map with -o, or a map to extend with --into"
+            "name either a folder for a new map with -o, or a map to extend with --into"
         )
     check_outputs(json_file)
     if view:
@@ -112,7 +99,7 @@ def map_(
         options=MappingOptions(
             descriptor=descriptor,
             max_keypoints=max_keypoints,
-            encoder=encoder,
+            encoder=encoder or "",
             dim=dim,
             window=window,
         ),
@@ -124,14 +111,10 @@ def map_(
         extend=into is not None,
         force=force,
         record=view,
-        threads=threads,
+        threads=threads or available_threads(),
     )
-    try:
-        with progress_bar() as progress:
-            figures = make_map(request, progress, note)
-    except MappingInterrupted:
-        note(f"stopped: the map so far is in {scene}; the same command with --resume continues it")
-        raise typer.Exit(130) from None
+    with progress_bar() as progress:
+        figures = make_map(request, progress, note)
     write_json(json_file, figures)
     _show(figures, scene)
 

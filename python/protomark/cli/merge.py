@@ -7,12 +7,15 @@ from typing import Annotated
 
 import typer
 
+from protomark.cli.options import JsonFile
+
 
 def merge(
     maps: Annotated[
         list[Path],
         typer.Argument(
-            metavar="MAP", help="Learning maps of the same encoder, dimensions and appearance bits."
+            metavar="MAP",
+            help="Learning maps of the same encoder, dimensions and appearance bits.",
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
@@ -24,23 +27,17 @@ def merge(
             "further map get new ids above all earlier ones.",
         ),
     ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the facts to this file.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Merge maps that were built apart, exactly.
 
-    The result is the map that would have been built from all observations together.
-    Landmarks with the same id are one landmark, and their observations are summed. The command
-    prints how many there are, as ids may be equal by accident. docs/sharing.md says more.
+    Reads learning maps and writes the map that would have been built from all their observations
+    together. Landmarks with the same id are one landmark, and their observations are summed. The
+    command prints how many there are, as ids may be equal by accident.
+
+    protomark merge monday.pmk tuesday.pmk -o week.pmk
     """
-    from protomark.cli.terminal import (
-        check_outputs,
-        console,
-        facts_table,
-        progress_bar,
-        write_json,
-    )
+    from protomark.cli.terminal import check_outputs, print_facts, progress_bar, write_json
     from protomark.maps.merge import merge_files
 
     check_outputs(output, json_file)
@@ -52,4 +49,4 @@ def merge(
         shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
         rows.append((Path(one["file"]).name, f"{one['landmarks']:,} landmarks{shared}"))
     rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
-    console.print(facts_table(rows))
+    print_facts(rows)

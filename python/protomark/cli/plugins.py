@@ -1,7 +1,8 @@
 """Commands of other distributions: entry points of the group `protomark.commands`.
 
-The name of an entry point is the command's, its value a function as Typer takes them. It is loaded
-when `--help` lists it or when the command is called, so its module should import little.
+The name of an entry point is that of the command, and its value is a function for Typer. The
+function is loaded when `--help` lists the command or when it is called, so its module should import
+little.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ GROUP = "protomark.commands"
 
 
 class CommandGroup(TyperGroup):
-    """The commands of `protomark`, its own first."""
+    """The commands of `protomark`, followed by those of other distributions."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names in the order in which `--help` lists them."""
-        own = super().list_commands(ctx)
-        return own + [name for name in _found() if name not in own]
+        names = super().list_commands(ctx)
+        return names + [name for name in _found() if name not in names]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of this name, None if there is none."""
-        own = super().get_command(ctx, cmd_name)
-        if own is not None or cmd_name not in (found := _found()):
-            return own
+        command = super().get_command(ctx, cmd_name)
+        if command is not None or cmd_name not in (found := _found()):
+            return command
         app = typer.Typer(
             add_completion=False,
             pretty_exceptions_enable=False,
@@ -38,7 +39,7 @@ class CommandGroup(TyperGroup):
 
 
 def _loaded(entry: EntryPoint) -> Any:
-    """The function of an entry point, or one that fails when it is called: help goes on."""
+    """The function of an entry point; if loading fails, one that raises when it is called."""
     try:
         return entry.load()
     except (ImportError, AttributeError) as error:

@@ -7,38 +7,44 @@ from typing import Annotated
 
 import typer
 
+from protomark.cli.options import JsonFile
+
 
 def split(
     file: Annotated[Path, typer.Argument(metavar="MAP", help="A learning map.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the parts.")],
     ids: Annotated[
         str,
-        typer.Option(help="Ids at which a part begins, ascending, for example 100000,200000."),
+        typer.Option(
+            metavar="ID,ID,...",
+            help="Split by id, before each of these, for example 100000,200000.",
+        ),
     ] = "",
     parts: Annotated[
-        int | None, typer.Option(min=1, help="Number of parts by id, of equally many landmarks.")
+        int | None,
+        typer.Option(min=1, help="Split by id into so many parts of equally many landmarks."),
     ] = None,
     cell_size: Annotated[
         float | None,
         typer.Option(
-            help="Edge of the cubes that divide space, in the unit of the positions; landmarks "
-            "without a position go into a part of their own."
+            help="Split by space into cubes with edges of this length, in the unit of the "
+            "positions; landmarks without a position get a part of their own."
         ),
     ] = None,
     sealed: Annotated[bool, typer.Option("--sealed", help="Seal the parts.")] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the facts to this file.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Split a map by id or by space.
 
-    The parts have no index. `protomark merge` makes the same map of them again.
+    Reads a learning map and writes one map file per part, without an index. `protomark merge`
+    makes the same map of the parts again.
+
+    protomark split city.pmk --cell-size 50 --sealed -o tiles/
     """
     from protomark.cli.terminal import (
         check_outputs,
         comma_separated_numbers,
-        console,
-        facts_table,
+        print_facts,
         progress_bar,
         write_json,
     )
@@ -54,4 +60,4 @@ def split(
         first, last = part["ids"]
         text = f"{part['landmarks']:,} landmarks, ids {first} to {last}, {part['bytes']:,} bytes"
         rows.append((Path(part["file"]).name, text))
-    console.print(facts_table(rows))
+    print_facts(rows)

@@ -1,4 +1,4 @@
-"""What all commands share: terminal output, progress, result files, and checks of outputs."""
+"""Terminal output, progress bars, result files and checks of outputs, for all commands."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from rich.table import Table
 from protomark.files import write_text
 from protomark.progress import Progress as Report
 
-# Results go to stdout; what only matters while waiting goes to stderr, so that pipes stay clean.
+# Results go to stdout; progress and notes go to stderr, so that pipes contain results only.
 console = Console()
 error_console = Console(stderr=True)
 
-# Seconds between lines of progress where stderr is no terminal.
+# Seconds between lines of progress if stderr is no terminal.
 _LINE_EVERY = 10.0
 
 
 def printable(text: str) -> str:
-    """The text with everything escaped that would control a terminal, or that none can show."""
+    """The text with all characters escaped that are not printable."""
     return "".join(
         c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
     )
@@ -50,12 +50,10 @@ def note(text: str) -> None:
 
 @contextmanager
 def progress_bar(prefix: str = "") -> Iterator[Report]:
-    """A function that draws the progress of one stage after the other.
+    """Yield a function that draws the progress of one stage after the other.
 
-    On a terminal this is a bar that disappears at the end, elsewhere a line every ten seconds.
-
-    Args:
-        prefix: printed before the name of each stage.
+    A terminal shows a bar that disappears at the end, any other output a line every ten seconds.
+    `prefix` comes before the name of each stage.
     """
     if not error_console.is_terminal:
         yield _plain_lines(prefix)
@@ -68,14 +66,14 @@ def progress_bar(prefix: str = "") -> Iterator[Report]:
         TimeRemainingColumn(),
         console=error_console,
         transient=True,
-        # Results printed meanwhile appear above the bar, unless stdout goes elsewhere.
+        # Results that are printed meanwhile appear above the bar.
         redirect_stdout=console.is_terminal,
     ) as bar:
         task, current = bar.add_task(prefix, total=None), ""
 
         def report(stage: str, done: int, total: int) -> None:
             nonlocal current
-            # A stage may append figures to its name after a comma; its clock goes on then.
+            # A stage may append figures to its name after a comma, which do not restart the clock.
             name = stage.partition(",")[0]
             if name != current:
                 bar.reset(task)
@@ -99,7 +97,7 @@ def _plain_lines(prefix: str) -> Report:
 
 
 def table_of(*columns: str, title: str = "", left: int = 1) -> Table:
-    """A table without rules but under its head; columns after the first `left` align right."""
+    """A table with a rule under its head; columns after the first `left` align right."""
     from rich.box import SIMPLE_HEAD
 
     table = Table(
@@ -117,23 +115,25 @@ def table_of(*columns: str, title: str = "", left: int = 1) -> Table:
     return table
 
 
-def facts_table(rows: list[tuple[str, str]]) -> Table:
-    """A table of names and values, without head or rules."""
+def print_facts(rows: list[tuple[str, str]]) -> None:
+    """Print names and values as a table without head or rules."""
     from rich.markup import escape
 
     table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")
     for row in rows:
         table.add_row(*(escape(printable(cell)) for cell in row))
-    return table
+    console.print(table)
 
 
 def readable_size(count: float) -> str:
-    """A number of bytes as KB or MB (powers of ten)."""
+    """A number of bytes in KB or MB (powers of ten)."""
     return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.0f} KB"
 
 
 def check_outputs(*paths: Path | None) -> None:
-    """Raise before any work if a result could not be written after it."""
+    """Raise before any work if its result could not be written."""
     for path in paths:
         if path is None:
             continue
@@ -144,7 +144,7 @@ def check_outputs(*paths: Path | None) -> None:
 
 
 def write_json(path: Path | None, facts: Any) -> None:
-    """Write the facts of a command to the file of `--json`, if one was named."""
+    """Write the facts of a command to the file of `--json`, if there is one."""
     if path is not None:
         write_text(path, json.dumps(facts, indent=2) + "\n")
 
@@ -163,4 +163,4 @@ def comma_separated_numbers(option: str, text: str) -> tuple[int, ...]:
     try:
         return tuple(int(number) for number in comma_separated(text))
     except ValueError:
-        raise ValueError(f"{option} {text}: not numbers with commas between them") from None
+        raise ValueError(f"{option} {text!r} is not a list of numbers such as 8,16,32") from None

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from protomark.cli.options import JsonFile, MaxKeypoints, Threads
+
 if TYPE_CHECKING:
     from protomark.tracks.make import TracksInput
 
@@ -44,35 +46,39 @@ def tracks(
         Path | None,
         typer.Option(
             "--database",
-            help="COLMAP database that already holds binary descriptors: they and the model's "
-            "points become the tracks, images are not read.",
+            help="COLMAP database with binary descriptors: its descriptors and the model's points "
+            "become the tracks, and images are not read.",
         ),
     ] = None,
-    max_keypoints: Annotated[
-        int, typer.Option(help="Keypoints kept in an image, strongest first, spread over it.")
-    ] = 2000,
+    max_keypoints: MaxKeypoints = 2000,
     partners: Annotated[
         int, typer.Option(help="About how many keyframes each keyframe is matched with.")
     ] = 24,
-    ratio: Annotated[float, typer.Option(help="Ratio test of matching, in (0, 1].")] = 0.8,
+    ratio: Annotated[
+        float,
+        typer.Option(help="Ratio test: a match is nearer than this share of the second nearest."),
+    ] = 0.8,
     max_error: Annotated[
         float, typer.Option(help="Largest epipolar and reprojection error, pixels.")
     ] = 3.0,
     min_angle: Annotated[
-        float, typer.Option(help="Smallest angle between two rays of a landmark, degrees.")
+        float, typer.Option(help="Smallest triangulation angle of a landmark, degrees.")
     ] = 1.0,
-    min_length: Annotated[int, typer.Option(help="Fewest observations of a landmark.")] = 3,
+    min_length: Annotated[
+        int, typer.Option(help="Leave out landmarks with fewer observations.")
+    ] = 3,
     refine_poses: Annotated[
         str,
         typer.Option(
-            help="yes, no, or auto: bundle adjustment where the matches say that the given poses "
-            "are only roughly right."
+            help="Whether bundle adjustment refines the given poses: yes, no, or auto: if the "
+            "matches do not fit them."
         ),
     ] = "auto",
     max_unlabelled: Annotated[
         int | None,
         typer.Option(
-            help="Keypoints without a landmark kept in a keyframe, the strongest (smaller files)."
+            help="Limit on keypoints without a landmark per keyframe, for smaller files; by "
+            "default all are kept."
         ),
     ] = None,
     augmentations: Annotated[
@@ -82,24 +88,23 @@ def tracks(
             "copies of each image, warped and with other light, blur and noise."
         ),
     ] = 0,
-    threads: Annotated[
-        int, typer.Option(help="CPU threads, 0 for one per core; the result is the same.")
-    ] = 0,
+    threads: Threads = 0,
     force: Annotated[
         bool, typer.Option("--force", help="Make files anew even if they are up to date.")
     ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Make tracks from images with known poses.
 
-    Tracks are keypoints, their descriptors, and the landmarks that they see.
-    A tracks file that was made with these options from this input is kept.
+    Reads images and their COLMAP model. Writes one file per sequence and descriptor with keypoints,
+    descriptors, and the landmarks that they observe. A file that was made with these options from
+    this input is kept.
+
+    protomark tracks kitchen/ -o tracks -d freak -d orb
     """
     from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
     from protomark.threads import available_threads
-    from protomark.tracks.extract import TracksOptions, find_sequence
+    from protomark.tracks.extract import TracksOptions
     from protomark.tracks.make import TracksInput, make_augmented_tracks, make_tracks
 
     options = [
@@ -119,7 +124,7 @@ def tracks(
     sources = [TracksInput(folder, images, model, database) for folder in folders]
     _check(sources, output, augmentations)
     check_outputs(json_file)
-    threads = threads if threads > 0 else available_threads()
+    threads = threads or available_threads()
     facts = []
     for source in sources:
         for one in options:
@@ -133,7 +138,7 @@ def tracks(
             _show(facts[-1], made.tracks.info)
             if not augmentations:
                 continue
-            folder = find_sequence(source.folder, images, model).images
+            folder = images or source.folder / "images"
             with progress_bar(f"{source.name}: ") as progress:
                 more = make_augmented_tracks(
                     made, folder, augmentations, force=force, threads=threads, progress=progress
@@ -144,27 +149,26 @@ def tracks(
 
 
 def _check(sources: list[TracksInput], output: Path, augmentations: int) -> None:
-    """Raise before any work if options do not fit together."""
+    """Raise before any work if options conflict."""
     first = sources[0]
     if augmentations < 0:
         raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
     if augmentations and first.database:
-        raise ValueError("--augmentations needs the images, and --database does not read them")
+        raise ValueError("--augmentations needs images, which --database does not read: drop one")
     if len(sources) > 1 and (first.images or first.model or first.database):
-        raise ValueError("--images, --model and --database go with one FOLDER, give one at a time")
+        raise ValueError("--images, --model and --database are for one FOLDER: give only one")
     names = [source.name for source in sources]
     double = sorted({n for n in names if names.count(n) > 1})
     if double:
         raise ValueError(
-            f"two folders are named {double[0]} and would write the same file; run them apart, "
-            "each with its own -o"
+            f"two folders are named {double[0]} and would write the same file: run the command for "
+            "each, with its own -o"
         )
     if output.exists() and not output.is_dir():
-        raise NotADirectoryError(f"{output}: not a folder, name one for the tracks with -o")
+        raise NotADirectoryError(f"{output} is not a folder: name one for the tracks with -o")
 
 
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
-    """Print counts, errors and the histogram of track lengths."""
     from rich.markup import escape
 
     from protomark.cli.terminal import note, say
@@ -186,16 +190,16 @@ def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
             + ("refined by bundle adjustment" if refined else "kept as they are")
         )
         if error > 1 and not refined:
-            note("  hint: these poses are only roughly right, --refine-poses auto refines them")
+            note("  these poses are only roughly right: --refine-poses auto refines them")
     without = info.get("images_without_pose") or []
     if without:
         more = f" and {len(without) - 3} more" if len(without) > 3 else ""
-        say(f"  left out, as they have no pose: {escape(', '.join(without[:3]))}{more}")
+        say(f"  left out without a pose: {escape(', '.join(without[:3]))}{more}")
     say("  observations per landmark:")
-    most = max(facts["track_length_histogram"].values(), default=0) or 1
+    top = max(facts["track_length_histogram"].values(), default=0) or 1
     for label, count in facts["track_length_histogram"].items():
         if count:
-            bar = "█" * max(1, round(_BAR * count / most))
+            bar = "█" * max(1, round(_BAR * count / top))
             say(f"  {label:>7} {bar:<{_BAR}} {count}")
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from protomark.cli.options import JsonFile, Threads
+
 if TYPE_CHECKING:
     from protomark.training.card import EncoderCard
     from protomark.training.encoder import TrainingRequest
@@ -15,20 +17,21 @@ if TYPE_CHECKING:
 
 def train(
     tracks: Annotated[
-        list[Path], typer.Argument(help="Tracks files to train on, one per sequence.")
+        list[Path],
+        typer.Argument(metavar="TRACKS", help="Tracks files to train on, one per sequence."),
     ],
     validation: Annotated[
         list[Path] | None,
         typer.Option(
             "--validation",
-            help="Tracks file that picks the model; may be repeated. By default the last of TRACKS "
-            "is not learned from but picks.",
+            help="Tracks file that selects the best model; may be repeated. By default the last of "
+            "TRACKS, which is then not trained on.",
         ),
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="Model file to write; by default DESCRIPTOR.pme, if not there."
+            "--output", "-o", help="Model file to write; by default DESCRIPTOR.pme, if it is new."
         ),
     ] = None,
     report: Annotated[
@@ -36,11 +39,11 @@ def train(
         typer.Option("--report", help="Tracks file to measure the result on; may be repeated."),
     ] = None,
     dims: Annotated[
-        str, typer.Option(help="Code lengths that shall serve, ascending.")
+        str, typer.Option(help="Code lengths that maps can choose from, ascending.")
     ] = "8,16,24,32,48,64",
-    steps: Annotated[int, typer.Option(help="Batches in all.")] = 4000,
-    batch: Annotated[int, typer.Option(help="Landmarks in a batch.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Of weights and batches.")] = 0,
+    steps: Annotated[int, typer.Option(help="Number of batches.")] = 4000,
+    batch: Annotated[int, typer.Option(help="Landmarks per batch.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Seed of weights and batches.")] = 0,
     upright: Annotated[
         bool,
         typer.Option(
@@ -49,41 +52,45 @@ def train(
         ),
     ] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    threads: Annotated[
-        int, typer.Option(help="CPU threads, 0 for one per core; take 1 on a busy machine.")
-    ] = 0,
+    threads: Threads = 0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the checkpoint beside the output.")
     ] = False,
-    name: Annotated[str, typer.Option(help="Name of the encoder; the output's if empty.")] = "",
+    name: Annotated[
+        str, typer.Option(help="Name of the encoder; by default that of the output.")
+    ] = "",
     licence: Annotated[str, typer.Option(help="Licence of the weights, for the model file.")] = "",
     data_licence: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=LICENCE", help="Licence of a sequence; may be repeated."),
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Train an encoder on tracks (needs PyTorch).
 
-    Works for any binary descriptor of 64 to 1024 bits: `protomark train my-tracks/*`. Beside the
-    model come its card (.md) and a picture of the training (.png) that is drawn anew at each
-    validation. Ctrl-C leaves a checkpoint, and the same command with --resume continues.
+    Reads tracks of any binary descriptor of 64 to 1024 bits. Writes the model (.pme), its card
+    (.md) and a picture of the training (.png) that is redrawn at each validation.
+
+    protomark train tracks/*.freak.safetensors -o my-freak.pme
+
+    Ctrl-C leaves a checkpoint, and the same command with --resume continues.
     """
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.cli.terminal import (
+        check_outputs,
+        comma_separated_numbers,
+        note,
+        progress_bar,
+        write_json,
+    )
     from protomark.extras import optional
 
     check_outputs(json_file)
     optional("torch")
     from protomark.training.data import hold_out
     from protomark.training.encoder import TrainingRequest, default_output, train_encoder
-    from protomark.training.train import TrainingInterrupted, TrainingOptions
+    from protomark.training.train import TrainingOptions
 
-    try:
-        parsed = tuple(int(d) for d in dims.split(","))
-    except ValueError:
-        raise ValueError(f"--dims {dims!r} is not a list of numbers such as 8,16,32") from None
+    numbers = comma_separated_numbers("--dims", dims)
     for entry in data_licence or []:
         if "=" not in entry:
             raise ValueError(f"--data-licence {entry!r} is not of the form NAME=LICENCE")
@@ -92,7 +99,7 @@ def train(
         training,
         selecting,
         output or default_output(training[0], resume, upright),
-        TrainingOptions(dims=parsed, steps=steps, landmarks=batch, seed=seed),
+        TrainingOptions(dims=numbers, steps=steps, landmarks=batch, seed=seed),
         report=report or [],
         resume=resume,
         upright=upright,
@@ -102,12 +109,8 @@ def train(
         device=device,
         threads=threads,
     )
-    try:
-        with progress_bar() as progress:
-            card = train_encoder(request, progress, note)
-    except TrainingInterrupted as stop:
-        note(f"{stop}; the same command with --resume continues ({request.output}.checkpoint)")
-        raise typer.Exit(130) from None
+    with progress_bar() as progress:
+        card = train_encoder(request, progress, note)
     write_json(json_file, asdict(card))
     _show(card, request)
 
@@ -116,16 +119,7 @@ def _show(card: EncoderCard, request: TrainingRequest) -> None:
     from protomark.cli.terminal import console, say, table_of
 
     table = table_of("sequence", "unaggregated", "dim", "bytes", "float", "integer", "ratio")
-    for f in card.figures:
-        for d in card.dims:
-            table.add_row(
-                f"{f.sequence} ({f.role})",
-                f"{f.unaggregated:.4f}",
-                str(d),
-                str(d + 1),
-                f"{f.float_precision[d]:.4f}",
-                f"{f.integer_precision[d]:.4f}",
-                f"{f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f}",
-            )
+    for sequence, _, unaggregated, _, _, *rest in card.figure_rows():
+        table.add_row(sequence, unaggregated, *rest)
     console.print(table)
     say(f"{request.output} ({card.bytes:,} bytes), {request.card_path} and {request.plot_path}")

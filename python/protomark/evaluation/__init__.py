@@ -1,1 +1,1 @@
-"""The protocol of the paper, its baselines, and reports."""
+"""Evaluates methods by the protocol of the paper."""

@@ -1,21 +1,19 @@
-"""The demo: from observations to poses, on the sample that ships."""
+"""The demo: from observations to poses, on the bundled sample."""
 
 from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import protomark as pm
 from protomark import sample
 from protomark.baselines.method import Method
 from protomark.baselines.support import Support
 from protomark.evaluation.frames import (
-    LocalizedFrame,
     QueryFrame,
     localize_frame,
     scene_depth,
@@ -24,6 +22,7 @@ from protomark.evaluation.frames import (
 from protomark.evaluation.methods import (
     APPEARANCE_BITS,
     APPEARANCE_DIMS,
+    MethodChoice,
     PrototypeMethod,
     choose_methods,
     method_choices,
@@ -43,11 +42,11 @@ OURS = (
     *("protomark-32x4", "protomark-64x4"),
     *("appearances-17", "appearances-33", "appearances-65"),
 )
-# Written into the picture, so that a later run recognises its own files.
+# Metadata of the picture, by which a later run recognises its own files.
 _MADE_BY = "protomark demo"
-# Bytes of a position in a sealed map.
+# Bytes per position in a sealed map.
 _POSITION_BYTES = 12
-# Bytes per landmark of the sealed map.
+# Bytes per landmark in the sealed map.
 _SIZE = 33
 
 
@@ -56,13 +55,14 @@ class DemoRow:
     """Results of one method.
 
     Attributes:
-        bytes_per_landmark: all that matching needs, the count included, the position not.
-        map_bytes: that of all landmarks, with positions.
+        name, label, family: see `methods.MethodChoice`.
+        bytes_per_landmark: all that matching needs, including the count, without the position.
+        map_bytes: bytes of all landmarks with positions.
         precision: share of query descriptors whose nearest landmark is their own.
         found: query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
         frames: query keyframes.
         median_error: median distance from the true camera centre, as a share of that depth.
-        ms_per_frame: matching and RANSAC of a whole frame on one thread.
+        ms_per_frame: milliseconds to match and localize a frame on one thread.
     """
 
     name: str
@@ -79,21 +79,21 @@ class DemoRow:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo built and compared.
+    """The maps of the demo, and its comparison.
 
     Attributes:
-        sequence: name of the tracks' sequence.
+        sequence: name of the sequence.
         descriptor: name of the descriptor.
-        bits: its length in bits.
-        support_keyframes: keyframes that built the map.
+        bits: length of the descriptor in bits.
+        support_keyframes: keyframes that build the map.
         landmarks: landmarks of the map.
         observations: observations of the map.
-        rows: one per method.
-        shown: name of the row that the sealed map and the picture are of.
-        folder: where the files were written.
-        files: sizes in bytes by name.
-        encoder_bytes: how many of the sealed map's bytes are its encoder.
-        seconds: from start to end.
+        rows: one row per method.
+        shown: name of the method that the sealed map and the picture show.
+        folder: folder of the files.
+        files: sizes in bytes by file name.
+        encoder_bytes: bytes of the encoder in the sealed map.
+        seconds: duration of the demo.
     """
 
     sequence: str
@@ -109,10 +109,6 @@ class DemoResult:
     encoder_bytes: int
     seconds: float
 
-    def as_dict(self) -> dict[str, object]:
-        """As JSON values."""
-        return asdict(self)
-
 
 def run_demo(
     output: Path,
@@ -121,16 +117,16 @@ def run_demo(
     encoder: str | None = None,
     progress: Progress = silent,
 ) -> DemoResult:
-    """Build, save and seal a map of the sample, localize query keyframes, compare, draw.
+    """Build, save and seal a map of the sample, localize query keyframes, compare and draw.
 
     Args:
-        output: folder for the two maps and the picture; it is made if it does not exist.
-        tracks_path: other tracks than the sample's.
-        encoder: name or path of the encoder; by default the descriptor's own.
+        output: folder of the two maps and the picture, created if it does not exist.
+        tracks_path: tracks to take in place of the sample's.
+        encoder: name or path of the encoder; None: the one for the descriptor.
         progress: called with each method.
 
     Raises:
-        FileExistsError: a file of the same name that the demo did not write is in the way.
+        FileExistsError: another file has the name of one that the demo writes.
     """
     began = time.perf_counter()
     tracks = Tracks.load(tracks_path or sample.path())
@@ -138,110 +134,88 @@ def run_demo(
     tracks = tracks_for(loaded, tracks)
     _check_output(output)
     output.mkdir(parents=True, exist_ok=True)
-    # The maps take their places together with the picture, by which a later run recognises them.
+    part = split(tracks, seed=0)
+    support = Support(
+        tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
+    )
+    # The maps replace older ones only with the picture, by which a later run recognises them.
     with tempfile.TemporaryDirectory(dir=output, prefix=".protomark-") as folder:
-        demo = _Demo(tracks, loaded, Path(folder))
-        rows, scene = demo.compare(progress)
-        shown = next(row for row in rows if row.name == demo.shown)
-        _draw(rows, shown, scene, output / PICTURE)
-        for name in (LEARNING_MAP, SEALED_MAP):
-            (Path(folder) / name).replace(output / name)
-    files = {name: (output / name).stat().st_size for name in (LEARNING_MAP, SEALED_MAP, PICTURE)}
+        sealed, name = _write_maps(tracks, part, loaded, Path(folder))
+        choices = method_choices([loaded])
+        ours = [choice.name for choice in choices if choice.name in OURS]
+        chosen = choose_methods(choices, [*BASELINES, *ours, name])
+        rows, pictures = [], {}
+        with one_blas_thread():
+            for done, choice in enumerate(chosen):
+                progress(f"compare, {choice.label}", done, len(chosen))
+                shown = choice.name == name
+                method = PrototypeMethod(sealed) if shown else choice.build(support)
+                row, pictures[choice.name] = _measure(choice, method, tracks, part, support)
+                rows.append(row)
+        _draw(rows, name, pictures[name], output / PICTURE)
+        for file in (LEARNING_MAP, SEALED_MAP):
+            (Path(folder) / file).replace(output / file)
     return DemoResult(
         sequence=str(tracks.info.get("sequence", "toy")),
         descriptor=tracks.descriptor,
         bits=tracks.bits,
-        support_keyframes=len(demo.part.support_keyframes),
-        landmarks=len(demo.support.ids),
-        observations=len(demo.support.landmarks),
+        support_keyframes=len(part.support_keyframes),
+        landmarks=len(support.ids),
+        observations=len(support.landmarks),
         rows=rows,
-        shown=demo.shown,
+        shown=name,
         folder=str(output),
-        files=files,
+        files={f: (output / f).stat().st_size for f in (LEARNING_MAP, SEALED_MAP, PICTURE)},
         encoder_bytes=dict(pm.file_sections(output / SEALED_MAP))["encoder"],
         seconds=time.perf_counter() - began,
     )
 
 
-class _Demo:
-    """The sample split into support and queries, and its map, sealed and opened again.
-
-    Attributes:
-        shown: name of the method that the sealed map is.
-    """
-
-    def __init__(self, tracks: Tracks, encoder: pm.Encoder, maps: Path) -> None:
-        self.tracks, self.encoder = tracks, encoder
-        self.part = split(tracks, seed=0)
-        rows = self.part.support_rows
-        self.support = Support(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
-        self.sealed, self.shown = _write_maps(tracks, self.part, encoder, maps)
-
-    def compare(self, progress: Progress) -> tuple[list[DemoRow], ScenePicture]:
-        """Each method's row, and the picture of the map that is shown."""
-        tracks, part = self.tracks, self.part
-        frames = [QueryFrame.of(tracks, int(keyframe)) for keyframe in part.query_keyframes]
-        choices = method_choices([self.encoder])
-        ours = [choice.name for choice in choices if choice.name in OURS]
-        chosen = choose_methods(choices, [*BASELINES, *ours, self.shown])
-        rows, depth = [], scene_depth(tracks)
-        located: list[LocalizedFrame] = []
-        matched: list[NDArray[np.float64]] = []
-        with one_blas_thread():
-            for done, choice in enumerate(chosen):
-                progress(f"compare, {choice.label}", done, len(chosen))
-                shown = choice.name == self.shown
-                method = PrototypeMethod(self.sealed) if shown else choice.build(self.support)
-                answers, _ = method.match(tracks.descriptors[part.query_rows])
-                right = answers[:, 0] == tracks.landmark_of_keypoint[part.query_rows]
-                start = time.perf_counter()
-                results = [_localize(method, frame, tracks) for frame in frames]
-                seconds = time.perf_counter() - start
-                if shown:
-                    located = [one for one, _ in results]
-                    matched = [positions[one.inliers] for one, positions in results]
-                size = method.bytes_per_landmark
-                errors = [one.position_error for one, _ in results]
-                rows.append(
-                    DemoRow(
-                        name=choice.name,
-                        label=choice.label,
-                        family=choice.family,
-                        bytes_per_landmark=size,
-                        map_bytes=round(len(self.support.ids) * (size + _POSITION_BYTES)),
-                        precision=float(right.mean()),
-                        found=sum(one.found(depth) for one, _ in results),
-                        frames=len(frames),
-                        median_error=float(np.median(errors)) / depth,
-                        ms_per_frame=1000 * seconds / len(frames),
-                    )
-                )
-        scene = ScenePicture(
-            landmarks=tracks.positions_of(self.support.ids),
-            matched=np.concatenate(matched),
-            support=tracks.cam_from_world[part.support_keyframes],
-            true=tracks.cam_from_world[part.query_keyframes],
-            estimated=[one.cam_from_world for one in located],
-        )
-        return rows, scene
-
-
-def _localize(
-    method: Method, frame: QueryFrame, tracks: Tracks
-) -> tuple[LocalizedFrame, NDArray[np.float64]]:
-    """The pose of a frame by a method, and the positions of the selected matches."""
-    matches = select_matches(*method.match(frame.descriptors))
-    positions = tracks.positions_of(matches.landmarks)
-    return localize_frame(frame, matches, positions), positions
+def _measure(
+    choice: MethodChoice, method: Method, tracks: Tracks, part: SupportQuerySplit, support: Support
+) -> tuple[DemoRow, ScenePicture]:
+    """The results of a method, and the data of a picture of its localized frames."""
+    answers, _ = method.match(tracks.descriptors[part.query_rows])
+    right = answers[:, 0] == tracks.landmark_of_keypoint[part.query_rows]
+    frames = [QueryFrame.of(tracks, int(keyframe)) for keyframe in part.query_keyframes]
+    start = time.perf_counter()
+    located, matched = [], []
+    for frame in frames:
+        matches = select_matches(*method.match(frame.descriptors))
+        positions = tracks.positions_of(matches.landmarks)
+        located.append(localize_frame(frame, matches, positions))
+        matched.append(positions[located[-1].inliers])
+    seconds = time.perf_counter() - start
+    size, depth = method.bytes_per_landmark, scene_depth(tracks)
+    row = DemoRow(
+        name=choice.name,
+        label=choice.label,
+        family=choice.family,
+        bytes_per_landmark=size,
+        map_bytes=round(len(support.ids) * (size + _POSITION_BYTES)),
+        precision=float(right.mean()),
+        found=sum(one.found(depth) for one in located),
+        frames=len(frames),
+        median_error=float(np.median([one.position_error for one in located])) / depth,
+        ms_per_frame=1000 * seconds / len(frames),
+    )
+    picture = ScenePicture(
+        landmarks=tracks.positions_of(support.ids),
+        matched=np.concatenate(matched),
+        support=tracks.cam_from_world[part.support_keyframes],
+        true=tracks.cam_from_world[part.query_keyframes],
+        estimated=[one.cam_from_world for one in located],
+    )
+    return row, picture
 
 
 def _write_maps(
     tracks: Tracks, part: SupportQuerySplit, encoder: pm.Encoder, output: Path
 ) -> tuple[pm.PrototypeMap | pm.SealedMap, str]:
-    """Build the map of the support, save and seal it, and open the sealed file again.
+    """Build, save and seal the map of the support; returns the sealed map and its method's name.
 
-    If the encoder has the dimensions for it the map keeps several appearances, in 33 bytes per
-    landmark, else one int8 prototype. Also returns the name of the method that this is.
+    If the encoder has the dimensions for it, the map keeps several appearances in 33 bytes per
+    landmark, otherwise one int8 prototype.
     """
     dim = APPEARANCE_DIMS[_SIZE]
     several = dim in encoder.dims
@@ -256,7 +230,8 @@ def _write_maps(
     return sealed, f"appearances-{_SIZE}" if several else f"protomark-{encoder.dim}"
 
 
-def _draw(rows: list[DemoRow], shown: DemoRow, scene: ScenePicture, path: Path) -> None:
+def _draw(rows: list[DemoRow], name: str, scene: ScenePicture, path: Path) -> None:
+    shown = next(row for row in rows if row.name == name)
     figure = new_figure(13, 6.2, w_pad=0.12, h_pad=0.08, wspace=0.04)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
     draw_scene(
@@ -265,49 +240,28 @@ def _draw(rows: list[DemoRow], shown: DemoRow, scene: ScenePicture, path: Path) 
         f"From above: {shown.found} of {shown.frames} queries found, "
         f"{shown.bytes_per_landmark:.0f} bytes per landmark",
     )
-    draw_curves(
-        right,
-        precision_curves([_summary(row) for row in rows]),
-        "bytes per landmark (log)",
-        "precision",
-        "Is the nearest landmark the right one?",
-    )
+    points = [
+        MethodSummary(row.name, row.label, row.family, row.bytes_per_landmark, row.precision)
+        for row in rows
+    ]
+    title = "Is the nearest landmark the right one?"
+    draw_curves(right, precision_curves(points), "bytes per landmark (log)", "precision", title)
     save_figure(figure, path, made_by=_MADE_BY)
 
 
-def _summary(row: DemoRow) -> MethodSummary:
-    return MethodSummary(
-        name=row.name,
-        label=row.label,
-        family=row.family,
-        bytes_per_landmark=row.bytes_per_landmark,
-        precision=row.precision,
-        spread=None,
-        ratio=None,
-        pose_recall=None,
-        right_share=None,
-        search_ms=row.ms_per_frame,
-    )
-
-
 def _check_output(output: Path) -> None:
-    """Raise before any work if a file that no demo wrote would be overwritten."""
+    """Raise before any work if the demo would overwrite a file that no demo wrote."""
     if output.exists() and not output.is_dir():
         raise FileExistsError(f"{output} is not a folder: name another one with --output")
     picture = output / PICTURE
-    if _is_demo_picture(picture):
-        return
-    # A map does not say who made it, so without the picture it counts as somebody else's.
+    if picture.is_file():
+        with picture.open("rb") as file:
+            if _MADE_BY.encode() in file.read(4096):
+                return
+    # A map does not tell who made it, so without the picture it may be somebody else's.
     for path in (picture, output / LEARNING_MAP, output / SEALED_MAP):
         if path.exists():
             raise FileExistsError(
                 f"{path} was not written by `protomark demo` and would be replaced: "
                 "name another folder with --output"
             )
-
-
-def _is_demo_picture(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return _MADE_BY.encode() in file.read(4096)

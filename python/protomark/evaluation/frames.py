@@ -1,4 +1,4 @@
-"""Localizes whole query keyframes from matches with a map, and measures how far off they are."""
+"""Localizes query keyframes by matches with a map, and measures their errors."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.pose import pose_error, transform
 from protomark.tracks.file import Tracks
 
-# A pose is found if it is off by at most this share of the median scene depth, and this angle.
+# A pose is found if its error is at most this share of the median scene depth, and this angle.
 DEPTH_SHARE = 0.01
 DEGREES = 2.0
-# This share of a frame's keypoints, those with the clearest matches, goes to RANSAC.
+# RANSAC gets the clearest matches, for this share of a frame's keypoints.
 SELECTED_SHARE = 0.25
 # Reprojection error of an inlier, and of a right match, as a share of the image's longer side.
 PIXEL_SHARE = 0.005
@@ -23,14 +23,14 @@ PIXEL_SHARE = 0.005
 
 @dataclass(frozen=True)
 class QueryFrame:
-    """One query keyframe: all its keypoints, with and without landmark.
+    """A query keyframe with all its keypoints, with and without landmark.
 
     Attributes:
         camera: its camera.
         cam_from_world: (3, 4) float64, its true pose.
         keypoints: (n, 2) float64, pixels.
         descriptors: (n, bits / 8) uint8.
-        landmarks: (n,) int64, the true landmark of each keypoint, -1 where none is known.
+        landmarks: (n,) int64, the true landmark of each keypoint, -1 if it is unknown.
     """
 
     camera: Camera
@@ -41,7 +41,7 @@ class QueryFrame:
 
     @classmethod
     def of(cls, tracks: Tracks, keyframe: int) -> QueryFrame:
-        """Keyframe number `keyframe` of some tracks."""
+        """The keyframe of this index in the tracks."""
         rows = tracks.keypoints_of(keyframe)
         return cls(
             camera=tracks.cameras[int(tracks.keyframe_camera[keyframe])],
@@ -53,13 +53,13 @@ class QueryFrame:
 
     @property
     def max_error(self) -> float:
-        """Pixels by which a right match may be off."""
+        """Largest reprojection error of a right match, pixels."""
         return PIXEL_SHARE * max(self.camera.width, self.camera.height)
 
 
 @dataclass(frozen=True)
 class FrameMatches:
-    """Selected matches of one frame, the clearest first.
+    """a selected matches of a frame, the clearest first.
 
     Attributes:
         keypoints: (a,) int64, row of the keypoint in its frame.
@@ -72,13 +72,13 @@ class FrameMatches:
 
 @dataclass(frozen=True)
 class LocalizedFrame:
-    """The pose of one frame, beside its true one.
+    """The pose of a frame and its error.
 
     Attributes:
-        cam_from_world: (3, 4) float64, or None where RANSAC found no pose.
+        cam_from_world: (3, 4) float64, None if RANSAC found no pose.
         position_error: distance of the camera centres, in world units, infinite without a pose.
         angle_error: angle between the orientations in degrees, infinite without a pose.
-        inliers: (a,) bool, which of the selected matches support the pose.
+        inliers: (a,) bool, whether each selected match supports the pose.
     """
 
     cam_from_world: NDArray[np.float64] | None
@@ -94,18 +94,17 @@ class LocalizedFrame:
 def select_matches(
     landmarks: NDArray[np.int64], distances: NDArray[np.floating], share: float = SELECTED_SHARE
 ) -> FrameMatches:
-    """The clearest matches of one frame.
+    """Select the clearest matches of a frame.
 
-    Keypoints are ranked by the ratio of the distances to their two nearest landmarks, equal
-    ratios by distance, then by order. A landmark keeps its best keypoint only. The first `share`
-    of the frame's keypoints is selected. A threshold on the ratio would favour some methods,
-    since ratios of Hamming and of Euclidean distances, and of few and of many dimensions,
-    spread differently; a share treats all alike.
+    Keypoints are ranked by the ratio of the distances to their two nearest landmarks, equal ratios
+    by distance, then by order, and a landmark keeps its first keypoint only. The first `share` of
+    the frame's keypoints is selected. A threshold on the ratio would favour some methods, as the
+    ratios of Hamming and Euclidean distances, and in few and many dimensions, spread differently.
 
     Args:
         landmarks: (n, 2) int64, two nearest landmarks, -1 where there is none.
         distances: (n, 2) float32.
-        share: how many of the n keypoints are selected at most.
+        share: limit on the selected share of the n keypoints.
     """
     nearest, second = distances[:, 0].astype(np.float64), distances[:, 1].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -120,12 +119,9 @@ def select_matches(
 def right_matches(
     frame: QueryFrame, matches: FrameMatches, positions: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether each match (a,) is the keypoint's true landmark, or one that projects near it.
+    """Whether each match (a,) is with the true landmark, or with one that projects near it.
 
-    Args:
-        frame: the frame, with its true pose.
-        matches: its selected matches.
-        positions: (a, 3) float64, position of each match's landmark.
+    `positions` (a, 3) are those of the matches' landmarks.
     """
     labelled = frame.landmarks[matches.keypoints] == matches.landmarks
     pixels = frame.camera.project(transform(frame.cam_from_world, positions))
@@ -136,12 +132,9 @@ def right_matches(
 def localize_frame(
     frame: QueryFrame, matches: FrameMatches, positions: NDArray[np.float64]
 ) -> LocalizedFrame:
-    """Absolute pose by PoseLib's RANSAC and refinement, beside the frame's true pose.
+    """Localize a frame by selected matches, and compare its pose with the true one.
 
-    Args:
-        frame: the frame.
-        matches: its selected matches, the clearest first.
-        positions: (a, 3) float64, position of each match's landmark.
+    `positions` (a, 3) are those of the matches' landmarks.
     """
     pixels = frame.keypoints[matches.keypoints]
     found = estimate_pose(pixels, positions, frame.camera, frame.max_error)
@@ -152,7 +145,7 @@ def localize_frame(
 
 
 def scene_depth(tracks: Tracks) -> float:
-    """Median, over all observations, of the landmark's depth in front of the camera."""
+    """Median depth of the landmarks over all observations, in world units."""
     rows = tracks.observations
     positions = tracks.positions_of(tracks.landmark_of_keypoint[rows])
     poses = tracks.cam_from_world[tracks.keyframe_of_keypoint[rows]]

@@ -1,4 +1,4 @@
-"""The compared methods, each under the name that `--methods`, JSON and tables use."""
+"""The compared methods, with their names in `--methods`, JSON and tables."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from protomark.baselines.support import Moments, Support
 from protomark.features.upright import SUFFIX
 from protomark.maps.info import matching_bytes
 
-# Codes of at least so many dimensions are compared at 4 bits per number, too.
+# Codes of at least this length are compared at 4 bits per number, too.
 MIN_4_BIT_DIM = 16
-# Bytes per landmark -> dimensions, for several appearances at 4 bits per number. Of 16 to 64
-# dimensions these were the most precise in as many bytes on the validation sequence.
+# Code lengths by bytes per landmark, for several appearances at 4 bits per number. Of lengths 16 to
+# 64 these were the most precise on the validation sequence.
 APPEARANCE_DIMS = {17: 24, 33: 48, 65: 64}
 APPEARANCE_BITS = 10
 PROJECTED_DIMS = (8, 16, 32, 64)
@@ -44,11 +44,11 @@ class MethodChoice:
     """A method that can be compared.
 
     Attributes:
-        name: short name, for example "pca-16".
-        label: what tables and plots say.
-        family: methods that differ only in size; plots join them by a line.
-        build: makes the map of a support.
-        default: whether it is compared when nobody names methods.
+        name: short name, such as "pca-16".
+        label: its name in tables and plots.
+        family: name of methods that differ only in size, which plots connect by a line.
+        build: builds the map of a support.
+        default: whether it is compared unless methods are named.
         upright: whether it takes upright descriptors (`protomark.features.upright`).
     """
 
@@ -61,15 +61,15 @@ class MethodChoice:
 
 
 class PrototypeMethod(Method):
-    """A map of prototypes, learning or sealed.
+    """A learning or a sealed map of prototypes.
 
-    A prototype has k int8 or 4-bit numbers. A landmark has one byte for the count, and where
-    landmarks have several prototypes one more that says how many.
+    A prototype has k numbers of 8 or 4 bits. A landmark has one byte for the count, and one for the
+    number of its prototypes if there may be several.
     """
 
     def __init__(self, scene: pm.PrototypeMap | pm.SealedMap) -> None:
         self.map = scene
-        # A learning map searches the int8 prototypes that a sealed one would hold.
+        # A learning map searches the int8 prototypes that a sealed one would have.
         self.bytes_per_landmark = matching_bytes(scene)
 
     def match(
@@ -90,13 +90,7 @@ def prototype_map(
 ) -> PrototypeMethod:
     """Protomark itself: means of an encoder's codes (Komorowski and Trzcinski, Eq. 1).
 
-    Args:
-        support: the observations.
-        encoder: an encoder for their descriptor.
-        dim: dimensions of a prototype, one of `encoder.dims`.
-        bytes_per_landmark: seal the map in so many bytes; None: int8 without loss.
-        appearance_bits: signs of a code that tell appearances apart.
-        threads: threads to encode on.
+    `bytes_per_landmark` and `appearance_bits` are those of `PrototypeMap` and its `seal`.
     """
     scene = pm.PrototypeMap(encoder, dim, appearance_bits)
     scene.add(support.landmarks, support.descriptors, threads=threads)
@@ -116,10 +110,9 @@ def method_choices(
     """Every method, in the order of tables.
 
     Args:
-        encoders: those of the descriptor in question; each is compared at all its dims.
-        discriminant_from: learn the linear discriminants from these moments, not from the
-            support.
-        threads: how many threads may build a map.
+        encoders: encoders for the descriptor, each of which is compared at all its dims.
+        discriminant_from: moments to learn linear discriminants from; None: those of the support.
+        threads: threads to build a map on.
     """
     listed = [
         MethodChoice("unaggregated", "Unaggregated", "unaggregated", unaggregated),
@@ -201,10 +194,10 @@ def _projected(
 def choose_methods(
     listed: Sequence[MethodChoice], names: Sequence[str] | None
 ) -> list[MethodChoice]:
-    """The methods of these names, or the default ones; "pca" stands for every "pca-...".
+    """The methods of these names or families, or the default ones.
 
     Raises:
-        ValueError: there is no method of some name; the message lists those there are.
+        ValueError: there is no method of some name.
     """
     if not names:
         return [choice for choice in listed if choice.default]

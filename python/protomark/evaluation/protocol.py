@@ -1,4 +1,4 @@
-"""The paper's protocol: which keyframes build the map, and which descriptors query it."""
+"""The paper's protocol: a split into keyframes that build the map, and queries."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class SupportQuerySplit:
     """Support and queries of one sequence at one seed.
 
     Attributes:
-        seed: what the split was drawn with.
+        seed: seed of the split.
         support_keyframes: (s,) int64, ascending indices of the keyframes that build the map.
         query_keyframes: (m - s,) int64, ascending indices of the others.
         support_rows: (o,) int64, ascending keypoint rows whose landmark is in the map.
-        query_rows: (q,) int64, ascending keypoint rows of the queries; the landmark of each is in
-            the map.
+        query_rows: (q,) int64, ascending keypoint rows of the queries, whose landmarks are in the
+            map.
     """
 
     seed: int
@@ -57,18 +57,18 @@ def split(
     """
     if tracks.info.get("augmentations"):
         raise ValueError(
-            "these tracks hold augmented copies of each keyframe, which are for training only; "
+            "these tracks hold augmented copies of each keyframe, which are for training only: "
             "give the plain tracks"
         )
     keyframes = len(tracks.keyframe_names)
     if keyframes < 2:
         raise ValueError(
-            f"{keyframes} keyframe(s) cannot be split into support and queries: "
-            "at least 2 are needed"
+            f"{keyframes} keyframe(s) cannot be split into support and queries: give tracks of "
+            "at least 2"
         )
     rng = np.random.default_rng(seed)
     order = rng.permutation(keyframes)
-    # round() would take halves to the even neighbour, which is hard to explain in a protocol.
+    # Halves are rounded up, where round() would round them to even.
     size = min(max(int(keyframes * support_share + 0.5), 1), keyframes - 1)
     in_support = np.zeros(keyframes, dtype=bool)
     in_support[order[:size]] = True
@@ -82,8 +82,8 @@ def split(
     query_rows = observations[in_map & ~supported]
     if not len(query_rows):
         raise ValueError(
-            f"no query keyframe sees a landmark with {min_observations} support observations "
-            f"(seed {seed}): the tracks are too few or too short to be evaluated"
+            f"no query keyframe observes a landmark with {min_observations} support observations "
+            f"(seed {seed}), so these tracks are too few or too short: give longer ones"
         )
     if len(query_rows) > max_queries:
         query_rows = np.sort(rng.choice(query_rows, size=max_queries, replace=False))

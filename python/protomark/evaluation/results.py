@@ -1,4 +1,4 @@
-"""Results of an evaluation, as JSON, tables and curves."""
+"""Results of an evaluation as JSON, tables and curves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TABLE_HEAD = (
     "right matches",
     "ms per 1,000 queries",
 )
-# Families of several sizes get a colour of their own, single methods are grey.
+# Families of several sizes have a colour, single methods are grey.
 _COLOURS = {"pca": AMBER, "discriminant": "#7c3aed"}
 _OUR_COLOURS = (OURS, "#0369a1", "#4d7c0f", "#be123c")
 _CURVE_LABELS = {
@@ -51,15 +51,15 @@ class MethodResult:
     """Results of one method on one sequence, with one entry per seed in the lists.
 
     Attributes:
-        name, label, family: as in `methods.MethodChoice`.
-        bytes_per_landmark: all that matching needs, the count included, the position not.
+        name, label, family: see `methods.MethodChoice`.
+        bytes_per_landmark: all that matching needs, including the count, without the position.
         precision: share of queries whose nearest landmark is their own.
         search_ms: milliseconds to search for 1,000 queries on one thread.
         build_s: seconds to build the map.
         frames: query keyframes that were localized.
-        found: those whose pose is within 1 % of the median scene depth and 2 degrees.
-        selected: matches that were given to RANSAC, over all frames.
-        right: those of them that are right.
+        found: query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
+        selected: matches for RANSAC, over all frames.
+        right: selected matches that are right.
     """
 
     name: str
@@ -75,7 +75,7 @@ class MethodResult:
     right: int = 0
 
     def summary(self) -> MethodSummary:
-        """Means over seeds; of the search times the least."""
+        """Means over seeds, but the least search time."""
         spread = float(np.std(self.precision, ddof=1)) if len(self.precision) > 1 else None
         return MethodSummary(
             name=self.name,
@@ -84,10 +84,9 @@ class MethodResult:
             bytes_per_landmark=float(np.mean(self.bytes_per_landmark)),
             precision=float(np.mean(self.precision)),
             spread=spread,
-            ratio=None,
             pose_recall=self.found / self.frames if self.frames else None,
             right_share=self.right / self.selected if self.selected else None,
-            # Other work on the machine only ever adds.
+            # Other programs on the machine only add time.
             search_ms=min(self.search_ms),
         )
 
@@ -97,10 +96,14 @@ class MethodSummary:
     """One row of a table.
 
     Attributes:
-        spread: standard deviation of the precision over seeds (or None with one seed).
-        ratio: precision as a share of the unaggregated one (or None where that was left out).
-        pose_recall: share of query keyframes whose pose was found (or None without frames).
-        right_share: share of right matches among those given to RANSAC (or None).
+        name, label, family: see `methods.MethodChoice`.
+        bytes_per_landmark: see `MethodResult`.
+        precision: mean precision.
+        spread: standard deviation of the precision over seeds, None with one seed.
+        ratio: precision as a share of the unaggregated one, None without that.
+        pose_recall: share of query keyframes whose pose was found, None without frames.
+        right_share: share of right matches among the selected ones, None without matches.
+        search_ms: milliseconds to search for 1,000 queries on one thread.
     """
 
     name: str
@@ -108,11 +111,11 @@ class MethodSummary:
     family: str
     bytes_per_landmark: float
     precision: float
-    spread: float | None
-    ratio: float | None
-    pose_recall: float | None
-    right_share: float | None
-    search_ms: float
+    spread: float | None = None
+    ratio: float | None = None
+    pose_recall: float | None = None
+    right_share: float | None = None
+    search_ms: float = 0.0
 
 
 @dataclass
@@ -120,10 +123,10 @@ class SequenceResult:
     """All methods on one sequence.
 
     Attributes:
-        sequence: its name.
+        sequence: name of the sequence.
         descriptor: name of the descriptor.
-        keyframes, landmarks, observations: of the tracks.
-        map_landmarks, support_observations, queries: means over seeds.
+        keyframes, landmarks, observations: numbers in the tracks.
+        map_landmarks, support_observations, queries: mean numbers over seeds.
         scene_depth: median depth of the observations, in world units.
         seeds: seeds of the splits.
         methods: one result per method, in the order of the table.
@@ -153,34 +156,24 @@ class SequenceResult:
 
 
 def mean_rows(results: Sequence[SequenceResult]) -> list[MethodSummary]:
-    """Means over sequences, of the methods that all of them have, in the first one's order."""
+    """Means over sequences of the methods that all of them have, in the order of the first."""
     tables = [{row.name: row for row in result.rows()} for result in results]
     rows = []
     for name, first in tables[0].items():
         if not all(name in table for table in tables):
             continue
         same = [table[name] for table in tables]
-        means = {
+        means: dict[str, Any] = {
             key: _mean([getattr(row, key) for row in same])
-            for key in ("ratio", "pose_recall", "right_share")
+            for key in ("bytes_per_landmark", "precision", "ratio", "pose_recall", "right_share")
         }
-        rows.append(
-            MethodSummary(
-                name=name,
-                label=first.label,
-                family=first.family,
-                bytes_per_landmark=float(np.mean([row.bytes_per_landmark for row in same])),
-                precision=float(np.mean([row.precision for row in same])),
-                spread=None,
-                search_ms=float(np.mean([row.search_ms for row in same])),
-                **means,
-            )
-        )
+        search_ms = float(np.mean([row.search_ms for row in same]))
+        rows.append(MethodSummary(name, first.label, first.family, **means, search_ms=search_ms))
     return rows
 
 
 def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -> None:
-    """Write results and the rows that tables show, whole or not at all."""
+    """Write results and the rows of their tables atomically."""
     sequences = [
         {**asdict(result), "table": [asdict(row) for row in result.rows()]} for result in results
     ]
@@ -189,7 +182,7 @@ def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -
 
 
 def load_json(path: str | os.PathLike[str]) -> list[SequenceResult]:
-    """Read what `save_json` wrote.
+    """Read results that `save_json` wrote.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -214,7 +207,7 @@ def _sequence_result(entry: dict[str, Any]) -> SequenceResult:
 
 
 def caption(result: SequenceResult) -> str:
-    """What was evaluated, in one line."""
+    """The data of an evaluation in one line."""
     return (
         f"{result.sequence}, {result.descriptor.upper()}: {result.keyframes} keyframes, "
         f"{result.map_landmarks:,.0f} landmarks in the map from "
@@ -224,7 +217,7 @@ def caption(result: SequenceResult) -> str:
 
 
 def table_row(row: MethodSummary) -> list[str]:
-    """One row of a table as text, in the order of its head."""
+    """The cells of a table row as text."""
     spread = f" ±{row.spread:.3f}" if row.spread is not None else ""
     return [
         row.label,
@@ -237,11 +230,18 @@ def table_row(row: MethodSummary) -> list[str]:
     ]
 
 
+def group_by_descriptor(results: Sequence[SequenceResult]) -> dict[str, list[SequenceResult]]:
+    """The results for each descriptor, in their order."""
+    groups: dict[str, list[SequenceResult]] = {}
+    for result in results:
+        groups.setdefault(result.descriptor, []).append(result)
+    return groups
+
+
 def evaluation_markdown(results: Sequence[SequenceResult]) -> str:
-    """All tables, and their mean where there are several, one descriptor after the other."""
+    """All tables by descriptor, and their mean if there are several."""
     parts = []
-    for descriptor in dict.fromkeys(result.descriptor for result in results):
-        same = [result for result in results if result.descriptor == descriptor]
+    for descriptor, same in group_by_descriptor(results).items():
         if len(same) > 1:
             names = ", ".join(result.sequence for result in same)
             parts.append(f"#### {descriptor.upper()}: mean of {names}\n")
@@ -253,13 +253,13 @@ def evaluation_markdown(results: Sequence[SequenceResult]) -> str:
 
 
 def summary_markdown(rows: Sequence[MethodSummary]) -> str:
-    """One table in Markdown; Protomark's rows are bold."""
+    """A table in Markdown, in which Protomark's rows are bold."""
     ours = [row.family.startswith("protomark") for row in rows]
     return markdown_table(_TABLE_HEAD, [table_row(row) for row in rows], ours)
 
 
 def precision_curves(rows: Sequence[MethodSummary]) -> list[Curve]:
-    """Precision over bytes per landmark; methods of one family are one curve."""
+    """Curves of precision over bytes per landmark, one per family of methods."""
     families: dict[str, list[MethodSummary]] = {}
     for row in rows:
         families.setdefault(row.family, []).append(row)
@@ -288,10 +288,10 @@ def precision_curves(rows: Sequence[MethodSummary]) -> list[Curve]:
 
 
 def save_precision_plot(rows: Sequence[MethodSummary], path: Path, title: str = "") -> None:
-    """Write precision over bytes per landmark as PNG, SVG or PDF.
+    """Plot precision over bytes per landmark as PNG, SVG or PDF.
 
     Raises:
-        ValueError: the suffix is another one.
+        ValueError: the path has another suffix.
     """
     figure = new_figure(8, 5)
     axes = figure.add_subplot()

@@ -1,4 +1,4 @@
-"""Runs all methods on the same queries of each sequence."""
+"""Evaluates methods on the same queries of each sequence."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class EvaluationOptions:
 
     Attributes:
         seeds: seeds of the splits.
-        pose_frames: query keyframes to localize at each seed, at most.
+        pose_frames: limit on query keyframes to localize per seed.
         threads: threads for all that is not timed.
-        encoders: names or files of encoders; a file is evaluated with those of its descriptor, or
-            of its upright form. None given: the one that ships for the descriptor.
-        methods: names of methods, or of families of methods; none given: the default ones.
-        discriminant_from: tracks files to learn the linear discriminants from; none given: they are
-            learned from each sequence's own support.
+        encoders: names or files of encoders, for the tracks' descriptors or their upright forms;
+            by default the one that ships for the descriptor.
+        methods: names of methods, or of families of methods; by default the default ones.
+        discriminant_from: tracks files to learn linear discriminants from; by default each
+            sequence's support.
     """
 
     seeds: Sequence[int] = (0, 1, 2)
@@ -90,10 +90,7 @@ def encoders_for(
 ) -> list[pm.Encoder]:
     """The encoders that take the descriptors of the tracks, or their upright form.
 
-    Args:
-        tracks: the tracks.
-        encoders: what to choose from.
-        given: whether the user named them; if not, only the one with the descriptor's name counts.
+    Unless the user gave them, only the encoder with the descriptor's name counts.
     """
     descriptor, bits = tracks.descriptor, tracks.bits
     if not given:
@@ -103,25 +100,25 @@ def encoders_for(
 
 
 def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
-    """Moments over several tracks files together, of landmarks with at least two observations.
+    """Moments over several tracks files, of landmarks with at least two observations.
 
     Raises:
         ValueError: a file holds other descriptors than `like`.
     """
-    landmarks, descriptors, at = [], [], 0
+    landmarks, descriptors, offset = [], [], 0
     for path in paths:
         tracks = Tracks.load(path)
         if (tracks.descriptor, tracks.bits) != (like.descriptor, like.bits):
             raise ValueError(
-                f"{path}: holds {tracks.descriptor} with {tracks.bits} bits, the tracks to "
+                f"{path} holds {tracks.descriptor} with {tracks.bits} bits, but the tracks to "
                 f"evaluate {like.descriptor} with {like.bits}: give tracks of the same descriptor"
             )
         rows = tracks.observations
         index = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
         repeated = np.bincount(index, minlength=len(tracks.landmark_ids))[index] >= 2
-        landmarks.append(index[repeated] + at)
+        landmarks.append(index[repeated] + offset)
         descriptors.append(tracks.descriptors[rows[repeated]])
-        at += len(tracks.landmark_ids)
+        offset += len(tracks.landmark_ids)
     return Support(np.concatenate(landmarks), np.concatenate(descriptors)).moments
 
 
@@ -132,17 +129,12 @@ def evaluate(
     options: EvaluationOptions,
     progress: Progress = silent,
 ) -> SequenceResult:
-    """Precision, pose recall and search time of each method at each seed.
+    """Measure precision, pose recall and search time of each method at each seed.
 
-    Args:
-        tracks: the sequence.
-        sequence: its name, for the tables.
-        methods: what to compare.
-        options: seeds, frames and threads.
-        progress: called with the method's label at each seed.
+    `progress` is called with each method's label at each seed.
     """
     results = [MethodResult(choice.name, choice.label, choice.family) for choice in methods]
-    # The same keypoints either way; only the bytes of their descriptors differ.
+    # Plain and upright tracks have the same keypoints, but other descriptors.
     sources = {False: tracks}
     if any(choice.upright for choice in methods):
         sources[True] = tracks.upright()
@@ -165,7 +157,7 @@ def evaluate(
             progress(stage, done, len(methods) * len(options.seeds))
             done += 1
             began = time.perf_counter()
-            # On small matrices more BLAS threads spend more time waiting than they save.
+            # For small matrices more BLAS threads wait longer than they save.
             with one_blas_thread():
                 method = choice.build(supports[choice.upright])
             result.build_s.append(time.perf_counter() - began)
@@ -190,22 +182,22 @@ def evaluate(
     )
 
 
-def draw_frames(tracks: Tracks, part: SupportQuerySplit, at_most: int) -> list[QueryFrame]:
-    """Up to `at_most` of the query keyframes, drawn at random, in order."""
+def draw_frames(tracks: Tracks, part: SupportQuerySplit, limit: int) -> list[QueryFrame]:
+    """Up to `limit` query keyframes, drawn at random, in order."""
     chosen = part.query_keyframes
-    if len(chosen) > at_most:
+    if len(chosen) > limit:
         rng = np.random.default_rng(part.seed)
-        chosen = np.sort(rng.choice(chosen, size=at_most, replace=False))
+        chosen = np.sort(rng.choice(chosen, size=limit, replace=False))
     return [QueryFrame.of(tracks, int(keyframe)) for keyframe in chosen]
 
 
 def measure_precision(
     tracks: Tracks, part: SupportQuerySplit, method: Method, threads: int, result: MethodResult
 ) -> None:
-    """Add the share of right answers, and the time of some queries on one thread, to a result."""
+    """Add the precision, and the time of a sample of queries on one thread, to a result."""
     queries = tracks.descriptors[part.query_rows]
     true = tracks.landmark_of_keypoint[part.query_rows]
-    # Queries are sorted by keyframe, so an even draw is as hard as the whole.
+    # Queries are sorted by keyframe, so an evenly spaced sample represents all of them.
     timed = np.unique(np.linspace(0, len(queries) - 1, TIMED_QUERIES).astype(np.int64))
     began = time.perf_counter()
     answers, _ = method.match(queries[timed], threads=1)
@@ -228,7 +220,7 @@ def measure_poses(
     threads: int,
     result: MethodResult,
 ) -> None:
-    """Add how many frames were localized, and how many selected matches were right, to a result."""
+    """Add the numbers of localized frames and of right matches to a result."""
     if not frames:
         return
     ends = np.cumsum([len(frame.keypoints) for frame in frames])

@@ -1,18 +1,21 @@
-"""The binary descriptors that OpenCV computes, each with the detector it is commonly used with."""
+"""The binary descriptors that OpenCV computes, with their detectors, and their bits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True)
 class DescriptorKind:
-    """A descriptor as it is commonly used.
+    """A descriptor and the detector that it is commonly used with.
 
     Attributes:
-        name: name on the command line and in files, for example "freak".
+        name: name on the command line and in files, such as "freak".
         bytes: length of a descriptor in bytes.
-        detector: the detector that finds its keypoints.
+        detector: the detector of its keypoints.
     """
 
     name: str
@@ -25,7 +28,6 @@ class DescriptorKind:
         return 8 * self.bytes
 
 
-# docs/tracks.md explains these pairs and gives their sources.
 DESCRIPTORS = {
     kind.name: kind
     for kind in (
@@ -41,7 +43,7 @@ DESCRIPTORS = {
 
 
 def descriptor_kind(name: str) -> DescriptorKind:
-    """The descriptor of a name.
+    """The descriptor of this name.
 
     Raises:
         ValueError: there is no such descriptor.
@@ -50,5 +52,10 @@ def descriptor_kind(name: str) -> DescriptorKind:
         return DESCRIPTORS[name.lower()]
     except KeyError:
         raise ValueError(
-            f"{name}: unknown descriptor, choose one of {', '.join(DESCRIPTORS)}"
+            f"{name} is not a descriptor of OpenCV: choose one of {', '.join(DESCRIPTORS)}"
         ) from None
+
+
+def unpack_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(n, B) uint8 -> (n, 8 B) uint8 of 0 and 1: bit i is bit i % 8 of byte i / 8, lowest first."""
+    return np.unpackbits(descriptors, axis=1, bitorder="little")

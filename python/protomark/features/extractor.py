@@ -1,4 +1,4 @@
-"""Detects keypoints in an image and describes them."""
+"""Detects and describes the keypoints of images."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 
 from protomark.extras import missing, optional
 from protomark.features.descriptors import descriptor_kind
-from protomark.geometry.neighbours import near_pairs
+from protomark.geometry.neighbours import near_pairs, runs
 
-# Two keypoints closer than this (pixels) are one place in the image, found at two pyramid levels or
-# at two corners of one edge. As landmarks they would look alike and lie within the error of each
-# other, so that nobody could say which of them a query should find.
+# Two keypoints closer than this (pixels) are one image point, detected at two pyramid levels or at
+# two corners of one edge. As landmarks their descriptors would be alike and their distance within
+# the error, so that a query could not tell them apart.
 MIN_DISTANCE = 4.0
 
-_AKAZE_THRESHOLDS = (1e-3, 1e-4)  # strict first, then for images with little contrast
+_AKAZE_THRESHOLDS = (1e-3, 1e-4)  # the second is for images with little contrast
+
+
+FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
 
 
 @dataclass
@@ -29,8 +32,8 @@ class Features:
         keypoints: (n, 2) float32, pixels; the centre of the upper left pixel is (0.5, 0.5).
         sizes: (n,) float32, diameter in pixels.
         angles: (n,) float32, degrees clockwise in [0, 360), -1 where there is none.
-        responses: (n,) float32, strength given by the detector.
-        octaves: (n,) int32, pyramid level given by the detector.
+        responses: (n,) float32, the detector's strength.
+        octaves: (n,) int32, the detector's pyramid level.
         descriptors: (n, bits / 8) uint8.
     """
 
@@ -44,6 +47,10 @@ class Features:
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    def where(self, rows: NDArray[Any]) -> Features:
+        """The keypoints at these rows (k,), or for which `rows` (n,) is true."""
+        return Features(*(getattr(self, name)[rows] for name in FEATURE_ARRAYS))
+
 
 class Extractor:
     """Detects and describes the keypoints of images.
@@ -52,19 +59,19 @@ class Extractor:
 
     Args:
         name: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
-        max_keypoints: the most keypoints to keep in an image: the strongest, spread over it.
+        max_keypoints: limit on keypoints per image: the strongest, spread over the image.
     """
 
     def __init__(self, name: str, max_keypoints: int = 2000) -> None:
         cv2 = optional("cv2")
         if max_keypoints < 1:
-            raise ValueError(f"max_keypoints is {max_keypoints}, it must be at least 1")
+            raise ValueError(f"max_keypoints is {max_keypoints}, but it must be at least 1")
         self.kind = descriptor_kind(name)
         self.max_keypoints = max_keypoints
         if not hasattr(cv2, "xfeatures2d"):
             raise missing("cv2.xfeatures2d")
         extra = cv2.xfeatures2d
-        # Detectors with a strict threshold first, then with lower ones for little contrast.
+        # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
         self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
         self._high_contrast = False
@@ -89,16 +96,16 @@ class Extractor:
         }[self.kind.name]().compute
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
-        """Features of a (height, width) uint8 image, the strongest first."""
-        # Some descriptors drop keypoints near the border, FREAK silently.
+        """The features of a (height, width) uint8 image, the strongest first."""
+        # Some descriptors drop keypoints near the border.
         described, descriptors = self._describe(image)
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
         if descriptors.shape != (len(described), self.kind.bytes):
             raise ValueError(
-                f"OpenCV gave {self.kind.name} descriptors of {descriptors.shape[1]} bytes, "
-                f"expected {self.kind.bytes}"
+                f"OpenCV returns {self.kind.name} descriptors of {descriptors.shape[1]} bytes, not "
+                f"{self.kind.bytes}: install another version"
             )
         n = len(described)
         xy = np.array([k.pt for k in described], np.float32).reshape(n, 2)
@@ -106,22 +113,16 @@ class Extractor:
         angles = np.array([k.angle for k in described], np.float32)
         responses = np.array([k.response for k in described], np.float32)
         octaves = np.array([k.octave for k in described], np.int32)
-        # -1 is OpenCV's "no angle"; orientations come in (-180, 180] or [0, 360).
+        # OpenCV's angles are -1 for none, or in (-180, 180] or [0, 360).
         angles = np.where(angles == -1, -1, np.mod(angles, 360)).astype(np.float32)
         angles[angles >= 360] = 0
-        # Some descriptors sort keypoints by pyramid level.
+        # Some descriptors reorder keypoints by pyramid level.
         order = np.lexsort((octaves, xy[:, 0], xy[:, 1], -responses))
-        return Features(
-            xy[order] + np.float32(0.5),
-            sizes[order],
-            angles[order],
-            responses[order],
-            octaves[order],
-            descriptors[order],
-        )
+        xy += np.float32(0.5)
+        return Features(xy, sizes, angles, responses, octaves, descriptors).where(order)
 
     def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
-        """The selected keypoints, and their descriptors."""
+        """Selected keypoints and their descriptors."""
         if self._akaze is not None:
             return self._describe_akaze(image, self._akaze)
         for detect in self._detect:
@@ -133,10 +134,11 @@ class Extractor:
     def _describe_akaze(
         self, image: NDArray[np.uint8], akaze: Callable[[Any, None], tuple[Sequence[Any], Any]]
     ) -> tuple[Sequence[Any], Any]:
-        """The same for AKAZE, with the scale space, which is most of the work, built once.
+        """Selected AKAZE keypoints and their descriptors, with as few scale spaces as possible.
 
-        At the low threshold keypoints and descriptors come from one scale space. Whether the strict
-        threshold suffices is guessed from the image before; the result does not depend on it.
+        At the low threshold keypoints and descriptors come from one scale space, which is most of
+        the work. Whether the strict threshold suffices is guessed from the previous image; the
+        result does not depend on the guess.
         """
         if not self._high_contrast:
             keypoints, descriptors = akaze(image, None)
@@ -157,7 +159,7 @@ class Extractor:
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:
-    """Up to `limit` keypoints, the strongest in each cell of a grid first, none too close."""
+    """Indices of up to `limit` keypoints, the strongest per grid cell first, none too close."""
     if not found:
         return []
     xy = np.array([k.pt for k in found], np.float64)
@@ -165,30 +167,27 @@ def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[i
     order = np.lexsort(([k.octave for k in found], xy[:, 0], xy[:, 1], -response))
     order = order[: 5 * limit]
     order = order[_apart(xy[order], MIN_DISTANCE)]
-    # About four keypoints per cell if they were spread evenly.
+    # Evenly spread keypoints would be four per cell.
     cell = max(1.0, float(np.sqrt(width * height / max(1.0, limit / 4))))
     columns = int(width // cell) + 1
-    cells = (xy[order, 1] // cell).astype(np.int64) * columns + (xy[order, 0] // cell).astype(
-        np.int64
-    )
+    column, row = (xy[order] // cell).astype(np.int64).T
+    cells = row * columns + column
     by_cell = np.argsort(cells, kind="stable")
-    starts = np.flatnonzero(np.diff(cells[by_cell], prepend=-1))
+    starts, lengths = runs(cells[by_cell])
     rank = np.empty(len(cells), np.int64)
-    rank[by_cell] = np.arange(len(cells)) - np.repeat(
-        starts, np.diff(np.append(starts, len(cells)))
-    )
+    rank[by_cell] = np.arange(len(cells)) - np.repeat(starts, lengths)
     chosen: list[int] = order[np.argsort(rank, kind="stable")[:limit]].tolist()
     return chosen
 
 
 def _apart(xy: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
-    """Indices of the points left when each point removes all later ones closer than `distance`."""
+    """Indices of the points that remain when each one removes all later ones within `distance`."""
     later, earlier = near_pairs(xy, xy, distance)
     close = (earlier < later) & (((xy[later] - xy[earlier]) ** 2).sum(1) < distance * distance)
     later, earlier = later[close], earlier[close]
     remaining = np.ones(len(xy), bool)
     while len(later):
-        # A point with no earlier neighbour left stays, and its later neighbours are removed.
+        # A point without an earlier neighbour remains, and its later neighbours are removed.
         undecided = np.zeros(len(xy), bool)
         undecided[later] = True
         removed = np.zeros(len(xy), bool)

@@ -25,28 +25,28 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not an image, or is cut off.
+        ValueError: the file is not an image, or it is truncated.
     """
     cv2 = optional("cv2")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
     data = np.fromfile(path, dtype=np.uint8)
-    # OpenCV fills the missing rows of a cut-off image with grey and only warns.
+    # OpenCV fills the missing rows of a truncated image with grey and only warns.
     start, end = data[:4].tobytes(), data[-4096:].tobytes()
     for magic, last in ((b"\xff\xd8", b"\xff\xd9"), (b"\x89PNG", b"IEND")):
         if start.startswith(magic) and last not in end:
             raise ValueError(
-                f"{path}: image is truncated (its end marker is missing), copy it anew"
+                f"{path}: the image is truncated (its end marker is missing), copy it anew"
             )
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(data, flags) if len(data) else None
     if image is None:
-        raise ValueError(f"{path}: not a readable image, or a truncated one; copy it anew")
+        raise ValueError(f"{path}: the image is truncated, or of an unknown format: copy it anew")
     return np.asarray(image, dtype=np.uint8)
 
 
 def to_gray(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """A (height, width) grey or (height, width, 3) BGR uint8 image as (height, width).
+    """Convert a (height, width) grey or (height, width, 3) BGR uint8 image to (height, width).
 
     Raises:
         ValueError: the array is not such an image.
@@ -59,6 +59,6 @@ def to_gray(image: NDArray[Any]) -> NDArray[np.uint8]:
     if image.ndim == 2:
         return image
     if image.shape[2] != 3:
-        raise ValueError(f"an image has 3 colours, not {image.shape[2]}")
+        raise ValueError(f"a colour image has 3 channels, not {image.shape[2]}")
     cv2 = optional("cv2")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -1,11 +1,11 @@
-"""A keypoint's angle and size as further bits of its descriptor, for cameras that stay upright.
+"""Adds a keypoint's angle and size to its descriptor, for cameras that stay upright.
 
 Binary descriptors are rotated by the keypoint's angle so that they do not change as the camera
-rolls. A camera that does not roll (on a car, a robot, a headset, a phone held as usual) sees the
-same angle at a landmark again and again, and that angle tells landmarks apart; so does the size of
-the keypoint. Komorowski and Trzcinski name this as future work. Encoders `<descriptor>-upright`
-take such longer descriptors. Both the map and the queries must be made with them, and where the
-camera rolls (a drone that comes back the other way) the plain encoder is better.
+rolls. A camera that does not roll (on a car, a robot, a headset, a phone held as usual) observes
+about the same angle at a landmark each time, so the angle tells landmarks apart, and so does the
+size of the keypoint. Komorowski and Trzcinski name this as future work. Encoders
+`<descriptor>-upright` take such longer descriptors, which both the map and the queries must have.
+If the camera rolls (a drone that returns the other way), the plain encoder is better.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ BYTES = 8
 _ANGLE_BINS = 32  # of the full turn
 _SIZE_BINS = 32  # a quarter octave each
 _MIN_SIZE = 6.0  # pixels, of the first bin
-# Neighbouring bins that are set, too, so that near values share bits.
+# Neighbouring bins on either side that are set, too, so that near values share bits.
 _ANGLE_REACH, _SIZE_REACH = 3, 2
 
 
@@ -29,16 +29,16 @@ def upright_descriptors(
 
     Args:
         descriptors: (n, B) uint8.
-        angles: (n,) degrees as OpenCV's KeyPoint.angle; negative or NaN: unknown, no bit is set.
-        sizes: (n,) pixels as OpenCV's KeyPoint.size; not positive or NaN: unknown.
+        angles: (n,) degrees, OpenCV's KeyPoint.angle; negative or NaN if unknown: no bit is set.
+        sizes: (n,) pixels, OpenCV's KeyPoint.size; not positive or NaN if unknown: likewise.
 
     Returns:
-        (n, B + 8) uint8: the descriptor, then 32 bits for the angle (bins of 11.25 degrees; the
-        keypoint's bin and three on either side are set) and 32 for the size (bins of a quarter
-        octave from 6 pixels on; the keypoint's bin and two on either side are set).
+        (n, B + 8) uint8: the descriptor, 32 bits for the angle (bins of 11.25 degrees, of which
+        the keypoint's and three on either side are set), and 32 bits for the size (bins of a
+        quarter octave from 6 pixels on, of which the keypoint's and two on either side are set).
 
     Raises:
-        ValueError: the lengths differ.
+        ValueError: the lengths of the arrays differ.
     """
     descriptors = np.ascontiguousarray(descriptors, np.uint8)
     angle, size = np.asarray(angles, np.float64), np.asarray(sizes, np.float64)

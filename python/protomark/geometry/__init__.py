@@ -1,1 +1,1 @@
-"""Cameras, poses, COLMAP models and the estimation of poses. Conventions are COLMAP's."""
+"""Cameras, poses, COLMAP models and the estimation of poses, with COLMAP's conventions."""

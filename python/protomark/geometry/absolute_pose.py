@@ -1,4 +1,4 @@
-"""Estimates where a camera stands from keypoints and the landmarks that they see."""
+"""Estimates the pose of a camera from keypoints and the landmarks that they observe."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 MAX_ITERATIONS = 2000
 MIN_ITERATIONS = 100
 
-# Whether a camera's focal length is right, roughly right and to be refined, or to be estimated.
+# A camera's focal length is right, roughly right and to be refined, or to be estimated.
 FocalLength = Literal["known", "rough", "unknown"]
 
 # Camera models that both COLMAP and PoseLib know.
@@ -32,7 +32,7 @@ POSE_MODELS = (
     "OPENCV_FISHEYE",
 )
 
-# Refinement: errors count less beyond this share of the largest error, up to this cost.
+# In refinement, errors count less beyond this share of the largest error, and cost at most this.
 _LOSS_SHARE = 0.5
 _MAX_LOSS = 20.0
 _REFINE_STEPS = 30
@@ -45,7 +45,7 @@ class AbsolutePose:
     Attributes:
         cam_from_world: (3, 4) float64.
         inliers: (n,) bool.
-        camera: the camera, with another focal length where that was estimated.
+        camera: the camera, with the estimated focal length if that was not known.
     """
 
     cam_from_world: Array
@@ -72,19 +72,18 @@ def estimate_pose(
     max_error: float,
     focal_length: FocalLength = "known",
 ) -> AbsolutePose | None:
-    """Absolute pose by RANSAC and refinement; None where four matches never agree.
+    """Absolute pose by RANSAC and refinement; None if no four matches agree.
 
-    Known cameras take PoseLib's LO-RANSAC with progressive sampling (Chum and Matas, PROSAC, CVPR
-    2005), others COLMAP's, whose refinement moves the focal length, too. Equal matches give equal
-    poses.
+    With a known focal length this is PoseLib's LO-RANSAC with progressive sampling (Chum and Matas,
+    PROSAC, CVPR 2005), otherwise COLMAP's, whose refinement moves the focal length, too. Equal
+    matches give equal poses.
 
     Args:
-        pixels: (n, 2) float64, keypoints, those of the likeliest matches first.
-        positions: (n, 3) float64, the landmark of each, in world coordinates.
-        camera: the camera; where its focal length is unknown, only its principal point and the
-            image size count.
-        max_error: reprojection error of an inlier, pixels.
-        focal_length: what is known of the camera's focal length.
+        pixels: (n, 2) float64, keypoints, the likeliest matches first.
+        positions: (n, 3) float64, their landmarks in world coordinates.
+        camera: the camera; if its focal length is unknown, only principal point and size count.
+        max_error: largest reprojection error of an inlier, pixels.
+        focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
 
     Raises:
         ValueError: poses cannot be estimated for this camera model.
@@ -130,7 +129,7 @@ def _estimate_with_focal_length(
     estimation.ransac.random_seed = 0
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     refinement.refine_focal_length = True
-    # A camera of its own: COLMAP writes the refined parameters into it.
+    # COLMAP writes the refined parameters into this camera.
     refined = pycolmap.Camera(camera.as_dict())
     with quiet():
         found = pycolmap.estimate_and_refine_absolute_pose(
@@ -154,17 +153,15 @@ def refine_pose(
     max_error: float,
     weights: Array | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Move a pose to the least (Cauchy) reprojection error by Levenberg-Marquardt.
-
-    PoseLib's refinement takes no weights.
+    """Move a pose to the least (Cauchy) reprojection error by Levenberg-Marquardt, with weights.
 
     Args:
         cam_from_world: (3, 4) float64, the pose to start from.
         pixels: (n, 2) float64, keypoints.
-        positions: (n, 3) float64, their landmarks in the world.
+        positions: (n, 3) float64, their landmarks in world coordinates.
         camera: the camera.
         max_error: largest reprojection error of an inlier, pixels.
-        weights: (n,) float64, how much each squared error counts, for the inliers, too; None: 1.
+        weights: (n,) float64, weights of the squared errors, also of inliers; None: 1.
 
     Returns:
         The pose (3, 4), and the inliers (n,) bool.
@@ -194,7 +191,7 @@ def _minimise(pose: Array, positions: Array, rays: Array, weights: Array, scale:
         in_front = square < np.inf
         z = np.where(in_front, z, 1.0)
         u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
-        # Derivatives by a small rotation, then by a small translation, in camera coordinates.
+        # Derivatives with respect to a small rotation and translation in camera coordinates.
         by_rotation = np.array([[-u * v, one + u * u, -v], [-one - v * v, u * v, u]])
         by_translation = np.array([[one, zero, -u], [zero, one, -v]]) / z
         jacobian = np.concatenate([by_rotation, by_translation], axis=1).transpose(2, 0, 1)
@@ -220,6 +217,6 @@ def _minimise(pose: Array, positions: Array, rays: Array, weights: Array, scale:
 def reprojection_error(
     cam_from_world: Array, pixels: Array, positions: Array, camera: Camera
 ) -> Array:
-    """Distance (n,) in pixels from keypoints to their projected landmarks, infinite behind."""
+    """Distance (n,) in pixels of keypoints from projected landmarks, infinite behind the camera."""
     projected = camera.project(transform(cam_from_world, positions))
     return np.asarray(np.linalg.norm(projected - pixels, axis=1))

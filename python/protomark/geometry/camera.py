@@ -1,4 +1,4 @@
-"""Cameras: COLMAP's models, as numbers that need no other library until pixels are projected."""
+"""Cameras with COLMAP's models; only projection needs pycolmap."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# How many parameters each of COLMAP's camera models has (src/colmap/sensor/models.h there).
+# Number of parameters of COLMAP's camera models (src/colmap/sensor/models.h there).
 CAMERA_MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -42,9 +42,9 @@ class Camera:
     """A COLMAP camera.
 
     Attributes:
-        model: name of the camera model, for example "PINHOLE".
-        width: image width in pixels; 0 if the camera serves images of any size.
-        height: image height in pixels, likewise.
+        model: name of the camera model, such as "PINHOLE".
+        width: image width in pixels; 0 if the camera fits images of any size.
+        height: image height in pixels; 0 likewise.
         params: the model's parameters in COLMAP's order. The centre of the upper left pixel is at
             (0.5, 0.5).
     """
@@ -59,7 +59,7 @@ class Camera:
         """Read MODEL:PARAMETERS, or MODEL WIDTH HEIGHT PARAMETERS as in COLMAP's cameras.txt.
 
         Raises:
-            ValueError: the text describes no camera that poses can be estimated for.
+            ValueError: the text is no such camera, or its first parameter is not positive.
         """
         has_size = ":" not in text
         words = text.replace(":", " ").replace(",", " ").split()
@@ -69,15 +69,15 @@ class Camera:
             name = words[0].upper()
         except IndexError:
             raise ValueError(
-                f"camera {text!r} lacks numbers, for example {CAMERA_EXAMPLE}"
+                f"camera {text!r} lacks numbers: write, for example, {CAMERA_EXAMPLE}"
             ) from None
         except ValueError:
             raise ValueError(
-                f"camera {text!r} has a parameter that is not a number, for example "
+                f"camera {text!r} has a parameter that is not a number: write, for example, "
                 f"{CAMERA_EXAMPLE}"
             ) from None
         if has_size and min(size) < 1:
-            raise ValueError(f"camera {text!r} has no pixels, for example {CAMERA_EXAMPLE}")
+            raise ValueError(f"camera {text!r} has no pixels: write, for example, {CAMERA_EXAMPLE}")
         camera = cls(name, *size, params)
         camera.check_params()
         if camera.params[0] <= 0:
@@ -86,12 +86,12 @@ class Camera:
 
     @classmethod
     def guess(cls, width: int, height: int) -> Camera:
-        """A pinhole camera for an image of which nothing else is known, as COLMAP guesses it."""
+        """A pinhole camera for an image of this size, with the focal length that COLMAP guesses."""
         focal = DEFAULT_FOCAL_RATIO * max(width, height)
         return cls("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
 
     def as_dict(self) -> dict[str, Any]:
-        """The form that PoseLib and pycolmap take."""
+        """The camera as JSON values, in the form that PoseLib and pycolmap take."""
         return {
             "model": self.model,
             "width": self.width,
@@ -100,19 +100,19 @@ class Camera:
         }
 
     def __str__(self) -> str:
-        """A line of COLMAP's cameras.txt without the id."""
+        """The line of COLMAP's cameras.txt without the id."""
         params = " ".join(f"{p:.12g}" for p in self.params)
         return f"{self.model} {self.width} {self.height} {params}"
 
     def check(self) -> None:
-        """Raise ValueError unless model, size and parameters are those of a COLMAP camera."""
+        """Raise ValueError unless model, size and parameters make a COLMAP camera."""
         for size in (self.width, self.height):
             if type(size) is not int or not 0 < size < 2**31:
                 raise ValueError(f"{str(size)[:40]!r} is not a number of pixels")
         self.check_params()
 
     def check_params(self) -> None:
-        """Raise ValueError unless the model is one of COLMAP's and has these parameters."""
+        """Raise ValueError unless the model is COLMAP's and has as many finite parameters."""
         expected = CAMERA_MODELS.get(self.model) if isinstance(self.model, str) else None
         if expected is None:
             raise ValueError(
@@ -128,10 +128,10 @@ class Camera:
 
     @property
     def colmap(self) -> Any:
-        """The same camera as a `pycolmap.Camera`.
+        """The camera as a `pycolmap.Camera`.
 
         Raises:
-            ValueError: the installed pycolmap does not know the model, or refuses the parameters.
+            ValueError: the installed pycolmap lacks the model, or rejects the parameters.
         """
         return _colmap_camera(self)
 
@@ -141,14 +141,14 @@ class Camera:
         return float(self.colmap.mean_focal_length())
 
     def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
-        """Undistort pixels (n, 2) to (n, 2) float64 x / z and y / z, NaN where the model fails."""
+        """Undistort pixels (n, 2) to x / z and y / z (n, 2) float64, NaN where the model fails."""
         out = np.full((len(pixels), 2), np.nan)
         if len(pixels):
             out[:] = np.asarray(self.colmap.cam_from_img(np.asarray(pixels, np.float64)))
         return out
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project points (n, 3) in camera coordinates to (n, 2) pixels, infinite behind it."""
+        """Project points (n, 3) in camera coordinates to pixels (n, 2), infinite behind it."""
         out = np.full((len(points), 2), np.inf)
         front = points[:, 2] > 0
         if front.any():
@@ -165,17 +165,19 @@ def _colmap_camera(camera: Camera) -> Any:
     try:
         converted = pycolmap.Camera(camera.as_dict())
     except (RuntimeError, ValueError):
-        raise ValueError(f"this pycolmap does not know camera model {camera.model}") from None
+        raise ValueError(
+            f"this pycolmap does not know camera model {camera.model}: update pycolmap"
+        ) from None
     if not converted.verify_params():
         raise ValueError(f"{camera.params} are not parameters of camera model {camera.model}")
     return converted
 
 
 def cameras_from_json(value: Any) -> dict[int, Camera]:
-    """Cameras by id from a JSON object whose values are those of `Camera.as_dict`.
+    """Cameras by id, from a JSON object with the values of `Camera.as_dict`.
 
     Raises:
-        ValueError: the value is something else, or one of the cameras is not COLMAP's.
+        ValueError: the value is no such object, or a camera is not COLMAP's.
     """
     if not isinstance(value, dict):
         raise ValueError("cameras are not a JSON object")

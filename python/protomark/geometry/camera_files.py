@@ -11,18 +11,18 @@ from protomark.geometry.camera import CAMERA_EXAMPLE, CAMERA_MODELS, Camera
 
 @dataclass(frozen=True)
 class CameraSet:
-    """Cameras, and which image was taken by which.
+    """Cameras, and the images that they took.
 
     Attributes:
-        cameras: all of them; one without a size (0 x 0) serves images of any size.
-        by_image: camera by image name, where the source names images.
+        cameras: all cameras; one without a size (0 x 0) fits images of any size.
+        by_image: cameras by image name, if the source names images.
     """
 
     cameras: tuple[Camera, ...] = ()
     by_image: Mapping[str, Camera] = field(default_factory=dict)
 
     def find(self, name: str, width: int, height: int) -> Camera:
-        """The camera of an image: by its name, else the only one of its size.
+        """The camera of an image: by the image's name, else the only one of its size.
 
         Raises:
             ValueError: no camera fits, or several do.
@@ -36,13 +36,13 @@ class CameraSet:
             return fitting[0]
         if fitting:
             raise ValueError(
-                f"{len(fitting)} of the cameras have {width} x {height} pixels and none names this "
-                "image: give a model folder with images, or one camera"
+                f"{len(fitting)} cameras have {width} x {height} pixels, and none names this "
+                "image: give a COLMAP model with images, or one camera"
             )
         sizes = ", ".join(sorted({f"{c.width} x {c.height}" for c in sized}))
         raise ValueError(
-            f"the image has {width} x {height} pixels, and none of the cameras does ({sizes}): "
-            "scale one of them"
+            f"the image has {width} x {height} pixels, and no camera does ({sizes}): scale the "
+            "image or a camera"
         )
 
 
@@ -50,14 +50,14 @@ def read_cameras(source: str) -> CameraSet:
     """Read cameras from a cameras.txt, a folder with a COLMAP model, or a camera written out.
 
     Raises:
-        FileNotFoundError, ValueError: the source is none of these, or broken.
+        FileNotFoundError, ValueError: the source is none of these, or it is broken.
     """
     if source.partition(":")[0].partition(" ")[0].upper() in CAMERA_MODELS:
         return CameraSet((Camera.parse(source),))
     path = Path(source)
     if not path.exists():
         raise FileNotFoundError(
-            f"{source}: no cameras.txt, no folder with a COLMAP model, and no camera such as "
+            f"{source} is no cameras.txt, no folder with a COLMAP model, and no camera such as "
             f"{CAMERA_EXAMPLE}"
         )
     if path.is_file() and path.suffix == ".txt":
@@ -82,11 +82,12 @@ def _read_text(path: Path) -> CameraSet:
                 raise ValueError
         except (ValueError, IndexError, OverflowError, TypeError):
             raise ValueError(
-                f"{path}, line {number}: not a COLMAP camera (id, model, width, height, parameters)"
+                f"{path}, line {number}: write a COLMAP camera as id, model, width, height, "
+                "parameters"
             ) from None
         cameras.append(camera)
     if not cameras:
-        raise ValueError(f"{path}: no cameras in it")
+        raise ValueError(f"{path} holds no cameras")
     return CameraSet(tuple(cameras))
 
 
@@ -101,7 +102,7 @@ def _read_model(folder: Path) -> CameraSet:
 
 
 def camera_from_exif(image: Path) -> Camera | None:
-    """A camera with the focal length that the image's EXIF data give; None without one."""
+    """A camera with the focal length of the image's EXIF data, None if they lack one."""
     from protomark.geometry.colmap import pycolmap, quiet
 
     options = pycolmap.ImageReaderOptions()

@@ -1,8 +1,8 @@
-"""COLMAP sparse models; the only module that imports pycolmap.
+"""Reads COLMAP models; the only module that imports pycolmap.
 
-Everything else that needs pycolmap imports it from here: `from protomark.geometry.colmap import
-pycolmap`. pycolmap carries a zlib of its own, and Python's `zlib` breaks for the whole process if
-it is first imported after pycolmap, so the order of the two imports below matters.
+Other modules import it from here: `from protomark.geometry.colmap import pycolmap`. pycolmap
+contains a zlib of its own, and Python's `zlib` fails in the whole process if it is first imported
+after pycolmap, so the order of the two imports below matters.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import contextlib
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,6 @@ from protomark.geometry.pose import camera_centers
 
 pycolmap = optional("pycolmap")
 
-__all__ = ["ColmapModel", "find_model", "pycolmap", "quiet", "read_model", "read_reconstruction"]
-
 _FILES = ("cameras", "images")
 
 
@@ -39,12 +37,12 @@ class ColmapModel:
     """Cameras of a sparse model, and its images that have a pose, in natural order of their names.
 
     Attributes:
-        cameras: COLMAP camera id -> camera.
+        cameras: cameras by COLMAP's id.
         names: m image names (img2 comes before img10).
         image_ids: (m,) int64, COLMAP image ids.
         camera_ids: (m,) int32, camera of each image.
         cam_from_world: (m, 3, 4) float64.
-        unposed: names of images in the model that have no pose.
+        unposed: names of the images without a pose.
     """
 
     cameras: dict[int, Camera]
@@ -60,21 +58,22 @@ class ColmapModel:
         return camera_centers(self.cam_from_world)
 
     def check_for_triangulation(self, path: Path) -> None:
-        """Raise ValueError unless two images have poses at different places."""
+        """Raise ValueError unless two images have poses at different positions."""
         if len(self.names) < 2:
             raise ValueError(
-                f"{path}: {len(self.names)} image(s) with a pose, at least two are needed; "
-                "is this the right model?"
+                f"{path}: {len(self.names)} image(s) have a pose, but triangulation needs two: "
+                "give the right model"
             )
         if np.ptp(self.centers, axis=0).max() <= 1e-9 * max(1.0, np.abs(self.centers).max()):
             raise ValueError(
-                f"{path}: all cameras stand at the same place, so no landmark can be triangulated"
+                f"{path}: all cameras have the same position, so no landmark can be triangulated: "
+                "give images of a moving camera"
             )
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep COLMAP's log off the terminal; failures reach the caller as exceptions."""
+    """Silence COLMAP's log; failures still raise exceptions."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
@@ -84,7 +83,7 @@ def quiet() -> Iterator[None]:
 
 
 def find_model(folder: Path) -> Path:
-    """The sparse model of a sequence folder: sparse/, sparse/0/ or the folder itself.
+    """The sparse model in a sequence folder: sparse/, sparse/0/ or the folder itself.
 
     Raises:
         FileNotFoundError: none of them holds a model.
@@ -93,8 +92,8 @@ def find_model(folder: Path) -> Path:
         if _suffix(candidate):
             return candidate
     raise FileNotFoundError(
-        f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/, "
-        "name it with --model"
+        f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/: "
+        "name its folder with --model"
     )
 
 
@@ -118,7 +117,7 @@ def read_reconstruction(path: Path) -> Any:
     suffix = _suffix(path)
     if suffix is None:
         raise FileNotFoundError(
-            f"{path}: no COLMAP model here (it needs cameras and images, .bin or .txt)"
+            f"{path} holds no COLMAP model: name a folder with cameras and images, .bin or .txt"
         )
     for name in _FILES:
         if (path / f"{name}{suffix}").stat().st_size == 0:
@@ -140,6 +139,75 @@ def read_reconstruction(path: Path) -> Any:
             ) from None
 
 
+def new_reconstruction(
+    cameras: Mapping[int, Camera],
+    images: Iterable[tuple[int, str, int, NDArray[Any], NDArray[np.float64]]],
+) -> Any:
+    """A `pycolmap.Reconstruction` of cameras and posed images, without points.
+
+    Args:
+        cameras: cameras by id.
+        images: id, name, camera id, keypoints (n, 2) in pixels and cam_from_world of each image.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    for camera_id, camera in cameras.items():
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera({**camera.as_dict(), "camera_id": camera_id})
+        )
+    for image_id, name, camera_id, keypoints, pose in images:
+        image = pycolmap.Image(
+            name=name,
+            camera_id=camera_id,
+            image_id=image_id,
+            keypoints=np.asarray(keypoints, np.float64).reshape(-1, 2),
+        )
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    return reconstruction
+
+
+def bundle_adjust(
+    reconstruction: Any,
+    image_ids: Iterable[int],
+    fixed: Sequence[int] = (),
+    *,
+    iterations: int = 30,
+    loss_scale: float = 1.0,
+    intrinsics: bool = False,
+    threads: int = 1,
+) -> bool:
+    """Move poses and points to the least (Cauchy) reprojection error; returns whether that worked.
+
+    Args:
+        reconstruction: a `pycolmap.Reconstruction`; changed.
+        image_ids: images that take part.
+        fixed: those of them whose poses stay; with fewer than two, two cameras fix the gauge.
+        iterations: limit on the solver's steps.
+        loss_scale: pixels beyond which an error counts less.
+        intrinsics: whether focal length and distortion move, too.
+        threads: threads of the solver; their number changes the last digits.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = intrinsics
+    options.refine_principal_point = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_scale
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.function_tolerance = 1e-4
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in image_ids:
+        config.add_image(image_id)
+    for image_id in fixed:
+        config.set_constant_rig_from_world_pose(image_id)
+    if len(fixed) < 2:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    with quiet():
+        return bool(adjuster.solve().is_solution_usable())
+
+
 def read_model(folder: Path) -> ColmapModel:
     """Cameras and poses of a sparse model.
 
@@ -151,7 +219,7 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def model_from_reconstruction(reconstruction: Any, path: Path) -> ColmapModel:
-    """The cameras and poses of a pycolmap reconstruction that was read from `path`.
+    """The cameras and poses of a `pycolmap.Reconstruction` that was read from `path`.
 
     Raises:
         ValueError: a camera or a pose is broken.

@@ -1,4 +1,4 @@
-"""Rigid motions: poses are (3, 4) float64 `cam_from_world` matrices, as COLMAP has them."""
+"""Poses: rigid motions as (3, 4) float64 `cam_from_world` matrices, COLMAP's convention."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ Array = NDArray[np.float64]
 
 
 def transform(cam_from_world: Array, points: Array) -> Array:
-    """Points (n, 3) in the world to (n, 3) in camera coordinates."""
+    """Points (n, 3) in camera coordinates, of points (n, 3) in world coordinates."""
     return np.asarray(points @ cam_from_world[:, :3].T + cam_from_world[:, 3])
 
 
 def camera_centers(cam_from_world: Array) -> Array:
-    """Camera centres (..., 3) in the world, of poses (..., 3, 4)."""
+    """Camera centres (..., 3) in world coordinates, of poses (..., 3, 4)."""
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
     return np.asarray(-np.einsum("...ji,...j->...i", rotation, translation))
 
@@ -26,9 +26,9 @@ def relative_pose(first: Array, second: Array) -> tuple[Array, Array]:
 
 
 def pose_error(estimate: Array, true: Array) -> tuple[float, float]:
-    """Distance of the camera centres in world units, and angle of the rotation in degrees."""
+    """Distance of the camera centres in world units, and angle between the poses in degrees."""
     distance = np.linalg.norm(camera_centers(estimate) - camera_centers(true))
-    # The distance of the matrices is exact for small angles, where arccos of the trace is not.
+    # Unlike arccos of the trace, the distance of the matrices is accurate for small angles.
     chord = np.linalg.norm(estimate[:, :3] - true[:, :3]) / np.sqrt(8)
     return float(distance), float(np.degrees(2 * np.arcsin(min(chord, 1.0))))
 
@@ -37,11 +37,11 @@ def rotation_from_quaternion(quaternion: Array) -> Array:
     """Rotation matrix (3, 3) of a quaternion w, x, y, z.
 
     Raises:
-        ValueError: the quaternion is not of length 1 (within 5 %).
+        ValueError: the quaternion's length is not 1 (within 5 %).
     """
     norm = np.linalg.norm(quaternion)
     if not np.isfinite(norm) or abs(norm - 1) > 0.05:
-        raise ValueError(f"quaternion {quaternion.tolist()} is not of length 1")
+        raise ValueError(f"the length of quaternion {quaternion.tolist()} is not 1")
     w, *v = quaternion / norm
     x = np.array(v)
     cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
@@ -51,7 +51,7 @@ def rotation_from_quaternion(quaternion: Array) -> Array:
 def quaternion_from_rotation(rotation: Array) -> Array:
     """Quaternion w, x, y, z with w >= 0 of a rotation matrix (3, 3).
 
-    The eigenvector of Bar-Itzhack (2000), which is well conditioned for every rotation.
+    This is the eigenvector of Bar-Itzhack (2000), which is well conditioned for every rotation.
     """
     r = rotation
     k = np.array(

@@ -1,4 +1,4 @@
-"""Reads and writes poses by image: COLMAP's images.txt and TUM trajectories."""
+"""Reads and writes poses of images: COLMAP's images.txt and TUM trajectories."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from protomark.geometry.pose import (
     rotation_from_quaternion,
 )
 
-# An image and a pose belong together if their times differ by less than this share of the median
-# step between poses.
+# An image has the pose whose time differs by less than this share of the median step between poses.
 _TIME_SHARE = 0.5
 
 
@@ -23,9 +22,9 @@ class PoseSet:
     """Poses by image name, or by time.
 
     Attributes:
-        by_name: name -> (3, 4) cam_from_world.
-        times: (n,) float64, ascending; empty where poses go by name.
-        poses: (n, 3, 4) float64, of these times.
+        by_name: (3, 4) cam_from_world by image name.
+        times: (n,) float64, ascending; empty if poses go by name.
+        poses: (n, 3, 4) float64, the poses at these times.
     """
 
     def __init__(
@@ -52,9 +51,8 @@ class PoseSet:
         """The pose of an image, None if the set has none for it.
 
         Args:
-            name: the image's name; one without folders is looked up, too.
-            time: the image's time in seconds; None: read it from a name such as
-                1305031102.175304.png.
+            name: the image's name, which is also looked up without its folders.
+            time: the image's time in seconds; None: that of a name like 1305031102.175304.png.
         """
         path = Path(name)
         if not len(self.times):
@@ -63,15 +61,14 @@ class PoseSet:
             time = float(path.stem) if time is None else time
         except ValueError:
             return None
-        at = int(np.argmin(np.abs(self.times - time)))
-        return self.poses[at] if abs(self.times[at] - time) <= self._limit else None
+        nearest = int(np.argmin(np.abs(self.times - time)))
+        return self.poses[nearest] if abs(self.times[nearest] - time) <= self._limit else None
 
 
 def read_poses(path: Path) -> PoseSet:
     """Read a COLMAP model (folder), a COLMAP images.txt, or a TUM trajectory.
 
-    A TUM trajectory has one line per pose: time, position and quaternion x y z w of the camera in
-    the world.
+    A line of a TUM trajectory has the time, position and quaternion x y z w of a camera.
 
     Raises:
         FileNotFoundError: there is nothing at `path`.
@@ -88,14 +85,12 @@ def read_poses(path: Path) -> PoseSet:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
         raise ValueError(
-            f"{path}: not a text file; give a COLMAP images.txt, a folder with a model, or a TUM "
+            f"{path} is not a text file: give a COLMAP images.txt, a folder with a model, or a TUM "
             "trajectory"
         ) from None
     rows = [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
     filled = [row for row in rows if row[1]]
-    if not filled:
-        raise ValueError(f"{path}: no poses in this file")
-    if all(len(words) == 8 for _, words in filled):
+    if filled and all(len(words) == 8 for _, words in filled):
         return _read_tum(path, filled)
     return _read_images_txt(path, rows)
 
@@ -112,21 +107,21 @@ def _read_tum(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
 
 
 def _read_images_txt(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
-    # Every image has a second line for its points, which may be empty.
+    # A second line per image is for its points, and may be empty.
     by_name = {}
     for number, words in rows[::2]:
         if not words:
             continue
         if len(words) < 10:
             raise ValueError(
-                f"{path}, line {number}: neither a line of COLMAP's images.txt nor of a TUM "
+                f"{path}, line {number}: write a line of COLMAP's images.txt or of a TUM "
                 "trajectory (time tx ty tz qx qy qz qw)"
             )
         values = _numbers(path, number, words[1:8])
         rotation = _rotation(path, number, values[:4])
         by_name[" ".join(words[9:])] = np.column_stack([rotation, values[4:7]])
     if not by_name:
-        raise ValueError(f"{path}: no poses in this file")
+        raise ValueError(f"{path} holds no poses: give a COLMAP images.txt or a TUM trajectory")
     return PoseSet(by_name)
 
 
@@ -134,9 +129,9 @@ def _numbers(path: Path, line: int, words: list[str]) -> NDArray[np.float64]:
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
-        raise ValueError(f"{path}, line {line}: not a pose, a word in it is not a number") from None
+        raise ValueError(f"{path}, line {line}: a word of this pose is not a number") from None
     if not np.isfinite(values).all():
-        raise ValueError(f"{path}, line {line}: a number is not finite")
+        raise ValueError(f"{path}, line {line}: a number of this pose is not finite")
     return values
 
 
@@ -148,7 +143,7 @@ def _rotation(path: Path, line: int, quaternion: NDArray[np.float64]) -> NDArray
 
 
 def images_txt(poses: Mapping[str, NDArray[np.float64]], camera_ids: Mapping[str, int]) -> str:
-    """The text of an images.txt with these poses (3, 4) by image name, without keypoints."""
+    """The text of an images.txt with poses (3, 4) by image name, and without keypoints."""
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and an empty line for the points"]
     for i, (name, pose) in enumerate(poses.items(), 1):
         numbers = " ".join(

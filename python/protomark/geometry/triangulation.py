@@ -13,8 +13,8 @@ Array = NDArray[np.float64]
 def epipolar_error(rotation: Array, translation: Array, first: Array, second: Array) -> Array:
     """Sampson distance (n,) of ray pairs (n, 2), in units of the image plane at z = 1.
 
-    Multiply by the focal length to get pixels. Where the two cameras stand at one place there is
-    no epipolar line, and the distance is that to the point which the rotation predicts.
+    Times the focal length this is in pixels. Two cameras at one position have no epipolar lines:
+    then it is the distance to the point that the rotation predicts.
     """
     length = np.linalg.norm(translation)
     a = np.column_stack([first, np.ones(len(first))])
@@ -37,7 +37,7 @@ def depth_of_first(
     """Depth (n,) along z in the first camera, and the angle (n,) between the rays in radians."""
     a = np.column_stack([first, np.ones(len(first))]) @ rotation.T
     b = np.column_stack([second, np.ones(len(second))])
-    # depth * a + translation is parallel to b: least squares in the cross product.
+    # depth * a + translation is parallel to b: solve the cross product by least squares.
     ab, tb = np.cross(a, b), np.cross(np.broadcast_to(translation, a.shape), b)
     depth = -(ab * tb).sum(1) / np.maximum((ab * ab).sum(1), 1e-24)
     sine = np.linalg.norm(ab, axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
@@ -45,11 +45,25 @@ def depth_of_first(
 
 
 def reprojection_residuals(points: Array, poses: Array, rays: Array) -> tuple[Array, Array]:
-    """Differences (n, 2) between projected points (n, 3) and rays (n, 2), and the depths (n,)."""
+    """Differences (n, 2) of projected points (n, 3) from rays (n, 2), and depths (n,)."""
     local = np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
     depth = local[:, 2]
     safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
     return local[:, :2] / safe[:, None] - rays, depth
+
+
+def pixel_errors(points: Array, poses: Array, rays: Array, focal: Array | float) -> Array:
+    """Reprojection errors (n,) in pixels of the undistorted image, infinite behind the camera.
+
+    Args:
+        points: (n, 3) positions.
+        poses: (n, 3, 4) cam_from_world.
+        rays: (n, 2) undistorted rays.
+        focal: (n,) focal lengths in pixels, or one for all.
+    """
+    difference, depth = reprojection_residuals(points, poses, rays)
+    error = np.linalg.norm(difference, axis=1) * focal
+    return np.where((depth > 0) & np.isfinite(error), error, np.inf)
 
 
 def refine_points(
@@ -61,7 +75,7 @@ def refine_points(
     iterations: int = 5,
     huber: float = 1.0,
 ) -> Array:
-    """Move each point to the least (Huber) reprojection error under fixed poses: Gauss-Newton.
+    """Move each point to the least (Huber) reprojection error under fixed poses, by Gauss-Newton.
 
     Args:
         points: (l, 3) positions to start from.
@@ -69,8 +83,8 @@ def refine_points(
         poses: (n, 3, 4) cam_from_world of each observation.
         seen: (n, 2) undistorted ray of each observation.
         focal: (n,) focal length of each observation, pixels.
-        iterations: most steps to take.
-        huber: pixels from where an error counts linearly.
+        iterations: limit on the steps.
+        huber: pixels beyond which an error counts linearly.
 
     Returns:
         (l, 3) positions; points whose error would grow stay where they are.
@@ -81,10 +95,10 @@ def refine_points(
     if not len(starts):
         return points.copy()
     present = landmark[order][starts]
-    # Only landmarks with observations from here on, one run of rows each.
+    # The loop has only landmarks with observations, one run of rows each.
     at = points[present]
     run = np.repeat(np.arange(len(present)), lengths)
-    # Columns that follow each other in memory, for the loop below.
+    # Contiguous columns make the loop faster.
     rotation = np.ascontiguousarray(poses[:, :, :3])
     columns = np.ascontiguousarray(rotation.transpose(1, 2, 0))
 
@@ -115,7 +129,7 @@ def refine_points(
         moved = np.where(np.isfinite(moved), moved, at)
         after = cost(moved)
         better = after[0] < best
-        # Pixels squared: what moves less than this stays within a thousandth of a pixel.
+        # In squared pixels: smaller gains move a projection by less than a thousandth of a pixel.
         if not (best - after[0] > 1e-6).any():
             break
         at = np.where(better[:, None], moved, at)
@@ -139,8 +153,8 @@ def widest_angle(points: Array, landmark: NDArray[np.int64], centers: Array) -> 
         landmark: (n,) index into points of each observation, ascending.
         centers: (n, 3) camera centre of each observation.
 
-    Found as the ray farthest from the first, then the ray farthest from that one: exact for two
-    rays, at least half the true angle for more.
+    The angle is measured from the ray farthest from the first to the ray farthest from that one:
+    exact for two rays, at least half the true angle for more.
     """
     count = len(points)
     direction = centers - points[landmark]

@@ -1,4 +1,4 @@
-"""Finds where images were taken in a map of prototypes."""
+"""Localizes images in a map."""
 
 from protomark.localization.localizer import Localizer
 from protomark.localization.prior import PosePrior

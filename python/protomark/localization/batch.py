@@ -26,7 +26,7 @@ from protomark.localization.solve import Localization
 from protomark.progress import Progress, silent
 
 POSES, CAMERAS, POINTS, TABLE = "images.txt", "cameras.txt", "points3D.txt", "poses.csv"
-# Distance in world units (metres where the map is metric) and degrees, as hloc reports them.
+# Distances in world units (metres if the map is metric) and angles in degrees, as in hloc.
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 STAGES = ("features", "encode", "search", "pose", "total")
 
@@ -41,12 +41,12 @@ class LocalizationRequest:
         camera: a cameras.txt, a folder with a COLMAP model, or a camera written out; None: focal
             lengths come from EXIF data and matches.
         refine_focal_length: whether focal lengths of given cameras are refined for each image.
-        true_poses: poses to measure against; None: nothing is measured.
-        priors: rough poses; None: the whole map is searched.
-        prior_distance: the priors' error in world units.
-        prior_degrees: the priors' error.
-        min_confidence: poses at least so likely to be right are written.
-        max_keypoints: the most keypoints to keep in an image.
+        true_poses: file or folder of poses to measure errors against.
+        priors: file or folder of rough poses; None: the whole map is searched.
+        prior_distance: largest error of a prior's position, in world units.
+        prior_degrees: largest error of a prior's orientation.
+        min_confidence: smallest probability of an accepted pose.
+        max_keypoints: limit on keypoints per image.
         threads: threads to encode and search on.
     """
 
@@ -68,11 +68,11 @@ class ImageResult:
     """The result for one image.
 
     Attributes:
-        name: of the image.
-        found: None where the image could not be read or has no fitting camera.
-        error: what was wrong with the image, or "".
-        true_error: distance and degrees from the true pose, infinite without a pose; None where
-            no true pose was given.
+        name: name of the image.
+        found: its localization, None if the image cannot be read or has no camera.
+        error: what is wrong with the image, else "".
+        true_error: distance and degrees from the true pose, infinite without a pose; None without
+            a true pose.
     """
 
     name: str
@@ -82,11 +82,11 @@ class ImageResult:
 
     @property
     def confidence(self) -> float:
-        """Probability that the pose is right, 0 without one."""
+        """Probability that the pose is right, 0 without a pose."""
         return self.found.confidence if self.found else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON values, and as a row of the table."""
+        """The result as JSON values."""
         found = self.found
         pose = found.cam_from_world if found else None
         return {
@@ -108,8 +108,8 @@ class LocalizationBatch:
     """The results for several images.
 
     Attributes:
-        images: in their order.
-        min_confidence: poses at least so likely to be right are written and counted.
+        images: results in the order of the images.
+        min_confidence: smallest probability of an accepted pose.
         interrupted: whether Ctrl-C ended the run early.
     """
 
@@ -118,17 +118,17 @@ class LocalizationBatch:
     interrupted: bool = False
 
     def pose(self, image: ImageResult) -> NDArray[np.float64] | None:
-        """An image's pose if that is likely enough, else None."""
+        """The pose of an image if it is accepted, else None."""
         if image.found is None or image.found.confidence < self.min_confidence:
             return None
         return image.found.cam_from_world
 
     def accepted(self, image: ImageResult) -> bool:
-        """Whether an image's pose is likely enough."""
+        """Whether the pose of an image is likely enough."""
         return self.pose(image) is not None
 
     def recall(self) -> list[dict[str, float]]:
-        """Share of the images with a true pose that were accepted within each of `THRESHOLDS`."""
+        """Share of the images with a true pose that are accepted and within each threshold."""
         measured = [i for i in self.images if i.true_error is not None]
         rows = []
         for distance, degrees in THRESHOLDS if measured else ():
@@ -168,7 +168,7 @@ class LocalizationBatch:
         }
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The summary and each result as JSON values."""
         return {**self.summary(), "each": [i.as_dict() for i in self.images]}
 
     def write(self, folder: Path) -> None:
@@ -189,7 +189,7 @@ class LocalizationBatch:
         write_text(folder / TABLE, self.table())
 
     def table(self) -> str:
-        """All images as CSV; a pose is the camera's centre and the rows of cam_from_world's R."""
+        """All images as CSV; a pose is the camera centre and the rows of the rotation."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         header = ["image", "accepted", "confidence", "inliers", "matches", "x", "y", "z"]
@@ -218,16 +218,16 @@ class LocalizationBatch:
 def localize_files(
     request: LocalizationRequest, output: Path, progress: Progress = silent
 ) -> LocalizationBatch:
-    """Localize images and write their poses; one that cannot be read does not end the run.
+    """Localize images and write their poses; an unreadable image does not end the run.
 
     Args:
         request: what to localize, and how.
-        output: folder for the poses; it is made if it does not exist.
+        output: folder for the poses, created if it does not exist.
         progress: called with each image.
 
     Raises:
-        FileNotFoundError, ValueError: the map, cameras or poses are broken or do not fit, or no
-            image can be read.
+        FileNotFoundError, ValueError: the map, a camera or the poses are missing, broken or do not
+            fit, or no image can be localized.
         FileExistsError: the folder holds another COLMAP model.
     """
     images = list_images(request.images)
@@ -249,26 +249,18 @@ def localize_files(
     with deferred_interrupt() as interrupted:
         for name, path in images:
             progress("localize", len(results), len(images))
-            prior = priors.find(name)
+            pose, true_pose = priors.find(name), true_poses.find(name)
+            error = (request.prior_distance, request.prior_degrees)
+            prior = None if pose is None else PosePrior(pose, *error)
             results.append(
-                _localize_file(
-                    localizer,
-                    name,
-                    path,
-                    cameras,
-                    request,
-                    None
-                    if prior is None
-                    else PosePrior(prior, request.prior_distance, request.prior_degrees),
-                    true_poses.find(name),
-                )
+                _localize_file(localizer, name, path, cameras, request, prior, true_pose)
             )
             if interrupted():
                 break
         stopped = interrupted() and len(results) < len(images)
     if all(result.found is None for result in results):
         raise ValueError(
-            f"none of {len(results)} images can be localized; {results[0].name}: {results[0].error}"
+            f"none of {len(results)} images is usable; {results[0].name}: {results[0].error}"
         )
     batch = LocalizationBatch(results, request.min_confidence, stopped)
     batch.write(output)
@@ -276,7 +268,7 @@ def localize_files(
 
 
 def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Names and paths of images; those of a folder are in natural order and named from there.
+    """Names and paths of images; those of a folder have relative names, in natural order.
 
     Raises:
         FileNotFoundError: a source is missing, or a folder holds no image.
@@ -287,27 +279,29 @@ def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
         if source.is_dir():
             names = [(name, source / name) for name in image_names(source)]
             if not names:
-                raise FileNotFoundError(f"{source}: no image in this folder")
+                raise FileNotFoundError(f"{source}: this folder holds no image")
         elif source.is_file():
             names = [(source.name, source)]
         else:
             raise FileNotFoundError(f"{source}: no such image or folder")
         for name, path in names:
             if name in found:
-                raise ValueError(f"two images are called {name}: {found[name]} and {path}")
+                raise ValueError(
+                    f"{found[name]} and {path} have the same name {name}: localize them apart"
+                )
             found[name] = path
     return list(found.items())
 
 
 def _poses_of(source: Path | None, images: Sequence[tuple[str, Path]]) -> PoseSet:
-    """Poses from a file or folder, which must be of some of the images."""
+    """Poses from a file or folder, of which one must belong to an image."""
     if source is None:
         return PoseSet({})
     poses = read_poses(source)
     if all(poses.find(name) is None for name, _ in images):
         raise ValueError(
-            f"{source}: none of its {len(poses)} poses belongs to one of the images, such as "
-            f"{images[0][0]}; it has one of {poses.example}"
+            f"{source}: none of its {len(poses)} poses (such as that of {poses.example}) belongs "
+            f"to an image (such as {images[0][0]}): give poses of these images"
         )
     return poses
 

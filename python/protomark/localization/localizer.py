@@ -1,4 +1,4 @@
-"""The localizer: an image in, its pose in a map out."""
+"""Localizes an image in a map: the image goes in, its pose comes out."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from protomark.subset import Subset
 
 
 class Localizer:
-    """Finds where images were taken.
+    """Finds where images were taken in a map.
 
         localizer = pm.Localizer("scene.pmk")
-        result = localizer.localize("frame.jpg", "PINHOLE:525,525,320,240")
-        result.cam_from_world, result.inliers, result.confidence, result.seconds
+        pose = localizer.localize("frame.jpg", "PINHOLE:525,525,320,240")
+        pose.cam_from_world, pose.inliers, pose.confidence, pose.seconds
 
-    Each thread needs a localizer of its own, as OpenCV's detectors are not safe to share.
+    Threads cannot share a localizer, as OpenCV's detectors are not thread-safe.
 
     Args:
         scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
             that `protomark map` wrote.
-        max_keypoints: the most keypoints to keep in an image.
-        min_probability: a match is accepted if it is at least so likely to be right.
+        max_keypoints: limit on keypoints per image: the strongest, spread over the image.
+        min_probability: smallest probability of an accepted match, in [0, 1].
         threads: threads to encode and search on.
 
     Raises:
-        FileError: the file is not a map.
+        FileNotFoundError, FileError: there is no such map, or it is broken.
         ValueError: no landmark of the map has a position, or its encoder was not calibrated.
     """
 
@@ -63,8 +63,8 @@ class Localizer:
         self._positions = self.scene.positions(self._ids)
         if not np.isfinite(self._positions).all(axis=1).any():
             raise ValueError(
-                f"none of the map's {len(self._ids)} landmarks has a position, so no pose can be "
-                "found in it: set them with `set_positions`, or build the map from tracks"
+                f"none of the map's {len(self._ids)} landmarks has a position, so images cannot be "
+                "localized in it: set positions with `set_positions`, or build the map from tracks"
             )
         self.calibration = MatchCalibration.of(self.scene.encoder, self.scene.dim)
         self._extractor: Extractor | None = None
@@ -77,17 +77,20 @@ class Localizer:
         *,
         focal_length: FocalLength = "known",
     ) -> Localization:
-        """The pose of one image.
+        """Find the pose of an image.
 
         Args:
-            image: a file, or (height, width) grey or (height, width, 3) BGR uint8.
+            image: a file, or a (height, width) grey or (height, width, 3) BGR uint8 array.
             camera: its camera, or the camera written out as "MODEL:PARAMETERS"; None: a pinhole
-                whose focal length is estimated.
-            prior: a rough pose: only landmarks that it makes visible are searched.
-            focal_length: "rough" to have the camera's refined, "unknown" to have it estimated.
+                camera whose focal length is estimated.
+            prior: a rough pose; only landmarks that are visible from near it are searched.
+            focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
+
+        Returns:
+            The pose, with its confidence and inliers, or the reason why there is none.
 
         Raises:
-            FileNotFoundError, ValueError: the image cannot be read, is not of the camera's size,
+            FileNotFoundError, ValueError: the image cannot be read or is not of the camera's size,
                 or OpenCV does not compute the map's descriptor.
         """
         began = time.perf_counter()
@@ -101,7 +104,7 @@ class Localizer:
             camera = replace(camera, width=width, height=height)
         elif (camera.width, camera.height) != (width, height):
             raise ValueError(
-                f"the image has {width} x {height} pixels, its camera {camera.width} x "
+                f"the image has {width} x {height} pixels, but its camera {camera.width} x "
                 f"{camera.height}: scale one of them"
             )
         features = self._extract(gray)
@@ -124,19 +127,22 @@ class Localizer:
         focal_length: FocalLength = "known",
         seconds: dict[str, float] | None = None,
     ) -> Localization:
-        """The pose of a frame whose keypoints are described already.
+        """Find the pose of a frame from its keypoints and descriptors.
 
         Args:
-            keypoints: (n, 2), pixels; the centre of the upper left pixel is (0.5, 0.5).
-            descriptors: (n, bits / 8) uint8, those that the map's encoder takes.
+            keypoints: (n, 2) pixels; the centre of the upper left pixel is (0.5, 0.5).
+            descriptors: (n, bits / 8) uint8, of the kind that the map's encoder takes.
             camera: the frame's camera.
             prior: see `localize`.
             focal_length: see `localize`.
-            seconds: time of earlier stages, by name.
+            seconds: seconds of earlier stages by name, to be included in the result.
+
+        Returns:
+            See `localize`.
 
         Raises:
-            ValueError: lengths differ, descriptors are not the encoder's, or poses cannot be
-                estimated for cameras of this model.
+            ValueError: the lengths differ, the encoder takes other descriptors, or poses cannot be
+                estimated for this camera model.
         """
         check_pose_model(camera)
         if len(keypoints) != len(descriptors):
@@ -160,7 +166,7 @@ class Localizer:
         return replace(result, seconds={**stages, "total": sum(stages.values())})
 
     def _positions_of(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions (..., 3) of ids (...), NaN where the id is -1 or has no position."""
+        """Positions (..., 3) of ids (...), NaN if the id is -1 or has no position."""
         where = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
         return np.where((ids >= 0)[..., None], self._positions[where], np.nan)
 

@@ -1,4 +1,4 @@
-"""A rough pose, and the landmarks that a camera near it can see."""
+"""A rough pose, and the landmarks that are visible from near it."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from numpy.typing import NDArray
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 
-# Points along each border of the image, which distortion bends.
+# Number of points along each border of the image, as distortion bends the borders.
 _BORDER = 33
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Roughly where a camera stands, from odometry, GPS or the frame before.
+    """A rough pose of a camera, from odometry, GPS or the previous frame.
 
     Attributes:
         cam_from_world: (3, 4) float64.
-        distance: the camera's camera_centers is at most so far off, in world units.
-        degrees: its orientation is at most so far off.
+        distance: largest error of the camera centre, in world units.
+        degrees: largest error of the orientation, in degrees.
+
+    Raises:
+        ValueError: the pose is not a finite (3, 4) matrix, or an error is negative.
     """
 
     cam_from_world: NDArray[np.float64]
@@ -34,43 +37,43 @@ class PosePrior:
             raise ValueError(f"a prior pose is a finite (3, 4) matrix, not {shape}")
         if not (self.distance >= 0 and self.degrees >= 0):
             raise ValueError(
-                f"distance {self.distance} and degrees {self.degrees} of a prior pose must not be "
-                "negative"
+                f"distance {self.distance} and degrees {self.degrees} of a prior pose must be 0 or "
+                "more"
             )
 
 
 def visible(prior: PosePrior, camera: Camera, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which positions are in the image of some pose that the prior allows.
+    """Whether each position is in the image of some pose that the prior allows.
 
-    No such position is missed; a few others may be included, and occlusion is not considered.
+    No such position is missed; a few others may be included, and occlusion is ignored.
 
     Args:
         prior: the rough pose.
         camera: the camera.
-        positions: (n, 3) float64, world coordinates, NaN where there are none.
+        positions: (n, 3) float64, world coordinates, NaN for none.
 
     Returns:
         (n,) bool, False for NaN.
     """
     normals = _field_of_view(camera)
-    away = positions - camera_centers(prior.cam_from_world)
-    distance = np.linalg.norm(away, axis=1)
-    placed = np.isfinite(distance)
-    away, distance = np.where(placed[:, None], away, 0.0), np.where(placed, distance, 0.0)
-    # The angle by which an error of the centre can change a landmark's direction: any angle for
-    # landmarks within that error.
+    offset = positions - camera_centers(prior.cam_from_world)
+    distance = np.linalg.norm(offset, axis=1)
+    finite = np.isfinite(distance)
+    offset, distance = np.where(finite[:, None], offset, 0.0), np.where(finite, distance, 0.0)
+    # An error of the centre can change a landmark's direction by the arcsine of this ratio, and by
+    # any angle if the landmark is nearer than the error.
     near = distance <= prior.distance
     ratio = np.where(near, 1.0, prior.distance / np.where(near, 1.0, distance))
     slack = np.arcsin(np.clip(ratio, 0.0, 1.0)) + np.radians(prior.degrees)
-    direction = away @ prior.cam_from_world[:, :3].T / np.maximum(distance, 1e-300)[:, None]
+    direction = offset @ prior.cam_from_world[:, :3].T / np.maximum(distance, 1e-300)[:, None]
     inside = np.arcsin(np.clip(direction @ normals.T, -1.0, 1.0)).min(axis=1, initial=np.pi)
-    return placed & (near | (inside >= -slack))
+    return finite & (near | (inside >= -slack))
 
 
 def _field_of_view(camera: Camera) -> NDArray[np.float64]:
-    """Inward normals (s, 3) of planes through the camera's centre that bound its field of view.
+    """Inward normals (s, 3) of planes through the camera centre that bound its field of view.
 
-    s is 0 for a field of view of 180 degrees or more.
+    A field of view of 180 degrees or more has none.
     """
     t = np.linspace(0, 1, _BORDER)
     w, h = camera.width * t, camera.height * t

@@ -15,7 +15,7 @@ from protomark.matching import accept
 
 # Reprojection error of an inlier, as a share of the image's longer side.
 MAX_ERROR = 0.005
-# So many nearest landmarks of a keypoint are considered once there is a pose.
+# Number of nearest landmarks per keypoint that are candidates once there is a pose.
 CANDIDATES = 3
 MIN_MATCHES = 4
 _NO_EVIDENCE = Evidence(0, 0, 0)
@@ -23,18 +23,18 @@ _NO_EVIDENCE = Evidence(0, 0, 0)
 
 @dataclass(frozen=True)
 class Localization:
-    """The result of localizing one frame.
+    """The pose of a frame, and its evidence.
 
     Attributes:
-        camera: the frame's camera, with another focal length where that was estimated.
-        cam_from_world: (3, 4) float64, or None where no pose was found.
+        camera: the frame's camera, with the estimated focal length if that was not known.
+        cam_from_world: (3, 4) float64, None without a pose.
         keypoints: (i,) int64, rows of the keypoints that agree with the pose.
-        pixels: (i, 2) float64, where they are in the image.
-        landmarks: (i,) int64, ids of the landmarks that they see.
-        evidence: what speaks for the pose.
-        confidence: probability that the pose is right, 0 without one.
+        pixels: (i, 2) float64, these keypoints in the image.
+        landmarks: (i,) int64, ids of the landmarks that they observe.
+        evidence: evidence for the pose.
+        confidence: probability that the pose is right, 0 without a pose.
         reason: why there is no pose, else "".
-        seconds: time of each stage: features, encode, search, pose, and total.
+        seconds: seconds of each stage: features, encode, search, pose, and total.
     """
 
     camera: Camera
@@ -70,7 +70,7 @@ class Candidates:
         keypoints: (n, 2) float64, pixels.
         landmarks: (n, c) int64, ids of the nearest landmarks, -1 where there is none.
         positions: (n, c, 3) float64, their positions, NaN where there is none.
-        probabilities: (n,) float64, that the nearest landmark is the right one.
+        probabilities: (n,) float64, the probability that the nearest landmark is right.
     """
 
     keypoints: NDArray[np.float64]
@@ -82,22 +82,24 @@ class Candidates:
 def solve_pose(
     candidates: Candidates, camera: Camera, min_probability: float, focal_length: FocalLength
 ) -> Localization:
-    """RANSAC over the likely matches; then keypoints may see any of their nearest landmarks.
+    """Solve the pose by RANSAC over likely matches, and refine it on all nearest landmarks.
 
     Args:
         candidates: the nearest landmarks of each keypoint.
         camera: the frame's camera.
-        min_probability: of a match that RANSAC gets.
-        focal_length: what is known of the camera's focal length.
+        min_probability: smallest probability of a match for RANSAC.
+        focal_length: see `geometry.absolute_pose.estimate_pose`.
     """
     keypoints, positions = candidates.keypoints, candidates.positions
     landmarks = np.where(np.isfinite(positions).all(axis=2), candidates.landmarks, -1)
     if len(keypoints) < MIN_MATCHES:
-        return Localization(camera, reason=f"{len(keypoints)} keypoints: blurred, dark or empty")
+        return Localization(
+            camera, reason=f"only {len(keypoints)} keypoints: blurred, dark or empty"
+        )
     matches = accept(landmarks[:, 0], candidates.probabilities, min_probability)
     evidence = Evidence(0, len(matches), 0)
     if len(matches) < MIN_MATCHES:
-        reason = f"{len(matches)} likely matches of {len(keypoints)} keypoints: another place?"
+        reason = f"only {len(matches)} likely matches of {len(keypoints)} keypoints: another place?"
         return Localization(camera, evidence=evidence, reason=reason)
     max_error = MAX_ERROR * max(camera.width, camera.height)
     found = estimate_pose(
@@ -134,7 +136,7 @@ def _complete(
     """Refine the pose on all keypoints to which one of their nearest landmarks projects.
 
     Returns:
-        The pose, and the inliers: rows of keypoints and columns of their landmarks.
+        The pose, and the rows and columns of the agreeing candidates.
     """
     pose, camera = found.cam_from_world, found.camera
     rows, columns = _agreeing(pose, camera, keypoints, landmarks, positions, max_error)
@@ -152,7 +154,7 @@ def _agreeing(
     positions: NDArray[np.float64],
     max_error: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the candidates within the error; each landmark and keypoint once."""
+    """Rows and columns of the candidates within the error, each landmark and keypoint once."""
     present = landmarks >= 0
     pixels = np.full((*landmarks.shape, 2), np.inf)
     pixels[present] = camera.project(transform(pose, positions[present]))
@@ -160,7 +162,7 @@ def _agreeing(
     inside = error <= max_error
     rows = np.flatnonzero(inside.any(axis=1))
     columns = inside[rows].argmax(axis=1)
-    # Of several keypoints that see one landmark, the nearest to its projection keeps it.
+    # A landmark keeps the keypoint that is nearest to its projection.
     order = np.lexsort((error[rows, columns], landmarks[rows, columns]))
     _, first = np.unique(landmarks[rows, columns][order], return_index=True)
     unique = np.sort(order[first])

@@ -1,1 +1,1 @@
-"""Incremental structure from motion whose map keeps prototypes in place of descriptors."""
+"""Incremental structure from motion with prototypes in place of descriptors."""

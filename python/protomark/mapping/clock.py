@@ -1,4 +1,4 @@
-"""Measures how long each stage takes."""
+"""Measures how long each stage of mapping takes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ STAGES = ("detect", "encode", "initialise", "match", "triangulate", "adjust", "o
 
 
 class Clock:
-    """Seconds by stage; time in a nested stage counts for the inner one only.
+    """Sums seconds by stage; time in a nested stage counts for the inner one only.
 
     Args:
-        now: the clock; `time.process_time` leaves out what other programs take.
+        now: returns the time in seconds; `time.process_time` leaves other programs out.
     """
 
     def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
@@ -29,7 +29,7 @@ class Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """What runs inside counts as `name`."""
+        """Count the time inside the context as `name`."""
         self._book()
         self._running.append(name)
         try:

@@ -1,4 +1,4 @@
-"""Removes observations and landmarks that do not fit."""
+"""Culls observations and landmarks that do not fit."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from protomark.mapping.frame import Ids
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Observations, Structure
 
-# A landmark older than the window is removed if it has fewer observations.
+# A landmark older than the window needs this many observations.
 _MIN_CONFIRMED = 3
-# A landmark is removed below this share of the angle that a new landmark needs.
+# A landmark needs this share of the triangulation angle of a new one.
 _ANGLE_SHARE = 0.6
 
 
@@ -31,10 +31,10 @@ def cull(
 
     Args:
         structure: frames and landmarks.
-        memory: what they look like.
+        memory: the landmarks' prototypes.
         frames: indices of the frames to check, with their landmarks.
         max_error: largest reprojection error, as a share of the image's longer side.
-        min_angle: smallest angle between two rays of a new landmark, degrees.
+        min_angle: smallest triangulation angle of a new landmark, degrees.
 
     Returns:
         Number of removed landmarks.
@@ -43,14 +43,13 @@ def cull(
     limit = np.array(
         [structure.tolerance(f.camera_id, max_error) for f in structure.frames], np.float64
     )
-    off = structure.errors(seen) > limit[seen.frames]
-    remove_observations(structure, memory, seen.where(off))
-    touched = np.unique(seen.landmarks)
-    return remove_weak(structure, memory, touched, min_angle)
+    outlier = structure.errors(seen) > limit[seen.frames]
+    remove_observations(structure, memory, seen.where(outlier))
+    return cull_landmarks(structure, memory, np.unique(seen.landmarks), min_angle)
 
 
 def remove_observations(structure: Structure, memory: Memory, seen: Observations) -> None:
-    """Remove observations."""
+    """Remove observations, from the memory, too, where their descriptors still exist."""
     for index in np.unique(seen.frames).tolist():
         frame = structure.frames[index]
         rows = seen.rows[seen.frames == index]
@@ -59,33 +58,20 @@ def remove_observations(structure: Structure, memory: Memory, seen: Observations
         frame.landmarks[rows] = -1
 
 
-def remove_weak(structure: Structure, memory: Memory, ids: Ids, min_angle: float) -> int:
-    """Remove landmarks that one keyframe sees, that were never confirmed, or with narrow rays."""
+def cull_landmarks(structure: Structure, memory: Memory, ids: Ids, min_angle: float) -> int:
+    """Remove landmarks with one keyframe, without confirmation, or with a narrow angle."""
     counts = structure.counts()
     weak = counts[ids] < 2
-    old = structure.born[ids] <= _window_start(structure)
-    weak |= old & (counts[ids] < _MIN_CONFIRMED)
-    angles = _angles(structure, ids)
-    weak |= angles < np.radians(_ANGLE_SHARE * min_angle)
-    _remove_landmarks(structure, memory, ids[weak])
-    return int(weak.sum())
-
-
-def _remove_landmarks(structure: Structure, memory: Memory, ids: Ids) -> None:
-    """Remove landmarks from structure and memory."""
-    ids = ids[structure.existing[ids]]
-    if len(ids):
+    frames = structure.frames
+    window_start = next((i for i, frame in enumerate(frames) if frame.in_window), len(frames))
+    weak |= (structure.born[ids] <= window_start) & (counts[ids] < _MIN_CONFIRMED)
+    weak |= _angles(structure, ids) < np.radians(_ANGLE_SHARE * min_angle)
+    removed = ids[weak & structure.existing[ids]]
+    if len(removed):
         # A landmark whose observations were all subtracted has left the memory already.
-        memory.remove(ids[memory.contains(ids)])
-        structure.remove(ids)
-
-
-def _window_start(structure: Structure) -> int:
-    """Index of the first frame in the window, the number of frames if it is empty."""
-    for index, frame in enumerate(structure.frames):
-        if frame.in_window:
-            return index
-    return len(structure.frames)
+        memory.remove(removed[memory.contains(removed)])
+        structure.remove(removed)
+    return int(weak.sum())
 
 
 def _angles(structure: Structure, ids: Ids) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Frames on their way into the map: the input image, and its keypoints with or without a pose."""
+"""Frames of the input: images, and their keypoints before and after they are registered."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class InputImage:
     """One image of the input.
 
     Attributes:
-        index: place in its input, from 0.
+        index: index in its input, from 0.
         name: name, unique in the map.
-        time: seconds, or the index where no times are known.
-        image: (height, width) uint8, None where it cannot be read.
+        time: seconds, or the index if the input has no times.
+        image: (height, width) uint8, None if it cannot be read.
         pose: (3, 4) given pose, or None.
         problem: why there is no image, else "".
     """
@@ -38,17 +38,17 @@ class Frame:
     """Keypoints and descriptors of an image, and once it is registered its pose and landmarks.
 
     Attributes:
-        index: place in its input, from 0.
+        index: index in its input, from 0.
         name: image name, unique in the map.
-        time: seconds, or the index where no times are known.
+        time: seconds, or the index if the input has no times.
         camera_id: its camera.
         keypoints: (n, 2) float32, pixels; those without a landmark are dropped when the frame
             leaves the window.
         rays: (n, 2) float64, undistorted.
-        descriptors: (n, bytes) uint8, None outside of the window.
-        encoded: (n, width), the same as the memory compares them; None outside of the window.
+        descriptors: (n, B) uint8, None outside of the window.
+        encoded: (n, width), the form that the memory compares; None outside of the window.
         pose: (3, 4) float64, cam_from_world; NaN before the frame is registered.
-        landmarks: (n,) int64, landmark that a keypoint sees, -1 for none.
+        landmarks: (n,) int64, the landmark that each keypoint observes, -1 for none.
         keyframe: whether its observations take part in bundle adjustment.
     """
 
@@ -65,25 +65,25 @@ class Frame:
     keyframe: bool = True
 
     def at(self, pose: Array) -> Frame:
-        """The frame with a pose and no landmarks yet, to register in a map."""
+        """A copy with a pose and without landmarks, to register in a map."""
         landmarks = np.full(len(self.keypoints), -1, np.int64)
         return replace(self, pose=np.ascontiguousarray(pose), landmarks=landmarks)
 
     @property
     def observed(self) -> Ids:
-        """Rows of the keypoints that see a landmark."""
+        """Rows of the keypoints that observe a landmark."""
         return np.flatnonzero(self.landmarks >= 0)
 
     @property
     def seen(self) -> Ids:
-        """The landmarks of these keypoints."""
+        """Landmarks that the keypoints observe."""
         return self.landmarks[self.landmarks >= 0]
 
     @property
     def codes(self) -> NDArray[Any]:
         """The encoded descriptors of a frame in the window."""
         if self.encoded is None:
-            raise ValueError(f"{self.name}: no descriptors, it has left the window")
+            raise ValueError(f"{self.name}: the frame has left the window and has no descriptors")
         return self.encoded
 
     @property
@@ -92,7 +92,7 @@ class Frame:
         return self.descriptors is not None
 
     def leave_window(self) -> None:
-        """Drop the descriptors, and the keypoints that see no landmark."""
+        """Drop the descriptors, and the keypoints that observe no landmark."""
         rows = self.observed
         self.keypoints, self.rays = self.keypoints[rows], self.rays[rows]
         self.landmarks = self.landmarks[rows]

@@ -1,4 +1,4 @@
-"""Records what became of each frame, and how the map grew."""
+"""Records what became of each frame, and the size of the map after it."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ REGISTERED = "registered"
 
 @dataclass
 class FrameRecord:
-    """One frame of the input.
+    """What became of one frame of the input.
 
     Attributes:
-        index: place in its input.
+        index: index in its input.
         name: image name.
-        outcome: "registered", or why not, in words.
-        keypoints: found in it.
+        outcome: "registered", or why it is not.
+        keypoints: number of keypoints.
         inliers: matches that agree with its pose, 0 without one.
         keyframe: whether it is a keyframe.
-        landmarks: landmarks of the map after it.
-        observations: observations of the map after it.
-        memory_bytes: what matching needs after it.
-        descriptor_bytes: what all descriptors of these observations would take.
-        window_bytes: descriptors that the window keeps to triangulate.
-        seconds: by stage.
+        landmarks: landmarks of the map after this frame.
+        observations: observations of the map after this frame.
+        memory_bytes: bytes that matching needs after this frame.
+        descriptor_bytes: bytes that all descriptors of these observations would take.
+        window_bytes: bytes of the descriptors in the window.
+        seconds: seconds by stage.
     """
 
     index: int
@@ -43,12 +43,12 @@ class FrameRecord:
 
 @dataclass
 class History:
-    """Records of all frames, in the order in which they came, and events.
+    """Records of all frames in the order of the input, and events.
 
     Attributes:
-        records: name of the frame -> its record.
+        records: records by frame name.
         events: sentences such as "frame 31: a place seen before, 45 landmarks merged".
-        closing_seconds: seconds by stage that belong to no frame (retries, last adjustment).
+        closing_seconds: seconds by stage after the last frame (retries, global adjustment).
     """
 
     records: dict[str, FrameRecord] = field(default_factory=dict)
@@ -56,7 +56,7 @@ class History:
     closing_seconds: dict[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """As JSON values."""
         return {
             "records": [vars(record) for record in self.records.values()],
             "events": self.events,
@@ -65,8 +65,7 @@ class History:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> History:
-        """Back from `as_dict`."""
+        """The history that `as_dict` returned."""
         records = [FrameRecord(**record) for record in values["records"]]
-        return cls(
-            {e.name: e for e in records}, list(values["events"]), dict(values["closing_seconds"])
-        )
+        by_name = {record.name: record for record in records}
+        return cls(by_name, list(values["events"]), dict(values["closing_seconds"]))

@@ -1,4 +1,4 @@
-"""Finds the first two frames of a map: a pair with enough parallax to trust its relative pose."""
+"""Finds the first two frames of a map: a pair with parallax and an unambiguous relative pose."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark._core import hamming_search
 from protomark.extras import optional
 from protomark.geometry.absolute_pose import (
     MAX_ITERATIONS,
@@ -18,26 +17,26 @@ from protomark.geometry.absolute_pose import (
 from protomark.geometry.camera import Camera
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 from protomark.mapping.frame import Array, Frame, Ids
+from protomark.tracks.matching import mutual, nearest_matches
 
 RATIO = 0.8
-# Fewest matches that must agree with the relative pose.
+# This many matches must agree with the relative pose.
 _MIN_MATCHES = 60
 # Median angle between the two rays of a match, degrees.
 MIN_PARALLAX = 2.0
 # If a rotation alone explains this share of the matches, there is no parallax.
 _MAX_ROTATED = 0.7
-# Share of the landmarks that a third frame sees which must agree with a pose of that frame, within
-# three quarters of the largest error; and the lead over any other relative pose, which must be
-# larger where there are few such frames.
+# A pose of each witness must agree with this share of the landmarks that it observes, within three
+# quarters of the largest error; and the best relative pose must fit the witnesses better than any
+# other by this factor, which is larger with one or two witnesses.
 _MIN_SUPPORT = 0.7
 _MIN_LEAD = 1.05
-_MIN_LEAD_OF_FEW = 1.2
-_FEW_WITNESSES = 2
+_MIN_LEAD_TWO_WITNESSES = 1.2
 _MAX_WITNESSES = 4
 _MIN_COMMON = 40
-# When more frames wait, every second one is dropped until the end, when lost frames are retried.
+# Of more waiting frames every second one is dropped; it is retried at the end as a lost frame.
 _MAX_WAITING = 40
-# A new frame is tried with at most so many of them, from the oldest to the newest.
+# A new frame is paired with at most so many waiting ones, from the oldest to the newest.
 _MAX_PARTNERS = 10
 
 
@@ -57,10 +56,10 @@ class TwoViewPose:
 
 
 class Initialiser:
-    """Collects frames until two of them show the scene from places far enough apart.
+    """Collects frames until two of them show the scene from positions far enough apart.
 
     Two views of a plane fit two relative poses, and views of little depth nearly do. Other waiting
-    frames, the witnesses, decide: landmarks of a wrong pose do not project where these saw them.
+    frames, the witnesses, decide: landmarks of a wrong pose do not project where these see them.
 
     Args:
         camera: camera of all frames.
@@ -75,13 +74,10 @@ class Initialiser:
         self._matches: dict[tuple[str, str], Ids] = {}
 
     def push(self, frame: Frame) -> TwoViewPose | None:
-        """Try a new frame with the waiting ones, the oldest first, and let it wait, too.
-
-        If many wait, some of them, spread evenly, are tried.
-        """
+        """Pair a new frame with waiting ones, the oldest first; without success it waits, too."""
         self.waiting.append(frame)
         if len(self.waiting) > _MAX_WAITING:
-            # The oldest stays, as a slow video needs a long baseline.
+            # The oldest frame stays, as a slow video needs a long baseline.
             del self.waiting[1:-1:2]
             self._matches.clear()
         last = len(self.waiting) - 1
@@ -117,17 +113,17 @@ class Initialiser:
         self.best_parallax = max(self.best_parallax, parallax[best])
         if parallax[best] < MIN_PARALLAX:
             return None
-        lead = _MIN_LEAD if len(witnesses) > _FEW_WITNESSES else _MIN_LEAD_OF_FEW
+        lead = _MIN_LEAD if len(witnesses) > 2 else _MIN_LEAD_TWO_WITNESSES
         for pose, (rival, _) in zip(candidates, scores, strict=True):
-            if support < lead * rival and not _alike(pose, candidates[best]):
+            if support < lead * rival and not _same_pose(pose, candidates[best]):
                 return None
         return candidates[best]
 
     def _candidates(self, one: Frame, other: Frame, rows: Ids) -> list[Array]:
-        """The relative pose that fits best, and those that a planar scene allows."""
+        """The relative pose that fits best, and those that a planar scene admits."""
         poselib = optional("poselib")
         camera, focal = self.camera.as_dict(), self._focal
-        a, b = (s.keypoints[rows[:, k]].astype(np.float64) for k, s in enumerate((one, other)))
+        a, b = (f.keypoints[rows[:, k]].astype(np.float64) for k, f in enumerate((one, other)))
         sampling = {"min_iterations": MIN_ITERATIONS, "max_iterations": MAX_ITERATIONS, "seed": 0}
         options = {"max_epipolar_error": self.max_error, **sampling}
         found, facts = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
@@ -169,7 +165,7 @@ class Initialiser:
     def _verify(
         self, pose: Array, ray_a: Array, ray_b: Array
     ) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which matches fit a pose, the depth in the first frame and the angle of each."""
+        """Whether each match fits a pose, its depth in the first frame, and its angle."""
         rotation, translation = pose[:, :3], pose[:, 3]
         depth, angle = depth_of_first(rotation, translation, ray_a, ray_b)
         error = epipolar_error(rotation, translation, ray_a, ray_b) * self._focal
@@ -178,7 +174,7 @@ class Initialiser:
         return good, depth, angle
 
     def _witnesses(self, first: int, second: int) -> list[tuple[Frame, Ids]]:
-        """Other frames, those between first, with their matches with the first one."""
+        """Further frames, preferably between the two, and their matches with the first one."""
         between = list(range(first + 1, second))
         near = sorted(set(range(second)) - {first, *between}, key=lambda i: abs(i - first))
         at = np.linspace(0, len(between) - 1, min(_MAX_WITNESSES, len(between))).round().astype(int)
@@ -200,33 +196,33 @@ class Initialiser:
         pose: Array,
         witnesses: list[tuple[Frame, Ids]],
     ) -> tuple[float, float]:
-        """How well landmarks of this relative pose fit the witnesses: a score, and the share.
+        """How well the landmarks of a relative pose fit the witnesses: a score, and a share.
 
-        The score counts each landmark as 1 less its squared error over the squared limit.
+        The score counts each landmark as 1 minus its squared error over the squared limit.
         """
         good, depth, _ = self._verify(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
         points = np.full((len(one.keypoints), 3), np.nan)
         at = rows[good, 0]
         points[at] = np.column_stack([one.rays[at], np.ones(len(at))]) * depth[good, None]
         limit = 0.75 * self.max_error
-        fit, fitting, total = 0.0, 0, 0
+        score, inliers, total = 0.0, 0, 0
         for witness, pairs in witnesses:
-            known = np.isfinite(points[pairs[:, 0], 0])
-            if known.sum() < _MIN_COMMON:
+            pairs = pairs[np.isfinite(points[pairs[:, 0], 0])]
+            if len(pairs) < _MIN_COMMON:
                 continue
-            pixels = witness.keypoints[pairs[known, 1]].astype(np.float64)
-            seen = points[pairs[known, 0]]
+            pixels = witness.keypoints[pairs[:, 1]].astype(np.float64)
+            seen = points[pairs[:, 0]]
             total += len(seen)
             found = estimate_pose(pixels, seen, self.camera, limit)
             if found is not None:
                 error = reprojection_error(found.cam_from_world, pixels, seen, self.camera)
-                fit += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
-                fitting += int((error <= limit).sum())
-        return fit, fitting / max(total, 1)
+                score += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
+                inliers += int((error <= limit).sum())
+        return score, inliers / max(total, 1)
 
 
-def _alike(first: Array, second: Array) -> bool:
-    """Whether two relative poses differ by less than 1 degree, and 10 degrees of direction."""
+def _same_pose(first: Array, second: Array) -> bool:
+    """Whether rotations differ by less than 1 degree, and translations by less than 10."""
     chord = np.linalg.norm(first[:, :3] - second[:, :3]) / np.sqrt(8)
     cosine = float(first[:, 3] @ second[:, 3])
     return bool(2 * np.degrees(np.arcsin(min(chord, 1.0))) < 1 and cosine > np.cos(np.radians(10)))
@@ -236,20 +232,15 @@ def match(first: Frame, second: Frame) -> Ids:
     """Mutual nearest neighbours (k, 2) that pass the ratio test."""
     assert first.descriptors is not None
     assert second.descriptors is not None
-    if len(first.descriptors) < 2 or len(second.descriptors) < 2:
-        return np.zeros((0, 2), np.int64)
-    index, distance = hamming_search(first.descriptors, second.descriptors, k=2)
-    rows = np.flatnonzero(distance[:, 0] < RATIO * distance[:, 1])
-    target = index[rows, 0]
-    back, _ = hamming_search(second.descriptors[target], first.descriptors, k=1)
-    mutual = back[:, 0] == rows
-    return np.column_stack([rows[mutual], target[mutual]]).astype(np.int64)
+    rows, target, _ = nearest_matches(first.descriptors, second.descriptors, RATIO)
+    pairs = np.column_stack([rows, target])
+    return pairs[mutual(first.descriptors, second.descriptors, rows, target)]
 
 
 def _rotated_share(rotation: Array, first: Array, second: Array, limit: float) -> float:
     """Share of ray pairs that a rotation alone explains.
 
-    The rotation is fitted robustly: least squares over the better half, from the given one on.
+    Starting at the given one, the rotation is fitted robustly: least squares over the better half.
     """
     a = np.column_stack([first, np.ones(len(first))])
     b = np.column_stack([second, np.ones(len(second))])

@@ -1,4 +1,4 @@
-"""Closes loops: recognises places seen before by prototypes of the whole map."""
+"""Closes loops: recognises places seen before by the prototypes of the whole map."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.prediction import MAX_STEP, predict
 from protomark.mapping.structure import Structure
 from protomark.mapping.tracking import TrackedPose, Tracker
-from protomark.mapping.triangulation import remember
+from protomark.mapping.triangulation import update_prototypes
 
-# Landmarks that the last so many keyframes see do not count as a revisit.
+# A revisit is by landmarks that the latest keyframes do not observe, at least so many, and at least
+# this share of those that the frame tracks: fewer are repeated texture.
 RECENT = 20
 _MIN_INLIERS = 30
-# Nor do few landmarks beside those that the frame tracks: that is repeated texture.
 _MIN_SHARE = 0.25
-# There is no drift to correct if the tracked landmarks are off by less than this many times the
-# largest error under the pose that the old landmarks give.
+# Drift is corrected if the tracked landmarks are off by more than this multiple of the largest
+# error under the pose that the old landmarks give.
 _DRIFT = 3.0
 
 
 def close_loop(
     structure: Structure, memory: Memory, tracker: Tracker, newest: int, max_error: float
 ) -> tuple[int, bool]:
-    """Search for the newest keyframe among landmarks that no recent keyframe saw.
+    """Search for the newest keyframe among landmarks that no recent keyframe observes.
 
-    If old landmarks give it a pose, the new landmarks that it sees are merged with the old ones. If
-    that pose differs from the tracked one, the difference is distributed over the frames since then
-    as a similarity (scale drifts, too), and a global adjustment has to follow.
+    If old landmarks give it a pose, the new landmarks that it observes are merged with the old
+    ones. If that pose differs from the tracked one, the difference is distributed over the frames
+    since then as a similarity (scale drifts, too), and a global adjustment has to follow.
 
     Returns:
         Number of merged landmarks, and whether drift was corrected.
@@ -44,7 +44,7 @@ def close_loop(
     old = structure.ids
     old = old[~recent[old]]
     frame = structure.frames[newest]
-    # Among old landmarks only: beside their duplicates they would not pass the ratio test.
+    # Only old landmarks are searched: beside their duplicates they would not pass the ratio test.
     found = tracker.relocalize(frame, old)
     if found is not None:
         found = tracker.track_local_map(frame, found.pose, old)
@@ -58,11 +58,11 @@ def close_loop(
         frame.camera_id, max_error
     )
     if drift:
-        _distribute_drift(structure, newest, found.pose, matches.rows, matches.ids)
+        _correct_drift(structure, newest, found.pose, matches.rows, matches.ids)
     seen = frame.landmarks[matches.rows]
     fresh = (seen < 0) & ~np.isin(matches.ids, frame.seen)
     structure.observe(frame, matches.rows[fresh], matches.ids[fresh])
-    remember(memory, frame, matches.rows[fresh])
+    update_prototypes(memory, frame, matches.rows[fresh])
     duplicate = (seen >= 0) & (seen != matches.ids)
     pairs = list(zip(seen[duplicate].tolist(), matches.ids[duplicate].tolist(), strict=True))
     return merge_duplicates(structure, memory, pairs, max_error, check=not drift), drift
@@ -71,7 +71,7 @@ def close_loop(
 def _across_gap(
     structure: Structure, tracker: Tracker, newest: int, old: Ids
 ) -> TrackedPose | None:
-    """The pose by prediction from the frames on the other side of a gap in the input."""
+    """The pose that the frames on the other side of a gap in the input predict, refined."""
     frame = structure.frames[newest]
     recent = set(structure.keyframes()[-RECENT:])
     others = [other for i, other in enumerate(structure.frames) if i not in recent]
@@ -81,7 +81,7 @@ def _across_gap(
 
 
 def _drift(structure: Structure, frame: Frame, pose: Array) -> float:
-    """Median reprojection error in pixels of what a frame sees, under another pose."""
+    """Median reprojection error in pixels of what a frame observes, under another pose."""
     rows = frame.observed
     return float(
         np.median(
@@ -95,15 +95,15 @@ def _drift(structure: Structure, frame: Frame, pose: Array) -> float:
     )
 
 
-def _distribute_drift(structure: Structure, newest: int, pose: Array, rows: Ids, ids: Ids) -> None:
-    """Rotate, move and scale the frames since the old sighting, each by its share."""
+def _correct_drift(structure: Structure, newest: int, pose: Array, rows: Ids, ids: Ids) -> None:
+    """Rotate, move and scale the frames since the last visit, each by its share."""
     cv2 = optional("cv2")
     frame = structure.frames[newest]
     rotation = pose[:, :3].T @ frame.pose[:, :3]
     turn = cv2.Rodrigues(rotation)[0][:, 0]
     before, after = camera_centers(frame.pose), camera_centers(pose)
     scale = _scale(structure, frame, pose, rows, ids)
-    start = max(_last_sighting(structure, newest, ids), _run_start(structure, newest))
+    start = max(_last_visit(structure, newest, ids), _run_start(structure, newest))
     index = np.arange(len(structure.frames))
     shares = np.clip((index - start) / max(newest - start, 1), 0, 1)
     first = np.full(len(structure.positions), len(structure.frames))
@@ -115,8 +115,9 @@ def _distribute_drift(structure: Structure, newest: int, pose: Array, rows: Ids,
         one = structure.frames[i]
         part, stretch = cv2.Rodrigues(share * turn)[0], scale**share
         shift = before + share * (after - before)
-        mine = np.flatnonzero((first == i) & structure.existing)
-        structure.positions[mine] = stretch * (structure.positions[mine] - before) @ part.T + shift
+        ids_first_seen = np.flatnonzero((first == i) & structure.existing)
+        local = structure.positions[ids_first_seen] - before
+        structure.positions[ids_first_seen] = stretch * local @ part.T + shift
         center = stretch * part @ (camera_centers(one.pose) - before) + shift
         turned = one.pose[:, :3] @ part.T
         one.pose = np.column_stack([turned, -turned @ center])
@@ -124,27 +125,26 @@ def _distribute_drift(structure: Structure, newest: int, pose: Array, rows: Ids,
 
 
 def _scale(structure: Structure, frame: Frame, pose: Array, rows: Ids, ids: Ids) -> float:
-    """Depth of the old landmarks over that of the new ones at the same keypoints (median)."""
+    """Median depth of the old landmarks over that of the new ones at the same keypoints."""
     new = frame.landmarks[rows]
     both = new >= 0
     if both.sum() < 10:
         return 1.0
-    deep = structure.positions[ids[both]] @ pose[2, :3] + pose[2, 3]
-    shallow = structure.positions[new[both]] @ frame.pose[2, :3] + frame.pose[2, 3]
-    return float(np.median(deep / shallow))
+    old_depth = structure.positions[ids[both]] @ pose[2, :3] + pose[2, 3]
+    new_depth = structure.positions[new[both]] @ frame.pose[2, :3] + frame.pose[2, 3]
+    return float(np.median(old_depth / new_depth))
 
 
-def _last_sighting(structure: Structure, newest: int, ids: Ids) -> int:
-    """Index of the last frame that saw many of the landmarks that are seen again."""
-    wanted = np.zeros(len(structure.positions), bool)
-    wanted[ids] = True
-    counts = [int(wanted[frame.seen].sum()) for frame in structure.frames[:newest]]
-    many = np.flatnonzero(np.array(counts) >= max(1, max(counts) // 2))
-    return int(many[-1])
+def _last_visit(structure: Structure, newest: int, ids: Ids) -> int:
+    """Index of the last frame that observed many of the landmarks which are observed again."""
+    revisited = np.zeros(len(structure.positions), bool)
+    revisited[ids] = True
+    counts = np.array([revisited[frame.seen].sum() for frame in structure.frames[:newest]])
+    return int(np.flatnonzero(counts >= max(1, counts.max() // 2))[-1])
 
 
 def _run_start(structure: Structure, newest: int) -> int:
-    """Index of the first frame of the unbroken run that ends with the newest one."""
+    """Index of the first frame of the gapless run that ends with the newest one."""
     frames = structure.frames
     start = newest
     while start > 0 and abs(frames[start].index - frames[start - 1].index) <= MAX_STEP:

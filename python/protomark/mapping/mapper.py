@@ -22,43 +22,42 @@ from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Structure
 from protomark.mapping.tracking import LandmarkMatches, TrackedPose, Tracker
-from protomark.mapping.triangulation import remember, triangulate
+from protomark.mapping.triangulation import triangulate, update_prototypes
 from protomark.progress import Progress, silent
 
-# Gives the images of some names once more, in their order or backward.
+# Yields the images of these names again, in their order or, if the flag is set, backward.
 Reread = Callable[[set[str], bool], Iterable[InputImage]]
 
-# Fewer keypoints than this are a black or blurred frame.
+# A frame with fewer keypoints is black or blurred.
 _MIN_KEYPOINTS = 50
-# Keyframes that local bundle adjustment moves, and the most steps it takes.
+# Local bundle adjustment moves this many keyframes, in at most so many steps.
 _LOCAL_SIZE = 10
 _LOCAL_ITERATIONS = 8
-# The whole map is adjusted whenever it has grown by this factor.
+# Global bundle adjustment follows whenever the number of keyframes has grown by this factor.
 _GROWTH = 1.5
 _FIRST_GLOBAL = 6
 # A map with fewer keyframes that loses this many frames in a row was initialised wrongly.
 _YOUNG_KEYFRAMES = 4
 _MAX_YOUNG_LOSSES = 3
-# A pose by prediction that matches a smaller share of the landmarks in view is compared with one
-# by relocalization.
-_DOUBTFUL_SHARE = 0.3
+# A tracked pose that matches a smaller share of the landmarks in view is checked by relocalization.
+_MIN_TRACKED_SHARE = 0.3
 _LOOP_EVERY = 3
 _LOOP_LOSS_SCALE = 8.0
-# If the map finds a guessed focal length to be off by more than this, its beginning is bent and the
-# map is restarted. So many keyframes decide, or all there are: after the first ones of `hololens`
-# the estimate is 530 to 790 pixels, and 495 in the end.
+# The map restarts if a guessed focal length proves to be off by more than this share, as its first
+# frames are bent. That is decided at this number of keyframes, or at the end: after the first
+# keyframes of `hololens` the estimate is 530 to 790 pixels, and 495 in the end.
 _MAX_FOCAL_OFFSET = 0.05
 _CALIBRATED_KEYFRAMES = 196
 
 
 class Mapper:
-    """A map in the making.
+    """Makes a map from one frame after the other.
 
     Args:
-        options: how to make it.
-        camera: camera of the frames to come.
+        options: how to make the map.
+        camera: camera of the next frames.
         threads: threads to search and adjust on.
-        new_memory: makes an empty memory; prototypes by default.
+        new_memory: creates an empty memory; by default one of prototypes.
     """
 
     def __init__(
@@ -78,7 +77,7 @@ class Mapper:
         self.next_global = _FIRST_GLOBAL
         self.lost_in_row = 0
         self.retrying = False
-        # Focal length that the map began with, 0 once it is settled.
+        # Focal length that the map was initialised with, 0 once it is confirmed.
         self.guessed_focal = camera.focal_length if options.calibrate else 0.0
         self.restarted = False
         self._extractor = Extractor(options.descriptor, options.max_keypoints)
@@ -86,19 +85,19 @@ class Mapper:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the frames to come."""
+        """Camera of the next frames."""
         return self.structure.cameras[self.camera_id]
 
     @property
     def scene(self) -> pm.PrototypeMap:
         """The map of prototypes."""
         if not isinstance(self.memory, Prototypes):
-            raise TypeError("only a memory of prototypes is a map that can be saved")
+            raise TypeError("this mapper's memory holds no prototypes, so it has no map to save")
         return self.memory.map
 
     @property
     def tracker(self) -> Tracker:
-        """Finds frames in the map as it is."""
+        """Finds frames in the current map."""
         o = self.options
         return Tracker(self.structure, self.memory, o.max_error, o.min_inliers, self.threads)
 
@@ -107,22 +106,21 @@ class Mapper:
         """Bytes of a descriptor."""
         return self._extractor.kind.bytes
 
-    # One frame: the paper's Section 3.
+    # The paper's Section 3: detect, track or relocalize, observe, and extend the map by keyframes.
 
     def add(self, image: InputImage) -> FrameRecord:
-        """Add the next frame to the map; its record says what became of it."""
+        """Add the next frame to the map; the record says what became of it."""
         self.clock.lap()
-        record = self.history.records.get(image.name)
-        first_time = record is None
-        if record is None:
-            record = FrameRecord(image.index, image.name, "")
-            self.history.records[image.name] = record
+        first_time = image.name not in self.history.records
+        record = self.history.records.setdefault(
+            image.name, FrameRecord(image.index, image.name, "")
+        )
         frame = self._detect(image, record)
         if frame is not None:
-            if self.options.fixed_poses and image.pose is None:
-                record.outcome = "no pose is given for it"
-            elif image.pose is not None:
+            if image.pose is not None:
                 self._register_given_pose(frame, image.pose)
+            elif self.options.fixed_poses:
+                record.outcome = "no pose is given for it"
             elif self.structure.frames:
                 self._register(frame, record)
                 self._check_young_map(record)
@@ -136,27 +134,28 @@ class Mapper:
 
     def _register(self, frame: Frame, record: FrameRecord) -> None:
         """Track or relocalize a frame, and update the map with it."""
-        found = self._track(frame)
+        found = self._track_or_relocalize(frame)
         if found is None:
             self.lost_in_row += 1
             record.outcome = "not found in the map: too few matches agree on a pose"
             return
         self.lost_in_row = 0
-        self._insert(frame, found)
+        self._insert_frame(frame, found)
 
-    def _insert(self, frame: Frame, found: TrackedPose) -> None:
-        """Let a frame with a pose update the landmarks it sees; a keyframe extends the map."""
+    def _insert_frame(self, frame: Frame, found: TrackedPose) -> None:
+        """Update the landmarks that a frame observes (Eq. 2); extend the map by a keyframe."""
         index = self._observe(frame, found)
         if self.structure.frames[index].keyframe:
             self._triangulate(index)
-            self._adjust_local(index)
+            adjusted = self._adjust_local_bundle(index)
+            self._cull(adjusted)
             self._shrink_window()
             self._close_loop(index)
-            self._adjust_if_grown()
+            self._adjust_global_bundle_if_grown()
         self._record(index)
 
     def _detect(self, image: InputImage, record: FrameRecord) -> Frame | None:
-        """Keypoints, descriptors and codes of an image; None if it is not usable."""
+        """Detect, describe and encode the keypoints of an image; None if it is not usable."""
         if image.image is None:
             record.outcome = image.problem
             return None
@@ -186,13 +185,13 @@ class Mapper:
             encoded,
         )
 
-    def _track(self, frame: Frame) -> TrackedPose | None:
-        """The pose of a frame by prediction from its neighbours, or by relocalization."""
+    def _track_or_relocalize(self, frame: Frame) -> TrackedPose | None:
+        """The pose of a frame near the one that its neighbours predict, or anywhere in the map."""
         with self.clock.stage("match"):
             predicted = predict(self.structure.frames, frame.index, frame.camera_id)
             found = None if predicted is None else self.tracker.track(frame, predicted)
-            if found is None or found.share < _DOUBTFUL_SHARE:
-                # A wrong prediction may have led to a wrong pose.
+            if found is None or found.share < _MIN_TRACKED_SHARE:
+                # A wrong prediction may lead to a wrong pose.
                 rough = self.tracker.relocalize(frame)
                 other = self.tracker.track_local_map(frame, rough.pose) if rough else None
                 if found is None or (other and len(other.matches) > len(found.matches)):
@@ -200,7 +199,7 @@ class Mapper:
         return found
 
     def _observe(self, frame: Frame, found: TrackedPose) -> int:
-        """Add a frame and its observations: prototypes learn (Eq. 2); return its index."""
+        """Update the prototypes that a frame observes (Eq. 2); returns the frame's index."""
         structure = self.structure
         frame = frame.at(found.pose)
         keyframes = structure.keyframes()
@@ -208,13 +207,13 @@ class Mapper:
         last = structure.frames[keyframes[-1]] if keyframes else None
         frame.keyframe = is_keyframe(structure, last, frame)
         structure.frames.append(frame)
-        remember(self.memory, frame, frame.observed)
+        update_prototypes(self.memory, frame, frame.observed)
         if not frame.keyframe:
             frame.leave_window()
         return len(structure.frames) - 1
 
     def _triangulate(self, index: int) -> None:
-        """New landmarks from the descriptors of the window; duplicates are merged."""
+        """Create landmarks from the descriptors of the window (Eq. 1), and merge duplicates."""
         o = self.options
         with self.clock.stage("triangulate"):
             window = [i for i in self._window() if i != index]
@@ -223,28 +222,30 @@ class Mapper:
             )
             merge_duplicates(self.structure, self.memory, duplicates, o.max_error)
 
-    def _adjust_local(self, index: int) -> None:
-        """Adjust the keyframes around a new one, and remove what does not fit."""
+    def _adjust_local_bundle(self, index: int) -> list[int]:
+        """Adjust the keyframes around a new one; returns their indices."""
         with self.clock.stage("adjust"):
             if self.options.fixed_poses:
-                moved = self._window()
-                adjustment.adjust(self.structure, [], moved, 0)
-            else:
-                moved = adjustment.adjust_local(
-                    self.structure, index, _LOCAL_SIZE, _LOCAL_ITERATIONS
-                )
-            self._cull(moved)
+                window = self._window()
+                adjustment.adjust(self.structure, [], window, 0)
+                return window
+            return adjustment.adjust_local_bundle(
+                self.structure, index, _LOCAL_SIZE, _LOCAL_ITERATIONS
+            )
 
     def _cull(self, frames: list[int]) -> None:
+        """Remove observations of these frames, and landmarks, that do not fit."""
         o = self.options
-        culling.cull(self.structure, self.memory, frames, o.max_error, o.min_angle)
+        with self.clock.stage("adjust"):
+            culling.cull(self.structure, self.memory, frames, o.max_error, o.min_angle)
 
     def _shrink_window(self) -> None:
+        """Drop the descriptors of all but the latest keyframes."""
         for i in self._window()[: -self.options.window]:
             self.structure.frames[i].leave_window()
 
     def _close_loop(self, index: int) -> None:
-        """Merge landmarks of a place seen before, and distribute the drift since then."""
+        """Merge landmarks of a place seen before, and correct the drift since then."""
         interval = 1 if self.retrying else _LOOP_EVERY
         if self.options.fixed_poses or len(self.structure.keyframes()) % interval:
             return
@@ -259,26 +260,26 @@ class Mapper:
             )
         if drift:
             with self.clock.stage("adjust"):
-                adjustment.adjust_global(
+                adjustment.adjust_global_bundle(
                     self.structure, 20, loss_scale=_LOOP_LOSS_SCALE, threads=self.threads
                 )
-            self._adjust_globally(1)
+            self._adjust_global_bundle(1)
 
-    def _adjust_if_grown(self) -> None:
+    def _adjust_global_bundle_if_grown(self) -> None:
         keyframes = len(self.structure.keyframes())
         if keyframes >= self.next_global:
             self.next_global = int(keyframes * _GROWTH) + 1
-            self._adjust_globally(2)
+            self._adjust_global_bundle(2)
 
-    def _adjust_globally(self, rounds: int) -> None:
-        """Global bundle adjustment and culling, with the camera if it is being calibrated."""
+    def _adjust_global_bundle(self, rounds: int) -> None:
+        """Adjust and cull the whole map, and the camera if it is being calibrated."""
         structure, o = self.structure, self.options
-        # After a restart the first keyframes must not overrule what all frames found.
+        # After a restart the first keyframes must not overrule the estimate from all frames.
         fixed = self.restarted and self.guessed_focal
         fixed = fixed and len(structure.keyframes()) < _CALIBRATED_KEYFRAMES
         with self.clock.stage("adjust"):
             for _ in range(rounds):
-                adjustment.adjust_global(
+                adjustment.adjust_global_bundle(
                     structure,
                     intrinsics=o.calibrate and not fixed,
                     poses=not o.fixed_poses,
@@ -288,7 +289,7 @@ class Mapper:
             self._refine_other_frames()
 
     def _refine_other_frames(self) -> None:
-        """Refine the poses of frames that are not keyframes on the landmarks that they see."""
+        """Refine the poses of frames that are not keyframes on the landmarks they observe."""
         if self.options.fixed_poses:
             return
         structure = self.structure
@@ -318,27 +319,27 @@ class Mapper:
         if len(self.structure.ids):
             with self.clock.stage("match"):
                 matches = self.tracker.match_projected(frame, pose, 1.5 * self.options.max_error)
-        self._insert(frame, TrackedPose(pose, matches))
+        self._insert_frame(frame, TrackedPose(pose, matches))
 
-    # The first two frames.
+    # Initialisation.
 
     def _reset_initialiser(self) -> None:
         tolerance = self.structure.tolerance(self.camera_id, self.options.max_error)
         self.initialiser = Initialiser(self.camera, tolerance)
 
     def _initialise(self, frame: Frame, record: FrameRecord) -> None:
-        """Begin the map with two frames of enough parallax, once there are such."""
+        """Start the map with two frames once a pair has enough parallax."""
         with self.clock.stage("initialise"):
             pair = self.initialiser.push(frame)
         if pair is None:
-            record.outcome = "before the first two frames with enough parallax"
+            record.outcome = "before the first pair of frames with enough parallax"
             return
         waiting = self.initialiser.waiting
         first, second = waiting[pair.first], waiting[pair.second]
-        if not self._begin_map(first, second, pair):
+        if not self._start_map(first, second, pair):
             self._abort_initialisation(record, "the first two frames share too few landmarks")
             return
-        # The frames between the two, then those before, from near to far.
+        # The frames between the two come first, then those before, from near to far.
         between = waiting[pair.first + 1 : pair.second]
         for one in [*between, *waiting[: pair.first][::-1]]:
             self._register(one, self.history.records[one.name])
@@ -347,12 +348,12 @@ class Mapper:
             self._abort_initialisation(record, reason)
             return
         self.history.events.append(
-            f"{second.name}: the map begins, with {first.name} and this frame"
+            f"{second.name}: the map starts with {first.name} and this frame"
         )
         self._reset_initialiser()
         self.lost_in_row = 0
 
-    def _begin_map(self, first: Frame, second: Frame, pair: TwoViewPose) -> bool:
+    def _start_map(self, first: Frame, second: Frame, pair: TwoViewPose) -> bool:
         """Triangulate and adjust two frames; False if they share too few landmarks."""
         self.structure.frames += [first.at(np.eye(3, 4)), second.at(pair.pose)]
         self._triangulate(1)
@@ -378,11 +379,10 @@ class Mapper:
         structure.recompute_views()
 
     def _abort_initialisation(self, record: FrameRecord, reason: str) -> None:
-        """Drop a map that was initialised wrongly, and wait for another pair of frames."""
+        """Discard a map that was initialised wrongly, and wait for another pair of frames."""
         for frame in self.structure.frames:
-            dropped = self.history.records[frame.name]
-            dropped.outcome = f"initialised wrongly: {reason}"
-            dropped.inliers, dropped.keyframe = 0, False
+            old = self.history.records[frame.name]
+            old.outcome, old.inliers, old.keyframe = f"initialised wrongly: {reason}", 0, False
         record.outcome = reason
         waiting = self.initialiser.waiting[-1:]
         self.structure = Structure({self.camera_id: self.camera})
@@ -392,18 +392,18 @@ class Mapper:
         self.initialiser.waiting = waiting
 
     def _check_young_map(self, record: FrameRecord) -> None:
-        """Abort a map that loses the camera when it has just begun."""
+        """Abort a map that loses the camera when it has just started."""
         young = len(self.structure.keyframes()) < _YOUNG_KEYFRAMES and not self.retrying
         if young and self.lost_in_row >= _MAX_YOUNG_LOSSES:
-            self._abort_initialisation(record, "the map was lost when it had just begun")
+            self._abort_initialisation(record, "the map lost the camera when it had just started")
 
     # The camera.
 
     def needs_restart(self, at_end: bool = False) -> bool:
-        """Whether the camera turned out so unlike the guess that the map has to begin again.
+        """Whether the camera proved so different from the guess that the map has to restart.
 
         Args:
-            at_end: no frame is left, so the keyframes there are must decide.
+            at_end: whether no frame is left, so that the existing keyframes decide.
         """
         if not self.guessed_focal or self.restarted:
             return False
@@ -411,11 +411,11 @@ class Mapper:
         if keyframes < (_FIRST_GLOBAL if at_end else _CALIBRATED_KEYFRAMES):
             return False
         if at_end:
-            self._adjust_globally(2)
+            self._adjust_global_bundle(2)
         return abs(self.camera.focal_length / self.guessed_focal - 1) > _MAX_FOCAL_OFFSET
 
     def restart(self) -> Mapper:
-        """An empty map that begins with the camera that this one found."""
+        """An empty map that starts with the camera which this one calibrated."""
         new = Mapper(self.options, self.camera, self.threads, self._new_memory)
         new.restarted = True
         new.history.events.append(
@@ -430,20 +430,20 @@ class Mapper:
         """Retry frames that were not found, adjust everything, and drop the window's descriptors.
 
         Args:
-            reread: gives lost frames once more; None: they are not retried.
-            progress: called with each frame that is retried.
+            reread: yields lost frames again; None: they are not retried.
+            progress: called with each retried frame.
         """
         self.clock.lap()
         if reread is not None and self.structure.frames and not self.options.fixed_poses:
             self._retry_lost_frames(reread, progress)
         progress("adjust", 0, 0)
         if self.structure.frames:
-            self._adjust_globally(2)
+            self._adjust_global_bundle(2)
         for frame in self.structure.frames:
             frame.descriptors = frame.encoded = None
-        # No landmark can be confirmed any more.
+        # With an empty window every landmark counts as old, and unconfirmed ones are culled.
         with self.clock.stage("adjust"):
-            culling.remove_weak(
+            culling.cull_landmarks(
                 self.structure, self.memory, self.structure.ids, self.options.min_angle
             )
         for frame in self.structure.frames:
@@ -453,10 +453,10 @@ class Mapper:
             total[name] = total.get(name, 0.0) + seconds
 
     def _retry_lost_frames(self, reread: Reread, progress: Progress) -> None:
-        """Retry backward first: a frame before the first one found often leads to the next."""
+        """Retry lost frames, backward first: most precede a registered frame that leads to them."""
         self.retrying = True
-        fruitless, backward = 0, True
-        while fruitless < 2:
+        failed_passes, backward = 0, True
+        while failed_passes < 2:
             lost = {
                 record.name
                 for record in self.history.records.values()
@@ -468,7 +468,7 @@ class Mapper:
                 progress("retry lost frames", number, len(lost))
             if found == len(lost):
                 return
-            fruitless = 0 if found else fruitless + 1
+            failed_passes = 0 if found else failed_passes + 1
             backward = not backward
 
     def _measure(self, record: FrameRecord) -> None:

@@ -1,4 +1,4 @@
-"""What a map keeps of its landmarks' descriptors, and how frames are matched with it."""
+"""What a map in the making keeps of descriptors, and how frames are matched with it."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ _PAIRS = 4096
 class Memory(ABC):
     """What a map keeps of descriptors, and how a frame is matched with it.
 
-    Descriptors are encoded once per frame; all other calls take the encoded form. Prototypes are
-    the memory of every map that Protomark makes; `protomark evaluate-mapping` compares others.
+    Descriptors are encoded once per frame; all other calls take the encoded form. Protomark's maps
+    have `Prototypes` for a memory; `protomark evaluate-mapping` compares it with others.
 
     Attributes:
-        ratio: largest ratio of what `search` gives for the nearest and second nearest landmark,
-            for a memory without calibration.
-        guided_ratio: largest ratio of `distances` among landmarks that project near the keypoint.
-        max_distance: largest distance among landmarks that project near the keypoint, as a share of
-            the median distance between keypoints and landmarks elsewhere.
+        ratio: limit on the ratio of the two distances that `search` returns, for a memory without
+            calibration.
+        guided_ratio: limit on the ratio of the two smallest `distances` to landmarks that project
+            near the keypoint.
+        max_distance: limit on the distance to a landmark that projects near the keypoint, as a
+            share of the median distance between keypoints and other landmarks.
     """
 
     ratio = 0.85**2
@@ -39,15 +40,15 @@ class Memory(ABC):
 
     @abstractmethod
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
-        """Encode descriptors (n, bytes) uint8 as (n, width), the form that is compared."""
+        """Encode descriptors (n, B) uint8 as (n, width), the form that is compared."""
 
     @abstractmethod
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Add observations: unknown ids are new landmarks."""
+        """Add observations; new ids are new landmarks."""
 
     @abstractmethod
     def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Take back observations that were added before, exactly."""
+        """Remove observations that were added before, exactly."""
 
     @abstractmethod
     def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
@@ -63,28 +64,28 @@ class Memory(ABC):
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """The two nearest landmarks of each descriptor, exactly: ids and distances (q, 2).
 
-        Without one, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
+        If there is none, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
 
         Args:
             encoded: (q, width).
             threads: threads to search on; the result is the same.
-            among: landmarks to search, ascending; None: all.
+            among: ids of the landmarks to search, ascending; None: all.
         """
 
     @abstractmethod
     def distances(
         self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Distances (p,) between row `rows[i]` of `encoded` and landmark `ids[i]`."""
+        """Distance (p,) of each row `rows[i]` of `encoded` from landmark `ids[i]`."""
 
     @abstractmethod
     def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of these landmarks the memory holds."""
+        """Whether the memory holds each landmark."""
 
     @property
     @abstractmethod
     def bytes(self) -> int:
-        """Bytes that matching needs for all landmarks, positions apart."""
+        """Bytes that matching needs for all landmarks, without positions."""
 
     def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
         """Rows of distances (q, 2) whose nearest landmark is accepted, the clearest first."""
@@ -95,11 +96,11 @@ class Memory(ABC):
 
 
 def clearest_rows(
-    nearest: NDArray[np.int32], doubt: NDArray[np.floating], limit: float
+    nearest: NDArray[np.int32], ambiguity: NDArray[np.floating], limit: float
 ) -> NDArray[np.int64]:
-    """Rows (k,) of `doubt` (q,) below a limit, by doubt and then by distance."""
-    rows = np.flatnonzero((nearest < NO_DISTANCE) & (doubt < limit))
-    return rows[np.lexsort((nearest[rows], doubt[rows]))]
+    """Rows (k,) whose ambiguity (q,) is below a limit, by ambiguity and then by distance."""
+    rows = np.flatnonzero((nearest < NO_DISTANCE) & (ambiguity < limit))
+    return rows[np.lexsort((nearest[rows], ambiguity[rows]))]
 
 
 class Prototypes(Memory):
@@ -122,11 +123,11 @@ class Prototypes(Memory):
         return self.encoder.encode(descriptors, self.dim)
 
     def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """Eq. 1 and Eq. 2 of the paper."""
+        """See `Memory.add`: Eq. 1 and Eq. 2 of the paper."""
         self.map.add_codes(ids, encoded)
 
     def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
-        """See `Memory.subtract`; a landmark halved at 255 observations may keep its share."""
+        """See `Memory.subtract`; landmarks whose sums were halved keep what they lack."""
         try:
             self.map.subtract_codes(ids, encoded)
         except ValueError:
@@ -148,21 +149,21 @@ class Prototypes(Memory):
         """See `Memory.search`."""
         if among is None:
             return self.map.search_codes(encoded, k=2, threads=threads)
-        # Sums of integers far below 2^24: exact in float32.
-        codes, places = encoded.astype(np.float32), self._rounded(among)
+        # Sums of integers far below 2^24 are exact in float32.
+        codes, prototypes = encoded.astype(np.float32), self._rounded(among)
         ids = np.full((len(codes), 2), -1, np.int64)
         distances = np.full((len(codes), 2), NO_DISTANCE, np.int32)
         if not len(among):
             return ids, distances
-        lengths = (places * places).sum(1)
-        for at in range(0, len(codes), _CHUNK):
-            some = codes[at : at + _CHUNK]
-            squares = (some * some).sum(1)[:, None] + lengths - 2 * some @ places.T
+        lengths = (prototypes * prototypes).sum(1)
+        for start in range(0, len(codes), _CHUNK):
+            chunk = slice(start, start + _CHUNK)
+            q = codes[chunk]
+            squares = (q * q).sum(1)[:, None] + lengths - 2 * q @ prototypes.T
+            rows = np.arange(len(q))
             for k in range(min(2, len(among))):
                 best = np.argmin(squares, axis=1)
-                rows = np.arange(len(some))
-                ids[at : at + _CHUNK, k] = among[best]
-                distances[at : at + _CHUNK, k] = squares[rows, best]
+                ids[chunk, k], distances[chunk, k] = among[best], squares[rows, best]
                 squares[rows, best] = np.inf
         return ids, distances
 
@@ -172,17 +173,18 @@ class Prototypes(Memory):
         """See `Memory.distances`."""
         if not len(rows):
             return np.zeros(0, np.float32)
-        at = np.zeros(int(ids.max()) + 1, np.int64)
-        at[ids] = 1
-        known = np.flatnonzero(at)
-        at[known] = np.arange(len(known))
-        codes, places = encoded.astype(np.float32), self._rounded(known)
+        # As np.unique with return_inverse, without sorting.
+        row_of_id = np.zeros(int(ids.max()) + 1, np.int64)
+        row_of_id[ids] = 1
+        unique = np.flatnonzero(row_of_id)
+        row_of_id[unique] = np.arange(len(unique))
+        codes, prototypes = encoded.astype(np.float32), self._rounded(unique)
         squares = np.empty(len(rows), np.float32)
-        # Pieces that fit into the cache are several times faster.
-        for a in range(0, len(rows), _PAIRS):
-            b = a + _PAIRS
-            difference = places[at[ids[a:b]]] - codes[rows[a:b]]
-            squares[a:b] = np.einsum("pd,pd->p", difference, difference)
+        # Chunks that fit into the cache are several times faster.
+        for start in range(0, len(rows), _PAIRS):
+            chunk = slice(start, start + _PAIRS)
+            difference = prototypes[row_of_id[ids[chunk]]] - codes[rows[chunk]]
+            squares[chunk] = np.einsum("pd,pd->p", difference, difference)
         return np.sqrt(squares)
 
     def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -190,24 +192,24 @@ class Prototypes(Memory):
         return np.isin(ids, self.map.ids)
 
     def _rounded(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Prototypes as search compares them: to integers, halves away from zero."""
+        """Prototypes as search compares them: rounded to integers, halves away from zero."""
         means = self.map.prototypes(ids)
         return np.sign(means) * np.floor(np.abs(means) + np.float32(0.5))
 
     @property
     def bytes(self) -> int:
-        """As in a sealed map: one byte per dimension and one for the count."""
+        """See `Memory.bytes`: as in a sealed map, one byte per number and one for the count."""
         return len(self.map) * (self.dim + 1)
 
     def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
         """See `Memory.accepted`; the probability decides if the encoder was calibrated."""
         if self.calibration is None:
             return super().accepted(distances)
-        doubt = 1 - self.calibration.probability(distances)
-        return clearest_rows(distances[:, 0], doubt, 1 - MIN_PROBABILITY)
+        ambiguity = 1 - self.calibration.probability(distances)
+        return clearest_rows(distances[:, 0], ambiguity, 1 - MIN_PROBABILITY)
 
     def use(self, scene: pm.PrototypeMap) -> None:
-        """Continue with a map that was saved.
+        """Continue with a saved map.
 
         Raises:
             ValueError: it was made with another encoder or other dimensions.

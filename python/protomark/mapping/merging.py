@@ -1,16 +1,16 @@
-"""Merges landmarks that are duplicates."""
+"""Merges duplicate landmarks."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.triangulation import refine_points, reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors, refine_points
 from protomark.mapping.frame import Ids
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
 
-# Share of the observations that must fit the joint position.
+# This share of the observations must fit the joint position.
 _FITTING = 0.9
 
 
@@ -21,17 +21,17 @@ def merge_duplicates(
     max_error: float,
     check: bool = True,
 ) -> int:
-    """Merge pairs of landmarks that no frame sees together and that one position fits.
+    """Merge pairs of landmarks that no frame observes together and that one position fits.
 
-    The one with more observations stays; its prototype becomes exactly what it would be if all
-    observations had been of it.
+    The landmark with more observations stays, and its prototype is exactly that of all observations
+    together.
 
     Args:
         structure: frames and landmarks.
-        memory: what they look like.
+        memory: the landmarks' prototypes.
         pairs: landmarks that may be duplicates.
         max_error: largest reprojection error, as a share of the image's longer side.
-        check: whether the joint position must fit; False while a loop is not closed yet.
+        check: whether one position must fit; False until a loop is closed.
 
     Returns:
         Number of merged pairs.
@@ -39,7 +39,7 @@ def merge_duplicates(
     chosen = _disjoint(structure, pairs)
     if not len(chosen):
         return 0
-    fits = ~_seen_together(structure, chosen)
+    fits = ~_observed_together(structure, chosen)
     into, source = chosen[fits].T
     if check and len(into):
         positions, good = _joint_positions(structure, into, source, max_error)
@@ -51,24 +51,24 @@ def merge_duplicates(
 
 
 def _disjoint(structure: Structure, pairs: list[tuple[int, int]]) -> Ids:
-    """Each landmark in at most one pair, the one seen more often first."""
+    """Pairs (n, 2) without a landmark in common, the one with more observations first."""
     counts, existing = structure.counts(), structure.existing
-    taken: set[int] = set()
-    out = []
+    used: set[int] = set()
+    chosen = []
     for a, b in sorted({(min(p), max(p)) for p in pairs}):
-        if a != b and existing[a] and existing[b] and a not in taken and b not in taken:
-            taken.update((a, b))
-            out.append((a, b) if counts[a] >= counts[b] else (b, a))
-    return np.array(out, np.int64).reshape(-1, 2)
+        if a != b and existing[a] and existing[b] and a not in used and b not in used:
+            used.update((a, b))
+            chosen.append((a, b) if counts[a] >= counts[b] else (b, a))
+    return np.array(chosen, np.int64).reshape(-1, 2)
 
 
-def _seen_together(structure: Structure, pairs: Ids) -> NDArray[np.bool_]:
-    """Whether some frame sees both landmarks of each pair (n, 2)."""
+def _observed_together(structure: Structure, pairs: Ids) -> NDArray[np.bool_]:
+    """Whether some frame observes both landmarks of each pair (n, 2)."""
     which = np.full(len(structure.positions), -1)
     which[pairs] = np.arange(len(pairs))[:, None]
     frames, landmarks = structure.pairs()
     pair = which[landmarks]
-    # A frame sees each landmark once, so a pair that occurs twice is seen together.
+    # A frame observes each landmark once, so a pair that occurs twice is observed together.
     key, count = np.unique((frames * len(pairs) + pair)[pair >= 0], return_counts=True)
     together = np.zeros(len(pairs), bool)
     together[key[count > 1] % len(pairs)] = True
@@ -89,10 +89,9 @@ def _joint_positions(
     weight = (counts[into] / np.maximum(counts[into] + counts[source], 1))[:, None]
     start = weight * structure.positions[into] + (1 - weight) * structure.positions[source]
     joint = refine_points(start, which, seen.poses, seen.rays, seen.focal)
-    difference, depth = reprojection_residuals(joint[which], seen.poses, seen.rays)
+    errors = pixel_errors(joint[which], seen.poses, seen.rays, seen.focal)
     limit = np.array([structure.tolerance(f.camera_id, max_error) for f in structure.frames])
-    fits = np.linalg.norm(difference, axis=1) * seen.focal <= limit[seen.frames]
-    fits &= depth > 0
+    fits = errors <= limit[seen.frames]
     total = np.bincount(which, minlength=len(into))
     share = np.bincount(which, fits, minlength=len(into)) / np.maximum(total, 1)
     return joint, share >= _FITTING

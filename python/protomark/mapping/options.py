@@ -1,4 +1,4 @@
-"""How a map is made: everything that determines its content."""
+"""Options that determine the content of a map."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from protomark.features.descriptors import descriptor_kind
 
 @dataclass(frozen=True)
 class MappingOptions:
-    """How a map is made. docs/mapping.md says how each default was chosen.
+    """How a map is made.
 
     Attributes:
         descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
-        max_keypoints: the most keypoints to keep in a frame.
+        max_keypoints: limit on keypoints per frame.
         encoder: name or file of the encoder; empty: the one that ships for the descriptor.
-        dim: dimensions of a prototype.
+        dim: numbers per prototype.
         window: number of latest keyframes that keep their descriptors, to triangulate landmarks.
         max_error: largest reprojection error of an observation, as a share of the longer side.
-        min_angle: smallest angle between two rays of a landmark, degrees.
-        min_inliers: fewest matches that must agree with a frame's pose.
+        min_angle: smallest triangulation angle of a landmark, degrees.
+        min_inliers: number of matches that must agree with a frame's pose.
         calibrate: whether focal length and distortion are refined while mapping.
         fixed_poses: whether poses are given and not adjusted.
     """

@@ -1,4 +1,4 @@
-"""Writes what a map leaves for others: a map file, a COLMAP model, a trajectory, a report."""
+"""Writes the files of a map: the map itself, a COLMAP model, a trajectory and a report."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from protomark.files import replacing_folder, write_text
-from protomark.geometry.colmap import pycolmap, quiet
+from protomark.files import write_text
 from protomark.geometry.pose_files import tum_trajectory
 from protomark.mapping.mapper import Mapper
-from protomark.mapping.structure import Structure
+from protomark.mapping.reconstruction import write_model
 from protomark.mapping.summary import map_pictures, summarise
 from protomark.maps.open import SCENE_MAP
 from protomark.report import map_page
@@ -21,7 +20,7 @@ MODEL, TRAJECTORY, REPORT, FIGURES = "sparse", "trajectory.txt", "report.html", 
 
 
 def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> dict[str, Any]:
-    """Write all outputs of a map; returns its figures.
+    """Write all files of a map to the folder `scene`; returns its figures.
 
     Args:
         mapper: the map.
@@ -44,34 +43,3 @@ def write_outputs(mapper: Mapper, scene: Path, source: str, finished: bool) -> d
     history = [vars(record) for record in mapper.history.records.values()]
     write_text(scene / FIGURES, json.dumps({**figures, "history": history}, indent=1) + "\n")
     return figures
-
-
-def write_model(structure: Structure, folder: Path) -> None:
-    """Write a COLMAP sparse model (binary) whose 3D point ids are the landmark ids."""
-    reconstruction = pycolmap.Reconstruction()
-    for camera_id in sorted({frame.camera_id for frame in structure.frames}):
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera({**structure.cameras[camera_id].as_dict(), "camera_id": camera_id})
-        )
-    tracks: dict[int, list[tuple[int, int]]] = {}
-    for image_id, frame in enumerate(structure.frames, 1):
-        rows = frame.observed
-        image = pycolmap.Image(
-            name=frame.name,
-            camera_id=frame.camera_id,
-            image_id=image_id,
-            keypoints=frame.keypoints[rows].astype(np.float64).reshape(-1, 2),
-        )
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.pose))
-        for index, landmark in enumerate(frame.landmarks[rows].tolist()):
-            tracks.setdefault(landmark, []).append((image_id, index))
-    for landmark in sorted(tracks):
-        track = pycolmap.Track([pycolmap.TrackElement(i, k) for i, k in tracks[landmark]])
-        reconstruction.add_point3D_with_id(
-            landmark, pycolmap.Point3D(xyz=structure.positions[landmark], track=track)
-        )
-        for image_id, index in tracks[landmark]:
-            reconstruction.images[image_id].set_point3D_for_point2D(index, landmark)
-    with quiet(), replacing_folder(folder) as temporary:
-        reconstruction.update_point_3d_errors()
-        reconstruction.write(str(temporary))

@@ -10,12 +10,12 @@ from protomark.extras import optional
 from protomark.geometry.pose import relative_pose
 from protomark.mapping.frame import Array, Frame
 
-# Frames further apart than this in the input do not predict each other's poses.
+# Frames predict the poses of frames at most this far away in the input.
 MAX_STEP = 3
 
 
 def predict(frames: Iterable[Frame], index: int, camera_id: int) -> Array | None:
-    """The pose of a camera that moves steadily through the two nearest frames of the input.
+    """The pose of a camera that moves at constant velocity through the two nearest frames.
 
     Args:
         frames: frames with a pose.
@@ -23,7 +23,7 @@ def predict(frames: Iterable[Frame], index: int, camera_id: int) -> Array | None
         camera_id: its camera.
 
     Returns:
-        (3, 4) cam_from_world; that of the only near frame if there is one, None if there is none.
+        (3, 4) cam_from_world; the pose of the nearest frame if only one is near, None if none is.
     """
     by_index = {frame.index: frame.pose for frame in frames if frame.camera_id == camera_id}
     near = _nearest(by_index, index)

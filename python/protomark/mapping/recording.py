@@ -12,17 +12,13 @@ from protomark.geometry.pose import camera_centers
 from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
 
-# The whole map is recorded once in this many frames, so that the recording grows more slowly.
+# The whole map is recorded only once in this many frames, to keep the recording small.
 _MAP_EVERY = 5
 _MAX_OBSERVATIONS = 20
 
 
 class Recording:
-    """Writes a .rrd file while a map is made.
-
-    Args:
-        path: file to write.
-    """
+    """Writes the .rrd file `path` while a map is made."""
 
     def __init__(self, path: Path) -> None:
         self._rr = rerun = optional("rerun")
@@ -32,7 +28,7 @@ class Recording:
         self._count = 0
 
     def show(self, mapper: Mapper, image: InputImage) -> None:
-        """Record what a frame added."""
+        """Record a frame and what it adds to the map."""
         rr, recording = self._rr, self._recording
         recording.set_time("frame", sequence=self._count)
         self._count += 1
@@ -71,13 +67,13 @@ class Recording:
         self._recording.log("world/path", rr.LineStrips3D([path], colors=[220, 38, 38]))
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the rest of the recording."""
         self._recording.flush()
         self._recording.disconnect()
 
 
 def _colours(counts: Any) -> Any:
-    """Colours (n, 3) uint8 from violet, seen twice, to yellow, seen often."""
+    """Colours (n, 3) uint8 from violet (two observations) to yellow (many)."""
     colormaps = optional("matplotlib").colormaps
     share = np.clip((counts - 2) / (_MAX_OBSERVATIONS - 2), 0, 1)
     return (255 * colormaps["viridis"](share)[:, :3]).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Makes, continues or extends a map from a source of frames."""
+"""Makes, resumes or extends a map from a source of frames."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.pose_files import read_poses
-from protomark.interrupt import deferred_interrupt
+from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.mapping.initialisation import MIN_PARALLAX
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
@@ -33,15 +33,15 @@ class MapRequest:
     Attributes:
         images: folder of images or video.
         output: folder of the map.
-        options: how to make it; a map that is continued keeps its own.
+        options: how to make it; a map that is resumed or extended keeps its own.
         camera: cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
-        focal: focal length to begin with, pixels.
-        poses: file or folder of given poses.
+        focal: focal length to start calibration with, pixels.
+        poses: file or folder of known poses.
         every: take every n-th frame only.
-        resume: continue an interrupted map.
-        extend: the output is a map that the images are added to.
-        force: make a new map where there is one.
-        record: also write a Rerun recording.
+        resume: whether to continue an interrupted map.
+        extend: whether to add the images to the existing map in `output`.
+        force: whether to replace an existing map.
+        record: whether to write a Rerun recording, too.
         threads: threads to search and adjust on.
     """
 
@@ -59,27 +59,23 @@ class MapRequest:
     threads: int = 1
 
 
-class MappingInterrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
-    """Ctrl-C was pressed; the map so far is written, and `resume` continues it."""
-
-
 def make_map(
     request: MapRequest,
     progress: Progress = silent,
     note: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Make, continue or extend a map; write it and its report.
+    """Make, resume or extend a map; write it and its report.
 
     Args:
         request: what to map, and how.
         progress: called with each frame.
-        note: called with what the user should know at once.
+        note: called with each message to the user.
 
     Returns:
         Its figures, see `protomark.mapping.summary.summarise`.
 
     Raises:
-        MappingInterrupted: Ctrl-C was pressed.
+        Interrupted: Ctrl-C was pressed; the map so far is written.
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
@@ -94,10 +90,15 @@ def make_map(
         if not mapper.structure.frames:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
             raise ValueError(_no_map(mapper, source))
+    progress("write", 0, 0)
     figures = write_outputs(mapper, request.output, source.path.name, finished)
-    session.close()
+    if session.recording is not None:
+        session.recording.close()
     if not finished:
-        raise MappingInterrupted
+        raise Interrupted(
+            f"stopped: the map so far is in {request.output}; the same command with --resume "
+            "continues it"
+        )
     save_state(mapper, request.output / STATE, session.facts)
     shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
     return figures
@@ -109,7 +110,7 @@ class _Session:
     Attributes:
         mapper: the map in the making.
         cursor: index of the next frame.
-        facts: what has to be known to continue: the inputs so far with their names' prefixes.
+        facts: the inputs so far with the prefixes of their frames' names, to continue the map.
     """
 
     def __init__(
@@ -146,15 +147,13 @@ class _Session:
         if self.source.poses is not None:
             options = replace(options, fixed_poses=True)
             if camera is None:
-                raise ValueError(
-                    "--poses needs the camera that they are for, give it with --camera"
-                )
+                raise ValueError("--poses needs the camera of the images: give it with --camera")
         if camera is None:
             camera, origin = self.source.guess_camera(request.focal)
             options = replace(options, calibrate=True)
             self.note(
-                f"camera: focal length {camera.params[0]:.0f} pixels is {origin}, it is refined "
-                "while mapping (--camera gives a known one)"
+                f"camera: the focal length of {camera.params[0]:.0f} pixels is {origin} and is "
+                "refined while mapping (--camera gives a calibrated one)"
             )
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
@@ -188,7 +187,7 @@ class _Session:
         }
 
     def add_frames(self) -> bool:
-        """Add frame after frame to the map; False if Ctrl-C stopped it."""
+        """Add all frames to the map; returns False if Ctrl-C stopped that."""
         saved = started = time.monotonic()
         first = self.cursor
         with deferred_interrupt(lambda: self.note("stopping after this frame")) as interrupted:
@@ -196,7 +195,7 @@ class _Session:
             while True:
                 image = next(images, None)
                 if self.mapper.needs_restart(at_end=image is None):
-                    # The guess has bent what was made with it.
+                    # The wrong focal length has bent the first part of the map.
                     self.mapper = self.mapper.restart()
                     self.note(self.mapper.history.events[-1])
                     self.cursor, first, started = 0, 0, time.monotonic()
@@ -225,45 +224,43 @@ class _Session:
     def _save(self) -> None:
         save_checkpoint(self.mapper, self.request.output, {**self.facts, "cursor": self.cursor})
 
-    def close(self) -> None:
-        """Finish the recording."""
-        if self.recording is not None:
-            self.recording.close()
-
 
 def _check_output(request: MapRequest) -> None:
     """Raise before any work if the output folder is not what the request needs."""
     scene = request.output
     if scene.exists() and not scene.is_dir():
-        raise NotADirectoryError(f"{scene}: not a folder, name one for the map with -o")
+        raise NotADirectoryError(f"{scene} is not a folder: name one for the map with -o")
     interrupted = (scene / CHECKPOINT).is_dir()
     if request.resume:
         if not interrupted:
-            raise FileNotFoundError(f"{scene}: no interrupted map here to resume")
+            raise FileNotFoundError(
+                f"{scene} holds no interrupted map: start a new one without --resume"
+            )
         return
     if request.extend:
         if interrupted:
             raise FileExistsError(
-                f"{scene}: this map was interrupted, finish it first with --resume"
+                f"{scene} holds an interrupted map: finish it with --resume first"
             )
         return
     if request.force or not scene.exists() or not any(scene.iterdir()):
         return
     if interrupted:
         raise FileExistsError(
-            f"{scene}: holds an interrupted map: --resume continues it, --force starts anew"
+            f"{scene} holds an interrupted map: --resume continues it, --force starts anew"
         )
     if (scene / STATE).exists():
         raise FileExistsError(
-            f"{scene}: holds a map already: --into {scene} extends it, --force makes it anew"
+            f"{scene} holds a map already: --into {scene} extends it, --force makes it anew"
         )
-    raise FileExistsError(f"{scene}: not empty, and not a map; name another folder with -o")
+    raise FileExistsError(f"{scene} holds other files: name another folder with -o")
 
 
 def _prefix(mapper: Mapper, source: FrameSource, inputs: dict[str, str]) -> str:
-    """What comes before the names of new frames, so that they differ from those of old ones.
+    """A prefix for the names of new frames that makes them differ from the old ones.
 
-    A folder that the map was made from before may have grown: its old images are skipped.
+    A folder that the map was made from may have new images: it keeps its prefix, and its old images
+    are skipped.
 
     Raises:
         ValueError: no frame is new.
@@ -286,8 +283,7 @@ def _no_map(mapper: Mapper, source: FrameSource) -> str:
         return f"{source.path}: no map: none of {len(records)} frames is usable: {outcomes.pop()}"
     parallax = mapper.initialiser.best_parallax
     return (
-        f"{source.path}: no map: among {len(records)} frames no two see enough of the same from "
-        f"places far enough apart (the best pair has {parallax:.1f} degrees of parallax, "
-        f"{MIN_PARALLAX:g} are needed); move the camera sideways, or check that frames overlap and "
-        "--camera is right"
+        f"{source.path}: no map: no two of {len(records)} frames overlap enough and are taken far "
+        f"enough apart (the best pair has {parallax:.1f} degrees of parallax, {MIN_PARALLAX:g} are "
+        "needed): move the camera sideways, or check that frames overlap and --camera is right"
     )

@@ -1,4 +1,4 @@
-"""Reads frames one after the other, from a folder of images or a video."""
+"""Reads the frames of a folder of images or a video."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose_files import PoseSet
 from protomark.mapping.frame import InputImage
 
-# Frames of a video that are held in memory to be read backward.
+# Number of a video's frames that are held in memory to read it backward.
 _CHUNK = 64
 _GUESSED_MODEL = "SIMPLE_RADIAL"
 
 
 class FrameSource(ABC):
-    """Frames in the order in which they came from the camera.
+    """Frames in the order in which the camera took them.
 
     Attributes:
         path: the folder or video.
-        prefix: what comes before the names of the frames in the map.
-        poses: given poses, or None.
+        prefix: prefix of the frames' names in the map.
+        poses: known poses, or None.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,24 +38,24 @@ class FrameSource(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """Number of frames; a video's is what its file says."""
+        """Number of frames, for a video according to its header."""
 
     @abstractmethod
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]: ...
 
     @abstractmethod
     def names(self) -> list[str]:
-        """Names of all frames, without prefix."""
+        """Names of all frames, without the prefix."""
 
     def images(
         self, start: int = 0, only: set[str] | None = None, backward: bool = False
     ) -> Iterator[InputImage]:
-        """Images with their names in the map and their given poses.
+        """Yield images with their names in the map and their known poses.
 
         Args:
-            start: index of the first one.
-            only: names in the map; None: all.
-            backward: from the last to the first.
+            start: index of the first image.
+            only: names in the map of the images to yield; None: all.
+            backward: whether to go from the last to the first.
         """
         if only is not None:
             size = len(self.prefix)
@@ -73,18 +73,18 @@ class FrameSource(ABC):
         for image in self._read(0, None, False):
             if image.image is not None:
                 return image.image.shape[1], image.image.shape[0]
-        raise ValueError(f"{self.path}: none of its {len(self)} frames can be read")
+        raise ValueError(f"{self.path}: none of its {len(self)} frames can be read, copy it anew")
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
-        """A camera to begin with, and where its focal length comes from.
+        """A camera to start calibration with, and the origin of its focal length.
 
         Args:
-            focal: focal length in pixels; None: from EXIF, else COLMAP's guess.
+            focal: focal length in pixels; None: from EXIF data, else COLMAP's guess.
         """
         width, height = self.size()
         origin = "given"
         if focal is None:
-            focal, origin = self._exif_focal_length(), "from EXIF"
+            focal, origin = self._exif_focal_length(), "from EXIF data"
         if focal is None:
             focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), "a guess"
         if not (np.isfinite(focal) and focal > 0):
@@ -160,10 +160,10 @@ class Video(FrameSource):
         if not backward:
             yield from self._read_forward(start, only)
             return
-        # A video decodes forward only: once for each chunk, which is then reversed.
-        wanted = [image.index for image in self._read_forward(start, only, decode=False)]
-        for last in range(len(wanted), 0, -_CHUNK):
-            chunk = set(wanted[max(0, last - _CHUNK) : last])
+        # A video decodes forward only: it is decoded once per chunk, which is then reversed.
+        indices = [image.index for image in self._read_forward(start, only, decode=False)]
+        for last in range(len(indices), 0, -_CHUNK):
+            chunk = set(indices[max(0, last - _CHUNK) : last])
             yield from reversed(list(self._read_forward(start, only, chunk)))
 
     def _read_forward(
@@ -199,7 +199,7 @@ def open_source(path: Path, every: int = 1) -> FrameSource:
     """Open a folder of images or a video.
 
     Args:
-        path: folder or file; the folder of a sequence, which holds images/, too.
+        path: a folder of images, the folder of a sequence (with images/ in it), or a video.
         every: take every n-th frame only.
 
     Raises:

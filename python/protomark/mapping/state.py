@@ -1,4 +1,4 @@
-"""Saves a map in the making, so that mapping can resume exactly where it stopped.
+"""Saves the state of a map in the making, so that mapping resumes exactly where it stopped.
 
 A checkpoint holds the descriptors of the window; a finished map has none.
 """
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.errors import FileError
+from protomark._core import FileError
 from protomark.extras import optional
 from protomark.files import replacing, replacing_folder
 from protomark.geometry.camera import Camera, cameras_from_json
@@ -30,7 +30,7 @@ _FORMAT, _VERSION = "protomark-mapping", "1"
 
 
 def save_checkpoint(mapper: Mapper, scene: Path, facts: dict[str, Any]) -> None:
-    """Save all that is needed to continue after the last frame, in place of the last checkpoint."""
+    """Save everything that is needed to continue after the last frame, as the only checkpoint."""
     with replacing_folder(scene / CHECKPOINT) as folder:
         save_state(mapper, folder / STATE, facts)
         mapper.scene.save(folder / SCENE_MAP)
@@ -42,7 +42,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
     Args:
         mapper: the map in the making, between two frames.
         path: file to write.
-        facts: JSON values that `load_state` returns.
+        facts: JSON values that `load_state` returns again.
     """
     save = optional("safetensors.numpy").save
     structure, waiting = mapper.structure, mapper.initialiser.waiting
@@ -84,18 +84,18 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
 def load_state(
     folder: Path, threads: int = 1, camera: Camera | None = None
 ) -> tuple[Mapper, dict[str, Any]]:
-    """Load a map as it was saved, to continue or to extend it.
+    """Load the state of a map, to resume or extend it.
 
     Args:
-        folder: a scene, or a checkpoint.
+        folder: folder of a map, or of a checkpoint.
         threads: threads to search and adjust on.
-        camera: camera of the frames to come, if it is another one than before.
+        camera: camera of the next frames, if it differs from that of the last ones.
 
     Returns:
         The map in the making, and the facts given to `save_state`.
 
     Raises:
-        FileError: there is none, or it is broken.
+        FileError: the folder holds no state, or a broken one.
     """
     path = folder / STATE
     try:
@@ -116,7 +116,7 @@ def load_state(
         mapper.history = History.from_dict(state["history"])
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
         raise FileError(
-            f"{path}: not a map that can be continued, or a broken one ({error})"
+            f"{path}: not the state of a map, or broken ({error}): make the map anew with --force"
         ) from None
     if camera is not None and camera != mapper.camera:
         mapper.camera_id = max(cameras) + 1
@@ -127,7 +127,7 @@ def load_state(
 def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     safetensors = optional("safetensors")
     if not path.is_file():
-        raise FileError(f"{path}: no such file; is this the folder of a map?")
+        raise FileError(f"{path}: no such file: name a folder that `protomark map` wrote")
     try:
         with safetensors.safe_open(path, "numpy") as file:
             metadata = file.metadata() or {}
@@ -135,7 +135,7 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     except safetensors.SafetensorError as error:
         raise ValueError(str(error)) from None
     if metadata.get("format") != _FORMAT or metadata.get("version") != _VERSION:
-        raise ValueError("another format or version")
+        raise ValueError("its format or version is unknown")
     state: dict[str, Any] = json.loads(metadata["state"])
     return arrays, state
 
@@ -161,11 +161,11 @@ def _restore_structure(
     types |= {"keypoints": "float32", "descriptors": "uint8"}
     for name in {*shapes, *types}:
         if arrays[name].dtype != types.get(name, "float64"):
-            raise ValueError(f"{name} is of type {arrays[name].dtype}")
+            raise ValueError(f"{name} has the wrong type {arrays[name].dtype}")
     for name in ("positions", "directions", "views", "distances", "born"):
         setattr(mapper.structure, name, arrays[name])
     if not mapper.memory.contains(mapper.structure.ids).all():
-        raise ValueError("its landmarks are not those of its map")
+        raise ValueError("its landmarks are not those of the map beside it")
 
 
 def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict[str, Any]) -> None:
@@ -176,7 +176,7 @@ def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict
         raise ValueError("its frames do not fit together")
     landmarks = arrays["landmarks"]
     if len(landmarks) and not -1 <= landmarks.min() <= landmarks.max() < len(structure.positions):
-        raise ValueError("a keypoint sees a landmark that does not exist")
+        raise ValueError("a keypoint observes a landmark that does not exist")
     used = 0
     for i, (index, name, time, camera_id, *flags) in enumerate(state["frames"] + state["waiting"]):
         a, b = int(offsets[i]), int(offsets[i + 1])

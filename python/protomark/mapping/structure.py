@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
-from protomark.geometry.triangulation import reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors
 from protomark.mapping.frame import Array, Frame, Ids
 
-# A landmark is searched for in views at most this angle off the mean of the directions that it was
-# seen from, and at distances changed by at most this factor: descriptors match no further.
+# Descriptors match in views within this angle of the mean direction that a landmark was observed
+# from, and at distances that differ by at most this factor.
 _MAX_VIEWING_COSINE = np.cos(np.radians(60))
 _MAX_SCALE_CHANGE = 2.0
-# Keypoints are not more accurate than this, however small the image.
+# Keypoints are at best this accurate (pixels), however small the image.
 _MIN_TOLERANCE = 2.5
 
 
 @dataclass
 class Observations:
-    """n observations, of all keyframes or of some frames.
+    """n observations of landmarks.
 
     Attributes:
-        frames: (n,) int64, index into the list of frames.
-        rows: (n,) int64, keypoint.
+        frames: (n,) int64, index of the frame.
+        rows: (n,) int64, row of the keypoint in its frame.
         landmarks: (n,) int64.
         poses: (n, 3, 4) float64.
-        rays: (n, 2) float64.
-        focal: (n,) float64, pixels.
+        rays: (n, 2) float64, undistorted.
+        focal: (n,) float64, focal length in pixels.
     """
 
     frames: Ids
@@ -43,29 +43,24 @@ class Observations:
     focal: Array
 
     def where(self, keep: Any) -> Observations:
-        """The observations for which `keep` is true, or those at the indices in `keep`."""
-        return Observations(
-            *(
-                getattr(self, name)[keep]
-                for name in ("frames", "rows", "landmarks", "poses", "rays", "focal")
-            )
-        )
+        """The observations for which `keep` (n,) is true."""
+        return Observations(*(values[keep] for values in vars(self).values()))
 
 
 @dataclass
 class Structure:
     """Frames in the order in which they were registered, and landmarks by id.
 
-    Landmark ids count up from 1 and index the arrays; an id is never used again.
+    Landmark ids count up from 1 and index the arrays; no id is used twice.
 
     Attributes:
-        cameras: camera id -> camera.
+        cameras: cameras by id.
         frames: frames with a pose.
-        positions: (l, 3) float64, NaN for an id that is not a landmark (any more).
+        positions: (l, 3) float64, NaN for ids of removed landmarks and for id 0.
         directions: (l, 3) float64, sum of unit vectors from the landmark to its cameras.
         views: (l,) int64, number of these vectors.
-        distances: (l, 2) float64, smallest and largest distance from which it was seen.
-        born: (l,) int64, number of frames in the map when the landmark was made.
+        distances: (l, 2) float64, smallest and largest distance of an observing camera.
+        born: (l,) int64, number of frames in the map when the landmark was created.
     """
 
     cameras: dict[int, Camera] = field(default_factory=dict)
@@ -78,7 +73,7 @@ class Structure:
 
     @property
     def existing(self) -> NDArray[np.bool_]:
-        """Which ids (l,) are landmarks."""
+        """Whether each id (l,) is a landmark."""
         return np.isfinite(self.positions[:, 0])
 
     @property
@@ -96,7 +91,7 @@ class Structure:
         return max(share * max(camera.width, camera.height), _MIN_TOLERANCE)
 
     def keyframes(self) -> list[int]:
-        """Indices of the keyframes in the list of frames."""
+        """Indices of the keyframes."""
         return [i for i, frame in enumerate(self.frames) if frame.keyframe]
 
     def create(self, positions: Array) -> Ids:
@@ -110,14 +105,14 @@ class Structure:
         return np.arange(start, start + count)
 
     def observe(self, frame: Frame, rows: Ids, ids: Ids) -> None:
-        """Record that keypoints of a frame see landmarks."""
+        """Record that keypoints of a frame (by row) observe landmarks."""
         frame.landmarks[rows] = ids
         self._add_views(camera_centers(frame.pose)[None], ids)
 
     def _add_views(self, centers: Array, ids: Ids) -> None:
         toward = centers - self.positions[ids]
         distance = np.linalg.norm(toward, axis=1)
-        # A frame sees each landmark once, so no id repeats.
+        # A frame observes each landmark once, so no id repeats.
         self.directions[ids] += toward / np.maximum(distance, 1e-12)[:, None]
         self.views[ids] += 1
         self.distances[ids, 0] = np.minimum(self.distances[ids, 0], distance)
@@ -156,32 +151,32 @@ class Structure:
         self.positions[source] = np.nan
 
     def weights(self, pose: Array, ids: Ids) -> Array:
-        """Weights (n,) in (0, 1] of landmarks in a pose: 1 where they project as well as keypoints.
+        """Weights (n,) in (0, 1] of landmarks in a pose: the better known a landmark, the larger.
 
-        The variance of a keypoint over that of keypoint and landmark together. Rays that spread by
-        an angle fix a landmark as well as a keypoint where it is seen from between them; the
-        further a view is from them, the more of the error of the landmark's depth it shows.
+        A weight is the variance of a keypoint over the variance of keypoint and projected landmark
+        together. Seen from between its rays, a landmark projects as accurately as a keypoint; the
+        further a view is from them, the more of the landmark's error in depth it shows.
         """
         toward = camera_centers(pose) - self.positions[ids]
         toward /= np.maximum(np.linalg.norm(toward, axis=1), 1e-12)[:, None]
         mean = self.directions[ids]
         length = np.maximum(np.linalg.norm(mean, axis=1), 1e-12)
-        # Squares of small angles. Many rays count no more than two that spread as much, as those of
-        # frames that are not keyframes did not fix the landmark.
+        # These are squares of small angles. Many rays count no more than two with the same spread,
+        # as those of frames other than keyframes did not determine the position.
         spread = 2 * (1 - length / np.maximum(self.views[ids], 1))
         off = 2 * (1 - (toward * mean).sum(1) / length)
         spread = np.maximum(spread, 1e-12)
         return np.asarray(2 * spread / (2 * spread + np.maximum(off, 0)))
 
     def visible(self, pose: Array, camera_id: int, margin: float = 0.0) -> tuple[Ids, Array]:
-        """Landmarks (m,) that a camera may recognise from a pose, and their projections (m, 2)."""
+        """Landmarks (m,) that a camera may recognise from a pose, and their pixels (m, 2)."""
         ids = self.ids
         at = self.positions[ids]
         local = transform(pose, at)
         front = local[:, 2] > 0
         ids, at, local = ids[front], at[front], local[front]
         camera = self.cameras[camera_id]
-        # Distortion is only defined within the image: it may bend rays from far outside back in.
+        # Beyond the image, distortion is undefined and may bend rays back into it.
         bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
         inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
         ids, at, local = ids[inside], at[inside], local[inside]
@@ -199,7 +194,7 @@ class Structure:
         return ids[inside], pixels[inside]
 
     def pairs(self, frames: Sequence[int] | None = None) -> tuple[Ids, Ids]:
-        """Frame index (n,) and landmark (n,) of each observation, of some frames or all."""
+        """Frame index (n,) and landmark (n,) of each observation of these frames; None: of all."""
         chosen = range(len(self.frames)) if frames is None else frames
         rows = [self.frames[i].landmarks for i in chosen]
         frame = np.repeat(np.array(chosen, np.int64), [len(r) for r in rows])
@@ -208,37 +203,34 @@ class Structure:
         return frame[seen], landmarks[seen]
 
     def observations(self, frames: Sequence[int] | None = None) -> Observations:
-        """All observations of some frames (by index), or of all keyframes."""
+        """Observations of these frames; None: of all keyframes."""
         chosen = self.keyframes() if frames is None else list(frames)
         rows = [self.frames[i].observed for i in chosen]
         counts = [len(r) for r in rows]
-        pick = [(self.frames[i], r) for i, r in zip(chosen, rows, strict=True)]
-        poses = np.array([f.pose for f, _ in pick]).reshape(-1, 3, 4)
-        focal = np.array([self.focal(f.camera_id) for f, _ in pick])
+        chosen_frames = [self.frames[i] for i in chosen]
+        poses = np.array([f.pose for f in chosen_frames]).reshape(-1, 3, 4)
+        focal = np.array([self.focal(f.camera_id) for f in chosen_frames])
+        rays = [f.rays[r] for f, r in zip(chosen_frames, rows, strict=True)]
         return Observations(
             np.repeat(np.array(chosen, np.int64), counts),
             np.concatenate([np.zeros(0, np.int64), *rows]),
-            np.concatenate([np.zeros(0, np.int64), *(f.landmarks[r] for f, r in pick)]),
+            np.concatenate([np.zeros(0, np.int64), *(f.seen for f in chosen_frames)]),
             np.repeat(poses, counts, axis=0),
-            np.concatenate([np.zeros((0, 2)), *(f.rays[r] for f, r in pick)]),
+            np.concatenate([np.zeros((0, 2)), *rays]),
             np.repeat(focal, counts),
         )
 
     def errors(self, seen: Observations) -> Array:
         """Reprojection errors in pixels of the undistorted image, infinite behind a camera."""
-        difference, depth = reprojection_residuals(
-            self.positions[seen.landmarks], seen.poses, seen.rays
-        )
-        error = np.linalg.norm(difference, axis=1) * seen.focal
-        return np.where((depth > 0) & np.isfinite(error), error, np.inf)
+        return pixel_errors(self.positions[seen.landmarks], seen.poses, seen.rays, seen.focal)
 
     def counts(self, keyframes_only: bool = True) -> Ids:
-        """Number (l,) of frames, or of keyframes, that see each id."""
+        """Number (l,) of keyframes, or of all frames, that observe each landmark."""
         _, landmarks = self.pairs(self.keyframes() if keyframes_only else None)
         return np.bincount(landmarks, minlength=len(self.positions))
 
     def set_camera(self, camera_id: int, camera: Camera) -> None:
-        """Change a camera's parameters, and the rays of its frames with them."""
+        """Replace a camera, and the rays of its frames with it."""
         self.cameras[camera_id] = camera
         for frame in self.frames:
             if frame.camera_id == camera_id:

@@ -1,4 +1,4 @@
-"""Summarises a map: figures for its report, and what the pictures in it show."""
+"""Summarises a map for its report: figures, and the data of its pictures."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from protomark.mapping.clock import STAGES
 from protomark.mapping.history import REGISTERED
 from protomark.mapping.mapper import Mapper
 from protomark.plot import MapPictures
-from protomark.tracks.summary import length_histogram
+from protomark.tracks.summary import track_figures
 
 
 def summarise(mapper: Mapper) -> dict[str, Any]:
-    """Counts, errors, bytes and times, for JSON."""
+    """Counts, errors, bytes and times of a map, as JSON values."""
     structure = mapper.structure
     records = list(mapper.history.records.values())
     registered = [r for r in records if r.outcome == REGISTERED]
@@ -39,10 +39,7 @@ def summarise(mapper: Mapper) -> dict[str, Any]:
         "keyframes": sum(f.keyframe for f in structure.frames),
         "landmarks": len(ids),
         "observations": len(seen.landmarks),
-        "track_length_mean": float(lengths.mean()) if len(lengths) else 0.0,
-        "track_length_histogram": length_histogram(lengths),
-        "reprojection_error_mean": float(errors.mean()) if len(errors) else 0.0,
-        "reprojection_error_median": float(np.median(errors)) if len(errors) else 0.0,
+        **track_figures(lengths, errors),
         "descriptor": mapper.options.descriptor,
         "bytes_per_landmark": mapper.memory.bytes / max(len(ids), 1),
         "memory_bytes": mapper.memory.bytes,
@@ -57,12 +54,7 @@ def summarise(mapper: Mapper) -> dict[str, Any]:
 
 
 def map_pictures(mapper: Mapper, facts: dict[str, Any]) -> MapPictures:
-    """What the pictures in the report show.
-
-    Args:
-        mapper: the map.
-        facts: its figures, from `summarise`.
-    """
+    """The data of the report's pictures; `facts` is what `summarise` returned."""
     structure = mapper.structure
     errors = structure.errors(structure.observations(range(len(structure.frames))))
     frames = sorted(structure.frames, key=lambda f: (f.camera_id, f.index))

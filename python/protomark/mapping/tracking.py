@@ -1,4 +1,4 @@
-"""A new frame against the map: matches with what its landmarks keep, and its pose."""
+"""Tracks and relocalizes frames: matches them with landmarks, and estimates their poses."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from protomark.mapping.frame import Array, Frame, Ids
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
 
-# Radii of the search around projected landmarks, as shares of the image's longer side: under a
+# Radius of the search around projected landmarks, as a share of the image's longer side: under a
 # predicted pose, and under a pose found by RANSAC.
 _PREDICTED_RADIUS = 0.06
 _FOUND_RADIUS = 0.02
-# A prediction off by more than this (median) leaves right matches outside of its radius.
+# A prediction that is off by more than this (median) leaves right matches outside of its radius.
 _LARGE_OFFSET = 0.5 * _PREDICTED_RADIUS
-# Landmarks that project this close to each other (pixels) may be duplicates, so the ratio test does
-# not compare them.
+# The ratio test does not compare landmarks that project this close to each other (pixels), as they
+# may be duplicates.
 _SAME_PLACE = 3.0
 _SAMPLE = 997
-# Share of the keypoints, or of the landmarks in view if these are fewer, that must match.
+# This share of the keypoints, or of the landmarks in view if these are fewer, must match.
 _MIN_SEEN = 0.03
 
 
 @dataclass
 class LandmarkMatches:
-    """k keypoints with the landmark that each may see, the clearest first; each occurs once.
+    """k matches of keypoints with landmarks, the clearest first; each occurs once.
 
     Attributes:
-        rows: (k,) int64, keypoint.
+        rows: (k,) int64, row of the keypoint in its frame.
         ids: (k,) int64, landmark.
     """
 
@@ -49,11 +49,11 @@ class LandmarkMatches:
 
 @dataclass
 class TrackedPose:
-    """A pose that was found for a frame.
+    """The pose of a frame.
 
     Attributes:
         pose: (3, 4) float64, cam_from_world.
-        matches: the matches that agree with it.
+        matches: matches that agree with the pose.
         share: their share of the landmarks in view, or of the keypoints if these are fewer.
     """
 
@@ -66,10 +66,10 @@ class Tracker:
     """Finds frames in a map.
 
     Args:
-        structure: where landmarks are.
-        memory: what they look like.
+        structure: frames and landmarks.
+        memory: the landmarks' prototypes.
         max_error: largest reprojection error, as a share of the image's longer side.
-        min_inliers: fewest matches that must agree with a pose.
+        min_inliers: number of matches that must agree with a pose.
         threads: threads to search on; the result is the same.
     """
 
@@ -85,15 +85,15 @@ class Tracker:
         self.max_error, self.min_inliers, self.threads = max_error, min_inliers, threads
 
     def track(self, frame: Frame, predicted: Array) -> TrackedPose | None:
-        """The pose of a frame that should be near a predicted one (ORB-SLAM's motion model)."""
+        """The pose of a frame near a predicted one (ORB-SLAM's motion model)."""
         found = self._solve(frame, self.match_projected(frame, predicted, _PREDICTED_RADIUS))
         if found and self._misses_matches(frame, predicted, found):
-            # The matches on one side of the radius also fit a wrong pose: search around that one.
+            # The matches within the radius also fit a wrong pose: search around the found one.
             found = self._solve(frame, self.match_projected(frame, found.pose, _PREDICTED_RADIUS))
         return self.track_local_map(frame, found.pose) if found else None
 
     def _misses_matches(self, frame: Frame, predicted: Array, found: TrackedPose) -> bool:
-        """Whether the prediction was so far off that its radius missed many right matches."""
+        """Whether the prediction was so far off that right matches lie outside of its radius."""
         off = reprojection_error(
             predicted,
             frame.keypoints[found.matches.rows].astype(np.float64),
@@ -103,16 +103,11 @@ class Tracker:
         return bool(np.median(off) > self.structure.tolerance(frame.camera_id, _LARGE_OFFSET))
 
     def relocalize(self, frame: Frame, among: Ids | None = None) -> TrackedPose | None:
-        """The pose of a frame that may be anywhere, by search in the whole map.
-
-        Args:
-            frame: the frame.
-            among: landmarks to search, ascending; None: all.
-        """
+        """The pose of a frame anywhere in the map, by search among landmarks; None: all of them."""
         return self._solve(frame, self.search(frame, among))
 
     def track_among(self, frame: Frame, predicted: Array, among: Ids) -> TrackedPose | None:
-        """The pose of a frame near a predicted one, by some landmarks only."""
+        """The pose of a frame near a predicted one, by these landmarks only."""
         return self._solve(frame, self.match_projected(frame, predicted, _PREDICTED_RADIUS, among))
 
     def track_local_map(
@@ -120,7 +115,7 @@ class Tracker:
     ) -> TrackedPose | None:
         """Match all landmarks in view under a rough pose, and refine the pose on them.
 
-        None if too few of the landmarks in view match: a wrong pose finds some matches, too.
+        Returns None if too small a share of them matches: a wrong pose finds matches, too.
         """
         matches = self.match_projected(frame, pose, _FOUND_RADIUS, among)
         for _ in range(2):
@@ -134,7 +129,7 @@ class Tracker:
         return TrackedPose(pose, matches.where(inliers), share)
 
     def search(self, frame: Frame, among: Ids | None = None) -> LandmarkMatches:
-        """Nearest landmark of each keypoint in the whole map, where the match is accepted."""
+        """Accepted matches of keypoints with their nearest landmark in the whole map."""
         ids, distances = self.memory.search(frame.codes, self.threads, among)
         rows = self.memory.accepted(distances)
         return _unique_landmarks(rows, ids[rows, 0])
@@ -142,27 +137,27 @@ class Tracker:
     def match_projected(
         self, frame: Frame, pose: Array, radius: float, among: Ids | None = None
     ) -> LandmarkMatches:
-        """Nearest landmark of each keypoint among those that project within `radius` of it."""
+        """Matches of keypoints with the nearest landmark that projects within `radius` of them."""
         structure = self.structure
         pixels = structure.tolerance(frame.camera_id, radius)
-        ids, places = structure.visible(pose, frame.camera_id, margin=pixels)
+        ids, projected = structure.visible(pose, frame.camera_id, margin=pixels)
         if among is not None:
             chosen = np.isin(ids, among)
-            ids, places = ids[chosen], places[chosen]
-        rows, near = near_pairs(frame.keypoints.astype(np.float64), places, pixels)
+            ids, projected = ids[chosen], projected[chosen]
+        rows, near = near_pairs(frame.keypoints.astype(np.float64), projected, pixels)
         if not len(rows):
             return LandmarkMatches(rows, rows)
         distance = self.memory.distances(frame.codes, rows, ids[near])
-        # For each keypoint the nearest landmark (pairs ascend in id, so of equals the lowest id),
-        # and the nearest one elsewhere in the image.
+        # For each keypoint find the nearest landmark (pairs ascend in id, so ties go to the lowest
+        # id), and the nearest one elsewhere in the image.
         starts, lengths = runs(rows)
         run = np.repeat(np.arange(len(starts)), lengths)
         first = np.minimum.reduceat(distance, starts)
         nearest = np.flatnonzero(distance == first[run])
         best = near[nearest[runs(run[nearest])[0]]]
-        x, y = places.T
-        off = (x[near] - x[best][run]) ** 2 + (y[near] - y[best][run]) ** 2
-        other = np.where(off > _SAME_PLACE**2, distance.astype(np.float64), np.inf)
+        x, y = projected.T
+        apart = (x[near] - x[best][run]) ** 2 + (y[near] - y[best][run]) ** 2
+        other = np.where(apart > _SAME_PLACE**2, distance.astype(np.float64), np.inf)
         second = np.minimum.reduceat(other, starts)
         with np.errstate(invalid="ignore"):
             fits = first < self.memory.guided_ratio * second
@@ -172,6 +167,7 @@ class Tracker:
         return _unique_landmarks(rows[order], ids[best[order]])
 
     def _typical_distance(self, frame: Frame, ids: Ids) -> float:
+        """Median distance of keypoints from landmarks that they do not observe."""
         count = min(_SAMPLE, len(frame.codes) * len(ids))
         pick = np.arange(count) * 7919
         rows, others = pick % len(frame.codes), ids[pick % len(ids)]
@@ -205,7 +201,7 @@ class Tracker:
 
 
 def _unique_landmarks(rows: Ids, ids: Ids) -> LandmarkMatches:
-    """Keep the first of several keypoints with one landmark."""
+    """Matches of which each landmark keeps the first."""
     _, first = np.unique(ids, return_index=True)
     first.sort()
     return LandmarkMatches(rows[first], ids[first])

@@ -1,17 +1,16 @@
-"""Makes new landmarks from the descriptors of the window."""
+"""Triangulates landmarks from the descriptors of the window."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from protomark.geometry.pose import relative_pose
-from protomark.geometry.triangulation import depth_of_first, refine_points, reprojection_residuals
+from protomark.geometry.triangulation import depth_of_first, pixel_errors, refine_points
 from protomark.mapping.frame import Frame, Ids
+from protomark.mapping.initialisation import RATIO
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
 from protomark.tracks.matching import View, match
-
-RATIO = 0.8
 
 
 def triangulate(
@@ -22,12 +21,12 @@ def triangulate(
     max_error: float,
     min_angle: float,
 ) -> list[tuple[int, int]]:
-    """Match a frame with those of the window, make landmarks, and extend existing ones.
+    """Match a frame with those of the window, create landmarks, and continue existing tracks.
 
     Matches are mutual nearest neighbours in Hamming distance that pass the ratio test and lie near
-    the epipolar line. Two keypoints without a landmark make one if the angle of their rays is wide
-    enough and the landmark projects back to both. If one of the two sees a landmark already, the
-    other observes it, too, if it projects there.
+    the epipolar line. Two keypoints without a landmark create one if the angle of their rays is
+    wide enough and the landmark projects back to both. If one of them observes a landmark already,
+    the other observes it, too, provided that it projects there.
 
     Args:
         structure: frames and landmarks.
@@ -35,10 +34,10 @@ def triangulate(
         newest: index of the frame, which is in the window.
         window: indices of the other frames of the window.
         max_error: largest reprojection error, as a share of the image's longer side.
-        min_angle: smallest angle between the two rays, degrees.
+        min_angle: smallest triangulation angle, degrees.
 
     Returns:
-        Pairs of landmarks that are duplicates by a match.
+        Pairs of landmarks whose keypoints match, so that they may be duplicates.
     """
     frame = structure.frames[newest]
     duplicates: list[tuple[int, int]] = []
@@ -61,21 +60,21 @@ def _pair(
     a, b = rows[:, 0], rows[:, 1]
     landmark_a, landmark_b = old.landmarks[a], new.landmarks[b]
     fresh = (landmark_a < 0) & (landmark_b < 0)
-    _create(structure, memory, old, new, a[fresh], b[fresh], max_error, min_angle)
+    _create_landmarks(structure, memory, old, new, a[fresh], b[fresh], max_error, min_angle)
     only_a, only_b = (landmark_a >= 0) & (landmark_b < 0), (landmark_a < 0) & (landmark_b >= 0)
-    _extend(structure, memory, new, b[only_a], landmark_a[only_a], limit)
-    _extend(structure, memory, old, a[only_b], landmark_b[only_b], limit)
+    _continue_tracks(structure, memory, new, b[only_a], landmark_a[only_a], limit)
+    _continue_tracks(structure, memory, old, a[only_b], landmark_b[only_b], limit)
     both = (landmark_a >= 0) & (landmark_b >= 0) & (landmark_a != landmark_b)
     return list(zip(landmark_a[both].tolist(), landmark_b[both].tolist(), strict=True))
 
 
 def _view(structure: Structure, frame: Frame) -> View:
     if frame.descriptors is None:
-        raise ValueError(f"{frame.name}: no descriptors, it has left the window")
+        raise ValueError(f"{frame.name}: the frame has left the window and has no descriptors")
     return View(frame.descriptors, frame.rays, frame.pose, structure.focal(frame.camera_id))
 
 
-def _create(
+def _create_landmarks(
     structure: Structure,
     memory: Memory,
     old: Frame,
@@ -98,38 +97,36 @@ def _create(
     seen = np.concatenate([old.rays[a], new.rays[b]])
     focal = np.repeat([structure.focal(f.camera_id) for f in (old, new)], count)
     points = refine_points(points, np.tile(np.arange(count), 2), poses, seen, focal, iterations=2)
-    difference, depth = reprojection_residuals(np.tile(points, (2, 1)), poses, seen)
-    error = np.linalg.norm(difference, axis=1) * focal
+    errors = pixel_errors(np.tile(points, (2, 1)), poses, seen, focal)
     limits = np.repeat([structure.tolerance(f.camera_id, max_error) for f in (old, new)], count)
-    fits = ((error <= limits) & (depth > 0)).reshape(2, count).all(0)
+    fits = (errors <= limits).reshape(2, count).all(0)
     a, b = a[fits], b[fits]
     ids = structure.create(points[fits])
     for frame, rows in ((old, a), (new, b)):
         structure.observe(frame, rows, ids)
-        remember(memory, frame, rows)
+        update_prototypes(memory, frame, rows)
 
 
-def _extend(
+def _continue_tracks(
     structure: Structure, memory: Memory, frame: Frame, rows: Ids, ids: Ids, limit: float
 ) -> None:
-    """Let keypoints observe landmarks that project to them and that the frame does not see yet."""
+    """Let keypoints observe landmarks that project to them and are new to the frame."""
     if not len(rows):
         return
-    difference, depth = reprojection_residuals(
-        structure.positions[ids], np.repeat(frame.pose[None], len(ids), axis=0), frame.rays[rows]
-    )
-    error = np.linalg.norm(difference, axis=1) * structure.focal(frame.camera_id)
-    # Landmarks may have been made, and keypoints taken, since the match.
-    fits = (depth > 0) & (error <= limit) & (frame.landmarks[rows] < 0)
+    poses = np.repeat(frame.pose[None], len(ids), axis=0)
+    focal = structure.focal(frame.camera_id)
+    errors = pixel_errors(structure.positions[ids], poses, frame.rays[rows], focal)
+    # Landmarks may have been created, and keypoints assigned, since the match.
+    fits = (errors <= limit) & (frame.landmarks[rows] < 0)
     fits &= ~np.isin(ids, frame.seen)
     rows, ids = rows[fits], ids[fits]
     _, first = np.unique(ids, return_index=True)
     rows, ids = rows[first], ids[first]
     structure.observe(frame, rows, ids)
-    remember(memory, frame, rows)
+    update_prototypes(memory, frame, rows)
 
 
-def remember(memory: Memory, frame: Frame, rows: Ids) -> None:
-    """Add the codes of keypoints to the landmarks that they see (Eq. 2)."""
+def update_prototypes(memory: Memory, frame: Frame, rows: Ids) -> None:
+    """Add the codes of keypoints to the prototypes of their landmarks (Eq. 1 and 2)."""
     if len(rows) and frame.encoded is not None:
         memory.add(frame.landmarks[rows], frame.encoded[rows])

@@ -1,1 +1,1 @@
-"""Map files: built from tracks, merged, split and described."""
+"""Builds, merges, splits, opens and describes map files."""

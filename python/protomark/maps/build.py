@@ -18,15 +18,15 @@ def build_map(
     appearance_bits: int = 0,
     threads: int = 1,
 ) -> PrototypeMap:
-    """A learning map with the prototypes and the position of every landmark of `tracks`.
+    """Build a learning map with the prototypes and the position of every landmark of `tracks`.
 
     Args:
         tracks: the observations.
         encoder: an encoder for their descriptor, or for its upright form.
-        dim: dimensions of a prototype, one of `encoder.dims`; None: all.
-        min_observations: landmarks with fewer are left out.
-        appearance_bits: signs of a code that tell the appearances of a landmark apart; 0: each
-            landmark has one prototype.
+        dim: numbers per prototype, one of `encoder.dims`; None: all.
+        min_observations: landmarks with fewer observations are left out.
+        appearance_bits: number of signs of a code that tell the appearances of a landmark apart;
+            0: each landmark has one prototype.
         threads: threads to encode on.
 
     Raises:
@@ -40,7 +40,8 @@ def build_map(
     keep = counts[inverse] >= min_observations
     if not keep.any():
         raise ValueError(
-            f"no landmark has {min_observations} observations: there is no map to build"
+            f"no landmark has {min_observations} observations: give longer tracks or lower "
+            "min_observations"
         )
     scene = PrototypeMap(encoder, dim, appearance_bits)
     scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
@@ -50,7 +51,7 @@ def build_map(
 
 
 def tracks_for(encoder: Encoder, tracks: Tracks) -> Tracks:
-    """The tracks with the descriptors that an encoder takes, upright ones if it needs them.
+    """The tracks with the descriptors that an encoder takes, plain or upright.
 
     Raises:
         ValueError: the encoder is for another descriptor.

@@ -1,4 +1,4 @@
-"""Describes what a file holds: a map, an encoder or tracks."""
+"""Describes the content of a file: a map, an encoder or tracks."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from protomark.tracks.file import Tracks
 
 
 def is_tracks(path: Path) -> bool:
-    """Whether `describe` reads a file as tracks, by its suffix."""
+    """Whether a file is a tracks file, by its suffix."""
     return path.suffix == ".safetensors"
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Facts about a file as JSON values; `kind` says what it is.
+    """Facts about a file as JSON values, of which `kind` tells what it is.
 
     Raises:
-        OSError, ValueError: the file cannot be read, or is not one of Protomark's.
+        OSError, ValueError: the file cannot be read, or it is not one of Protomark's.
     """
     if is_tracks(path):
         return _describe_tracks(path)
@@ -68,11 +68,11 @@ def _describe_encoder(path: Path) -> dict[str, Any]:
 
 
 def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
-    """Bytes per landmark that matching needs of a sealed map: prototypes and count, not ids.
+    """Bytes per landmark that matching needs in a sealed map: prototypes and count, without ids.
 
-    A learning map counts as if it were sealed without loss. The numbers that pad a prototype to a
-    multiple of 4 bytes are counted; the up to 15 rows that pad the whole section
-    (`docs/format.md`) are not, as they do not grow with the map.
+    A learning map counts as if it were sealed without loss. The padding of a prototype to a
+    multiple of 4 bytes counts; the up to 15 rows that pad the whole section do not, as they do not
+    grow with the map.
     """
     bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
     in_a_word = 32 // bits
@@ -84,7 +84,7 @@ def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
 
 
 def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]) -> float | None:
-    """Bytes per landmark of a sealed map's index, with the rows that pad its blocks."""
+    """Bytes per landmark of a sealed map's index, including the rows that pad its blocks."""
     if not isinstance(scene, pm.SealedMap) or scene.nlist == 0:
         return None
     width = {8: 4, 4: 8}[scene.code_bits]  # dimensions in 4 bytes

@@ -15,18 +15,18 @@ MAX_ID = 2**63 - 1
 def merge_files(
     inputs: Sequence[Path], output: Path, renumber: bool = False, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Merge learning maps, in this order, into the map file `output`; facts as JSON values.
+    """Merge learning maps, in this order, into the map file `output`; returns facts as JSON values.
 
     Args:
         inputs: map files of the same encoder, dimensions and appearance bits.
-        output: the file to write; none of the inputs.
-        renumber: landmarks of different files are different landmarks, whatever their ids: those of
-            each further file get new ids above all earlier ones.
+        output: the file to write, which is none of the inputs.
+        renumber: whether landmarks of different files differ, whatever their ids: those of each
+            further file then get new ids above all earlier ones.
         progress: called with each map.
 
     Raises:
-        ValueError: there are fewer than two inputs, one occurs twice, is sealed, does not fit the
-            first, or is the output.
+        ValueError: there are fewer than two inputs, or one occurs twice, is sealed, does not fit
+            the first, or is the output.
         OSError: a file cannot be read or written.
     """
     _check_inputs(inputs, output)
@@ -66,7 +66,7 @@ def _check_inputs(inputs: Sequence[Path], output: Path) -> None:
     seen: set[Path] = set()
     for path in inputs:
         if path.resolve() in seen:
-            raise ValueError(f"{path} is named twice: its observations would count twice")
+            raise ValueError(f"{path} is named twice, and its observations would count twice")
         seen.add(path.resolve())
         if path.exists() and output.exists() and path.samefile(output):
             raise ValueError(f"{output} is one of the maps to merge: name another file to write")
@@ -92,5 +92,7 @@ def _merge_renumbered(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
         return
     first = int(existing[-1]) + 1
     if int(theirs[-1]) > MAX_ID - first:
-        raise ValueError(f"landmark ids from {first} on leave no room for those up to {theirs[-1]}")
+        raise ValueError(
+            f"ids from {first} on leave no room for those up to {theirs[-1]}: use smaller ids"
+        )
     merged.merge_map(scene, into=theirs + first, source=theirs)

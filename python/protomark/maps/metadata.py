@@ -8,9 +8,9 @@ from datetime import datetime, timezone
 
 
 def creation_time() -> str:
-    """Now in UTC, such as 2026-11-23T03:39:41Z, or the time that SOURCE_DATE_EPOCH gives.
+    """The time in UTC, such as 2026-11-23T03:39:41Z, or that of SOURCE_DATE_EPOCH.
 
-    That variable makes builds repeatable (https://reproducible-builds.org/specs/source-date-epoch).
+    The variable makes builds repeatable (https://reproducible-builds.org/specs/source-date-epoch).
 
     Raises:
         ValueError: SOURCE_DATE_EPOCH is not a number of seconds since 1970 up to the year 9999.
@@ -32,14 +32,10 @@ def _utc(seconds: int) -> datetime:
 
 
 def command_metadata(frame: str | None, pairs: Sequence[str]) -> dict[str, str]:
-    """The metadata of a map that a command makes: "created", and what the user gives.
-
-    Args:
-        frame: the coordinate frame; None: not given.
-        pairs: texts of the form NAME=TEXT, as --metadata takes them.
+    """The metadata of a map that a command makes: "created", "frame" and the given pairs.
 
     Raises:
-        ValueError: one of `pairs` is not of that form.
+        ValueError: a pair is not of the form NAME=TEXT.
     """
     metadata = {"created": creation_time()}
     if frame is not None:

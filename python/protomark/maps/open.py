@@ -6,12 +6,12 @@ from pathlib import Path
 
 import protomark as pm
 
-# The map in the folder that `protomark map` writes.
+# Name of the map in the folder that `protomark map` writes.
 SCENE_MAP = "scene.pmk"
 
 
 def map_path(path: str | Path) -> Path:
-    """The map file at a path, which may be the folder that `protomark map` wrote.
+    """The map file at a path: the path itself, or the map in a folder of `protomark map`.
 
     Raises:
         FileNotFoundError: the folder holds no map.
@@ -20,12 +20,12 @@ def map_path(path: str | Path) -> Path:
     if not path.is_dir():
         return path
     if not (path / SCENE_MAP).is_file():
-        raise FileNotFoundError(f"{path}: no {SCENE_MAP} in this folder; name a map file")
+        raise FileNotFoundError(f"{path} holds no {SCENE_MAP}: name a map file")
     return path / SCENE_MAP
 
 
 def open_map(path: str | Path) -> pm.PrototypeMap | pm.SealedMap:
-    """Open a map.
+    """Open a map file, or the map in a folder of `protomark map`.
 
     Raises:
         FileNotFoundError, FileError: there is no map at the path, or it is broken.

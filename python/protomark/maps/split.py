@@ -21,27 +21,27 @@ def split_file(
     sealed: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Split a learning map by one of `ids`, `parts` and `cell_size`; facts as JSON values.
+    """Split a learning map by `ids`, `parts` or `cell_size`; returns facts as JSON values.
 
     The files are NAME.0.pmk, NAME.1.pmk, ... by id, and NAME.I_J_K.pmk and NAME.nowhere.pmk by
-    space; sealed ones are NAME.0.sealed.pmk and so on. A part without landmarks gets no file.
+    space; sealed ones are NAME.0.sealed.pmk and so on. A part without landmarks has no file.
 
     Args:
         path: the map file, NAME.pmk.
-        folder: where the parts go; it is made if it does not exist.
-        ids: ascending ids at which a part begins.
+        folder: folder of the parts, created if it does not exist.
+        ids: ascending ids, at each of which a part starts.
         parts: number of parts by id, of equally many landmarks (give or take one).
-        cell_size: edge of the cubes into which space is cut, in the unit of the positions.
-        sealed: seal the parts.
+        cell_size: edge of the cubes that divide space, in the unit of the positions.
+        sealed: whether to seal the parts.
         progress: called with each part.
 
     Raises:
-        ValueError: none or several of the three are given, the one does not fit the map, the map is
-            sealed, or a part would replace it.
+        ValueError: none or several of the three are given, or the one does not fit the map, the
+            map is sealed, or a part would replace it.
         OSError: a file cannot be read or written.
     """
     if sum(option is not None for option in (ids, parts, cell_size)) != 1:
-        raise ValueError("say how to split: one of --ids, --parts and --cell-size")
+        raise ValueError("give one of --ids, --parts and --cell-size to split by")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: name a folder to write the parts to")
     scene = open_learning_map(path)
@@ -76,7 +76,9 @@ def _by_id(
     if boundaries is None:
         ids = scene.ids
         if parts is None or not 1 <= parts <= len(ids):
-            raise ValueError(f"--parts {parts}: a map of {len(ids)} landmarks has 1 to {len(ids)}")
+            raise ValueError(
+                f"--parts {parts}: a map of {len(ids)} landmarks has 1 to {len(ids)} parts"
+            )
         boundaries = ids[np.arange(1, parts) * len(ids) // parts].tolist()
     width = len(str(len(boundaries)))
     return [(f"{i:0{width}}", part) for i, part in enumerate(scene.split_by_id(boundaries))]

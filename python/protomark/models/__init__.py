@@ -1,4 +1,4 @@
-"""The encoders that ship, each beside its card: data, licence, figures."""
+"""The encoders that ship, each beside its card with data, licence and figures."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _FOLDER = Path(__file__).parent
 
 
 def names() -> list[str]:
-    """Names of the encoders that ship, for example "freak"."""
+    """Names of the encoders that ship, such as "freak"."""
     return sorted(path.stem for path in _FOLDER.glob(f"*{SUFFIX}"))
 
 
 def resolve(source: str | os.PathLike[str]) -> Path:
-    """The model file that a bundled name or a path means.
+    """The model file of a bundled name or a path.
 
     Raises:
         FileNotFoundError: it is neither.

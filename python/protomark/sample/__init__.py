@@ -1,8 +1,8 @@
-"""One small real map, so that everything runs after install.
+"""One small real sequence, so that everything runs right after installation.
 
-The tracks of the sequence "toy" (a toy on a textured table; github.com/sfmtool/sfmtool,
-Apache-2.0): FREAK keypoints and descriptors, poses and landmarks that `protomark tracks` computed;
-no image.
+These are the tracks of the sequence "toy" (a toy on a textured table; github.com/sfmtool/sfmtool,
+Apache-2.0): FREAK keypoints and descriptors, poses and landmarks, which `protomark tracks` computed
+from its images.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ NAME = "toy.freak.safetensors"
 
 
 def path() -> Path:
-    """The tracks file that ships.
+    """The path of the bundled tracks file.
 
     Raises:
         FileNotFoundError: the installation lacks it.
@@ -27,5 +27,5 @@ def path() -> Path:
 
 
 def load() -> Tracks:
-    """The bundled tracks. Raises FileNotFoundError where the installation lacks them."""
+    """Load the bundled tracks; raises FileNotFoundError if the installation lacks them."""
     return Tracks.load(path())

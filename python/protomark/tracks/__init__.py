@@ -1,4 +1,4 @@
-"""Observations: which descriptor of which keyframe saw which landmark."""
+"""Tracks: observations of landmarks by the descriptors of keyframes."""
 
 from protomark.tracks.file import Tracks
 

@@ -1,8 +1,9 @@
-"""Augments tracks for training: each image warped and relit, its keypoints detected anew.
+"""Augments tracks for training: warps and relights each image, and detects its keypoints anew.
 
-A keypoint found in a copy belongs to the landmark whose keypoint in the original it falls on, so
-that an encoder sees what detection, blur, noise, exposure, compression, rotation and scale do to a
-descriptor. Places and angles are those in the original image, so that poses and cameras stay true.
+A keypoint of a copy belongs to the landmark whose keypoint in the original it falls on, so that an
+encoder learns what detection, blur, noise, exposure, compression, rotation and scale do to a
+descriptor. Positions and angles are those in the original image, so that poses and cameras remain
+valid.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import FEATURE_ARRAYS, Extractor, Features
 from protomark.features.images import read_gray
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
 from protomark.tracks.file import Tracks
 
-# Raised whenever the same tracks give other augmentations.
+# Increased whenever the same tracks yield other augmentations.
 METHOD = 1
-_MAX_DISTANCE = 2.0  # pixels between a keypoint of the copy and that of the original
+_MAX_DISTANCE = 2.0  # pixels, between keypoints of the copy and of the original
 _MAX_SIZE_RATIO = 1.5
 
 
@@ -35,7 +36,7 @@ def augment(
 
     Args:
         image: (height, width) uint8.
-        rng: where all random numbers come from.
+        rng: source of all random numbers.
 
     Returns:
         The copy, of the same shape; the homography (3, 3) from the image's pixels to the copy's
@@ -75,14 +76,13 @@ def add_augmentations(
     """The observations of `tracks` and those in `count` augmented copies of each keyframe.
 
     Copies are keyframes of their own, named image#1, image#2, ..., with the original's pose.
-    Keypoints without a landmark are left out. The same tracks give the same result on any number
-    of threads.
+    Keypoints without a landmark are left out. The result does not depend on the number of threads.
 
     Args:
-        tracks: what `extract` made.
+        tracks: tracks that `extract` made.
         images: folder of the images that the keyframes name.
         count: copies of each keyframe, at least 1.
-        threads: keyframes worked on at a time.
+        threads: keyframes to work on at a time.
         progress: called with each keyframe.
 
     Raises:
@@ -90,9 +90,9 @@ def add_augmentations(
         ValueError: `count` is below 1, an image is broken, or the tracks are augmented already.
     """
     if count < 1:
-        raise ValueError(f"{count} augmentations: there must be at least 1")
+        raise ValueError(f"{count} augmentations: give at least 1")
     if tracks.info.get("augmentations"):
-        raise ValueError("these tracks are augmented already; give the plain ones")
+        raise ValueError("these tracks are augmented already: give the plain ones")
     plain = tracks.where(tracks.landmark_of_keypoint >= 0)
     options = tracks.info.get("options", {})
     local = threading.local()
@@ -113,11 +113,10 @@ def add_augmentations(
     keyframes = np.array([i for i, *_ in flat])
     ends = int(plain.offsets[-1]) + np.cumsum([len(f) for _, _, f, _ in flat])
 
-    def joined(name: str) -> Any:
-        return np.concatenate([getattr(plain, name), *(getattr(f, name) for _, _, f, _ in flat)])
-
-    arrays = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
-    values: dict[str, Any] = {name: joined(name) for name in arrays}
+    values: dict[str, Any] = {
+        name: np.concatenate([getattr(plain, name), *(getattr(f, name) for _, _, f, _ in flat)])
+        for name in FEATURE_ARRAYS
+    }
     return replace(
         plain,
         **values,
@@ -143,51 +142,39 @@ def _copy(
     sizes: NDArray[np.float32],
     landmarks: NDArray[np.int64],
 ) -> tuple[Features, NDArray[np.int64]]:
-    """Features of a copy that fall on a keypoint of the original, there, and their landmarks."""
+    """Features of a copy, moved to the keypoints of the original they fall on, and landmarks."""
     copy, homography, scale, angle = augment(image, rng)
     features = extractor(copy)
     if not len(features) or not len(keypoints):
-        return _where(features, np.zeros(len(features), bool)), np.zeros(0, np.int64)
-    # In OpenCV the centre of the first pixel is (0, 0), in COLMAP (0.5, 0.5).
+        return features.where(np.zeros(0, np.int64)), np.zeros(0, np.int64)
+    # The centre of the first pixel is (0, 0) in OpenCV, and (0.5, 0.5) in COLMAP.
     there = np.column_stack([features.keypoints - 0.5, np.ones(len(features))])
     back = there @ np.linalg.inv(homography).T
     xy = back[:, :2] / back[:, 2:] + 0.5
     nearest, gap = _nearest(xy, keypoints)
     ratio = features.sizes / scale / sizes[nearest]
     fits = (gap < _MAX_DISTANCE**2) & (ratio < _MAX_SIZE_RATIO) & (ratio > 1 / _MAX_SIZE_RATIO)
-    # A keypoint of the original takes the closest one that fits.
+    # A keypoint of the original keeps the closest one that fits.
     order = np.lexsort((gap, ~fits, nearest))
     first = np.zeros(len(xy), bool)
     first[order[np.flatnonzero(np.diff(nearest[order], prepend=-1))]] = True
     keep = fits & first
     features.keypoints[:] = xy
     features.sizes /= np.float32(scale)
-    known = features.angles >= 0
-    features.angles[known] = np.mod(features.angles[known] - np.float32(angle), 360)
+    oriented = features.angles >= 0
+    features.angles[oriented] = np.mod(features.angles[oriented] - np.float32(angle), 360)
     features.angles[features.angles >= 360] = 0
-    return _where(features, keep), landmarks[nearest[keep]]
+    return features.where(keep), landmarks[nearest[keep]]
 
 
 def _nearest(
     xy: NDArray[np.float64], keypoints: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Of each point (n, 2) the nearest keypoint and its squared distance, in bounded memory."""
+    """The nearest keypoint to each point (n, 2), and its squared distance, in bounded memory."""
     nearest, gap = np.empty(len(xy), np.int64), np.empty(len(xy))
-    for at in range(0, len(xy), 512):
-        rows = slice(at, at + 512)
+    for start in range(0, len(xy), 512):
+        rows = slice(start, start + 512)
         distances = (xy[rows, None, 0] - keypoints[None, :, 0]) ** 2
         distances += (xy[rows, None, 1] - keypoints[None, :, 1]) ** 2
-        nearest[rows] = distances.argmin(1)
-        gap[rows] = distances.min(1)
+        nearest[rows], gap[rows] = distances.argmin(1), distances.min(1)
     return nearest, gap
-
-
-def _where(features: Features, keep: NDArray[np.bool_]) -> Features:
-    return Features(
-        features.keypoints[keep],
-        features.sizes[keep],
-        features.angles[keep],
-        features.responses[keep],
-        features.octaves[keep],
-        features.descriptors[keep],
-    )

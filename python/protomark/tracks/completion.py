@@ -1,9 +1,9 @@
-"""Observations that matching missed, and landmarks that are one: found by projection.
+"""Finds observations that matching missed, and duplicate landmarks, by projection.
 
-COLMAP joins what was matched. A keypoint that passed no ratio test, though it lies where a landmark
-projects and looks like it, is still an observation of it; and two landmarks that project to one
-keypoint and look alike are one landmark. Both kinds of error would count against every method
-that is measured with these labels.
+COLMAP's landmarks contain what was matched. A keypoint that passes no ratio test is still an
+observation of a landmark that projects to it and has a similar descriptor, and two landmarks that
+project to one keypoint and have similar descriptors are one landmark. Both kinds of error would
+count against every method that is measured with these labels.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ _POPCOUNT = np.array([bin(i).count("1") for i in range(256)], np.uint8)
 
 
 def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> None:
-    """Refine positions, drop what does not fit, and number the landmarks anew, in place.
+    """Refine positions, remove what does not fit, and number the landmarks anew, in place.
 
-    Dropped are observations with a reprojection error above `max_error` pixels, then landmarks with
-    fewer than `min_length` observations or a widest angle below `min_angle` degrees. Landmarks are
-    numbered by their first keypoint.
+    This removes observations with a reprojection error above `max_error` pixels, then landmarks
+    with fewer than `min_length` observations or a widest angle below `min_angle` degrees. Landmarks
+    are numbered by their first keypoint.
     """
     if not len(scene.positions):
         return
@@ -51,12 +51,12 @@ def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> 
     keep &= np.isfinite(scene.positions).all(1)
     scene.labels[(scene.labels >= 0) & ~keep[scene.labels]] = -1
     seen = scene.labels[scene.labels >= 0]
-    kept, first = np.unique(seen, return_index=True)
-    kept = kept[np.argsort(first, kind="stable")]
+    remaining, first = np.unique(seen, return_index=True)
+    remaining = remaining[np.argsort(first, kind="stable")]
     number = np.full(count, -1, np.int64)
-    number[kept] = np.arange(len(kept))
+    number[remaining] = np.arange(len(remaining))
     scene.labels = np.where(scene.labels >= 0, number[scene.labels], -1)
-    scene.positions = scene.positions[kept]
+    scene.positions = scene.positions[remaining]
 
 
 def complete(
@@ -65,16 +65,16 @@ def complete(
     max_error: float,
     max_distance: int,
 ) -> tuple[int, int]:
-    """One pass over the keyframes: add observations, then merge landmarks, in place.
+    """Add observations in one pass over the keyframes, then merge landmarks, in place.
 
     Args:
         scene: labelled keypoints; labels and positions change.
-        partners: for each keyframe, the keyframes that see the same things.
+        partners: for each keyframe, the keyframes with an overlapping view.
         max_error: largest distance in pixels between projection and keypoint.
         max_distance: largest Hamming distance in bits to the nearest descriptor of the landmark.
 
     Returns:
-        How many observations were added, how many landmarks were merged into another.
+        Numbers of added observations and of merged landmarks.
     """
     added = 0
     votes: list[NDArray[np.int64]] = []
@@ -83,16 +83,12 @@ def complete(
         candidates, keypoint, distance = _candidates(scene, i, partners[i], rows, max_error)
         fits = distance <= max_distance
         candidates, keypoint, distance = candidates[fits], keypoint[fits], distance[fits]
-        holder = scene.labels[keypoint]
-        taken = holder >= 0
-        votes.append(
-            np.column_stack(
-                [np.minimum(candidates, holder)[taken], np.maximum(candidates, holder)[taken]]
-            )
-        )
-        candidates, keypoint, distance = candidates[~taken], keypoint[~taken], distance[~taken]
+        label = scene.labels[keypoint]
+        free = label < 0
+        votes.append(np.sort(np.column_stack([candidates, label])[~free], axis=1))
+        candidates, keypoint, distance = candidates[free], keypoint[free], distance[free]
         best = _best(candidates, distance) & _best(keypoint, distance)
-        # Equal distances: the first keypoint, the first landmark.
+        # Of equal distances, the first keypoint and the first landmark count.
         _, once = np.unique(keypoint[best], return_index=True)
         chosen, label = keypoint[best][once], candidates[best][once]
         _, once = np.unique(label, return_index=True)
@@ -102,7 +98,7 @@ def complete(
 
 
 def _best(key: NDArray[np.int64], distance: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each entry has the smallest distance among those of its key."""
+    """Whether each entry has the smallest distance of all entries with its key."""
     if not len(key):
         return np.zeros(0, bool)
     _, group_of = np.unique(key, return_inverse=True)
@@ -119,18 +115,18 @@ def _candidates(
     rows: NDArray[np.int64],
     radius: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Landmarks that partners see and this keyframe does not, with keypoints where they project.
+    """Landmarks that partners but not this keyframe observe, and keypoints they project to.
 
     Returns:
-        landmark, keypoint row and Hamming distance to the nearest of the landmark's descriptors.
+        Landmark, keypoint row, and Hamming distance to the landmark's nearest descriptor.
     """
     nothing = np.zeros(0, np.int64)
-    own = slice(int(scene.offsets[keyframe]), int(scene.offsets[keyframe + 1]))
+    here = slice(int(scene.offsets[keyframe]), int(scene.offsets[keyframe + 1]))
     seen = np.zeros(len(scene.positions), bool)
     for p in partners:
         labels = scene.labels[scene.offsets[p] : scene.offsets[p + 1]]
         seen[labels[labels >= 0]] = True
-    labels = scene.labels[own]
+    labels = scene.labels[here]
     seen[labels[labels >= 0]] = False
     landmarks = np.flatnonzero(seen)
     camera = scene.model.cameras[int(scene.model.camera_ids[keyframe])]
@@ -138,11 +134,11 @@ def _candidates(
     pixels = camera.project(transform(pose, scene.positions[landmarks]))
     inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
     landmarks, pixels = landmarks[inside], pixels[inside]
-    a, b = near_pairs(pixels, scene.keypoints[own].astype(np.float64), radius)
+    a, b = near_pairs(pixels, scene.keypoints[here].astype(np.float64), radius)
     if not len(a):
         return nothing, nothing, nothing
-    landmarks, keypoints = landmarks[a], b + own.start
-    # All descriptors of each landmark, next to the keypoint's.
+    landmarks, keypoints = landmarks[a], b + here.start
+    # Pair all descriptors of each landmark with the keypoint's.
     sorted_labels = scene.labels[rows]
     start = np.searchsorted(sorted_labels, landmarks, "left")
     length = np.searchsorted(sorted_labels, landmarks, "right") - start

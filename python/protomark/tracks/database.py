@@ -16,7 +16,7 @@ from protomark.features.descriptors import DESCRIPTORS, descriptor_kind
 from protomark.features.extractor import Features
 from protomark.tracks.file import Tracks
 
-_FAR = 1e9  # pixels; a product of two such numbers is still a float32
+_MAX_PIXEL = 1e9  # a product of two such numbers is still a float32
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,14 @@ class _Image:
     descriptors: NDArray[np.uint8]
 
 
-def digest_of(database: Path, model: Path) -> str:
-    """Digest of the content of the database and of the model's files.
+def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
+    """What the tracks are made from and how, for their `info`: equal for equal tracks.
+
+    The input is a digest of the content of the database and of the model's files.
 
     Raises:
         FileNotFoundError: the database is missing.
+        ValueError: there is no such descriptor.
     """
     if not database.is_file():
         raise FileNotFoundError(f"{database}: no such COLMAP database")
@@ -39,22 +42,23 @@ def digest_of(database: Path, model: Path) -> str:
         with path.open("rb") as file:
             while block := file.read(1 << 20):
                 digest.update(block)
-    return digest.hexdigest()
+    options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
+    return {"options": options, "input": digest.hexdigest()}
 
 
 def tracks_from_database(
     database: Path, model_path: Path, descriptor: str, name: str = ""
 ) -> Tracks:
-    """Keypoints and descriptors of the database, landmarks of the model.
+    """Tracks with the keypoints and descriptors of a database, and the landmarks of a model.
 
-    A landmark that the model saw twice in one image keeps the keypoint with the smaller
-    reprojection error; landmarks with fewer than two observations are left out.
+    A landmark with two observations in one image keeps the one with the smaller reprojection error;
+    landmarks with fewer than two observations are left out.
 
     Args:
         database: COLMAP database (SQLite) whose descriptors are binary, as uint8 blobs.
         model_path: folder of the sparse model with points, made from this database.
-        descriptor: name of the descriptor, for example "orb".
-        name: name of the sequence, for the file's provenance.
+        descriptor: name of the descriptor, such as "orb".
+        name: name of the sequence, for the file's `info`.
 
     Raises:
         FileNotFoundError: the database or the model is missing.
@@ -70,7 +74,7 @@ def tracks_from_database(
     if not reconstruction.points3D:
         raise ValueError(
             f"{model_path}: the model has no points, so the database's descriptors have no "
-            "landmarks; run protomark tracks without --database to make them from the images"
+            "landmarks: run `protomark tracks` without --database to make them from the images"
         )
     by_name = _read(database, kind.name, kind.bytes)
     features, labels = [], []
@@ -84,7 +88,7 @@ def tracks_from_database(
         if len(found) != image.num_points2D():
             raise ValueError(
                 f"{database}: image {image_name} has {len(found)} keypoints, but "
-                f"{image.num_points2D()} in the model; is this the model's database?"
+                f"{image.num_points2D()} in the model: give the database of this model"
             )
         label = np.full(len(found), -1, np.int64)
         error = np.full(len(found), np.inf)
@@ -95,7 +99,7 @@ def tracks_from_database(
             if seen is not None:
                 error[row] = float(np.linalg.norm(seen - found.keypoints[row]))
         order = np.lexsort((error, label))
-        # label -1 comes first and repeats: setting it to -1 again changes nothing.
+        # Label -1 repeats, too, and stays -1.
         twice = order[1:][label[order[1:]] == label[order[:-1]]]
         label[twice] = -1
         features.append(found)
@@ -105,38 +109,19 @@ def tracks_from_database(
     keep = np.flatnonzero(count >= 2)
     number = np.full(len(positions) + 1, -1, np.int64)
     number[keep] = np.arange(len(keep))
-    tracks = Tracks(
-        descriptor=kind.name,
-        cameras=model.cameras,
-        keyframe_names=model.names,
-        keyframe_camera=model.camera_ids,
-        cam_from_world=model.cam_from_world,
-        offsets=np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64),
-        keypoints=np.concatenate([f.keypoints for f in features]),
-        sizes=np.concatenate([f.sizes for f in features]),
-        angles=np.concatenate([f.angles for f in features]),
-        responses=np.concatenate([f.responses for f in features]),
-        octaves=np.concatenate([f.octaves for f in features]),
-        descriptors=np.concatenate([f.descriptors for f in features]),
-        landmark_of_keypoint=number[label],
-        landmark_ids=np.arange(len(keep), dtype=np.int64),
-        landmark_positions=positions[keep],
-        info={
-            "sequence": name,
-            "options": {"descriptor": kind.name, "database": True},
-            "input": digest_of(database, model_path),
-            "images_without_pose": model.unposed,
-            "poses_refined": False,
-        },
-    )
-    tracks.check()
-    return tracks
+    info = {
+        "sequence": name,
+        **provenance(database, model_path, descriptor),
+        "images_without_pose": model.unposed,
+        "poses_refined": False,
+    }
+    return Tracks.from_features(kind.name, model, features, number[label], positions[keep], info)
 
 
 def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
-    """Keypoints and descriptors by the name of their image."""
+    """Keypoints and descriptors by image name."""
     try:
-        # Read-only, and never created: a database that is open elsewhere stays as it is.
+        # Read-only mode neither creates nor changes a database, which may be open elsewhere.
         connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
         try:
             _check_tables(connection, database)
@@ -148,10 +133,10 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
     except sqlite3.Error as error:
         raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
     images: dict[str, _Image] = {}
-    none = (None, None, None)
+    empty = (None, None, None)
     for image_id, (name,) in names.items():
-        kr, kc, kd = keypoints.get(image_id, none)
-        dr, dc, dd = descriptors.get(image_id, none)
+        kr, kc, kd = keypoints.get(image_id, empty)
+        dr, dc, dd = descriptors.get(image_id, empty)
         kr, kc, kd = kr or 0, kc or 2, kd or b""
         dr, dc, dd = dr or 0, dc or width, dd or b""
         numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
@@ -162,18 +147,18 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
         if dr and dc != width:
             guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
             raise ValueError(
-                f"{database}: image {name} has descriptors of {dc} bytes, {descriptor} has "
-                f"{width}; name the right one with -d"
+                f"{database}: image {name} has descriptors of {dc} bytes, but {descriptor} has "
+                f"{width}: name the right descriptor with -d"
                 + (f" ({' or '.join(guess)})" if guess else "")
             )
         if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
             raise ValueError(
-                f"{database}: image {name} has {kr} keypoints and {dr} descriptors that do "
-                "not fit together, extract its features anew"
+                f"{database}: the {kr} keypoints and {dr} descriptors of image {name} do not fit "
+                "together: extract its features anew"
             )
         points = np.frombuffer(kd, "<f4").reshape(kr, kc)
-        if not (np.abs(points) < _FAR).all():
-            raise ValueError(f"{database}: image {name} has keypoints that are not in any image")
+        if not (np.abs(points) < _MAX_PIXEL).all():
+            raise ValueError(f"{database}: image {name} has keypoints far outside of any image")
         images[name] = _Image(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
     return images
 
@@ -181,11 +166,11 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
 def _by_image(
     connection: sqlite3.Connection, database: Path, table: str, columns: str
 ) -> dict[int, tuple[Any, ...]]:
-    """The rows of a table by image_id, which must be unique: a stranger's table need not say so.
+    """The rows of a table by image_id, which need not be unique in a malicious file.
 
-    One table at a time: joined on ids that repeat, rows would multiply.
+    This reads one table at a time, as a join on repeated ids would multiply rows.
     """
-    # Rows of a broken file may share their bytes, so that all together are more than it holds.
+    # Rows of a malicious file may share their bytes, so that they exceed the file's size together.
     room = math.prod(
         connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")
     )
@@ -193,29 +178,29 @@ def _by_image(
     for image_id, *row in connection.execute(f"SELECT image_id, {columns} FROM {table}"):
         if type(image_id) is not int or image_id in rows:
             raise ValueError(
-                f"{database}: not a COLMAP database, in {table} the image_id "
-                f"{str(image_id)[:40]!r} is {'there twice' if image_id in rows else 'no number'}"
+                f"{database}: not a COLMAP database, as in {table} the image_id "
+                f"{str(image_id)[:40]!r} {'occurs twice' if image_id in rows else 'is no number'}"
             )
         room -= sum(len(cell) for cell in row if isinstance(cell, (bytes, str)))
         if room < 0:
-            raise ValueError(f"{database}: {table} has more in it than the file can hold")
+            raise ValueError(f"{database}: the rows of {table} exceed the size of the file")
         rows[image_id] = tuple(row)
     return rows
 
 
 def _check_tables(connection: sqlite3.Connection, database: Path) -> None:
-    """Raise ValueError unless what is read is stored; views and computed columns can be endless."""
+    """Raise ValueError for views and computed columns, which may be endless."""
     for table in ("images", "keypoints", "descriptors"):
         (kind,) = connection.execute(
             "SELECT type FROM sqlite_master WHERE name = ?", (table,)
         ).fetchone() or ("missing",)
         columns = connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
         if kind != "table" or any(hidden for *_, hidden in columns):
-            raise ValueError(f"{database}: not a COLMAP database, {table} is no plain table")
+            raise ValueError(f"{database}: not a COLMAP database, as {table} is no plain table")
 
 
 def _features(image: _Image) -> Features:
-    """Scale and angle as COLMAP keeps them: none, (scale, radians), or an affine shape."""
+    """Features with COLMAP's scale and angle: none, (scale, radians), or an affine shape."""
     k = image.keypoints
     n = len(k)
     sizes, angles = np.ones(n, np.float32), np.full(n, -1, np.float32)
@@ -234,13 +219,3 @@ def _features(image: _Image) -> Features:
         np.zeros(n, np.int32),
         np.ascontiguousarray(image.descriptors),
     )
-
-
-def is_up_to_date(path: Path, database: Path, model: Path, descriptor: str) -> bool:
-    """Whether `path` holds the tracks of this very database and model."""
-    try:
-        info: dict[str, Any] = Tracks.load(path).info
-    except (ValueError, OSError):
-        return False
-    options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
-    return info.get("options") == options and info.get("input") == digest_of(database, model)

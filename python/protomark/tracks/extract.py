@@ -1,4 +1,4 @@
-"""Makes tracks from an image folder with a COLMAP sparse model."""
+"""Extracts tracks from images with a COLMAP sparse model."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ from protomark.tracks.scene import Scene
 
 Pairs = dict[tuple[int, int], VerifiedMatches]
 
-# Matches are kept this far (pixels) from the epipolar line until the error of the poses is known.
+# Matches may be this far (pixels) from the epipolar line until the error of the poses is known.
 _ROUGH_ERROR = 16.0
-# Poses with a larger epipolar error (pixels, median over pairs of each pair's median) are refined
-# under `refine_poses="auto"`. Structure from motion has 0.2 to 0.7, rough poses 1.3 and more.
+# `refine_poses="auto"` refines poses with a larger epipolar error (pixels, median over pairs of the
+# pair's median). Structure from motion has 0.2 to 0.7, rough poses have 1.3 and more.
 _ROUGH_POSES = 1.0
 _MIN_MATCHES = 15
 _REFINE_ERRORS = (12.0, 4.0)
-# The strongest keypoints of an image that take part in refinement; more cost time and do not
-# lower the error.
+# Each image's strongest keypoints take part in refinement; more cost time and do not lower the
+# error.
 _REFINE_KEYPOINTS = 700
 _COMPLETION_PASSES = 3
-# Raised whenever the same options give other tracks, so that old files are made anew.
+# Increased whenever the same options yield other tracks, so that old files are made anew.
 _METHOD = 3
 
 
 @dataclass(frozen=True)
 class TracksOptions:
-    """How tracks are made. A file made with other options is made anew.
+    """How tracks are made.
 
     Attributes:
         descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
-        max_keypoints: keypoints kept in an image.
+        max_keypoints: limit on keypoints per image.
         partners: about how many keyframes each keyframe is matched with.
-        ratio: ratio test, nearest to second nearest Hamming distance.
+        ratio: limit on the ratio of the nearest to the second nearest Hamming distance.
         max_error: largest epipolar and reprojection error, pixels.
-        min_angle: smallest angle between two rays of a landmark, degrees.
-        min_length: fewest observations of a landmark.
-        refine_poses: "yes", "no", or "auto": where matches show that poses are only roughly right.
-        max_unlabelled: keypoints without a landmark that a keyframe keeps, the strongest; None
-            keeps all. Fewer make smaller files, but a query frame then has fewer of the keypoints
-            that match nothing.
+        min_angle: smallest triangulation angle of a landmark, degrees.
+        min_length: smallest number of observations of a landmark.
+        refine_poses: "yes", "no", or "auto": if the matches do not fit the poses.
+        max_unlabelled: limit on keypoints without a landmark per keyframe, the strongest; None: no
+            limit. A limit makes smaller files, but query frames that lack keypoints which match
+            nothing.
     """
 
     descriptor: str = "freak"
@@ -88,11 +88,11 @@ class TracksOptions:
 
 @dataclass(frozen=True)
 class SequenceFolder:
-    """Where a sequence lies.
+    """The folders of a sequence.
 
     Attributes:
-        name: the sequence's name, used for the output file.
-        images: folder of the images; names in the model are relative to it.
+        name: name of the sequence.
+        images: folder of the images, to which names in the model are relative.
         model: folder of the sparse model.
     """
 
@@ -104,7 +104,7 @@ class SequenceFolder:
 def find_sequence(
     folder: Path, images: Path | None = None, model: Path | None = None
 ) -> SequenceFolder:
-    """Find images/ and sparse/ or sparse/0/ in a folder, unless told otherwise.
+    """Find images/ and sparse/ or sparse/0/ in a folder, unless they are given.
 
     Raises:
         FileNotFoundError: the folder, its images or its model are missing.
@@ -115,49 +115,38 @@ def find_sequence(
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder of images, name it with --images")
     if not any(file.is_file() for file in images.rglob("*")):
-        raise FileNotFoundError(f"{images}: the folder is empty, it should hold the images")
+        raise FileNotFoundError(f"{images}: the folder of images is empty, name it with --images")
     return SequenceFolder(folder.resolve().name, images, model or colmap.find_model(folder))
 
 
-def read_posed_model(folder: Path) -> colmap.ColmapModel:
-    """A model whose poses landmarks can be triangulated from.
+def provenance(
+    sequence: SequenceFolder, options: TracksOptions, model: colmap.ColmapModel | None = None
+) -> dict[str, Any]:
+    """What the tracks are made from and how, for their `info`: equal for equal tracks.
+
+    The input is a digest of cameras, poses, image names and file sizes.
 
     Raises:
-        FileNotFoundError, ValueError: as `colmap.read_model`, or the model holds too little.
+        FileNotFoundError: the model, or an image that it names, is missing.
+        ValueError: the model is broken, or no landmark can be triangulated from its poses.
     """
-    model = colmap.read_model(folder)
-    model.check_for_triangulation(folder)
-    return model
-
-
-def fingerprint(sequence: SequenceFolder, model: colmap.ColmapModel) -> str:
-    """Digest of what the tracks are made from: cameras, poses, image names and file sizes.
-
-    Raises:
-        FileNotFoundError: an image that the model names is missing.
-    """
+    model = model or _read_posed_model(sequence.model)
     digest = hashlib.sha256(model.cam_from_world.tobytes())
     digest.update(repr((sorted(model.cameras.items()), model.camera_ids.tolist())).encode())
     for name in model.names:
         path = sequence.images / name
         if not path.is_file():
             raise FileNotFoundError(
-                f"{path}: image is missing, though the model {sequence.model} has a pose for it"
+                f"{path}: the image is missing, but the model {sequence.model} has a pose for it"
             )
         digest.update(f"{name}\0{path.stat().st_size}\0".encode())
-    return digest.hexdigest()
+    return {"method": _METHOD, "options": asdict(options), "input": digest.hexdigest()}
 
 
-def is_up_to_date(path: Path, options: TracksOptions, sequence: SequenceFolder) -> bool:
-    """Whether `path` holds tracks made with these options from this very input."""
-    try:
-        info = Tracks.load(path).info
-        made_with = TracksOptions(**info.get("options", {}))
-    except (ValueError, OSError, TypeError):
-        return False
-    if info.get("method") != _METHOD or made_with != options:
-        return False
-    return info.get("input") == fingerprint(sequence, read_posed_model(sequence.model))
+def _read_posed_model(folder: Path) -> colmap.ColmapModel:
+    model = colmap.read_model(folder)
+    model.check_for_triangulation(folder)
+    return model
 
 
 def extract(
@@ -166,20 +155,20 @@ def extract(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Tracks:
-    """Detect, describe, match, triangulate and complete: the tracks of one sequence.
+    """Make the tracks of a sequence: detect, describe, match, triangulate and complete.
 
     Args:
         sequence: images and model, see `find_sequence`.
-        options: how to make them.
+        options: how to make the tracks.
         threads: threads for detection and matching; the result is the same.
         progress: called with each stage.
 
     Raises:
         FileNotFoundError: an image or the model is missing.
-        ValueError: an image or the model is broken, or nothing could be triangulated.
+        ValueError: an image or the model is broken, or no landmark can be triangulated.
     """
-    given = read_posed_model(sequence.model)
-    digest = fingerprint(sequence, given)
+    given = _read_posed_model(sequence.model)
+    made_from = provenance(sequence, options, given)
     features = _detect(sequence, given, options, threads, progress)
     work = _Matching(given, features, options, threads, progress)
     overlap = work.match_covisible()
@@ -200,7 +189,7 @@ def extract(
     if not reconstruction.points3D:
         raise _nothing_triangulated(sequence)
     scene = _scene(work, *triangulation.labels_of(reconstruction, keypoints))
-    # A descriptor agrees with a landmark's if nearly all verified matches are no closer.
+    # A descriptor may belong to a landmark if its distance is at most that of 99 % of the matches.
     distances = np.concatenate([m.distances for m in matches.values()])
     max_distance = int(np.percentile(distances, 99)) if len(distances) else 0
     added, merged = _complete(scene, overlap, max_distance, options, progress)
@@ -209,9 +198,7 @@ def extract(
     shift = np.linalg.norm(given.centers - work.model.centers, axis=1)
     info: dict[str, Any] = {
         "sequence": sequence.name,
-        "method": _METHOD,
-        "options": asdict(options),
-        "input": digest,
+        **made_from,
         "epipolar_error": round(error, 3),
         "poses_refined": refine,
         "pose_shift_median": float(np.median(shift)),
@@ -224,7 +211,9 @@ def extract(
         "max_descriptor_distance": max_distance,
         "software": _versions(),
     }
-    tracks = tracks_from_scene(scene, features, options.descriptor, info)
+    tracks = Tracks.from_features(
+        options.descriptor, scene.model, features, scene.labels, scene.positions, info
+    )
     if options.max_unlabelled is not None:
         tracks = tracks.where(_labelled_or_strong(tracks, options.max_unlabelled))
     return tracks
@@ -236,7 +225,7 @@ class _Matching:
     Attributes:
         model: cameras and poses.
         rays: undistorted keypoints of each keyframe.
-        matches: between keyframes (i, j), i < j.
+        matches: matches of each pair of keyframes (i, j), i < j.
     """
 
     def __init__(
@@ -270,7 +259,7 @@ class _Matching:
         self.matches |= dict(zip(chosen, found, strict=True))
 
     def match_covisible(self) -> NDArray[np.float64]:
-        """Match keyframes that see the same; returns the overlap (m, m) of their views."""
+        """Match keyframes with overlapping views; returns the overlap (m, m)."""
         self._match(pairs.neighbour_pairs(len(self.views)), "match neighbours")
         overlap = pairs.overlaps(self.model, pairs.depth_quartiles(self.views, self.matches))
         chosen = pairs.covisible_pairs(overlap, self.options.partners)
@@ -278,7 +267,7 @@ class _Matching:
         return overlap
 
     def refine_poses(self) -> bool:
-        """Bundle-adjust the poses on the strongest keypoints; False if nothing triangulates."""
+        """Bundle-adjust the poses; returns False if no landmark can be triangulated."""
         keypoints = [f.keypoints for f in self.features]
         for step, limit in enumerate(_REFINE_ERRORS):
             self.progress("refine poses", step, len(_REFINE_ERRORS))
@@ -324,14 +313,14 @@ def _complete(
     options: TracksOptions,
     progress: Progress,
 ) -> tuple[int, int]:
-    """Add observations that matching missed; returns how many, and how many landmarks merged."""
+    """Add missed observations and merge duplicates; returns the numbers of both."""
     completion.clean(scene, options.max_error, options.min_angle, 2)
     partners = [np.flatnonzero(row > pairs.MIN_OVERLAP) for row in overlap]
     added = merged = 0
     for step in range(_COMPLETION_PASSES):
         progress("complete", step, _COMPLETION_PASSES)
-        more, joined = completion.complete(scene, partners, options.max_error, max_distance)
-        added, merged = added + more, merged + joined
+        counts = completion.complete(scene, partners, options.max_error, max_distance)
+        added, merged = added + counts[0], merged + counts[1]
         completion.clean(scene, options.max_error, options.min_angle, 2)
     completion.clean(scene, options.max_error, options.min_angle, options.min_length)
     progress("complete", _COMPLETION_PASSES, _COMPLETION_PASSES)
@@ -349,36 +338,9 @@ def _labelled_or_strong(tracks: Tracks, limit: int) -> NDArray[np.bool_]:
 
 def _nothing_triangulated(sequence: SequenceFolder) -> ValueError:
     return ValueError(
-        f"{sequence.name}: no landmark could be triangulated; "
-        "do images and poses belong together, and does the camera move?"
+        f"{sequence.name}: no landmark can be triangulated: give images of a moving camera, and "
+        "the poses of these images"
     )
-
-
-def tracks_from_scene(
-    scene: Scene, features: list[Features], descriptor: str, info: dict[str, Any]
-) -> Tracks:
-    """Put a labelled scene and its features into a Tracks."""
-    model = scene.model
-    tracks = Tracks(
-        descriptor=descriptor,
-        cameras=model.cameras,
-        keyframe_names=model.names,
-        keyframe_camera=model.camera_ids,
-        cam_from_world=np.ascontiguousarray(model.cam_from_world),
-        offsets=scene.offsets,
-        keypoints=scene.keypoints,
-        sizes=np.concatenate([f.sizes for f in features]),
-        angles=np.concatenate([f.angles for f in features]),
-        responses=np.concatenate([f.responses for f in features]),
-        octaves=np.concatenate([f.octaves for f in features]),
-        descriptors=scene.descriptors,
-        landmark_of_keypoint=scene.labels,
-        landmark_ids=np.arange(len(scene.positions), dtype=np.int64),
-        landmark_positions=scene.positions,
-        info=info,
-    )
-    tracks.check()
-    return tracks
 
 
 def _detect(
@@ -389,7 +351,7 @@ def _detect(
     progress: Progress,
 ) -> list[Features]:
     cv2 = optional("cv2")
-    # OpenCV's detectors are costly to make and not safe to share, so each thread keeps its own.
+    # OpenCV's detectors are costly to create and not thread-safe, so each thread has its own.
     local = threading.local()
 
     def one(index: int) -> Features:
@@ -400,8 +362,8 @@ def _detect(
         camera = model.cameras[int(model.camera_ids[index])]
         if image.shape != (camera.height, camera.width):
             raise ValueError(
-                f"{path}: {image.shape[1]}x{image.shape[0]} pixels, but its camera in the model "
-                f"has {camera.width}x{camera.height}; use the images of this model"
+                f"{path} has {image.shape[1]}x{image.shape[0]} pixels, but its camera in the model "
+                f"{camera.width}x{camera.height}: give the images of this model"
             )
         features: Features = local.extractor(image)
         return features
@@ -416,7 +378,7 @@ def _detect(
 
 
 def _epipolar_error(matches: Pairs) -> float:
-    """Median over pairs of each pair's median, so that a pair with many matches counts once."""
+    """Median over pairs of each pair's median error, so that all pairs count alike."""
     medians = [float(np.median(m.errors)) for m in matches.values() if len(m) >= _MIN_MATCHES]
     return float(np.median(medians)) if medians else 0.0
 

@@ -1,8 +1,7 @@
-"""One sequence of keyframes, keypoints, descriptors and landmarks, and its file.
+"""Reads and writes tracks: the keyframes, keypoints, descriptors and landmarks of a sequence.
 
-The file is a safetensors file: every array below is a tensor of the same name, and everything
-that is not an array (cameras, image names, provenance) is JSON in the file's metadata.
-`docs/tracks.md` describes it for readers in other languages.
+A tracks file is a safetensors file. Every array below is a tensor of the same name; cameras, image
+names and `info` are JSON in the file's metadata.
 """
 
 from __future__ import annotations
@@ -10,22 +9,27 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
+from protomark.features.extractor import FEATURE_ARRAYS, Features
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.files import replacing
 from protomark.geometry.camera import Camera, cameras_from_json
 
+if TYPE_CHECKING:
+    from protomark.geometry.colmap import ColmapModel
+
 FORMAT = "protomark-tracks"
 VERSION = 1
 
-# name -> (dtype, shape), with m keyframes, n keypoints, l landmarks, b bytes per descriptor
+# Dtypes and shapes, with m keyframes, n keypoints, l landmarks, b bytes per descriptor.
 _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "keyframe_camera": (np.int32, ("m",)),
     "cam_from_world": (np.float64, ("m", 3, 4)),
@@ -50,8 +54,8 @@ class Tracks:
     centre of the upper left pixel is (0.5, 0.5).
 
     Attributes:
-        descriptor: name of the descriptor, for example "freak".
-        cameras: COLMAP camera id -> camera.
+        descriptor: name of the descriptor, such as "freak".
+        cameras: cameras by COLMAP's id.
         keyframe_names: m image names.
         keyframe_camera: (m,) int32, camera id of each keyframe.
         cam_from_world: (m, 3, 4) float64, rotation and translation.
@@ -59,13 +63,13 @@ class Tracks:
         keypoints: (n, 2) float32, x and y in pixels.
         sizes: (n,) float32, diameter of the keypoint in pixels.
         angles: (n,) float32, orientation in degrees, clockwise, [0, 360), -1 where there is none.
-        responses: (n,) float32, strength given by the detector.
-        octaves: (n,) int32, pyramid level given by the detector.
-        descriptors: (n, bits / 8) uint8, the bytes that OpenCV gives.
+        responses: (n,) float32, the detector's strength.
+        octaves: (n,) int32, the detector's pyramid level.
+        descriptors: (n, bits / 8) uint8, in OpenCV's bytes.
         landmark_of_keypoint: (n,) int64, landmark id of each keypoint, -1 where there is none.
         landmark_ids: (l,) int64, ascending.
         landmark_positions: (l, 3) float64, in world coordinates.
-        info: where the tracks come from and how they were made (JSON values).
+        info: what the tracks were made from, and how (JSON values).
     """
 
     descriptor: str
@@ -85,6 +89,42 @@ class Tracks:
     landmark_positions: NDArray[np.float64]
     info: dict[str, Any] = field(default_factory=dict)
 
+    @classmethod
+    def from_features(
+        cls,
+        descriptor: str,
+        model: ColmapModel,
+        features: Sequence[Features],
+        landmark_of_keypoint: NDArray[np.int64],
+        positions: NDArray[np.float64],
+        info: dict[str, Any],
+    ) -> Tracks:
+        """The tracks of a model's images.
+
+        Args:
+            descriptor: name of the descriptor.
+            model: cameras and m poses.
+            features: m keyframes' keypoints.
+            landmark_of_keypoint: (n,) rows of `positions`, -1 where there is none.
+            positions: (l, 3) landmarks, whose ids are 0 to l - 1.
+            info: what the tracks were made from, and how.
+        """
+        tracks = cls(
+            descriptor=descriptor,
+            cameras=model.cameras,
+            keyframe_names=model.names,
+            keyframe_camera=model.camera_ids,
+            cam_from_world=np.ascontiguousarray(model.cam_from_world),
+            offsets=np.cumsum([0, *map(len, features)], dtype=np.int64),
+            **{k: np.concatenate([getattr(f, k) for f in features]) for k in FEATURE_ARRAYS},
+            landmark_of_keypoint=landmark_of_keypoint,
+            landmark_ids=np.arange(len(positions), dtype=np.int64),
+            landmark_positions=positions,
+            info=info,
+        )
+        tracks.check()
+        return tracks
+
     @property
     def bits(self) -> int:
         """Length of a descriptor in bits."""
@@ -97,18 +137,18 @@ class Tracks:
 
     @property
     def observations(self) -> NDArray[np.int64]:
-        """Rows of the keypoints that see a landmark."""
+        """Rows of the keypoints that observe a landmark."""
         return np.flatnonzero(self.landmark_of_keypoint >= 0)
 
     def keypoints_of(self, keyframe: int) -> slice:
-        """The rows of one keyframe's keypoints."""
+        """The rows of a keyframe's keypoints."""
         return slice(int(self.offsets[keyframe]), int(self.offsets[keyframe + 1]))
 
     def where(self, keep: NDArray[np.bool_]) -> Tracks:
-        """The tracks with only the keypoints for which `keep` (n,) is true; landmarks stay."""
-        kept = np.bincount(self.keyframe_of_keypoint[keep], minlength=len(self.keyframe_names))
+        """The tracks with the keypoints for which `keep` (n,) is true, and with all landmarks."""
+        counts = np.bincount(self.keyframe_of_keypoint[keep], minlength=len(self.keyframe_names))
         rows = {name: getattr(self, name)[keep] for name, (_, s) in _ARRAYS.items() if s[0] == "n"}
-        offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         return replace(self, offsets=offsets, **rows)
 
     def upright(self) -> Tracks:
@@ -119,8 +159,8 @@ class Tracks:
         """
         if not (self.angles >= 0).any():
             raise ValueError(
-                f"no keypoint of these {self.descriptor} tracks has an angle; the upright encoders "
-                "need them"
+                f"no keypoint of these {self.descriptor} tracks has an angle, which upright "
+                "encoders need: take the plain encoder"
             )
         return replace(
             self,
@@ -129,11 +169,11 @@ class Tracks:
         )
 
     def positions_of(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions (n, 3) of landmarks (n,) that the tracks hold."""
+        """Positions (n, 3) of landmarks (n,)."""
         return self.landmark_positions[np.searchsorted(self.landmark_ids, landmark_ids)]
 
     def check(self) -> None:
-        """Raise ValueError, naming the array, if shapes, types or indices do not fit together."""
+        """Raise ValueError if shapes, types or indices do not fit together."""
         names = self.keyframe_names
         if not isinstance(names, list) or not all(map(_is_text, names)):
             raise ValueError("tracks: keyframe_names are not a list of texts")
@@ -191,7 +231,7 @@ class Tracks:
                 )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file whole or not at all: beside the target, then renamed over it."""
+        """Write the file atomically."""
         save = optional("safetensors.numpy").save
         self.check()
         header = {
@@ -212,7 +252,7 @@ class Tracks:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is not a tracks file, or is broken.
+            ValueError: the file is not a tracks file, or it is broken.
         """
         safetensors = optional("safetensors")
         path = Path(path)
@@ -247,9 +287,9 @@ class Tracks:
 
 def _check_version(text: str) -> None:
     if not re.fullmatch("[1-9][0-9]{0,8}", text):
-        raise ValueError(f"version {text[:20]!r} is not one that a tracks file can have")
+        raise ValueError(f"tracks files have no version {text[:20]!r}")
     if int(text) > VERSION:
-        raise ValueError(f"tracks version {text}, this Protomark reads up to {VERSION}; update it")
+        raise ValueError(f"tracks version {text}: this Protomark reads up to {VERSION}, update it")
 
 
 def _json(header: dict[str, str], name: str) -> Any:
@@ -260,10 +300,10 @@ def _json(header: dict[str, str], name: str) -> Any:
 
 
 def _is_text(value: Any) -> bool:
-    # JSON may hold halves of characters (lone surrogates), which no file or terminal takes.
+    # JSON may contain lone surrogates, which cannot be written or printed.
     return isinstance(value, str) and not re.search("[\ud800-\udfff]", value)
 
 
 def sequence_name(path: Path) -> str:
-    """The name of a sequence, its file's up to the first dot: toy for toy.freak.safetensors."""
+    """The name of a sequence: its file name up to the first dot."""
     return path.name.split(".")[0] or path.name

@@ -1,10 +1,11 @@
-"""Makes tracks files, and keeps those that are up to date."""
+"""Makes tracks files, unless they are up to date."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,20 @@ from protomark.geometry.colmap import find_model
 from protomark.progress import Progress, silent
 from protomark.tracks import database
 from protomark.tracks.augmentation import METHOD, add_augmentations
-from protomark.tracks.extract import TracksOptions, extract, find_sequence, is_up_to_date
+from protomark.tracks.extract import TracksOptions, extract, find_sequence, provenance
 from protomark.tracks.file import Tracks
 from protomark.tracks.summary import summarise
 
 
 @dataclass(frozen=True)
 class TracksInput:
-    """Where tracks are made from.
+    """What to make tracks from.
 
     Attributes:
-        folder: a sequence, which holds images/ and a COLMAP model in sparse/ or sparse/0/.
+        folder: a sequence, with images/ and a COLMAP model in sparse/ or sparse/0/.
         images: folder of the images, if it is another one.
         model: folder of the COLMAP model, if it is another one.
-        database: a COLMAP database that already holds binary descriptors; images are not read then.
+        database: a COLMAP database with binary descriptors, which are read in place of the images.
     """
 
     folder: Path
@@ -45,21 +46,20 @@ class TracksFile:
 
     Attributes:
         path: the file.
-        tracks: what it holds.
-        skipped: whether it was there already, made from the same input with the same options.
-        augmentations: copies of each keyframe that it holds, 0 for plain tracks.
+        tracks: its content.
+        skipped: whether it was up to date: made from the same input with the same options.
     """
 
     path: Path
     tracks: Tracks
     skipped: bool
-    augmentations: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON values."""
         facts = {"file": str(self.path), **summarise(self.tracks)}
         facts |= {"seconds": self.tracks.info.get("seconds"), "skipped": self.skipped}
-        return facts | ({"augmentations": self.augmentations} if self.augmentations else {})
+        count = self.tracks.info.get("augmentations")
+        return facts | ({"augmentations": count} if count else {})
 
 
 def make_tracks(
@@ -74,18 +74,17 @@ def make_tracks(
     """Make the tracks of a sequence and save them as NAME.DESCRIPTOR.safetensors.
 
     Args:
-        source: where to make them from.
+        source: what to make them from.
         options: how to make them.
-        output: folder for the file; it is made if it does not exist.
-        force: make the file anew even if it is up to date.
+        output: folder of the file, created if it does not exist.
+        force: whether to make the file anew even if it is up to date.
         threads: threads for detection and matching.
         progress: called with each stage.
 
     Raises:
-        FileNotFoundError, ValueError: something is missing, broken, or gives no landmark.
+        FileNotFoundError, ValueError: an input is missing or broken, or yields no landmark.
     """
     path = output / f"{source.name}.{options.descriptor}.safetensors"
-    make: Callable[[], Tracks]
     if source.database is not None:
         if not source.folder.is_dir():
             raise FileNotFoundError(f"{source.folder}: no such folder")
@@ -93,18 +92,13 @@ def make_tracks(
         if not model.is_dir():
             raise FileNotFoundError(f"{model}: no such folder of a COLMAP model")
         inputs = (source.database, model, options.descriptor)
-        current = not force and database.is_up_to_date(path, *inputs)
-        make = lambda: database.tracks_from_database(*inputs, source.name)  # noqa: E731
+        made_from = partial(database.provenance, *inputs)
+        make = partial(database.tracks_from_database, *inputs, source.name)
     else:
         sequence = find_sequence(source.folder, source.images, source.model)
-        current = not force and is_up_to_date(path, options, sequence)
-        make = lambda: extract(sequence, options, threads, progress)  # noqa: E731
-    if current:
-        return TracksFile(path, Tracks.load(path), skipped=True)
-    tracks = _timed(make)
-    output.mkdir(parents=True, exist_ok=True)
-    tracks.save(path)
-    return TracksFile(path, tracks, skipped=False)
+        made_from = partial(provenance, sequence, options)
+        make = partial(extract, sequence, options, threads, progress)
+    return _make_unless_current(path, made_from, make, force)
 
 
 def make_augmented_tracks(
@@ -122,32 +116,38 @@ def make_augmented_tracks(
         plain: tracks that were made from images.
         images: folder of these images.
         count: copies of each keyframe.
-        force: make the file anew even if it is up to date.
+        force: whether to make the file anew even if it is up to date.
         threads: keyframes to work on at a time.
         progress: called with each keyframe.
     """
-    path = augmented_path(plain.path)
-    expected: dict[str, Any] = {"augmentations": count, "augmentation_method": METHOD}
-    expected |= {key: plain.tracks.info.get(key) for key in ("method", "options", "input")}
-    if path.is_file() and not force:
-        try:
-            existing = Tracks.load(path)
-            if all(existing.info.get(key) == value for key, value in expected.items()):
-                return TracksFile(path, existing, skipped=True, augmentations=count)
-        except (ValueError, OSError):
-            pass
-    tracks = _timed(lambda: add_augmentations(plain.tracks, images, count, threads, progress))
-    tracks.save(path)
-    return TracksFile(path, tracks, skipped=False, augmentations=count)
+    made_from: dict[str, Any] = {"augmentations": count, "augmentation_method": METHOD}
+    made_from |= {key: plain.tracks.info.get(key) for key in ("method", "options", "input")}
+    make = partial(add_augmentations, plain.tracks, images, count, threads, progress)
+    return _make_unless_current(augmented_path(plain.path), lambda: made_from, make, force)
 
 
 def augmented_path(plain: Path) -> Path:
-    """Where augmented tracks go: toy.freak.augmented.safetensors for toy.freak.safetensors."""
+    """The path of augmented tracks: toy.freak.augmented.safetensors for toy.freak.safetensors."""
     return plain.with_name(f"{plain.stem}.augmented.safetensors")
 
 
-def _timed(make: Callable[[], Tracks]) -> Tracks:
+def _make_unless_current(
+    path: Path, made_from: Callable[[], dict[str, Any]], make: Callable[[], Tracks], force: bool
+) -> TracksFile:
+    """Make and save tracks unless the file holds tracks that were made from the same."""
+    existing = None if force else _load(path)
+    if existing and all(existing.info.get(k) == v for k, v in made_from().items()):
+        return TracksFile(path, existing, skipped=True)
     begin = time.perf_counter()
     tracks = make()
     tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
-    return tracks
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tracks.save(path)
+    return TracksFile(path, tracks, skipped=False)
+
+
+def _load(path: Path) -> Tracks | None:
+    try:
+        return Tracks.load(path)
+    except (ValueError, OSError):
+        return None

@@ -1,4 +1,4 @@
-"""Matches the descriptors of two keyframes and verifies them against their known poses."""
+"""Matches the descriptors of two keyframes, and verifies the matches by their poses."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from protomark.geometry.triangulation import epipolar_error
 
 @dataclass
 class View:
-    """What matching needs of one keyframe.
+    """The data of a keyframe that matching needs.
 
     Attributes:
         descriptors: (n, bits / 8) uint8.
-        rays: (n, 2) float64, undistorted x / z and y / z, NaN where undistortion failed.
+        rays: (n, 2) float64, undistorted x / z and y / z, NaN where undistortion fails.
         pose: (3, 4) float64, cam_from_world.
         focal: focal length in pixels.
     """
@@ -34,7 +34,7 @@ class VerifiedMatches:
     """k matches between two keyframes.
 
     Attributes:
-        rows: (k, 2) int64, keypoint of the first and of the second keyframe.
+        rows: (k, 2) int64, rows of the keypoints in the first and the second keyframe.
         distances: (k,) int32, Hamming distance in bits.
         errors: (k,) float64, epipolar (Sampson) error in pixels.
     """
@@ -51,34 +51,48 @@ class VerifiedMatches:
         return VerifiedMatches(self.rows[keep], self.distances[keep], self.errors[keep])
 
 
+def nearest_matches(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+    """Nearest neighbours in Hamming distance that pass the ratio test.
+
+    Returns:
+        Rows (k,) of the first descriptors, of the second ones, and distances (k,) in bits.
+    """
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int32)
+    index, distance = hamming_search(first, second, k=2)
+    rows = np.flatnonzero(distance[:, 0] < ratio * distance[:, 1])
+    return rows, index[rows, 0], distance[rows, 0].astype(np.int32)
+
+
+def mutual(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    rows: NDArray[np.int64],
+    target: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Whether the nearest neighbour of each target (k,) is the row (k,) that it was found for."""
+    if not len(rows):
+        return np.zeros(0, bool)
+    back, _ = hamming_search(second[target], first, k=1)
+    return np.asarray(back[:, 0] == rows)
+
+
 def match(first: View, second: View, ratio: float, max_error: float) -> VerifiedMatches:
-    """Mutual nearest neighbours that pass the ratio test and lie on each other's epipolar lines.
+    """Mutual nearest neighbours that pass the ratio test and lie near the epipolar lines.
 
     Args:
-        first: keyframe whose keypoints look for a match.
-        second: keyframe in which they look.
-        ratio: the nearest distance must be below this share of the second nearest; in (0, 1].
+        first: keyframe of the queries.
+        second: keyframe to search.
+        ratio: limit on the ratio of the nearest to the second nearest distance, in (0, 1].
         max_error: largest epipolar error in pixels.
     """
-    empty = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0))
-    if len(first.descriptors) < 2 or len(second.descriptors) < 2:
-        return empty
-    index, distance = hamming_search(first.descriptors, second.descriptors, k=2)
-    rows = np.flatnonzero(distance[:, 0] < ratio * distance[:, 1])
-    target = index[rows, 0]
+    rows, target, distance = nearest_matches(first.descriptors, second.descriptors, ratio)
     error = _epipolar_errors(first, second, rows, target)
-    near = error <= max_error  # NaN is not
-    rows, target, error = rows[near], target[near], error[near]
-    if not len(rows):
-        return empty
-    back, _ = hamming_search(second.descriptors[target], first.descriptors, k=1)
-    mutual = back[:, 0] == rows
-    rows, target, error = rows[mutual], target[mutual], error[mutual]
-    return VerifiedMatches(
-        np.column_stack([rows, target]).astype(np.int64),
-        distance[rows, 0].astype(np.int32),
-        error,
-    )
+    near = error <= max_error  # false for NaN
+    matches = VerifiedMatches(np.column_stack([rows, target]), distance, error).where(near)
+    return matches.where(mutual(first.descriptors, second.descriptors, *matches.rows.T))
 
 
 def with_errors(matches: VerifiedMatches, first: View, second: View) -> VerifiedMatches:

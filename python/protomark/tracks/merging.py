@@ -1,4 +1,4 @@
-"""Landmarks that are one: merged where votes, poses and keyframes agree."""
+"""Merges duplicate landmarks where votes, poses and keyframes agree."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.neighbours import runs
-from protomark.geometry.triangulation import refine_points, reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors, refine_points, reprojection_residuals
 from protomark.tracks.scene import Scene
 
-# Landmarks this close (pixels) are one, though detection found two keypoints in some keyframe.
+# Landmarks this close (pixels) are one, even if they have two keypoints in some keyframe.
 SAME_POINT = 2.0
-# Share of observations of a merged landmark that may not fit; they lose it.
+# Share of a merged landmark's observations that may not fit, and are removed.
 _MISFITS = 0.1
 _ROUNDS = 8
 
 
 def merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
-    """Merge landmarks that were voted one and fit one position, in place.
+    """Merge landmarks that have votes and fit one position, in place.
 
-    Two landmarks merge if they lie within `max_error` pixels of each other, those that share a
-    keyframe only within `SAME_POINT`; in a shared keyframe the keypoint that fits better keeps the
-    landmark. In each round a landmark takes part in one merge, so that a chain of doubles becomes
-    one over several rounds.
+    Two landmarks merge if they project within `max_error` pixels of each other, or within
+    `SAME_POINT` if they share a keyframe, in which the keypoint that fits better keeps the
+    landmark. In each round a landmark takes part in one merge, so that a chain of duplicates merges
+    over several rounds.
 
     Args:
         scene: labelled keypoints; labels and positions change.
-        votes: (v, 2) rows of positions, one pair for each time that two were found to be alike.
+        votes: (v, 2) rows of positions, one pair per keypoint at which two landmarks coincide.
         max_error: largest reprojection error in pixels.
 
     Returns:
-        How many landmarks were merged into another.
+        Number of landmarks that were merged into another.
     """
     merged = 0
     for _ in range(_ROUNDS):
@@ -52,8 +52,8 @@ def _round(
     """Merge pairs that have no landmark in common.
 
     Returns:
-        (l,) the landmark that each is now part of; and (l,) the landmark of a higher row with which
-        each was tried in vain, -1 where none.
+        The landmark (l,) that each one is now part of; and the landmark (l,) of a higher row whose
+        merge with each one failed, -1 for none.
     """
     pairs, count = np.unique(votes, axis=0, return_counts=True)
     rows = scene.observations()
@@ -76,9 +76,8 @@ def _round(
         return into, refused
     poses, seen, focal = scene.model.cam_from_world[keyframes], scene.rays[rows], scene.focal[rows]
     moved = refine_points(scene.positions, after, poses, seen, focal)
-    difference, depth = reprojection_residuals(moved[after], poses, seen)
-    error = np.where(depth > 0, np.linalg.norm(difference, axis=1) * focal, np.inf)
-    # Of two keypoints in one keyframe the better one counts, the other loses its landmark.
+    error = pixel_errors(moved[after], poses, seen, focal)
+    # Of two keypoints in one keyframe the better one keeps the landmark.
     order = np.lexsort((error, keyframes, after))
     again = (np.diff(after[order], prepend=-1) == 0) & (np.diff(keyframes[order], prepend=-1) == 0)
     spare = np.zeros(len(rows), bool)
@@ -86,41 +85,41 @@ def _round(
     misfit = (error > max_error) & ~spare
     total = np.bincount(after[~spare], minlength=len(into))
     bad = np.bincount(after[misfit], minlength=len(into)) > _MISFITS * total
-    lost = np.flatnonzero(bad[into] & (into != np.arange(len(into))))
-    refused[into[lost]] = lost
-    into[lost] = lost
-    fine = ~bad[after]
-    scene.labels[rows[fine]] = np.where(spare[fine] | misfit[fine], -1, after[fine])
-    scene.positions[after[fine]] = moved[after[fine]]
+    failed = np.flatnonzero(bad[into] & (into != np.arange(len(into))))
+    refused[into[failed]] = failed
+    into[failed] = failed
+    merged = ~bad[after]
+    scene.labels[rows[merged]] = np.where(spare[merged] | misfit[merged], -1, after[merged])
+    scene.positions[after[merged]] = moved[after[merged]]
     return into, refused
 
 
 def _share_keyframe(
     pairs: NDArray[np.int64], labels: NDArray[np.int64], keyframes: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Whether the two landmarks of each pair (n, 2) are seen together; labels ascending."""
+    """Whether a keyframe observes both landmarks of each pair (n, 2); labels ascend."""
     starts, lengths = runs(labels)
     seen = {
         int(labels[s]): frozenset(keyframes[s : s + n].tolist())
         for s, n in zip(starts, lengths, strict=True)
     }
-    nothing: frozenset[int] = frozenset()
-    return np.array(
-        [not seen.get(a, nothing).isdisjoint(seen.get(b, nothing)) for a, b in pairs.tolist()], bool
-    )
+    empty: frozenset[int] = frozenset()
+    shared = [not seen.get(a, empty).isdisjoint(seen.get(b, empty)) for a, b in pairs.tolist()]
+    return np.array(shared, bool)
 
 
 def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Median distance (n,) in pixels between two landmarks, over the keyframes of the first."""
+    """Median distance (n,) in pixels between the landmarks of pairs, in keyframes of the first."""
     labels = scene.labels[rows]
     start = np.searchsorted(labels, pairs[:, 0], "left")
     length = np.searchsorted(labels, pairs[:, 0], "right") - start
     pair = np.repeat(np.arange(len(pairs)), length)
     at = rows[np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]]
     poses = scene.model.cam_from_world[scene.keyframe[at]]
-    nothing = np.zeros((len(at), 2))
-    first, _ = reprojection_residuals(scene.positions[pairs[pair, 0]], poses, nothing)
-    second, _ = reprojection_residuals(scene.positions[pairs[pair, 1]], poses, nothing)
+    first, second = (
+        reprojection_residuals(scene.positions[pairs[pair, k]], poses, np.zeros((len(at), 2)))[0]
+        for k in (0, 1)
+    )
     distance = np.linalg.norm(first - second, axis=1) * scene.focal[at]
     order = np.lexsort((distance, pair))
     out = np.full(len(pairs), np.inf)

@@ -1,9 +1,9 @@
-"""Which keyframes see the same things: pairs to match, from the poses alone.
+"""Chooses pairs of keyframes to match, by the overlap of their views.
 
-Keyframes that follow each other are matched first. Their matches give the depth of each view, and
-with depth and pose the share of one view that another one sees. From the keyframes that share
-enough, each picks partners: its neighbours in time, the views closest to its own, and others
-spread over the whole sequence, so that every revisit is found.
+Consecutive keyframes are matched first. Their matches yield the depth of each view, and depth and
+pose the share of one view that another one sees. Among the keyframes with enough overlap each picks
+partners: its neighbours in time, the most similar views, and others spread over the whole sequence,
+so that every revisit is found.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from protomark.geometry.triangulation import depth_of_first
 from protomark.tracks.matching import VerifiedMatches, View
 
 MIN_OVERLAP = 0.2
-MAX_VIEWING_ANGLE = 50.0  # degrees; binary descriptors do not match across more
+MAX_VIEWING_ANGLE = 50.0  # degrees; binary descriptors do not match across wider angles
 MAX_SCALE_CHANGE = 2.0
 NEIGHBOURS = (1, 2, 4)
 _GRID = 6
@@ -25,14 +25,14 @@ _FAR = 1e6
 
 
 def neighbour_pairs(count: int) -> list[tuple[int, int]]:
-    """Pairs of keyframes that follow each other, first index smaller, sorted."""
+    """Pairs of keyframes that are 1, 2 or 4 apart, smaller index first, sorted."""
     return sorted((i, i + step) for step in NEIGHBOURS for i in range(count - step))
 
 
 def depth_quartiles(
     views: list[View], matches: dict[tuple[int, int], VerifiedMatches]
 ) -> NDArray[np.float64]:
-    """(m, 3) quartiles of the depths each keyframe sees; those of all where it sees too few."""
+    """Quartiles (m, 3) of the depths in each keyframe; of all depths if it has too few."""
     seen: list[list[NDArray[np.float64]]] = [[] for _ in views]
     for (i, j), pair in matches.items():
         for a, b, rows in ((i, j, pair.rows), (j, i, pair.rows[:, ::-1])):
@@ -50,7 +50,7 @@ def depth_quartiles(
 
 
 def overlaps(model: ColmapModel, depths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, m) float64: share of view i that view j sees from a like angle and distance."""
+    """Share (m, m) of view i that view j sees from a similar angle and distance."""
     m = len(model.names)
     grids, bounds = {}, {}
     for camera_id, camera in model.cameras.items():
@@ -58,7 +58,7 @@ def overlaps(model: ColmapModel, depths: NDArray[np.float64]) -> NDArray[np.floa
         y = (np.arange(_GRID) + 0.5) / _GRID * camera.height
         grid = camera.rays(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
         grids[camera_id] = grid[np.isfinite(grid).all(1)]
-        # The outermost grid rays, widened to the image border.
+        # The outermost rays of the grid, extended to the image border.
         middle, half = grids[camera_id].mean(0), np.ptp(grids[camera_id], axis=0) / 2
         bounds[camera_id] = np.stack([middle, half * _GRID / (_GRID - 1)])
     rotation, translation = model.cam_from_world[:, :, :3], model.cam_from_world[:, :, 3]
@@ -86,7 +86,7 @@ def overlaps(model: ColmapModel, depths: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def covisible_pairs(overlap: NDArray[np.float64], partners: int) -> list[tuple[int, int]]:
-    """Pairs of keyframes to match, first index smaller, sorted.
+    """Pairs of keyframes to match, smaller index first, sorted.
 
     Args:
         overlap: (m, m) share of view i that view j sees.
@@ -95,7 +95,7 @@ def covisible_pairs(overlap: NDArray[np.float64], partners: int) -> list[tuple[i
     m = len(overlap)
     both = np.minimum(overlap, overlap.T)
     chosen = set(neighbour_pairs(m))
-    # A pick joins two keyframes, so each picks about half as many as it gets.
+    # A pick pairs two keyframes, so each picks about half as many partners as it gets.
     picks = max(1, round(partners * 0.6))
     for i in range(m):
         candidates = np.flatnonzero(both[i] >= MIN_OVERLAP)

@@ -1,4 +1,4 @@
-"""All keypoints of a sequence while their landmarks are being found."""
+"""The keypoints of a sequence while their landmarks are being determined."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.colmap import ColmapModel
-from protomark.geometry.triangulation import reprojection_residuals
+from protomark.geometry.triangulation import pixel_errors
 
 
 @dataclass
@@ -20,10 +20,10 @@ class Scene:
         offsets: (m + 1,) int64, rows of each keyframe.
         keyframe: (n,) int64, keyframe of each keypoint.
         keypoints: (n, 2) float32, pixels.
-        rays: (n, 2) float64, undistorted, NaN where that failed.
+        rays: (n, 2) float64, undistorted, NaN where undistortion fails.
         focal: (n,) float64, focal length in pixels.
         descriptors: (n, bits / 8) uint8.
-        labels: (n,) int64, row in positions, -1 where none.
+        labels: (n,) int64, row of the landmark in positions, -1 for none.
         positions: (l, 3) float64.
     """
 
@@ -43,14 +43,10 @@ class Scene:
         return rows[np.argsort(self.labels[rows], kind="stable")]
 
     def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Reprojection error in pixels of observations, infinite behind the camera.
-
-        Measured in the undistorted image, scaled by the focal length.
-        """
-        difference, depth = reprojection_residuals(
+        """Reprojection errors (n,) of observations in pixels of the undistorted image."""
+        return pixel_errors(
             self.positions[self.labels[rows]],
             self.model.cam_from_world[self.keyframe[rows]],
             self.rays[rows],
+            self.focal[rows],
         )
-        error = np.linalg.norm(difference, axis=1) * self.focal[rows]
-        return np.where((depth > 0) & np.isfinite(error), error, np.inf)

@@ -1,4 +1,4 @@
-"""Counts, track lengths and reprojection errors of tracks."""
+"""Summarises tracks: counts, track lengths and reprojection errors."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from protomark.tracks.file import Tracks
 
 
 def reprojection_errors(tracks: Tracks) -> NDArray[np.float64]:
-    """(n,) float64, pixels, of each observation in the order of `tracks.observations`."""
+    """Reprojection errors (n,) in pixels, in the order of `tracks.observations`."""
     rows = tracks.observations
     keyframe = tracks.keyframe_of_keypoint[rows]
     index = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
     pose = tracks.cam_from_world[keyframe]
-    local = (
-        np.einsum("nij,nj->ni", pose[:, :, :3], tracks.landmark_positions[index]) + pose[:, :, 3]
-    )
+    positions = tracks.landmark_positions[index]
+    local = np.einsum("nij,nj->ni", pose[:, :, :3], positions) + pose[:, :, 3]
     pixels = np.zeros((len(rows), 2))
     for camera_id, camera in tracks.cameras.items():
-        mine = tracks.keyframe_camera[keyframe] == camera_id
-        pixels[mine] = camera.project(local[mine])
+        taken = tracks.keyframe_camera[keyframe] == camera_id
+        pixels[taken] = camera.project(local[taken])
     errors: NDArray[np.float64] = np.linalg.norm(pixels - tracks.keypoints[rows], axis=1)
     return errors
 
 
 def summarise(tracks: Tracks) -> dict[str, Any]:
-    """Counts, track lengths and reprojection error as JSON values."""
+    """Counts, track lengths and reprojection errors of tracks, as JSON values."""
     rows = tracks.observations
     lengths = np.unique(tracks.landmark_of_keypoint[rows], return_counts=True)[1]
     errors = reprojection_errors(tracks)
@@ -40,18 +39,25 @@ def summarise(tracks: Tracks) -> dict[str, Any]:
         "keypoints": len(tracks.keypoints),
         "landmarks": len(tracks.landmark_ids),
         "observations": len(rows),
-        "track_length_mean": float(lengths.mean()) if len(lengths) else 0.0,
+        **track_figures(lengths, errors),
         "track_length_median": float(np.median(lengths)) if len(lengths) else 0.0,
         "track_length_max": int(lengths.max(initial=0)),
-        "track_length_histogram": length_histogram(lengths),
-        "reprojection_error_mean": float(errors.mean()) if len(errors) else 0.0,
-        "reprojection_error_median": float(np.median(errors)) if len(errors) else 0.0,
         "poses_refined": bool(tracks.info.get("poses_refined", False)),
     }
 
 
+def track_figures(lengths: NDArray[np.int64], errors: NDArray[np.float64]) -> dict[str, Any]:
+    """Figures of track lengths and of reprojection errors in pixels, as JSON values."""
+    return {
+        "track_length_mean": float(lengths.mean()) if len(lengths) else 0.0,
+        "track_length_histogram": length_histogram(lengths),
+        "reprojection_error_mean": float(errors.mean()) if len(errors) else 0.0,
+        "reprojection_error_median": float(np.median(errors)) if len(errors) else 0.0,
+    }
+
+
 def length_histogram(lengths: NDArray[np.int64]) -> dict[str, int]:
-    """Number of tracks by their number of observations, for example {"2": 17, "4-5": 9}."""
+    """Number of landmarks by number of observations, such as {"2": 17, "4-5": 9}."""
     edges = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
     histogram = {}
     for low, end in zip(edges, (*edges[1:], None), strict=True):

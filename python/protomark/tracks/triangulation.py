@@ -1,4 +1,4 @@
-"""Landmarks from matches and poses: COLMAP's triangulator, and its bundle adjustment."""
+"""Triangulates landmarks from matches and poses, and refines poses, by COLMAP."""
 
 from __future__ import annotations
 
@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.colmap import ColmapModel, pycolmap, quiet
+from protomark.geometry.colmap import (
+    ColmapModel,
+    bundle_adjust,
+    new_reconstruction,
+    pycolmap,
+    quiet,
+)
 from protomark.tracks.matching import VerifiedMatches
 
 _SEED = 0
-# Enough to fix the six numbers of a pose many times over.
+# More than enough points to determine the six numbers of a pose.
 _POINTS_PER_POSE = 200
 
 
@@ -25,23 +31,23 @@ def triangulate(
     max_error: float,
     min_angle: float,
 ) -> Any:
-    """Join matches into landmarks under the poses of `model`.
+    """Triangulate landmarks from matches under the poses of `model`.
 
     Args:
         model: cameras and m poses.
         keypoints: m arrays (n, 2), pixels.
-        matches: (i, j) -> matches between keyframes i < j.
+        matches: matches by pairs of keyframes (i, j), i < j.
         max_error: largest reprojection error in pixels.
-        min_angle: smallest angle between two rays of a landmark, degrees.
+        min_angle: smallest triangulation angle of a landmark, degrees.
 
     Returns:
-        pycolmap.Reconstruction whose image ids are 1 + index of the keyframe.
+        A `pycolmap.Reconstruction` whose image ids are keyframe indices plus one.
     """
     reconstruction = _posed(model, keypoints)
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.extract_colors = False
     pipeline.min_num_matches = 1
-    # More threads add up in another order, and other labels come out.
+    # With more threads the order of sums, and so the labels, would vary.
     pipeline.num_threads = 1
     pipeline.random_seed = _SEED
     pipeline.mapper.filter_max_reproj_error = max_error
@@ -50,12 +56,12 @@ def triangulate(
     options.random_seed = _SEED
     options.min_angle = min_angle
     options.merge_max_reproj_error = options.complete_max_reproj_error = max_error
-    # The triangulator bounds angles, the user pixels; the widest-angled camera decides.
+    # The triangulator limits angles, not pixels; the camera with the widest angle decides.
     focal = min(camera.focal_length for camera in model.cameras.values())
     angle = float(np.degrees(np.arctan(1.5 * max_error / focal)))
     options.create_max_angle_error = options.continue_max_angle_error = angle
     options.re_max_angle_error = 2 * angle
-    # Cameras are given, not estimated: COLMAP must not refuse strong distortion as implausible.
+    # Cameras are given, so COLMAP must not reject strong distortion as implausible.
     for bounds in (pipeline, pipeline.mapper, options):
         bounds.min_focal_length_ratio = 1e-12
         bounds.max_focal_length_ratio = bounds.max_extra_param = 1e12
@@ -68,21 +74,9 @@ def triangulate(
 
 
 def _posed(model: ColmapModel, keypoints: list[NDArray[np.float32]]) -> Any:
-    reconstruction = pycolmap.Reconstruction()
-    for camera_id, camera in model.cameras.items():
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera({**camera.as_dict(), "camera_id": camera_id})
-        )
-    for i, name in enumerate(model.names):
-        image = pycolmap.Image(
-            name=name,
-            camera_id=int(model.camera_ids[i]),
-            image_id=i + 1,
-            keypoints=np.asarray(keypoints[i], np.float64).reshape(-1, 2),
-        )
-        pose = pycolmap.Rigid3d(model.cam_from_world[i])
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    return reconstruction
+    parts = zip(model.names, model.camera_ids, keypoints, model.cam_from_world, strict=True)
+    numbered = [(i, name, int(camera), *rest) for i, (name, camera, *rest) in enumerate(parts, 1)]
+    return new_reconstruction(model.cameras, numbered)
 
 
 def _write_database(
@@ -116,10 +110,10 @@ def _write_database(
 def labels_of(
     reconstruction: Any, keypoints: list[NDArray[np.float32]]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Index of each keypoint's landmark (n,), -1 where none, and the positions (l, 3).
+    """Index (n,) of each keypoint's landmark, -1 for none, and positions (l, 3).
 
-    Where one landmark has two keypoints of one keyframe, the one with the smaller reprojection
-    error keeps it.
+    Of two keypoints in one keyframe, the one with the smaller reprojection error keeps the
+    landmark.
     """
     offsets = np.concatenate([[0], np.cumsum([len(k) for k in keypoints])])
     labels = np.full(offsets[-1], -1, np.int64)
@@ -142,32 +136,14 @@ def labels_of(
 
 
 def refine_poses(model: ColmapModel, reconstruction: Any) -> ColmapModel:
-    """Bundle adjustment of poses and points (not of cameras), robust against wrong matches.
+    """Adjust poses and points (not cameras) robustly against wrong matches.
 
-    The result stays in the world of `model`: scale, rotation and origin are those that bring the
-    refined cameras closest to the given ones. Points that poses do not need are deleted.
+    The result stays in the world of `model`: its scale, rotation and origin bring the refined
+    cameras closest to the given ones. Points that the poses do not need are deleted.
     """
     _thin(reconstruction)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = False
-    options.refine_principal_point = False
-    options.refine_extra_params = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 1.0
-    options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = 30
-    options.ceres.solver_options.function_tolerance = 1e-4
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.images:
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not pycolmap.bundle_adjustment, which writes to the terminal.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    with quiet():
-        summary = adjuster.solve()
-    if not summary.is_solution_usable():
-        raise ValueError("bundle adjustment failed; try --refine-poses no")
+    if not bundle_adjust(reconstruction, list(reconstruction.images)):
+        raise ValueError("bundle adjustment failed: try --refine-poses no")
     poses = np.array(
         [reconstruction.images[i + 1].cam_from_world().matrix() for i in range(len(model.names))]
     )
@@ -175,7 +151,7 @@ def refine_poses(model: ColmapModel, reconstruction: Any) -> ColmapModel:
 
 
 def _thin(reconstruction: Any) -> None:
-    """Keep the longest tracks, enough for every pose: time grows with each observation."""
+    """Delete all but the longest tracks, enough for every pose, to save time."""
     points = sorted(
         reconstruction.points3D.items(), key=lambda item: (-item[1].track.length(), item[0])
     )
@@ -190,10 +166,10 @@ def _thin(reconstruction: Any) -> None:
 
 
 def _aligned(source: ColmapModel, target: ColmapModel) -> ColmapModel:
-    """Source moved by the similarity that brings its cameras closest to those of target.
+    """The source, moved by the similarity that brings its cameras closest to those of target.
 
-    The rotation comes from the cameras' orientations, which also serves where their centres lie on
-    one line; scale and shift come from the centres.
+    The rotation is that of the cameras' orientations, which also works if their centres lie on one
+    line; scale and shift are those of the centres.
     """
     turns = np.einsum(
         "mji,mjk->ik", target.cam_from_world[:, :, :3], source.cam_from_world[:, :, :3]

@@ -1,1 +1,1 @@
-"""Training encoders from tracks (PyTorch, `pip install protomark[train]`)."""
+"""Trains encoders from tracks with PyTorch (the extra `train`)."""

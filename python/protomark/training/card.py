@@ -1,4 +1,4 @@
-"""The card beside a model: what it was trained on, how, and how precise it is."""
+"""The card beside a model: its data, training and precision."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from protomark.report import markdown_table
 from protomark.training.data import TrainingSource
+
+_DATA_HEAD = ("sequence", "used for", "keyframes", "landmarks", "observations", "licence")
+_PRECISION_HEAD = (
+    *("sequence", "splits", "unaggregated", "medoid", "majority", "dim", "bytes per landmark"),
+    *("float", "integer", "ratio to unaggregated"),
+)
 
 
 @dataclass(frozen=True)
@@ -15,14 +22,14 @@ class SequencePrecision:
     """Precision on one sequence, averaged over splits.
 
     Attributes:
-        sequence: its name.
+        sequence: name of the sequence.
         role: "validation" or "report".
-        seeds: how many splits.
-        unaggregated: of the raw descriptors on the same queries.
-        medoid: of one descriptor per landmark, the one closest to its others.
-        majority: of the quantised mean, each bit as most of the landmark's descriptors have it.
-        float_precision: of the float network, by dimension.
-        integer_precision: of the integer encoder with int8 prototypes, by dimension.
+        seeds: number of splits.
+        unaggregated: precision of all raw descriptors.
+        medoid: precision of one descriptor per landmark, the one closest to the others.
+        majority: precision of the quantised mean of each landmark's descriptors.
+        float_precision: precision of the float network, by code length.
+        integer_precision: precision of the integer encoder with int8 prototypes, by code length.
     """
 
     sequence: str
@@ -37,25 +44,25 @@ class SequencePrecision:
 
 @dataclass(frozen=True)
 class EncoderCard:
-    """Everything a card says; also what `protomark train --json` writes.
+    """The content of a card, which `protomark train --json` writes, too.
 
     Attributes:
-        name: of the encoder.
-        descriptor: that it encodes.
-        bits: length of a descriptor.
-        widths: units of each layer, input and output included.
-        dims: prefixes that may be used alone.
+        name: name of the encoder.
+        descriptor: descriptor that it encodes.
+        bits: length of the descriptor.
+        widths: units per layer, including input and output.
+        dims: prefixes that maps may use alone.
         bytes: size of the model file.
         encode_ns: nanoseconds to encode one descriptor on one thread.
-        licence: of the weights.
+        licence: licence of the weights.
         sources: training sequences.
         validation: validation sequences.
-        command: that trains it again.
-        seconds: that training took.
+        command: command that trains the encoder again.
+        seconds: duration of the training.
         machine: processor or accelerator, threads and arithmetic of the training.
-        steps: batches in all.
-        best_step: the one whose weights were kept.
-        figures: precision, by sequence.
+        steps: number of batches.
+        best_step: step whose weights the encoder has.
+        figures: precision by sequence.
         history: (step, loss, mean validation precision) of each validation.
         plot: file name of the picture of the training, beside the card, or "".
         calibrated_on: sequences that the match calibration was fitted to, or "".
@@ -87,7 +94,7 @@ class EncoderCard:
         return sum(a * b for a, b in pairwise(self.widths))
 
     def markdown(self) -> str:
-        """The card as it stands beside the model."""
+        """The card as Markdown."""
         dims = ", ".join(map(str, self.dims))
         lines = [
             f"# Encoder `{self.name}`",
@@ -114,17 +121,14 @@ class EncoderCard:
             "",
             "## Data",
             "",
-            "| sequence | used for | keyframes | landmarks | observations | licence |",
-            "|---|---|---|---|---|---|",
         ]
+        data = []
         for role, sources in (("training", self.sources), ("validation", self.validation)):
-            lines += [
-                f"| {s.name} | {role} | {s.keyframes} | {s.landmarks} | {s.observations} "
-                f"| {s.licence or 'not stated'} |"
-                for s in sources
-            ]
+            for s in sources:
+                counts = map(str, (s.keyframes, s.landmarks, s.observations))
+                data.append([s.name, role, *counts, s.licence or "not stated"])
         lines += [
-            "",
+            markdown_table(_DATA_HEAD, data, left=len(_DATA_HEAD)),
             "## Precision",
             "",
             "Share of queries whose nearest prototype is their own landmark's: 90 % of the "
@@ -133,21 +137,28 @@ class EncoderCard:
             "landmark; *float*: the network before rounding, *integer*: the encoder in this file "
             "with int8 prototypes.",
             "",
-            "| sequence | splits | unaggregated | medoid | majority | dim | bytes per landmark "
-            "| float | integer | ratio to unaggregated |",
-            "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+            markdown_table(_PRECISION_HEAD, self.figure_rows()),
         ]
-        for f in self.figures:
-            for d in self.dims:
-                lines.append(
-                    f"| {f.sequence} ({f.role}) | {f.seeds} | {f.unaggregated:.4f} "
-                    f"| {f.medoid:.4f} | {f.majority:.4f} | {d} | {d + 1} "
-                    f"| {f.float_precision[d]:.4f} | {f.integer_precision[d]:.4f} "
-                    f"| {f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f} |"
-                )
         if self.plot:
-            lines += ["", "## Training", "", f"![loss and validation precision]({self.plot})"]
-        return "\n".join(lines) + "\n"
+            lines += ["## Training", "", f"![loss and validation precision]({self.plot})", ""]
+        return "\n".join(lines)
+
+    def figure_rows(self) -> list[list[str]]:
+        """The precision on each sequence by code length, as text for a table."""
+        return [
+            [
+                f"{f.sequence} ({f.role})",
+                str(f.seeds),
+                *(f"{share:.4f}" for share in (f.unaggregated, f.medoid, f.majority)),
+                str(d),
+                str(d + 1),
+                f"{f.float_precision[d]:.4f}",
+                f"{f.integer_precision[d]:.4f}",
+                f"{f.integer_precision[d] / max(f.unaggregated, 1e-9):.3f}",
+            ]
+            for f in self.figures
+            for d in self.dims
+        ]
 
 
 def _duration(seconds: float) -> str:
@@ -156,5 +167,5 @@ def _duration(seconds: float) -> str:
 
 
 def describe_data(sources: Sequence[TrainingSource]) -> str:
-    """One line for the model file: the sequences and their licences."""
+    """The sequences and their licences, in one line for the model file."""
     return "; ".join(f"{s.name} ({s.licence})" if s.licence else s.name for s in sources)

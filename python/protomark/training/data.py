@@ -1,4 +1,4 @@
-"""Reads tracks for training, and checks before the first step all that can be checked."""
+"""Reads tracks for training, and checks them before the first step."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from protomark.training.validation import Trial
 
 MIN_BITS = 64
 MAX_BITS = 1024
-# Landmarks with 3 or more views that all training sequences together must have.
+# Number of landmarks with 3 or more views that training needs.
 MIN_LANDMARKS = 500
 
 
 @dataclass(frozen=True)
 class TrainingSource:
-    """What the card says of one tracks file.
+    """A tracks file in the card.
 
     Attributes:
         name: file name up to its first dot.
         file: file name.
-        keyframes, landmarks, observations: how many there are.
-        licence: what the user says of it, else what the tracks' `info` says, else "".
+        keyframes, landmarks, observations: their numbers.
+        licence: licence that the user or the tracks' `info` states, else "".
     """
 
     name: str
@@ -41,11 +41,11 @@ class TrainingSource:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Everything that training reads.
+    """The data of a training.
 
     Attributes:
         descriptor: name of the descriptor of all tracks.
-        bits: its length.
+        bits: length of the descriptor.
         views: training sequences.
         trials: splits of the validation sequences.
         sources: the training files.
@@ -63,22 +63,22 @@ class TrainingData:
 
 
 def read_tracks(path: Path, upright: bool) -> Tracks:
-    """A tracks file, with upright descriptors (`protomark.features.upright`) if asked for."""
+    """Load tracks, with plain or upright descriptors (`protomark.features.upright`)."""
     tracks = Tracks.load(path)
     return tracks.upright() if upright else tracks
 
 
 def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """The files to train on and those to validate on: the last one, if none is named for it.
+    """The files to train on, and those to validate on: by default the last one.
 
     Raises:
-        ValueError: a single file would have to do both.
+        ValueError: there is only one file.
     """
     if validation:
         return list(training), list(validation)
     if len(training) < 2:
         raise ValueError(
-            f"{training[0]}: one tracks file cannot serve for training and validation; give "
+            f"{training[0]}: one tracks file cannot serve for training and validation: give "
             "another sequence with --validation"
         )
     return list(training[:-1]), [training[-1]]
@@ -87,7 +87,7 @@ def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list
 def load_trials(
     tracks: Tracks, path: Path, seeds: Sequence[int], max_queries: int = 10_000
 ) -> list[Trial]:
-    """Splits of one sequence, one per seed."""
+    """Splits of a sequence, one per seed."""
     return [Trial.from_tracks(tracks, sequence_name(path), s, max_queries) for s in seeds]
 
 
@@ -105,39 +105,39 @@ def load_training(
     Args:
         training: tracks files to train on.
         validation: tracks files that select the model, none of them in `training`.
-        seeds: each validation sequence is split once per seed.
-        max_queries: queries of one split.
-        licences: of the sequences, by name, for the card.
-        upright: train on angles and sizes of keypoints, too.
+        seeds: seeds of the splits of each validation sequence.
+        max_queries: limit on queries per split.
+        licences: licences of the sequences by name, for the card.
+        upright: whether to train on angles and sizes of keypoints, too.
         progress: called with each file.
 
     Raises:
         FileNotFoundError: a file is missing.
         ValueError: a file is broken, a sequence is for training and for validation, descriptors
-            are mixed or of a length that cannot be trained, or there is too little to learn from.
+            differ or have an unsuitable length, or there are too few landmarks.
     """
     if not training:
-        raise ValueError("no training tracks: give at least one tracks file")
+        raise ValueError("there are no training tracks: give at least one tracks file")
     if not validation:
-        raise ValueError("no validation tracks: give at least one with --validation")
+        raise ValueError("there are no validation tracks: give a file with --validation")
     both = {p.resolve() for p in training} & {p.resolve() for p in validation}
     if both:
         raise ValueError(
-            f"{sorted(both)[0].name} is given for training and for validation; "
+            f"{sorted(both)[0].name} is given for training and for validation: "
             "validate on a sequence that is not trained on"
         )
     licences = licences or {}
     unknown = set(licences) - {sequence_name(p) for p in [*training, *validation]}
     if unknown:
         raise ValueError(
-            f"a licence is given for {min(unknown)}, which is not one of the sequences; "
-            "a sequence's name is its file's name up to the first dot"
+            f"a licence is given for {min(unknown)}, which is not one of the sequences: "
+            "name a sequence by its file name up to the first dot"
         )
     descriptor, bits = "", 0
     views: list[Views] = []
     trials: list[Trial] = []
     sources: list[TrainingSource] = []
-    learned: dict[str, str] = {}  # digest of what tracks were made from -> their file
+    learned: dict[str, str] = {}  # training files by the digest of their input
     digest = hashlib.sha256()
     for i, path in enumerate(tracked([*training, *validation], progress, "read tracks")):
         tracks = read_tracks(path, upright)
@@ -145,21 +145,21 @@ def load_training(
             descriptor, bits = tracks.descriptor, tracks.bits
             if not MIN_BITS <= bits <= MAX_BITS:
                 raise ValueError(
-                    f"{path}: descriptors of {bits} bits; encoders are trained for "
+                    f"{path} has descriptors of {bits} bits: encoders are trained for "
                     f"{MIN_BITS} to {MAX_BITS} bits"
                 )
         elif (tracks.descriptor, tracks.bits) != (descriptor, bits):
             raise ValueError(
-                f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but "
-                f"{training[0]} has {descriptor} of {bits}; train on one descriptor at a time"
+                f"{path} has {tracks.descriptor} descriptors of {tracks.bits} bits, but "
+                f"{training[0]} has {descriptor} of {bits}: train on one descriptor at a time"
             )
         made_from = str(tracks.info.get("input", ""))
         if i < len(training):
             learned[made_from] = path.name
         elif made_from and made_from in learned:
-            # Augmented tracks are another file of the same sequence.
+            # Augmented and plain tracks are files of the same sequence.
             raise ValueError(
-                f"{path.name} and {learned[made_from]} are of the same images; validate on a "
+                f"{path.name} and {learned[made_from]} are of the same images: validate on a "
                 "sequence that is not trained on"
             )
         digest.update(tracks.descriptors.tobytes())
@@ -169,8 +169,8 @@ def load_training(
             found = Views.from_tracks(tracks, sequence_name(path))
             if not (found.counts >= 3).any():
                 raise ValueError(
-                    f"{path}: no landmark has 3 or more views, so there is nothing to learn from "
-                    "it; make longer tracks or leave the file out"
+                    f"{path}: no landmark has the 3 views that training needs: make longer tracks "
+                    "or leave the file out"
                 )
             views.append(found)
         else:
@@ -178,8 +178,8 @@ def load_training(
     learnable = int(sum((v.counts >= 3).sum() for v in views))
     if learnable < MIN_LANDMARKS:
         raise ValueError(
-            f"only {learnable} landmarks have 3 or more views, training needs at least "
-            f"{MIN_LANDMARKS}; give more or longer tracks"
+            f"only {learnable} landmarks have 3 or more views, but training needs "
+            f"{MIN_LANDMARKS}: give more or longer tracks"
         )
     return TrainingData(
         descriptor,

@@ -1,4 +1,4 @@
-"""Trains an encoder from tracks files: reads them, trains, writes the model and its card."""
+"""Trains an encoder from tracks files, and writes the model and its card."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 import protomark as pm
-from protomark._core import hamming_search
-from protomark.baselines.binary import majority, medoid
+from protomark.baselines import binary
 from protomark.baselines.support import Support
 from protomark.files import write_text
 from protomark.match_calibration import SOURCE_KEY
@@ -48,16 +47,16 @@ class TrainingRequest:
         training: tracks files to train on.
         validation: tracks files that select the model.
         output: the model file to write; its card (.md) and a picture of the training (.png) are
-            written beside it, and a checkpoint (`<output>.checkpoint`) until training is done.
-        options: what determines the weights.
-        report: tracks files on which the finished encoder is measured, and nothing else.
-        resume: continue from the checkpoint.
-        upright: train on angles and sizes of keypoints, too.
-        name: of the encoder; the output's stem if empty.
-        licence: of the weights.
-        data_licences: of the sequences, by name, for the card and the model file.
+            written beside it, and a checkpoint (`<output>.checkpoint`) until training ends.
+        options: options that determine the weights.
+        report: further tracks files to measure the encoder on.
+        resume: whether to continue from the checkpoint.
+        upright: whether to train on angles and sizes of keypoints, too.
+        name: name of the encoder; if empty, the output's stem.
+        licence: licence of the weights.
+        data_licences: licences of the sequences by name, for the card and the model file.
         device: "cpu" or "cuda".
-        threads: for PyTorch on a CPU; 0 for one per core.
+        threads: CPU threads; 0: one per core.
     """
 
     training: Sequence[Path]
@@ -87,24 +86,24 @@ class TrainingRequest:
         """Raise before the first step if a result could not be written after the last."""
         self.options.check()
         if self.device != "cpu" and not self.device.startswith("cuda"):
-            raise ValueError(f"device {self.device!r} is not known; give cpu or cuda")
+            raise ValueError(f"device {self.device!r} is unknown: give cpu or cuda")
         if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise ValueError("no CUDA device that this PyTorch can use; train with --device cpu")
+            raise ValueError("this PyTorch finds no CUDA device: train with --device cpu")
         if self.output in (self.card_path, self.plot_path):
             raise ValueError(
                 f"{self.output}: {self.output.suffix} is the suffix of a file that is written "
-                "beside the model; name the model .pme"
+                "beside the model: name the model .pme"
             )
         for path in (self.output, self.card_path, self.plot_path):
             if path.is_dir():
-                raise ValueError(f"{path} is a folder; name a file to write")
+                raise ValueError(f"{path} is a folder: name a file to write")
             if not path.absolute().parent.is_dir():
                 raise FileNotFoundError(
                     f"{path}: the folder {path.absolute().parent} does not exist"
                 )
 
     def command(self, data: TrainingData) -> str:
-        """The command that trains this encoder again, with files by name only."""
+        """The command that trains this encoder again, with file names instead of paths."""
         words = ["protomark", "train", *(s.file for s in data.sources)]
         for source in data.validation_sources:
             words += ["--validation", source.file]
@@ -140,12 +139,12 @@ def train_encoder(
     Args:
         request: what to train from, and what to write.
         progress: called with each step.
-        note: called with a line for each validation, and with warnings.
+        note: called with a line per validation, and with warnings.
 
     Raises:
         FileNotFoundError: a tracks file, the output's folder, or the checkpoint is missing.
-        ValueError: tracks, outputs, options, device or checkpoint do not fit.
-        TrainingInterrupted: Ctrl-C; `resume` continues.
+        ValueError: tracks, outputs, options, device or checkpoint are invalid.
+        Interrupted: Ctrl-C was pressed; `resume` continues.
     """
     request.check()
     keep_freed_memory()
@@ -227,12 +226,12 @@ def default_output(tracks: Path, resume: bool = False, upright: bool = False) ->
     """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
 
     Raises:
-        FileExistsError: it, its card or its picture exists already, and would be overwritten.
+        FileExistsError: the model, its card or its picture exists already.
     """
     output = Path(f"{read_tracks(tracks, upright).descriptor}.pme")
     for path in (output, output.with_suffix(".md"), output.with_suffix(".png")):
         if path.exists() and not resume:
-            raise FileExistsError(f"{path} exists and is kept; name another file with -o")
+            raise FileExistsError(f"{path} exists already: name another file with -o")
     return output
 
 
@@ -241,8 +240,8 @@ def _check_report(path: Path, data: TrainingData, upright: bool) -> None:
     tracks = read_tracks(path, upright)
     if (tracks.descriptor, tracks.bits) != (data.descriptor, data.bits):
         raise ValueError(
-            f"{path}: {tracks.descriptor} descriptors of {tracks.bits} bits, but the encoder is "
-            f"for {data.descriptor} of {data.bits}; report on tracks of the same descriptor"
+            f"{path} has {tracks.descriptor} descriptors of {tracks.bits} bits, but the encoder is "
+            f"for {data.descriptor} of {data.bits}: report on tracks of the same descriptor"
         )
     load_trials(tracks, path, REPORT_SEEDS)
 
@@ -288,19 +287,16 @@ def _save_plot(history: Sequence[ValidationStep], path: Path, name: str) -> None
 def _calibrated(
     encoder: pm.Encoder, paths: Sequence[Path], threads: int, note: Callable[[str], None]
 ) -> tuple[pm.Encoder, str]:
-    """The encoder with a match calibration, fitted to those files that are not augmented.
+    """The encoder with a match calibration that is fitted to the plain tracks, and its data.
 
-    Tracks that leave nothing to fit do not fail the training: the encoder then has no calibration.
+    If the tracks allow no fit, the training goes on, and the encoder has no calibration.
     """
     plain = [path for path in paths if not Tracks.load(path).info.get("augmentations")]
     try:
-        with one_blas_thread():  # more threads sum in another order
+        with one_blas_thread():  # more threads would change the order of sums
             encoder, _ = calibrate(encoder, plain, threads)
     except ValueError as error:
-        note(
-            "not calibrated, so `protomark localize` will not know which matches to accept: "
-            f"{error}"
-        )
+        note(f"the encoder is not calibrated, so `protomark localize` cannot use it: {error}")
     return encoder, encoder.notes.get(SOURCE_KEY, "")
 
 
@@ -318,43 +314,32 @@ def _measure(
     plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if request.upright else trials
     floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
     integers = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
-    binary = [
-        _binary_precision(t, seed, threads) for t, seed in zip(plain, REPORT_SEEDS, strict=True)
-    ]
+    shares = [binary_precision(t, threads) for t in plain]
+    unaggregated, medoid, majority = np.mean(shares, axis=0).tolist()
     return SequencePrecision(
         sequence_name(path),
         role,
         len(trials),
-        float(np.mean([unaggregated_precision(t, threads) for t in plain])),
-        float(np.mean([b["medoid"] for b in binary])),
-        float(np.mean([b["majority"] for b in binary])),
+        unaggregated,
+        medoid,
+        majority,
         {d: float(np.mean([p[d] for p in floats])) for d in dims},
         {d: float(np.mean([p[d] for p in integers])) for d in dims},
     )
 
 
-def _binary_precision(trial: Trial, seed: int, threads: int) -> dict[str, float]:
-    """Precision of maps with one binary descriptor per landmark."""
-    support = Support(trial.landmarks, trial.support, seed)
-    found = {}
-    for name, method in (("medoid", medoid(support)), ("majority", majority(support))):
-        nearest, _ = method.match(trial.queries, threads=threads)
-        found[name] = float((nearest[:, 0] == trial.targets).mean())
-    return found
-
-
-def unaggregated_precision(trial: Trial, threads: int = 1) -> float:
-    """Share of queries whose nearest raw descriptor is one of their own landmark's."""
-    found, _ = hamming_search(trial.queries, trial.support, k=1, threads=threads)
-    return float((trial.landmarks[found[:, 0]] == trial.targets).mean())
+def binary_precision(trial: Trial, threads: int = 1) -> list[float]:
+    """Precision of all raw descriptors, of medoids and of majorities, one each per landmark."""
+    support = Support(trial.landmarks, trial.support)
+    shares = []
+    for method in (binary.unaggregated, binary.medoid, binary.majority):
+        nearest, _ = method(support).match(trial.queries, threads=threads)
+        shares.append(float((nearest[:, 0] == trial.targets).mean()))
+    return shares
 
 
 def encode_nanoseconds(encoder: pm.Encoder) -> float:
-    """Nanoseconds to encode one descriptor to full length on one thread, the best of five rounds.
-
-    Of 20,000 random descriptors at a time, in processor time, to which other work on the machine
-    adds little.
-    """
+    """Nanoseconds of processor time to encode one descriptor on one thread, the best of rounds."""
     rng = np.random.default_rng(0)
     descriptors = rng.integers(0, 256, (_TIMED_DESCRIPTORS, encoder.bits // 8), np.uint8)
     seconds = []

@@ -1,8 +1,8 @@
-"""The prototype loss: a view against the mean of its landmark's other views.
+"""The prototype loss: a view is classified among the prototypes of a batch.
 
-It trains the operation that the map performs. Every query of a batch is classified among all
-prototypes of the batch by a softmax over negative squared distances (Eq. 3 of the paper); its own
-landmark's prototype is the mean (Eq. 1) of the *other* views, as the map has never seen the query.
+This trains the operation that the map performs. The classification is a softmax over negative
+squared distances (Eq. 3 of the paper). The prototype of the query's landmark is the mean (Eq. 1) of
+its *other* views, as a map does not contain the query.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from torch.nn import functional
 def leave_one_out(
     embeddings: Tensor, landmarks: Tensor, queries: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The queries of a batch, and the prototypes that they are held against.
+    """The queries of a batch, and the prototypes that they are compared with.
 
     Args:
-        embeddings: (n, k) float, one row a view.
-        landmarks: (n,) int64, landmark of each row, numbered 0..m-1, each with a view.
+        embeddings: (n, k) float, one row per view.
+        landmarks: (n,) int64, landmark of each row, each of 0..m-1 with a view.
         queries: (q,) int64, rows to classify; their landmarks have at least 2 views.
 
     Returns:
-        (q, k) float32 queries; (q,) int64 their landmarks; (q, k) means of these landmarks' other
-        views, as the support of a query is everything but itself; (m, k) means of all views of
-        each landmark.
+        Queries (q, k) float32; their landmarks (q,) int64; means (q, k) of the other views of these
+        landmarks; means (m, k) of all views of each landmark.
     """
     embeddings = embeddings.float()
     count = torch.bincount(landmarks)
     total = embeddings.new_zeros(len(count), embeddings.shape[1])
     total = total.index_add(0, landmarks, embeddings)
     query, target = embeddings[queries], landmarks[queries]
-    own = (total[target] - query) / (count[target] - 1)[:, None]
-    return query, target, own, total / count[:, None]
+    others = (total[target] - query) / (count[target] - 1)[:, None]
+    return query, target, others, total / count[:, None]
 
 
 class PrototypeLoss(nn.Module):
     """Cross-entropy over the prototypes of a batch, averaged over nested prefixes.
 
-    The first d numbers of an embedding are trained to serve alone, for every d in `dims`
-    (Matryoshka), each with a learned temperature of its own as distances grow with d.
+    For every d in `dims` the first d numbers of an embedding are trained to work alone (Kusupati et
+    al., Matryoshka Representation Learning, NeurIPS 2022), with a learned temperature, as distances
+    grow with d.
 
     Args:
         dims: lengths of the prefixes, the largest at most the embedding's length.
@@ -61,30 +61,23 @@ class PrototypeLoss(nn.Module):
         queries: Tensor,
         dims: Sequence[int] | None = None,
     ) -> Tensor:
-        """Loss of one batch.
+        """Scalar loss of one batch: the mean over queries and prefixes.
 
-        Args:
-            embeddings: (n, k) float, one row a view.
-            landmarks: (n,) int64, landmark of each row, numbered 0..m-1, each with a view.
-            queries: (q,) int64, rows to classify; their landmarks have at least 2 views.
-            dims: the prefixes that count this time, some of `self.dims`; None for all.
-
-        Returns:
-            Scalar: mean over prefixes and queries.
+        The batch is that of `leave_one_out`; `dims` are the prefixes that count, None: all.
         """
-        query, target, own, prototype = leave_one_out(embeddings, landmarks, queries)
+        query, target, others, prototype = leave_one_out(embeddings, landmarks, queries)
 
         losses = []
         column = target[:, None]
         for d, log_temperature in zip(self.dims, self.log_temperature, strict=True):
             if dims is not None and d not in dims:
                 continue
-            # |q - p|^2 without |q|^2, which is the same for all prototypes and cancels.
-            q, p, o = query[:, :d], prototype[:, :d], own[:, :d]
+            # |q - p|^2 without |q|^2, which is the same for all prototypes.
+            q, p, o = query[:, :d], prototype[:, :d], others[:, :d]
             inverse = torch.exp(-log_temperature)
             logits = torch.addmm(-inverse * p.square().sum(1), q, p.T * (2 * inverse))
-            own_logit = inverse * (2 * (q * o).sum(1) - o.square().sum(1))
-            logits = logits.scatter(1, column, own_logit[:, None])
+            target_logit = inverse * (2 * (q * o).sum(1) - o.square().sum(1))
+            logits = logits.scatter(1, column, target_logit[:, None])
             losses.append(self.of_logits(logits, target))
         return torch.stack(losses).mean()
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +31,13 @@ Search = Callable[[NDArray[np.uint8]], tuple[NDArray[np.int64], NDArray[np.int32
 
 @dataclass(frozen=True)
 class LabelledMatches:
-    """The nearest landmarks of all keypoints of some frames, with and without landmark.
+    """The nearest landmarks of all n keypoints of several frames.
 
     Attributes:
-        distances: (n, 2) float64, squared, to the two nearest landmarks.
-        right: (n,) bool, whether the nearest is the keypoint's own, or projects to within half a
+        distances: (n, 2) float64, squared distances to the two nearest landmarks.
+        right: (n,) bool, whether the nearest landmark is the true one, or projects to within half a
             percent of the image's longer side.
-        frame: (n,) int64, which frame each keypoint is of.
+        frame: (n,) int64, index of each keypoint's frame.
     """
 
     distances: NDArray[np.float64]
@@ -50,17 +49,17 @@ def label_matches(tracks: Tracks, frames: Sequence[QueryFrame], search: Search) 
     """Search a map of `tracks` for every keypoint of `frames`."""
     distances, right, number = [], [], []
     for i, frame in enumerate(frames):
-        ids, away = search(frame.descriptors)
+        ids, squared = search(frame.descriptors)
         rows = np.flatnonzero(ids[:, 0] >= 0)
         matches = FrameMatches(rows, ids[rows, 0])
         right.append(right_matches(frame, matches, tracks.positions_of(matches.landmarks)))
-        distances.append(away[rows, :2].astype(np.float64))
+        distances.append(squared[rows, :2].astype(np.float64))
         number.append(np.full(len(rows), i))
     return LabelledMatches(np.concatenate(distances), np.concatenate(right), np.concatenate(number))
 
 
 def fit_calibration(sequences: Sequence[LabelledMatches]) -> MatchCalibration:
-    """The calibration that fits the matches of some sequences best, each sequence counting alike.
+    """The calibration that fits the matches of sequences best, each with the same weight.
 
     Raises:
         ValueError: no match is right, or all are.
@@ -75,7 +74,7 @@ def fit_calibration(sequences: Sequence[LabelledMatches]) -> MatchCalibration:
 def held_out_frames(
     tracks: Tracks, frames: int = FRAMES, seed: int = 0
 ) -> tuple[NDArray[np.int64], list[QueryFrame]]:
-    """Rows of the observations that build a map, and frames to query it with.
+    """Keypoint rows that build a map, and frames to query it with.
 
     A random tenth of the keyframes are queries, as in `protomark evaluate`.
 
@@ -89,7 +88,7 @@ def held_out_frames(
 def matches_by_dim(
     encoder: pm.Encoder, tracks: Tracks, frames: int = FRAMES, seed: int = 0, threads: int = 1
 ) -> dict[int, LabelledMatches]:
-    """Matches with maps of `tracks` by each length of the encoder's codes."""
+    """Matches with maps of `tracks`, by code length."""
     tracks = tracks_for(encoder, tracks)
     rows, queries = held_out_frames(tracks, frames, seed)
     codes = encoder.encode(tracks.descriptors[rows], threads=threads)
@@ -103,15 +102,15 @@ def matches_by_dim(
 
 @dataclass(frozen=True)
 class CalibrationQuality:
-    """How well a calibration fits one sequence that it was not fitted to (or was the only one).
+    """How well a calibration fits a sequence to which it was not fitted, unless it is the only one.
 
     Attributes:
-        sequence: its name.
-        dim: length of a code.
+        sequence: name of the sequence.
+        dim: code length.
         right: share of keypoints whose nearest landmark is right.
-        precision: share of right matches among those accepted.
+        precision: share of accepted matches that are right.
         recall: share of right matches that are accepted.
-        expected: mean probability of the accepted ones, to compare with `precision`.
+        expected: mean probability of accepted matches, to compare with `precision`.
     """
 
     sequence: str
@@ -121,15 +120,11 @@ class CalibrationQuality:
     recall: float
     expected: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """As JSON values."""
-        return asdict(self)
-
 
 def measure_calibration(
     sequence: str, dim: int, calibration: MatchCalibration, matches: LabelledMatches
 ) -> CalibrationQuality:
-    """How well a calibration predicts which matches of one sequence are right."""
+    """Measure how well a calibration predicts which matches of a sequence are right."""
     probability = calibration.probability(matches.distances)
     accepted = probability >= MIN_PROBABILITY
     right = matches.right[accepted]
@@ -146,13 +141,13 @@ def measure_calibration(
 def calibrate(
     encoder: pm.Encoder, paths: Sequence[Path], threads: int = 1, progress: Progress = silent
 ) -> tuple[pm.Encoder, list[CalibrationQuality]]:
-    """The encoder with a match calibration, and how well that fits each sequence.
+    """Fit the match calibration of an encoder, and measure it on each sequence.
 
-    The quality on each sequence is of a fit to the others, where there are any.
+    The quality on a sequence is that of a fit to the others, if there are any.
 
     Args:
         encoder: the encoder.
-        paths: tracks files of its descriptor (of the plain one, if it is an upright encoder).
+        paths: tracks files of its plain descriptor.
         threads: threads to encode and search on.
         progress: called with each file.
 
@@ -163,7 +158,7 @@ def calibrate(
     for path in tracked(paths, progress, "query maps"):
         name = sequence_name(path)
         if name in found:
-            raise ValueError(f"{path}: two files are of the sequence {name}")
+            raise ValueError(f"{path}: two files are of the sequence {name}, give one of them")
         tracks = Tracks.load(path)
         try:
             found[name] = matches_by_dim(encoder, tracks, threads=threads)

@@ -1,6 +1,6 @@
 """The encoder as a floating-point network: fully connected layers with SELU in between.
 
-Inputs are bits as -1 and +1, which keeps them centred for the self-normalising activation.
+Inputs are bits as -1 and +1, so that they are centred for the self-normalising activation.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-MAX_WEIGHT_BYTES = 600_000
-"""An encoder that ships is at most this large; one int8 weight is one byte."""
+from protomark.features.descriptors import unpack_bits
 
+# Limit on the int8 weights of an encoder that ships.
+MAX_WEIGHT_BYTES = 600_000
 _WIDEST = 768
 
 
@@ -26,10 +27,10 @@ def weight_bytes(bits: int, hidden: Sequence[int], dim: int) -> int:
 
 
 def default_hidden(bits: int, dim: int) -> tuple[int, ...]:
-    """One hidden layer, the widest up to 768 units whose int8 weights fit `MAX_WEIGHT_BYTES`.
+    """One hidden layer of up to 768 units whose int8 weights fit into `MAX_WEIGHT_BYTES`.
 
     The paper's funnel (two hidden layers, the second half as wide) fits the training sequences
-    better and unseen ones worse; `docs/training.md` has the figures.
+    better, but others worse.
     """
     width = _WIDEST
     while weight_bytes(bits, (width,), dim) > MAX_WEIGHT_BYTES:
@@ -37,18 +38,13 @@ def default_hidden(bits: int, dim: int) -> tuple[int, ...]:
     return (width,)
 
 
-def unpack_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, B) uint8 -> (n, 8 B) uint8 of 0 and 1; bit i is byte i / 8, bit i % 8, low bit first."""
-    return np.unpackbits(descriptors, axis=1, bitorder="little")
-
-
 class EncoderNetwork(nn.Module):
-    """f: signs (n, bits) float32 of -1 and +1 -> embeddings (n, dim) float32.
+    """Maps signs (n, bits) float32 of -1 and +1 to embeddings (n, dim) float32.
 
     Args:
         bits: length of a descriptor.
         dim: length of an embedding.
-        hidden: widths of the hidden layers; `default_hidden(bits, dim)` if not given.
+        hidden: widths of the hidden layers; None: `default_hidden(bits, dim)`.
     """
 
     def __init__(self, bits: int, dim: int, hidden: Sequence[int] | None = None) -> None:
@@ -60,7 +56,7 @@ class EncoderNetwork(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
-            # LeCun normal: what SELU needs to keep activations at mean 0 and variance 1.
+            # With LeCun's normal weights SELU keeps activations at mean 0 and variance 1.
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
             nn.init.zeros_(layer.bias)
 
@@ -74,7 +70,7 @@ class EncoderNetwork(nn.Module):
 
 
 def to_signs(descriptors: NDArray[np.uint8], device: torch.device | str = "cpu") -> Tensor:
-    """Packed descriptors (n, B) uint8 -> (n, 8 B) float32 of -1 and +1 on `device`."""
+    """Signs (n, 8 B) float32 of packed descriptors (n, B) uint8, on `device`."""
     bits = torch.from_numpy(unpack_bits(np.ascontiguousarray(descriptors))).to(device)
     return bits.to(torch.float32).mul_(2).sub_(1)
 

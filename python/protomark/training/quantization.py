@@ -1,9 +1,9 @@
-"""From the float network to the integer encoder.
+"""Quantises the float network to the integer encoder.
 
-`QuantizedNetwork` computes in floating point what the integer encoder computes, rounding
-included, and passes gradients straight through the roundings; training ends with it in the loop.
-`export` writes the same network as integer layers, and `integer_forward` is the plain NumPy
-rendering of the integer arithmetic that the C++ encoder must equal byte for byte.
+`QuantizedNetwork` computes in floating point what the integer encoder computes, including
+rounding, and passes gradients straight through the rounding; training ends with it in the loop.
+`export` returns the same network as integer layers, and `integer_forward` is a plain NumPy version
+of the integer arithmetic, which the C++ encoder must equal byte for byte.
 
 Weights are int8 with one scale per output. A pre-activation is rounded to 8 bits over a range
 [low, high] of its layer, looked up in a 256-entry table that holds SELU, and comes out as uint8.
@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from protomark.training.network import EncoderNetwork, unpack_bits
+from protomark.features.descriptors import unpack_bits
+from protomark.training.network import EncoderNetwork
 
-_QUANTILE = 0.9999  # ranges cover this share of what the calibration descriptors give
-_FLAT = -5.0  # SELU is flat below; a wider range would only waste steps
+_QUANTILE = 0.9999  # share of the pre-activations of calibration descriptors that ranges cover
+_FLAT = -5.0  # SELU is flat below, so that a wider range would waste steps
 _MAX_MULT = 1 << 30
 
 
@@ -43,7 +44,7 @@ class Layer(TypedDict):
 
 
 def _round(x: Tensor) -> Tensor:
-    """Halves up, as the integer encoder's shift rounds."""
+    """Round halves up, as the integer encoder's shift does."""
     return torch.floor(x + 0.5)
 
 
@@ -56,8 +57,8 @@ def _straight_through(x: Tensor, value: Tensor) -> Tensor:
 class _Activation:
     """SELU between 8-bit pre-activations and 8-bit activations.
 
-    A pre-activation p becomes q = round((p - middle) / step), the activation is table[q + 128],
-    and its real value (table[q + 128] - zero) * unit.
+    A pre-activation p becomes q = round((p - middle) / step), the activation is table[q + 128], and
+    its real value is (table[q + 128] - zero) * unit.
     """
 
     middle: float
@@ -80,12 +81,11 @@ class _Activation:
 class QuantizedNetwork(nn.Module):
     """An `EncoderNetwork` as its integer encoder computes it.
 
-    The parameters are those of the float network, shared, not copied. Ranges are buffers that
-    `calibrate` sets.
+    It shares the parameters of the float network; `calibrate` sets its ranges, which are buffers.
 
     Attributes:
-        low: (hidden layers,) least pre-activation that 8 bits cover, by layer.
-        high: (hidden layers,) greatest.
+        low: (hidden layers,) smallest pre-activation that 8 bits cover, by layer.
+        high: (hidden layers,) largest pre-activation that 8 bits cover, by layer.
         scale: real value of one code unit.
     """
 
@@ -104,7 +104,7 @@ class QuantizedNetwork(nn.Module):
 
     @torch.no_grad()
     def calibrate(self, signs: Tensor) -> None:
-        """Set ranges and code scale by what the float network makes of `signs` (n, bits)."""
+        """Set ranges and code scale by the float network's activations for `signs` (n, bits)."""
         x = signs
         *hidden, last = self.network.layers
         for i, layer in enumerate(hidden):
@@ -120,9 +120,9 @@ class QuantizedNetwork(nn.Module):
         return _Activation.between(self.low[layer], self.high[layer])
 
     def forward(self, signs: Tensor) -> Tensor:
-        """Embeddings (n, dim) float32: whole codes times `scale`."""
-        # x is the layer's integer input less its zero point. It and the weights have at most 8
-        # bits and a sign, which bfloat16 holds exactly, so this may run under autocast.
+        """Embeddings (n, dim) float32: integer codes times `scale`."""
+        # x is the layer's integer input minus its zero point. It and the weights have at most 8
+        # bits and a sign, which bfloat16 represents exactly, so this may run under autocast.
         x, unit, zero = signs / 2, 2.0, 0.5
         for i, layer in enumerate(self.network.layers):
             weights, bias, real = _whole_numbers(layer, unit, zero, self._activation(i))
@@ -171,8 +171,8 @@ def _whole_numbers(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Weights (out, in) and bias (out,) as whole numbers, and the real value of their unit (out,).
 
-    The layer's inputs are (x - zero) * unit for whole x, and `activation.middle` is taken off its
-    outputs: (weights @ x + bias) * real = layer((x - zero) * unit) - middle, but for rounding.
+    Inputs are (x - zero) * unit for whole x, and `activation.middle` is subtracted from outputs: up
+    to rounding, (weights @ x + bias) * real = layer((x - zero) * unit) - middle.
     """
     assert isinstance(layer, nn.Linear)
     scale = layer.weight.detach().abs().amax(1).clamp_min(1e-8) / 127
@@ -194,8 +194,8 @@ def integer_forward(layers: list[Layer], descriptors: NDArray[np.uint8]) -> NDAr
     """Codes (n, dim) int8 of packed descriptors (n, B) uint8, in exact integer arithmetic.
 
     Args:
-        layers: as `QuantizedNetwork.export` gives them.
-        descriptors: bit i of a descriptor is byte i / 8, bit i % 8, least significant first.
+        layers: layers that `QuantizedNetwork.export` returned.
+        descriptors: (n, B) uint8; bit i of a descriptor is bit i % 8 of byte i / 8, lowest first.
     """
     x = unpack_bits(descriptors)
     for layer in layers:
@@ -207,4 +207,4 @@ def integer_forward(layers: list[Layer], descriptors: NDArray[np.uint8]) -> NDAr
             codes: NDArray[np.int8] = np.clip(t, -127, 127).astype(np.int8)
             return codes
         x = layer["table"][np.clip(t, -128, 127) + 128]
-    raise ValueError("the last layer has a table; an encoder ends with a layer without one")
+    raise ValueError("the last layer has a table, but an encoder ends with a layer without one")

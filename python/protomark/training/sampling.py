@@ -1,7 +1,7 @@
-"""Batches of landmarks for training, drawn from tracks.
+"""Draws batches of landmarks for training from tracks.
 
-A batch holds landmarks of one sequence, as confusions live within a scene. Sequences are drawn by
-a power of their size, so that a long one does not drown the others.
+A batch holds landmarks of one sequence, as a map confuses landmarks of one scene. Sequences are
+drawn with a probability that is a power of their size, so that a long one does not dominate.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Views:
 
     @classmethod
     def from_tracks(cls, tracks: Tracks, name: str) -> Views:
-        """The observations of `tracks`; landmarks without one are left out."""
+        """The observations of `tracks`, without landmarks that have none."""
         rows = tracks.observations
         landmarks = tracks.landmark_of_keypoint[rows]
         order = np.argsort(landmarks, kind="stable")
@@ -50,11 +50,11 @@ class Views:
 
 @dataclass(frozen=True)
 class Batch:
-    """Views of some landmarks.
+    """The views of a batch's landmarks.
 
     Attributes:
         descriptors: (n, B) uint8, grouped by landmark.
-        landmarks: (n,) int64, 0..m-1 ascending.
+        landmarks: (n,) int64, 0..m-1, ascending.
         queries: (q,) int64, rows whose landmark has at least two other views in the batch.
     """
 
@@ -72,8 +72,8 @@ def random_views(
     """Up to `limit` random views of each landmark.
 
     Returns:
-        rows (n,) int64 of `views.descriptors`, group (n,) int64 as positions in `landmarks`
-        (ascending), rank (n,) int64 of each row within its group, random.
+        Rows (n,) int64 of `views.descriptors`; their groups (n,) int64, ascending indices into
+        `landmarks`; the random rank (n,) int64 of each row in its group.
     """
     counts = views.counts[landmarks]
     group = np.repeat(np.arange(len(landmarks)), counts)
@@ -89,12 +89,12 @@ class BatchSampler:
     """Draws batches from several sequences.
 
     Args:
-        sequences: at least one, each with landmarks of 3 or more views.
-        landmarks: landmarks in a batch.
-        views: at most this many views of a landmark.
-        queries: at most this many queries of a landmark.
-        balance: sequences are drawn with probability proportional to (number of landmarks with 3
-            or more views) ** balance: 0 draws all alike, 1 draws all landmarks alike.
+        sequences: one or more sequences, each with landmarks of 3 or more views.
+        landmarks: landmarks per batch.
+        views: limit on views per landmark.
+        queries: limit on queries per landmark.
+        balance: the probability of a sequence is proportional to (number of landmarks with 3 or
+            more views) ** balance: 0 favours no sequence, 1 favours no landmark.
         noise: probability that a bit is flipped.
     """
 
@@ -116,13 +116,13 @@ class BatchSampler:
         self.probability = weight / weight.sum()
 
     def choose(self, sequence: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The landmarks of a batch, (m,) int64, distinct: here at random."""
+        """Distinct random landmarks (m,) int64 for a batch."""
         views = self.sequences[sequence]
         size = min(self.landmarks, len(views))
         return rng.choice(len(views), size, replace=False, shuffle=False)
 
     def sample(self, rng: np.random.Generator) -> Batch:
-        """One batch; the same state of `rng` gives the same batch."""
+        """Draw a batch; the same state of `rng` yields the same batch."""
         sequence = int(rng.choice(len(self.sequences), p=self.probability))
         views = self.sequences[sequence]
         chosen = self.choose(sequence, rng)

@@ -1,8 +1,8 @@
-"""The training loop: batches of landmarks in, the integer encoder's weights out.
+"""Trains the weights of the integer encoder on batches of landmarks.
 
-The first part of the steps trains the float network; then quantisation enters the loop. Every
-`validate_every` steps the precision on validation tracks is measured and a checkpoint is written;
-the model kept is the one whose quantised network was best.
+The first steps train the float network; then quantisation enters the loop. Every `validate_every`
+steps the precision on validation tracks is measured and a checkpoint is written; the result is the
+quantised network with the best precision.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from protomark.files import replacing
-from protomark.interrupt import deferred_interrupt
+from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.training.loss import PrototypeLoss
 from protomark.training.network import EncoderNetwork, embed, to_signs
 from protomark.training.quantization import QuantizedNetwork
@@ -32,23 +32,23 @@ CHECKPOINT_VERSION = 1
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """What determines the weights, besides the data.
+    """Options that determine the weights, besides the data.
 
     Attributes:
-        dims: prefixes trained to serve alone, ascending; the last is the embedding's length.
-        hidden: widths of the hidden layers, or None for `default_hidden`.
-        steps: batches in all.
-        landmarks: landmarks in a batch.
-        views: at most this many views of a landmark in a batch.
-        queries: at most this many of them are queries.
+        dims: ascending prefixes that are trained to work alone; the last is the full length.
+        hidden: widths of the hidden layers; None: `default_hidden`.
+        steps: number of batches.
+        landmarks: landmarks per batch.
+        views: limit on views per landmark in a batch.
+        queries: limit on queries per landmark in a batch.
         balance: see `BatchSampler`.
         noise: probability that a bit is flipped.
-        learning_rate: peak rate of Adam, reached after a warm-up, then falling as a cosine.
-        weight_decay: of AdamW.
+        learning_rate: peak rate of AdamW after a warm-up, from which it falls as a cosine.
+        weight_decay: weight decay of AdamW.
         clip: largest norm of the gradient.
-        quantized_share: this last part of the steps has quantisation in the loop.
+        quantized_share: share of the steps, the last ones, with quantisation in the loop.
         validate_every: steps between validations and checkpoints.
-        seed: of weights and batches.
+        seed: seed of weights and batches.
     """
 
     dims: tuple[int, ...] = (8, 16, 24, 32, 48, 64)
@@ -67,7 +67,7 @@ class TrainingOptions:
     seed: int = 0
 
     def check(self) -> None:
-        """Raise ValueError, naming the option, if a value makes no sense."""
+        """Raise ValueError if an option is invalid."""
         if not self.dims or list(self.dims) != sorted(set(self.dims)) or self.dims[0] < 1:
             raise ValueError(f"dims {self.dims} must be positive and ascending, as in 8,16,32")
         if self.dims[-1] > 255:
@@ -86,9 +86,9 @@ class TrainingOptions:
         return self.steps - max(round(self.steps * self.quantized_share), 1)
 
     def trained_dims(self, step: int) -> tuple[int, ...]:
-        """The prefixes in the loss of a step: with more than three, every other one in turn.
+        """The prefixes in the loss of a step: of more than three, every other one in turn.
 
-        The loss costs as much as the network, for each prefix; neighbours train each other.
+        For each prefix the loss costs as much as the network, and neighbours train each other.
         """
         if len(self.dims) <= 3:
             return self.dims
@@ -105,13 +105,13 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class ValidationStep:
-    """What one validation found.
+    """The result of a validation.
 
     Attributes:
-        step: steps done.
-        steps: steps in all.
+        step: number of finished steps.
+        steps: number of all steps.
         loss: mean training loss since the last validation.
-        precision: validation precision by dimension, of the network as it is in the loop.
+        precision: precision by code length, of the network in the loop.
         quantized: whether quantisation is in the loop.
         seconds: training time so far, over all runs.
     """
@@ -125,27 +125,19 @@ class ValidationStep:
 
     @property
     def mean_precision(self) -> float:
-        """Mean over the dimensions; what picks the model."""
+        """Mean precision over code lengths, which selects the model."""
         return sum(self.precision.values()) / len(self.precision)
-
-
-class TrainingInterrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
-    """Training was stopped by Ctrl-C after a whole step; the checkpoint is written."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__(f"stopped after step {step}")
-        self.step = step
 
 
 class Trainer:
     """Trains one encoder.
 
     Args:
-        sequences: training views, all of one descriptor length; see `data.load_training`.
+        sequences: training sequences, see `data.load_training`.
         trials: validation splits.
-        options: see `TrainingOptions`.
-        checkpoint: file to write checkpoints to, None for none.
-        fingerprint: of the data, so that a checkpoint is not continued with other data.
+        options: options that determine the weights.
+        checkpoint: file of the checkpoint, None for none.
+        fingerprint: digest of the data, so that no checkpoint is resumed with other data.
         device: "cpu" or "cuda".
         half: whether matrix products run in bfloat16.
     """
@@ -200,14 +192,14 @@ class Trainer:
         self._losses: list[float] = []
 
     def run(self, report: Callable[[int, float, ValidationStep | None], None]) -> None:
-        """Train to the end; afterwards `quantized` holds the best model.
+        """Train to the end; then `quantized` holds the best model.
 
         Args:
-            report: called after every step with the steps done, the loss, and a `ValidationStep` if
-                validation ran.
+            report: called after every step with the number of finished steps, the loss, and a
+                `ValidationStep` if there was a validation.
 
         Raises:
-            TrainingInterrupted: Ctrl-C was pressed.
+            Interrupted: Ctrl-C was pressed; the checkpoint is written.
             ValueError: the loss is no longer finite.
         """
         options = self.options
@@ -227,12 +219,15 @@ class Trainer:
                 report(self.step, loss, progress)
                 if interrupted() and self.step < options.steps:
                     self.save_checkpoint()
-                    raise TrainingInterrupted(self.step)
+                    raise Interrupted(
+                        f"stopped after step {self.step}; the same command with --resume "
+                        f"continues ({self.checkpoint})"
+                    )
         self.quantized.load_state_dict(self.best_state)
 
     def _train_step(self) -> float:
         options = self.options
-        # A generator for each step, so that a resumed run needs no generator state.
+        # Each step has a generator of its own, so that resuming needs no generator state.
         batch = self.sampler.sample(np.random.default_rng([options.seed, self.step]))
         for group in self.optimizer.param_groups:
             group["lr"] = options.rate(self.step)
@@ -252,7 +247,7 @@ class Trainer:
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ValueError(
-                f"the loss is {value} at step {self.step}; train with a smaller learning rate"
+                f"the loss is {value} at step {self.step}: train with a smaller learning rate"
             )
         self.optimizer.step()
         self._losses.append(value)
@@ -285,7 +280,7 @@ class Trainer:
         return progress
 
     def save_checkpoint(self) -> None:
-        """Write the checkpoint, whole or not at all."""
+        """Write the checkpoint atomically."""
         if self.checkpoint is None:
             return
         state = {
@@ -311,28 +306,28 @@ class Trainer:
 
         Raises:
             FileNotFoundError: there is no checkpoint.
-            ValueError: it is broken, or of other data or options.
+            ValueError: the checkpoint is broken, or of other data or options.
         """
         path = self.checkpoint
         if path is None or not path.is_file():
-            raise FileNotFoundError(f"{path}: no checkpoint to resume; run without --resume")
+            raise FileNotFoundError(f"{path}: no checkpoint to resume, train without --resume")
         try:
             state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
         except Exception as error:
             raise ValueError(
-                f"{path}: not a checkpoint, or a broken one; delete it and train anew"
+                f"{path}: not a checkpoint, or a broken one: delete it and train anew"
             ) from error
         if state.get("version") != CHECKPOINT_VERSION:
-            raise ValueError(f"{path}: checkpoint of another version; delete it and train anew")
+            raise ValueError(f"{path}: checkpoint of another version: delete it and train anew")
         if state["fingerprint"] != self.fingerprint:
             raise ValueError(
-                f"{path}: checkpoint of other tracks; give the same ones, or train without --resume"
+                f"{path}: checkpoint of other tracks: give the same ones, or train without --resume"
             )
         for name, value in asdict(self.options).items():
             if state["options"].get(name) != value:
                 raise ValueError(
-                    f"{path}: checkpoint was made with {name} {state['options'].get(name)}, "
-                    f"not {value}; give the same, or train anew without --resume"
+                    f"{path}: the checkpoint was made with {name} {state['options'].get(name)}, "
+                    f"not {value}: give the same, or train without --resume"
                 )
         self.step = state["step"]
         self.seconds = state["seconds"]
@@ -347,10 +342,10 @@ class Trainer:
 
 
 def keep_freed_memory() -> None:
-    """Tell glibc to keep large freed blocks instead of returning them to the system.
+    """Make glibc retain large freed blocks instead of returning them to the system.
 
-    Each step allocates the same large matrices; getting their pages anew costs up to half of a
-    step on a CPU. Does nothing where the C library is another.
+    Each step allocates the same large matrices, and allocating their pages anew takes up to half of
+    a step on a CPU. With another C library this does nothing.
     """
     m_trim_threshold, m_mmap_max = -1, -4
     try:

@@ -1,4 +1,4 @@
-"""Precision on validation tracks by the paper's protocol, with float or integer prototypes."""
+"""Measures precision by the paper's protocol, with float or integer prototypes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Embed = Callable[[NDArray[np.uint8]], NDArray[np.floating] | NDArray[np.int8]]
 
 @dataclass(frozen=True)
 class Trial:
-    """Support and queries of one sequence and seed, ready to be embedded.
+    """Support and queries of a sequence at a seed.
 
     Attributes:
         name: name of the sequence.
         support: (n, B) uint8, grouped by landmark.
         starts: (l,) int64, first row of each landmark in `support`.
         queries: (q, B) uint8.
-        targets: (q,) int64, the queries' landmarks, 0..l-1.
+        targets: (q,) int64, landmarks of the queries, 0..l-1.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Trial:
     def from_tracks(
         cls, tracks: Tracks, name: str, seed: int = 0, max_queries: int = 10_000
     ) -> Trial:
-        """One random 90/10 split of the keyframes.
+        """A random 90/10 split of the keyframes.
 
         Raises:
             ValueError: the tracks are too few or too short.
@@ -64,9 +64,9 @@ class Trial:
 
 
 def precision(trial: Trial, embed: Embed, dims: Sequence[int]) -> dict[int, float]:
-    """Share of queries whose nearest prototype is their own landmark's, for each prefix in `dims`.
+    """Share of queries whose nearest prototype is their landmark's, for each prefix in `dims`.
 
-    int8 codes are compared with means rounded to int8, as a map does; floats with exact means.
+    int8 codes are compared with means rounded to int8, as in a map; floats with exact means.
     """
     support, queries = embed(trial.support), embed(trial.queries)
     counts = np.diff(np.append(trial.starts, len(support)))
@@ -83,7 +83,7 @@ def _share_right(
 ) -> float:
     norms = (prototypes**2).sum(1)
     right = 0
-    # Whole numbers up to 2^24 are exact in float32, so integer codes are compared exactly here.
+    # Integer codes are compared exactly, as whole numbers up to 2^24 are exact in float32.
     for i in range(0, len(queries), 512):
         distances = norms - (2 * queries[i : i + 512]) @ prototypes.T
         right += int((distances.argmin(1) == targets[i : i + 512]).sum())

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from protomark.geometry.similarity import align, trajectory_error
+from protomark_bench.trajectory import align, trajectory_error
 
 
 def random_similarity(rng):
@@ -61,7 +61,7 @@ def test_error_of_known_offsets():
     ("estimated", "true", "say"),
     [
         (np.zeros((2, 3)), np.zeros((2, 3)), "at least three"),
-        (np.zeros((5, 3)), np.ones((5, 3)), "one place"),
+        (np.zeros((5, 3)), np.ones((5, 3)), "same position"),
         (np.zeros((5, 3)), np.ones((4, 3)), "shape"),
     ],
 )

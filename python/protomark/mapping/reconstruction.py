@@ -1,0 +1,58 @@
+"""A map in the making as a COLMAP reconstruction: to adjust it, and to write it as a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from protomark.files import replacing_folder
+from protomark.geometry.colmap import new_reconstruction, pycolmap, quiet
+from protomark.mapping.structure import Observations, Structure
+
+
+def to_reconstruction(structure: Structure, frames: Sequence[int], seen: Observations) -> Any:
+    """A `pycolmap.Reconstruction` of frames and their observations.
+
+    Image ids are frame indices plus one, and point ids are landmark ids.
+
+    Args:
+        structure: frames and landmarks.
+        frames: indices of the frames, ascending.
+        seen: observations of these frames; an image has no other keypoints.
+    """
+    cameras = {
+        i: structure.cameras[i] for i in sorted({structure.frames[i].camera_id for i in frames})
+    }
+    index = np.empty(len(seen.frames), np.int64)
+    images = []
+    for i in frames:
+        frame, rows = structure.frames[i], np.flatnonzero(seen.frames == i)
+        index[rows] = np.arange(len(rows))
+        keypoints = frame.keypoints[seen.rows[rows]]
+        images.append((i + 1, frame.name, frame.camera_id, keypoints, frame.pose))
+    reconstruction = new_reconstruction(cameras, images)
+    # Access through the reconstruction takes longer than everything else per observation.
+    by_id = {i + 1: reconstruction.images[i + 1] for i in frames}
+    order = np.argsort(seen.landmarks, kind="stable")
+    ids, starts = np.unique(seen.landmarks[order], return_index=True)
+    image_ids, index = (seen.frames[order] + 1).tolist(), index[order].tolist()
+    ends = [*starts[1:].tolist(), len(image_ids)]
+    for landmark, a, b in zip(ids.tolist(), starts.tolist(), ends, strict=True):
+        elements = [pycolmap.TrackElement(image_ids[k], index[k]) for k in range(a, b)]
+        point = pycolmap.Point3D(xyz=structure.positions[landmark], track=pycolmap.Track(elements))
+        reconstruction.add_point3D_with_id(landmark, point)
+        for k in range(a, b):
+            by_id[image_ids[k]].set_point3D_for_point2D(index[k], landmark)
+    return reconstruction
+
+
+def write_model(structure: Structure, folder: Path) -> None:
+    """Write a COLMAP sparse model (binary) whose 3D point ids are the landmark ids."""
+    frames = range(len(structure.frames))
+    reconstruction = to_reconstruction(structure, frames, structure.observations(frames))
+    with quiet(), replacing_folder(folder) as temporary:
+        reconstruction.update_point_3d_errors()
+        reconstruction.write(str(temporary))
