@@ -1,13 +1,9 @@
 // What a file holds, and whether it is whole.
 #pragma once
 
-#include <cstddef>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/types.h"

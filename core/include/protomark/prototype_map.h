@@ -1,15 +1,8 @@
 // The learning map: exact prototypes of landmarks under any history of changes.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/search.h"

@@ -1,7 +1,7 @@
 // AVX2: x86 since Haswell and Zen.
 #include <immintrin.h>
 
-#include "kernels/generic.h"
+#include "kernels/generic_search.h"
 
 namespace protomark::kernels {
 namespace {
@@ -43,7 +43,7 @@ struct Avx2 : ByPairs<Avx2, 32> {
     return (Ints)_mm256_sra_epi32(upper, _mm_cvtsi32_si128(shift - 32));
   }
   // Looks bytes up in 256 entries, 16 at a time: in step k of each half, only bytes that are not
-  // negative after 16 k was taken away choose an entry. Entries are stored as differences to those
+  // negative after subtracting 16 k choose an entry. Entries are stored as differences from those
   // 16 before, so that the steps up to the right one add up to it.
   class Table {
    public:
