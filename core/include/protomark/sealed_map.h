@@ -27,8 +27,7 @@ class PROTOMARK_API SealedMap {
   const std::shared_ptr<const Encoder>& encoder() const;
   const Metadata& metadata() const;
   std::size_t dim() const;
-  // Number of landmarks.
-  std::size_t size() const;
+  std::size_t size() const;  // number of landmarks
   std::size_t prototype_count() const;
   // Bits per number of a prototype: 8 or 4.
   int code_bits() const;

@@ -125,7 +125,6 @@ class IdIndex {
   std::uint64_t seed_ = hash_seed();
 };
 
-// A set of landmark ids.
 class IdSet {
  public:
   bool empty() const { return ids_.empty(); }

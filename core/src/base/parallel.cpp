@@ -13,7 +13,7 @@
 namespace protomark {
 namespace {
 
-// Threads stay once started, so that a mistyped number must not start thousands.
+// Threads stay once started; a mistyped number must not start thousands.
 constexpr std::size_t kMaxThreads = 256;
 
 thread_local bool inside_task = false;

@@ -1,4 +1,4 @@
-// Loops that share their work among the threads of one pool.
+// Loops whose work the threads of one pool share.
 #pragma once
 
 #include <algorithm>

@@ -25,7 +25,7 @@ constexpr std::size_t kMaxLayers = 16;
 
 // Descriptors that go through the network together, at most: activations stay in the L2 cache.
 constexpr std::size_t kBatch = 512;
-// Threads take multiples of so many descriptors.
+// Threads take multiples of this many descriptors.
 constexpr std::size_t kGrain = 64;
 
 struct Field {

@@ -4,7 +4,6 @@
 #include <bit>
 
 #include "file/sections.h"
-#include "protomark/types.h"
 
 namespace protomark {
 namespace {

@@ -13,7 +13,6 @@
 #include <utility>
 
 #include "file/sections.h"
-#include "protomark/types.h"
 
 namespace protomark {
 namespace {

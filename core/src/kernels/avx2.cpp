@@ -114,10 +114,10 @@ struct Avx2 : ByPairs<Avx2, 32> {
     }
   }
   static unsigned near_words(const Words& counts, std::int32_t limit) {
-    const __m256i most = _mm256_set1_epi64x(limit);
+    const __m256i limits = _mm256_set1_epi64x(limit);
     const auto far = [&](auto half) {
       return static_cast<unsigned>(
-          _mm256_movemask_pd((__m256d)_mm256_cmpgt_epi64((__m256i)half, most)));
+          _mm256_movemask_pd((__m256d)_mm256_cmpgt_epi64((__m256i)half, limits)));
     };
     return 0xff ^ (far(counts.v[0]) | far(counts.v[1]) << 4);
   }

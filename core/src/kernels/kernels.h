@@ -36,9 +36,9 @@ struct Hit {
 
 // Queries that a scan takes at a time, so that they share its loads.
 inline constexpr std::size_t kScanQueries = 16;
-// Up to so many queries a scan computes the biases itself, which costs less than reading them.
+// Up to this many queries a scan computes the biases itself, which costs less than reading them.
 inline constexpr std::size_t kFewQueries = 4;
-// A scan pauses after so many hits, so that the caller can tighten the limits. Its last step may
+// A scan pauses after this many hits, so that the caller can tighten the limits. Its last step may
 // exceed that by what kScanQueries queries can hit in 64 rows.
 inline constexpr std::size_t kHitsEnough = 64;
 inline constexpr std::size_t kHitRoom = kHitsEnough + kScanQueries * 64;

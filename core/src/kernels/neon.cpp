@@ -128,9 +128,9 @@ struct Neon {
     }
   }
   static unsigned near_words(const Words& counts, std::int32_t limit) {
-    const int64x2_t most = vdupq_n_s64(limit);
+    const int64x2_t limits = vdupq_n_s64(limit);
     const auto near = [&](int i) {
-      return vmovn_u64(vcleq_s64(vreinterpretq_s64_u64(counts.v[i]), most));
+      return vmovn_u64(vcleq_s64(vreinterpretq_s64_u64(counts.v[i]), limits));
     };
     const uint32x4_t none = vdupq_n_u32(0);
     return bits_of(vcombine_u32(near(0), near(1)), vcombine_u32(near(2), near(3)), none, none);

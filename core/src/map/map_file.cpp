@@ -31,7 +31,7 @@ void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::
     return "'" + e.info().name + "' (identity " + e.identity().substr(0, 12) + ")";
   };
   invalid(map, ": it was made with encoder ", describe(encoder), ", not with ", describe(expected),
-          ": use the map's own encoder, or build the map with the other");
+          ": use the map's encoder, or build the map with the other");
 }
 
 void expect_descriptor(const Encoder& encoder, const std::string& descriptor,

@@ -21,7 +21,7 @@ std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
 void add_metadata(ContainerWriter& file, const Metadata& metadata);
 Metadata read_metadata(const ContainerReader& file);
 // Returns the metadata of a map after merging another one into it (PrototypeMap::merge_map). Throws
-// std::invalid_argument if these are too many.
+// std::invalid_argument if there are too many.
 Metadata merged(const Metadata& into, const Metadata& other);
 // Returns the centroids of inverted lists (nlist x dim); none without an index.
 std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim);

@@ -7,7 +7,6 @@
 
 #include "base/id_index.h"
 #include "base/parallel.h"
-#include "base/text.h"
 #include "map/map_state.h"
 
 namespace protomark {
@@ -135,11 +134,11 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
   struct Difference {
     std::int64_t id;
     std::uint16_t appearance;
-    int count = 0;
+    int count;
     std::vector<int> sum;
   };
-  std::unordered_map<std::uint32_t, std::size_t> of_row;
   std::vector<Difference> differences;
+  std::unordered_map<std::uint32_t, std::size_t> of_row;
   const auto never_added = [](std::int64_t id) {
     invalid("descriptors to subtract from landmark ", id, " were never added to it");
   };
@@ -153,8 +152,8 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
     for (std::size_t d = 0; d < dim; ++d) difference.sum[d] += codes.row(i)[d];
     ++difference.count;
   }
-  for (const auto& [value, index] : of_row) {
-    const Row row{value};
+  for (const auto& [row_value, index] : of_row) {
+    const Row row{row_value};
     const Difference& difference = differences[index];
     const int left = store.count(row) - difference.count;
     if (left < 0) {

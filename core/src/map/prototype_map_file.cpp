@@ -278,7 +278,7 @@ void PrototypeMap::save(const std::filesystem::path& path) const {
   std::error_code error;
   // Another name of the same file (a hard link) counts as another file.
   if (std::filesystem::canonical(path, error) == state_->journaled && !error) {
-    const std::scoped_lock lock_of_journal(state_->journal_mutex);
+    const std::scoped_lock lock(state_->journal_mutex);
     if (state_->journal) return state_->fold();
   }
   const std::shared_lock lock(state_->changing);
@@ -298,7 +298,7 @@ PrototypeMap PrototypeMap::load(const std::filesystem::path& path, bool journal)
 }
 
 bool PrototypeMap::has_journal() const {
-  const std::scoped_lock lock_of_journal(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   return state_->journal != nullptr;
 }
 
@@ -308,7 +308,7 @@ Journal& MapState::need_journal() const {
 }
 
 std::size_t PrototypeMap::commit() {
-  const std::scoped_lock lock_of_journal(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   Journal& journal = state_->need_journal();
   ContainerWriter file = journal.record(FileKind::commit);
   std::vector<std::byte> record;
@@ -338,26 +338,26 @@ std::size_t PrototypeMap::commit() {
 }
 
 void PrototypeMap::compact() {
-  const std::scoped_lock lock_of_journal(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   state_->fold();
 }
 
 void MapState::fold() {
-  Journal& own = need_journal();
+  Journal& of_map = need_journal();
   std::string identity;
   {
     const std::shared_lock lock(changing);
-    file_of(*this).write(own.map(), [&](const std::string& written) {
-      own.fold(written);
+    file_of(*this).write(of_map.map(), [&](const std::string& written) {
+      of_map.fold(written);
       identity = written;
     });
     *store.uncommitted = {};
   }
-  own.restart(identity);
+  of_map.restart(identity);
 }
 
 void PrototypeMap::close() {
-  const std::scoped_lock lock_of_journal(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   const std::unique_lock lock(state_->changing);
   state_->store.uncommitted.reset();
   state_->journal.reset();

@@ -5,7 +5,6 @@
 #include <unordered_map>
 #include <utility>
 
-#include "base/text.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
 

@@ -131,7 +131,7 @@ class RowWriter {
     prototypes_(std::as_bytes(std::span(packed_)));
     packed_.clear();
   }
-  // Writes owners in blocks while there are at least so many words.
+  // Writes owners in blocks while there are at least `least` words.
   void flush_owners(std::size_t least) {
     std::vector<std::uint64_t>& words = packed_owners_.words();
     while (words.size() >= least) {

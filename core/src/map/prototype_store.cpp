@@ -13,7 +13,7 @@
 namespace protomark {
 namespace {
 
-// Adding to a large map mostly waits for memory, so that is prefetched so many observations ahead.
+// Adding to a large map mostly waits for memory: prefetches it this many observations ahead.
 constexpr std::size_t kAhead = 16;
 
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an

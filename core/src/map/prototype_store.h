@@ -65,7 +65,7 @@ class PrototypeStore : public RowTable {
   }
 
   void reserve(std::size_t landmarks, std::size_t rows);
-  // Makes room for so many more landmarks and rows in a change of `changed` rows. Others may read
+  // Makes room for more landmarks and rows in a change of `changed` rows. Others may read
   // meanwhile, as `searching` is held only to swap arrays.
   void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                  FairSharedMutex& searching);

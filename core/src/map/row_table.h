@@ -85,7 +85,8 @@ class RowTable {
 
   // Bytes per row as in a file, so that equal maps have the same.
   std::size_t row_bytes() const;
-  // Calls visit(array, size, padding) for each array, with the size for so many landmarks and rows.
+  // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
+  // and rows.
   template <typename Visit>
   void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
     if (!several_) landmarks = rows;

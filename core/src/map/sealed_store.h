@@ -14,7 +14,7 @@ struct SealFormat {
 // std::invalid_argument, which names the smallest possible number, if that is too small.
 SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark);
 
-// Returns the bytes that prototypes, their number and the counts of so many landmarks take.
+// Returns the bytes that prototypes, their number and the counts of landmarks take.
 std::size_t sealed_bytes(std::size_t landmarks, std::size_t rows, std::size_t dim, int bits);
 
 // Returns the bits of a row's owner, which is a landmark or, for padding, the number of landmarks.

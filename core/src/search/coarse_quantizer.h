@@ -21,7 +21,7 @@ class CoarseQuantizer {
   // Returns a number of lists with which the index takes at most 4 bytes per prototype, both in a
   // learning map, where a row takes `row_bytes`, and in a sealed one.
   static std::size_t default_nlist(std::size_t prototypes, std::size_t dim, std::size_t row_bytes);
-  // Returns how many prototypes suffice to learn so many lists.
+  // Returns how many prototypes suffice to learn this many lists.
   static std::size_t sample_size(std::size_t nlist) { return 48 * nlist; }
 
   std::size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }

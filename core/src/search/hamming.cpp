@@ -91,8 +91,8 @@ Matches hamming_search(Descriptors queries, Descriptors database, std::size_t k,
                                          std::min(bits, options.max_distance.value_or(bits)));
   Neighbours nearest(k, limits);
   run_search(options.threads, Division::of_rows(options.threads, queries.rows, database.rows),
-             database.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
-               scan({queries.row(some.begin), some.size(), queries.columns}, database, rows,
+             database.rows, nearest, [&](Range range, Range rows, Neighbours& part) {
+               scan({queries.row(range.begin), range.size(), queries.columns}, database, rows,
                     landmarks, part);
              });
   write_answer(nearest, {}, {}, 0, matches);

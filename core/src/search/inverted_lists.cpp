@@ -13,7 +13,7 @@ constexpr std::size_t kQueries = 1 << 14;
 // Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
 // which, or a nearer one, limits the distance.
 constexpr std::size_t kMinStep = 16, kMaxSampled = 64;
-// Up to so many lists a heap is faster than selection.
+// Up to this many lists a heap is faster than selection.
 constexpr std::size_t kFewProbes = 16;
 // Queries that are compared with centroids together.
 constexpr std::size_t kBatch = 256;
@@ -180,8 +180,8 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
     for (const Range& range : {Range{0, 1}, Range{1, nprobe}}) {
       const std::vector<Visit> visits = sorted_visits(nearest_to, nprobe, range, lists.nlist());
       run_search(options.threads, Division::of_lists(options.threads, visits.size()), visits.size(),
-                 nearest, [&](Range all, Range some, Neighbours& part) {
-                   scan_visits(lists, std::span(visits).subspan(some.begin, some.size()),
+                 nearest, [&](Range all, Range work, Neighbours& part) {
+                   scan_visits(lists, std::span(visits).subspan(work.begin, work.size()),
                                {prototypes, prepared, all, part});
                  });
     }

@@ -7,8 +7,7 @@
 
 namespace protomark {
 
-// A list is a chain of blocks of kPackedRows rows, as kernels scan them, all full but the last one.
-// No block is empty.
+// A list is a chain of blocks of kPackedRows rows, all full but the last one, which is not empty.
 class ListBlocks {
  public:
   static constexpr std::uint32_t kNone = UINT32_MAX;

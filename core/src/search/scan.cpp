@@ -186,8 +186,8 @@ Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::siz
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.neighbours(k, options);
   run_search(options.threads, Division::of_rows(options.threads, queries.rows, prototypes.rows),
-             prototypes.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
-               PrototypeScan(prototypes, prepared, some, part).scan(rows);
+             prototypes.rows, nearest, [&](Range range, Range rows, Neighbours& part) {
+               PrototypeScan(prototypes, prepared, range, part).scan(rows);
              });
   write_answer(nearest, prepared.norms(), options, 0, matches);
   return matches;

@@ -1,8 +1,6 @@
 // Compares queries with packed prototypes.
 #pragma once
 
-#include "kernels/kernels.h"
-#include "protomark/search.h"
 #include "search/driver.h"
 #include "search/packed.h"
 
