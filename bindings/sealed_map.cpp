@@ -9,20 +9,20 @@ namespace protomark::python {
 nb::dict from_summary(const MapSummary& summary) {
   nb::dict result;
   result["observations"] = summary.observations;
-  const auto& counts = summary.landmarks_by_count;
+  const auto& counts = summary.count_histogram;
   result["count_histogram"] = to_numpy(std::vector<std::int64_t>(counts.begin(), counts.end()));
   result["landmarks_with_position"] = summary.landmarks_with_position;
-  result["extent"] = summary.landmarks_with_position == 0
-                         ? nb::none()
-                         : to_numpy(std::vector<Position>{summary.low, summary.high});
+  result["extent"] = nb::none();
+  if (const auto& extent = summary.extent) {
+    result["extent"] = to_numpy(std::vector<Position>(extent->begin(), extent->end()));
+  }
   return result;
 }
 
 void bind_sealed_map(nb::module_& m) {
   nb::class_<SealedMap> map(
       m, "SealedMap",
-      "A map that only answers, mapped from its file. Processes that have it open share its "
-      "memory.");
+      "A map that only answers, mapped from its file into memory that processes share.");
   bind_answers(map);
   map.def("nprobe", &SealedMap::nprobe, "recall"_a, ReleaseGil(),
           "Number of inverted lists that a search with this recall, in (0, 1], visits, as measured "

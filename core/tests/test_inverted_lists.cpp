@@ -8,7 +8,7 @@
 #include <set>
 #include <string>
 
-#include "base/rounded_mean.h"
+#include "base/quantize.h"
 #include "check.h"
 #include "file/container.h"
 #include "protomark/protomark.h"
@@ -142,9 +142,7 @@ void learning() {
     CHECK(quantizer.assign({view.row(i), 1, kDim}, 1)[0] == own[i]);
   // All lists are used, and nearly all codes are in that of the nearest centroid.
   CHECK(std::set(own.begin(), own.end()).size() == 40);
-  std::vector<std::int64_t> nearest(n);
-  std::vector<std::int32_t> distances(n);
-  search_exact(quantizer.packed(), view, {}, {nearest.data(), n, 1}, {distances.data(), n, 1});
+  const std::vector<std::int64_t> nearest = search_exact(quantizer.packed(), view, 1, {}).ids.data;
   std::size_t same = 0;
   for (std::size_t i = 0; i < n; ++i) same += nearest[i] == own[i] ? 1 : 0;
   CHECK(same > n * 98 / 100);

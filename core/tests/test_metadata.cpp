@@ -7,7 +7,7 @@
 #include <iterator>
 #include <memory>
 
-#include "base/utf8.h"
+#include "base/text.h"
 #include "check.h"
 #include "file/container.h"
 #include "file/sections.h"

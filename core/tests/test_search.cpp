@@ -5,7 +5,7 @@
 #include <bit>
 #include <map>
 
-#include "base/sq4.h"
+#include "base/quantize.h"
 #include "check.h"
 #include "protomark/hamming.h"
 #include "random.h"
@@ -38,27 +38,16 @@ std::int64_t squared_distance(const std::int8_t* a, const std::int8_t* b, std::s
   return sum;
 }
 
-struct Answer {
-  std::vector<std::int64_t> ids;
-  std::vector<std::int32_t> distances;
-
-  Answer(std::size_t queries, std::size_t k)
-      : ids(queries * k, 12345), distances(queries * k, -1) {}
-  MatrixView<std::int64_t> ids_view(std::size_t k) { return {ids.data(), ids.size() / k, k}; }
-  MatrixView<std::int32_t> distances_view(std::size_t k) {
-    return {distances.data(), ids.size() / k, k};
+// Counts the neighbours of query q that differ from the expected ones, up to a distance.
+int wrong(const Matches& matches, std::size_t q, const Ranking& expected, std::int64_t limit) {
+  int count = 0;
+  for (std::size_t j = 0; j < matches.ids.columns; ++j) {
+    const bool is_there = j < expected.size() && expected[j].first <= limit;
+    count += matches.ids.row(q)[j] != (is_there ? expected[j].second : -1);
+    count += matches.distances.row(q)[j] != (is_there ? expected[j].first : INT32_MAX);
   }
-  // Places of query q that are not those of `expected`, up to a distance.
-  int wrong(std::size_t q, std::size_t k, const Ranking& expected, std::int64_t limit) const {
-    int count = 0;
-    for (std::size_t j = 0; j < k; ++j) {
-      const bool is_there = j < expected.size() && expected[j].first <= limit;
-      count += ids[q * k + j] != (is_there ? expected[j].second : -1);
-      count += distances[q * k + j] != (is_there ? expected[j].first : INT32_MAX);
-    }
-    return count;
-  }
-};
+  return count;
+}
 
 struct Map {
   std::size_t rows;
@@ -91,9 +80,8 @@ Map random_map(test::Random& random, std::size_t rows, std::size_t dim, bool app
 
 void check_search(const Map& map, const PackedPrototypes& prototypes, Codes queries, std::size_t k,
                   const SearchOptions& options) {
-  Answer answer(queries.rows, k);
-  search_exact(prototypes, queries, options, answer.ids_view(k), answer.distances_view(k));
-  int wrong = 0;
+  const Matches matches = search_exact(prototypes, queries, k, options);
+  int differences = 0;
   for (std::size_t q = 0; q < queries.rows; ++q) {
     Ranking expected = ranking(map.rows, map.row_ids.data(), [&](std::size_t r) {
       return squared_distance(&map.codes[r * map.dim], queries.row(q), map.dim);
@@ -103,9 +91,9 @@ void check_search(const Map& map, const PackedPrototypes& prototypes, Codes quer
           *options.ratio * *options.ratio * static_cast<double>(expected[1].first))) {
       expected.clear();
     }
-    wrong += answer.wrong(q, k, expected, options.max_distance.value_or(INT32_MAX));
+    differences += wrong(matches, q, expected, options.max_distance.value_or(INT32_MAX));
   }
-  CHECK(wrong == 0);
+  CHECK(differences == 0);
 }
 
 void check_codes(test::Random& random, std::size_t rows, std::size_t dim, std::size_t n, int span) {
@@ -152,10 +140,9 @@ void check_prefixes(test::Random& random) {
     for (std::size_t i = 0; i < codes.size(); ++i) codes[i] = value(i);
     for (std::size_t i = 0; i < queries.size(); ++i) queries[i] = value(i);
     const std::vector<CodeVector> packed = pack_codes({codes.data(), kRows, kDim});
-    Answer answer(kQueries, 2);
-    search_exact({packed.data(), kRows, kDim}, {queries.data(), kQueries, kDim}, {},
-                 answer.ids_view(2), answer.distances_view(2));
-    int wrong = 0;
+    const Matches matches =
+        search_exact({packed.data(), kRows, kDim}, {queries.data(), kQueries, kDim}, 2, {});
+    int differences = 0;
     for (std::size_t q = 0; q < kQueries; ++q) {
       Ranking expected;
       for (std::size_t r = 0; r < kRows; ++r) {
@@ -163,9 +150,9 @@ void check_prefixes(test::Random& random) {
                               static_cast<std::int64_t>(r));
       }
       std::partial_sort(expected.begin(), expected.begin() + 2, expected.end());
-      wrong += answer.wrong(q, 2, expected, INT32_MAX);
+      differences += wrong(matches, q, expected, INT32_MAX);
     }
-    CHECK(wrong == 0);
+    CHECK(differences == 0);
   }
 }
 
@@ -196,9 +183,9 @@ void check_hamming(test::Random& random, std::size_t rows, std::size_t bytes, st
   auto database = random.integers<std::uint8_t>(rows * bytes, 0, 3);
   if (rows > 2) std::fill_n(database.begin(), bytes, std::uint8_t{255});
   const auto queries = random.integers<std::uint8_t>(n * bytes, 0, 3);
-  std::vector<std::int64_t> numbers(rows), landmarks(rows);
+  std::vector<std::int64_t> row_ids(rows), landmarks(rows);
   for (std::size_t r = 0; r < rows; ++r) {
-    numbers[r] = static_cast<std::int64_t>(r);
+    row_ids[r] = static_cast<std::int64_t>(r);
     landmarks[r] = random.integer(0, static_cast<std::int64_t>(rows));
   }
   for (int threads = 1; threads <= 4; ++threads) {
@@ -207,16 +194,14 @@ void check_hamming(test::Random& random, std::size_t rows, std::size_t bytes, st
     options.threads = threads;
     if (threads % 2 == 0) options.max_distance = static_cast<std::int32_t>(bytes);
     for (const bool distinct : {false, true}) {
-      Answer answer(n, k);
       const Descriptors all{database.data(), rows, bytes}, some{queries.data(), n, bytes};
-      const Matches matches = distinct ? hamming_search(some, all, landmarks, k, options)
-                                       : hamming_search(some, all, k, options);
-      answer.ids = matches.ids.data;
-      answer.distances = matches.distances.data;
-      int wrong = 0;
+      options.landmarks.reset();
+      if (distinct) options.landmarks = landmarks;
+      const Matches matches = hamming_search(some, all, k, options);
+      int differences = 0;
       for (std::size_t q = 0; q < n; ++q) {
         const Ranking expected =
-            ranking(rows, distinct ? landmarks.data() : numbers.data(), [&](std::size_t r) {
+            ranking(rows, distinct ? landmarks.data() : row_ids.data(), [&](std::size_t r) {
               std::int64_t sum = 0;
               for (std::size_t b = 0; b < bytes; ++b) {
                 sum += std::popcount(
@@ -224,9 +209,9 @@ void check_hamming(test::Random& random, std::size_t rows, std::size_t bytes, st
               }
               return sum;
             });
-        wrong += answer.wrong(q, k, expected, options.max_distance.value_or(INT32_MAX));
+        differences += wrong(matches, q, expected, options.max_distance.value_or(INT32_MAX));
       }
-      CHECK(wrong == 0);
+      CHECK(differences == 0);
     }
   }
 }
@@ -240,10 +225,7 @@ void check_limits() {
     SearchOptions options;
     options.max_distance = max_distance;
     options.ratio = ratio;
-    Answer answer(1, 3);
-    search_exact({packed.data(), 3, 2}, {query.data(), 1, 2}, options, answer.ids_view(3),
-                 answer.distances_view(3));
-    return answer.ids;
+    return search_exact({packed.data(), 3, 2}, {query.data(), 1, 2}, 3, options).ids.data;
   };
   CHECK(ids({}, {}) == Ids{0, 1, 2});
   CHECK(ids(25, {}) == Ids{0, 1, -1});
@@ -281,9 +263,7 @@ int main() {
   // The largest distances.
   check_codes(random, 50, 256, 20, 127);
   const std::vector<std::int8_t> low(packed_size(1, 256), -127), high(256, 127);
-  Answer answer(1, 1);
-  search_exact({low.data(), 1, 256}, {high.data(), 1, 256}, {}, answer.ids_view(1),
-               answer.distances_view(1));
-  CHECK(answer.ids[0] == 0 && answer.distances[0] == 254 * 254 * 256);
+  const Matches matches = search_exact({low.data(), 1, 256}, {high.data(), 1, 256}, 1, {});
+  CHECK(matches.ids.data[0] == 0 && matches.distances.data[0] == 254 * 254 * 256);
   return check::result();
 }

@@ -1,27 +1,21 @@
 // The encoder: an integer network from packed bits to int8 codes, the same bytes on every machine.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <span>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "protomark/types.h"
 
 namespace protomark {
 
-// One fully connected layer:
+// A fully connected layer:
 //   sum  = bias[o] + sum_i weights[o][i] * x[i]
 //   t    = (sum * multipliers[o] + 2^(shift - 1)) >> shift      (64-bit product)
 //   next = table[clamp(t, -128, 127) + 128]                     (hidden layers)
 //   code = clamp(t, -127, 127)                                  (last layer)
-// The first layer takes the bits of the descriptor, 0 or 1, as x; later layers take the bytes that
-// the table of the layer before gave.
+// x are the bits of the descriptor, 0 or 1, in the first layer, and the bytes that the layer before
+// gave in later ones.
 struct Layer {
   std::size_t inputs = 0;
   std::size_t outputs = 0;
@@ -32,21 +26,19 @@ struct Layer {
   std::array<std::uint8_t, 256> table{};
 };
 
-// What a model says of itself: four texts that are always there, and any others.
 struct EncoderInfo {
-  std::string name;        // as in "freak"
-  std::string descriptor;  // the descriptor that it takes, as in "freak"
+  std::string name;        // of the model, not empty
+  std::string descriptor;  // that it takes, as in "freak", not empty
   std::string data;        // what it was trained on
   std::string licence;
-  std::vector<std::pair<std::string, std::string>> notes;
+  std::vector<std::pair<std::string, std::string>> notes;  // other texts, by other names
 };
 
 class PROTOMARK_API Encoder {
  public:
-  // Takes a network. `dims` are the lengths at which a code may be cut, ascending, the last one the
-  // number of outputs; a code times `scale` is the real value. Throws std::invalid_argument if
-  // layers do not fit together, a sum could exceed 32 bits, or a note has one of the four keys that
-  // are always there.
+  // `dims` are the lengths at which a code may be cut, ascending, the last one the number of
+  // outputs; a code times `scale` is the real value. Throws std::invalid_argument if layers do not
+  // fit together, a sum could exceed 32 bits, or a note is named like a field of EncoderInfo.
   Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims, float scale);
 
   // Reads and checks a model file. Throws FileError.
@@ -70,10 +62,10 @@ class PROTOMARK_API Encoder {
   // Multiply-adds per descriptor.
   std::size_t multiply_adds() const;
 
-  // Encodes descriptors (n x bytes) to codes (n x dim), where dim is one of dims(); 0 means the
+  // Encodes descriptors (n x bytes) to codes (n x dim), where dim is one of dims(), or 0 for the
   // full length. Throws std::invalid_argument if shapes do not fit.
   Matrix<std::int8_t> encode(Descriptors descriptors, std::size_t dim = 0, int threads = 1) const;
-  // Encodes into memory of the caller, with dim = codes.columns.
+  // Encodes into memory of the caller; dim is codes.columns.
   void encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads = 1) const;
 
  private:

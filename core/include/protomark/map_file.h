@@ -1,13 +1,9 @@
-// Files of any kind: what they hold, and whether they are whole.
+// What a file holds, and whether it is whole.
 #pragma once
 
-#include <cstddef>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/types.h"
@@ -16,21 +12,20 @@ namespace protomark {
 
 enum class MapKind { learning, sealed };
 
-// Tells by its header what a map file holds. Throws FileError if it is not a map.
+// Reads the kind of a map file from its header. Throws FileError if it is not a map.
 PROTOMARK_API MapKind map_kind(const std::filesystem::path& path);
 
-// Reads the encoder of a map file, and nothing else of it. Throws FileError.
+// Reads only the encoder of a map file. Throws FileError.
 PROTOMARK_API std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path);
 
-// Throw std::invalid_argument, in a sentence that begins with `map`, unless `encoder`, that of the
-// map, has the identity of `expected` or takes descriptors of this name ("freak"): whatever else is
-// encoded by another means nothing in the map.
+// Throw std::invalid_argument unless a map's `encoder` has the identity of `expected`, or takes
+// descriptors of this name ("freak"); errors begin with `map`.
 PROTOMARK_API void expect_encoder(const Encoder& encoder, const Encoder& expected,
                                   const std::string& map);
 PROTOMARK_API void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
                                      const std::string& map);
 
-// Returns names and sizes in bytes of the sections of a model or map file. Throws FileError.
+// Returns the names and sizes in bytes of a file's sections. Throws FileError.
 PROTOMARK_API std::vector<std::pair<std::string, std::size_t>> file_sections(
     const std::filesystem::path& path);
 
@@ -43,8 +38,7 @@ struct FileJournal {
   std::size_t torn_bytes;  // at its end, of a commit that was interrupted
 };
 
-// Describes the journal beside a map file (PrototypeMap::commit), if there is one. Throws
-// FileError.
+// Describes the journal beside a map file (PrototypeMap::commit). Throws FileError.
 PROTOMARK_API std::optional<FileJournal> file_journal(const std::filesystem::path& path);
 
 }  // namespace protomark

@@ -1,15 +1,8 @@
 // The learning map: exact prototypes of landmarks under any history of changes.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/search.h"
@@ -30,43 +23,41 @@ struct IndexOptions {
 
 struct SealOptions {
   // Bytes that a landmark may take on average for its prototypes, their number and its count (not
-  // for position, id and index). By default the sealed map gives the answers of the learning map: 8
-  // bits per number, every appearance. Otherwise prototypes have 8 bits per number if all of them
-  // fit; else 4 bits, and appearances are merged, those of least merge cost first (Ward's
-  // criterion: what merging adds to the squared distances of all observations to their prototypes),
-  // until they fit.
+  // for position, id and index). By default prototypes have 8 bits per number and every appearance
+  // is kept, so that the sealed map gives the answers of the learning map. Otherwise they have 8
+  // bits per number if all of them fit; else 4 bits, and appearances are merged, those of least
+  // merge cost first (Ward's criterion: what merging adds to the squared distances of all
+  // observations to their prototypes), until they fit.
   std::optional<double> bytes_per_landmark = std::nullopt;
-  // 32: positions are floats relative to their middle. 16: they are steps of a grid over their
+  // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
   // bounding box, 65534 from end to end along each axis.
   int position_bits = 32;
 };
 
-// A landmark is kept as the integer sum of its codes and their number n, so that its prototype, the
-// mean (Komorowski and Trzcinski, Eq. 1), follows every change without rounding: observations may
-// come in any order and in any batches (Eq. 2), be subtracted again, and landmarks be merged.
+// The map keeps the integer sum of a landmark's codes and their number n, so that its prototype,
+// the mean (Komorowski and Trzcinski, Eq. 1), follows every change exactly: observations may come
+// in any order and in any batches (Eq. 2), be subtracted again, and landmarks be merged.
 //
 // A map may tell *appearances* of a landmark apart: the signs of the first `appearance_bits`
 // numbers of a code say which appearance an observation is of, and each one that occurs has a sum
-// and a count of its own. That depends on the observation alone, so all of the above holds for each
-// appearance. A landmark is then as far away as the nearest of its appearances.
+// and a count of its own. A landmark is then as far away as the nearest of its appearances.
 //
-// n goes to 255. Before one more is added, sum and n are halved (toward zero, the mean never beyond
-// 127), so that an old landmark forgets slowly; from then on its observations can no longer be
-// subtracted exactly.
+// n is at most 255. Before one more is added, sum and n are halved (toward zero, the mean never
+// beyond 127), so that an old landmark forgets slowly; from then on its observations can no longer
+// be subtracted exactly.
 //
 // Search compares codes with prototypes rounded to int8, halves away from zero.
 //
-// Every function does all it was asked, or throws and changes nothing (unless memory runs out
-// during a change). Any number of threads may use a map; docs/sharing.md says which calls wait for
-// which. A search sees each change of up to 2048 observations or landmarks at once, larger ones in
-// pieces of that size.
+// A function that throws changes nothing (unless memory runs out during a change). Any number of
+// threads may use a map (docs/sharing.md). A search sees a change of up to 2048 observations or
+// landmarks as a whole, a larger one in pieces of that size.
 class PROTOMARK_API PrototypeMap {
  public:
   static constexpr int kMaxCount = 255;
   static constexpr std::size_t kMaxAppearanceBits = 16;
 
-  // An empty map. Codes have `dim` dimensions, one of the encoder's; 0 means all. `appearance_bits`
-  // is 0 (one prototype per landmark) to 16 and at most dim.
+  // Makes an empty map. `dim` is one of the encoder's dims(), or 0 for the full length;
+  // `appearance_bits` is 0 (one prototype per landmark) to 16, and at most dim.
   explicit PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t dim = 0,
                         std::size_t appearance_bits = 0);
   PrototypeMap(PrototypeMap&& other) noexcept;
@@ -75,20 +66,18 @@ class PROTOMARK_API PrototypeMap {
   const std::shared_ptr<const Encoder>& encoder() const;
   std::size_t dim() const;
   std::size_t appearance_bits() const;
-  // Number of landmarks.
-  std::size_t size() const;
-  // One prototype per appearance of each landmark.
-  std::size_t prototype_count() const;
+  std::size_t size() const;             // number of landmarks
+  std::size_t prototype_count() const;  // one per appearance of each landmark
   // Returns the ids of all landmarks in ascending order.
   std::vector<std::int64_t> ids() const;
 
-  // Adds observations: descriptor i is one of landmark ids[i], which is new if the map does not
-  // hold it. Ids are not negative.
+  // Adds observations: descriptor i (n x bytes) is of landmark ids[i], which is new if the map does
+  // not hold it. Ids are not negative.
   void add(std::span<const std::int64_t> ids, Descriptors descriptors, int threads = 1);
   // Undoes `add`. A landmark without observations leaves the map. Throws UnknownLandmark, and
   // std::invalid_argument if these observations cannot have been added.
   void subtract(std::span<const std::int64_t> ids, Descriptors descriptors, int threads = 1);
-  // The same for descriptors that are encoded already.
+  // The same for descriptors that are encoded already (n x dim).
   void add_codes(std::span<const std::int64_t> ids, Codes codes);
   void subtract_codes(std::span<const std::int64_t> ids, Codes codes);
   // Removes landmarks. Throws UnknownLandmark.
@@ -100,66 +89,66 @@ class PROTOMARK_API PrototypeMap {
   void merge_landmarks(std::span<const std::int64_t> into, std::span<const std::int64_t> source);
   // Merges another map of the same encoder, dim and appearance_bits into this one, as if its
   // observations had been added here. Landmark source[i] of the other map becomes landmark into[i]
-  // of this one, existing or new; all others keep their ids. If several become one, they are summed
-  // by ascending id in the other map; positions follow as in merge_landmarks. Metadata is taken
-  // over under names that this map lacks, and "created" becomes the earlier one. The other map does
-  // not change. Throws UnknownLandmark for a source that the other map does not hold, and
-  // std::invalid_argument if maps differ, a source is named twice or an id is negative.
+  // of this one, existing or new; all others keep their ids. If several become one, they are merged
+  // by ascending id in the other map, positions as in merge_landmarks. This map takes over metadata
+  // under names that it lacks, and the earlier "created". Throws UnknownLandmark for a source that
+  // the other map does not hold, and std::invalid_argument if maps differ, a source is named twice
+  // or an id is negative.
   void merge_map(const PrototypeMap& other, std::span<const std::int64_t> into = {},
                  std::span<const std::int64_t> source = {});
 
-  // Return parts of this map, with all that it knows of their landmarks, but without an index. All
-  // parts merged into an empty map, in any order, equal this map without its index.
+  // Return parts of this map, without an index. All parts merged into an empty map, in any order,
+  // equal this map without its index.
   //
-  // By id: landmarks below boundaries[0], from there to below boundaries[1] and so on, one part
-  // more than boundaries. Throws std::invalid_argument unless boundaries ascend.
+  // By id: the landmarks below boundaries[0], those from there to below boundaries[1] and so on.
+  // Throws std::invalid_argument unless boundaries ascend.
   std::vector<PrototypeMap> split_by_id(std::span<const std::int64_t> boundaries) const;
-  // By space: a part per cube of this edge that holds landmarks, by ascending cell, and at last
-  // one of the landmarks without a position if there are any. Throws std::invalid_argument if
-  // `cell_size` is not above 0 or is too small for the extent of the map.
+  // By space: a part per cube of this edge that holds landmarks, by ascending cell, then one of the
+  // landmarks without a position if there are any. Throws std::invalid_argument if `cell_size` is
+  // not above 0 or is too small for the extent of the map.
   std::vector<MapPart> split_by_space(double cell_size) const;
 
-  // Sets world coordinates, which are finite; NaN in all three takes a position away.
+  // Sets world coordinates, which are finite; NaN in all three removes the position.
   void set_positions(std::span<const std::int64_t> ids, std::span<const Position> positions);
-  // What the map says of itself; a new map says nothing. Throws as check_metadata.
+  // Replaces the metadata, of which a new map has none. Throws as check_metadata.
   void set_metadata(Metadata metadata);
   Metadata metadata() const;
 
-  // Return what the map knows of landmarks, and throw UnknownLandmark: positions, numbers of
-  // observations over all appearances, and means over all appearances (n x dim), in code units.
+  // Return positions, numbers of observations over all appearances, and means over all appearances
+  // (n x dim, in code units). Throw UnknownLandmark.
   std::vector<Position> positions(std::span<const std::int64_t> ids) const;
   std::vector<std::uint32_t> counts(std::span<const std::int64_t> ids) const;
   Matrix<float> prototypes(std::span<const std::int64_t> ids) const;
-  // Return the prototypes of one landmark (n x dim) and the observations of each, by ascending sign
-  // bits of the appearance.
+  // Return the prototypes of a landmark (appearances x dim, in code units) and the number of
+  // observations of each, by ascending sign bits of the appearance. Throw UnknownLandmark.
   Matrix<float> appearances(std::int64_t id) const;
   std::vector<std::uint32_t> appearance_counts(std::int64_t id) const;
   MapSummary summary() const;
 
-  // Learns the centroids of inverted lists from the map's prototypes, which are kept by list from
-  // then on, through every change, so that a search may take `recall` or `nprobe`. Learns anew if
-  // there is an index. Throws std::invalid_argument for another nlist and for an empty map.
+  // Learns the centroids of inverted lists from the map's prototypes, anew if there is an index,
+  // and keeps prototypes by list from then on, through every change, so that a search may take
+  // `recall` or `nprobe`. Throws std::invalid_argument for another nlist and for an empty map.
   //
-  // Searches go on meanwhile: prototypes are put into lists in a copy of the map, which takes as
-  // much memory again. `in_place` takes 5 to 10 bytes per prototype instead (and once the largest
-  // of the map's arrays if that has no room for half-filled blocks), but searches wait while
+  // Searches go on meanwhile, as prototypes are put into lists in a copy of the map, which takes as
+  // much memory again. `in_place` takes 5 to 10 bytes per prototype instead (and the largest of the
+  // map's arrays once more if that has no room for half-filled blocks), but searches wait while
   // prototypes move. Lists and answers are the same. If memory runs out the map is as before.
   void build_index(const IndexOptions& options = {}, int threads = 1);
   void drop_index();
   // Number of inverted lists; 0 means no index.
   std::size_t nlist() const;
-  // Returns how many lists a search with this recall, above 0 and at most 1, visits. That is
-  // measured on the map (docs/index.md), and again when a tenth of it has changed. Throws
-  // std::invalid_argument for another recall, and without an index.
+  // Returns how many lists a search with this recall, above 0 and at most 1, visits, as measured on
+  // the map (docs/index.md), and again when a tenth of it has changed. Throws std::invalid_argument
+  // for another recall, and without an index.
   std::size_t nprobe(double recall, int threads = 1) const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).
   Matches search(Descriptors queries, std::size_t k = 2, const SearchOptions& options = {}) const;
   Matches search_codes(Codes queries, std::size_t k = 2, const SearchOptions& options = {}) const;
 
-  // Writes the map, whole or not at all, landmarks by ascending id, so that equal maps (with equal
-  // centroids) give equal files. Onto the file that it was loaded from with a journal: compacts.
-  // Throws FileError, also if another map may commit to `path`, or has, which would be lost.
+  // Writes the map, whole or not at all; equal maps (with equal centroids) give equal files.
+  // Compacts if `path` is the file that the map was loaded from with a journal. Throws FileError,
+  // also if another map has the journal of `path`, or that holds commits, which would be lost.
   void save(const std::filesystem::path& path) const;
   // Reads a map file and what was committed to the journal beside it. With `journal` the map alone
   // may commit to it until it is closed or destroyed. Throws FileError.
@@ -172,22 +161,21 @@ class PROTOMARK_API PrototypeMap {
   bool has_journal() const;
   // Makes all changes so far durable, at a cost that grows with the number of landmarks that
   // changed: once it has returned, the map file and its journal give this map, whatever happens.
-  // Returns the number of bytes written, 0 if nothing changed. Throws FileError, after which the
-  // map in memory is as before and one may commit again; throws std::invalid_argument without a
-  // journal, as compact does.
+  // Returns the number of bytes written, 0 if nothing changed. Throws FileError, after which one
+  // may commit again, and std::invalid_argument without a journal.
   std::size_t commit();
   // Writes the map file anew and empties the journal. Whatever happens, the two of them give this
-  // map or what was committed last. Throws FileError if the map file cannot be written. If only the
-  // journal cannot be emptied it returns: the map file holds everything, what stands in the journal
-  // no longer counts, and the next commit tries again.
+  // map or what was committed last. Throws FileError if the map file cannot be written, and
+  // std::invalid_argument without a journal. If only the journal cannot be emptied it returns: its
+  // commits no longer count, and the next commit tries again.
   void compact();
-  // Releases the journal. What was not committed is in memory only.
+  // Releases the journal. Changes that were not committed stay in memory only.
   void close();
 
   // Writes a sealed map (protomark/sealed_map.h), with the index and metadata. A landmark keeps at
   // most 255 appearances. Throws FileError, and std::invalid_argument for other options, for fewer
   // bytes_per_landmark than one 4-bit prototype takes, and for positions further than 3.4e38 from
-  // their middle.
+  // the middle of the map.
   void seal(const std::filesystem::path& path, const SealOptions& options = {}) const;
 
  private:
@@ -199,8 +187,8 @@ class PROTOMARK_API PrototypeMap {
 
 // The landmarks of one cube of space.
 struct MapPart {
-  // Coordinate i of each position is in [cell[i], cell[i] + 1) * cell_size; nullopt: the landmarks
-  // have no position.
+  // Coordinate i of each position is in [cell[i], cell[i] + 1) * cell_size. nullopt: no landmark
+  // has a position.
   std::optional<std::array<std::int64_t, 3>> cell;
   PrototypeMap map;
 };

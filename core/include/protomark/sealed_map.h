@@ -1,14 +1,8 @@
-// The sealed map: what a map needs to answer, mapped from its file without parsing.
+// The sealed map: answers searches from a small file that it maps into memory.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/search.h"
@@ -16,17 +10,16 @@
 
 namespace protomark {
 
-// A landmark takes dim bytes per prototype (dimensions padded to a multiple of 4), or dim / 2 with
-// 4 bits per number (padded to a multiple of 8); a byte for its count; another one if landmarks
-// have several prototypes; 12 or 6 for its position, if the map has positions; and an eighth of a
-// byte and the bits of the gaps between ids, unless ids are 0 ... n - 1. Any number of threads may
-// use a sealed map.
+// Bytes per landmark: dim per prototype (dimensions padded to a multiple of 4), or dim / 2 with 4
+// bits per number (padded to a multiple of 8); one for its count; another one if landmarks have
+// several prototypes; 12 or 6 for its position, if the map has positions; an eighth and the bits of
+// the gaps between ids, unless ids are 0 ... n - 1. Any number of threads may use a sealed map.
 class PROTOMARK_API SealedMap {
  public:
   // Maps a file. Does not read the large sections, which verify_file checks. Throws FileError.
   explicit SealedMap(const std::filesystem::path& path);
-  // Opens the bytes of a map file, which stand at a multiple of 64 and must outlive the map; errors
-  // call the file `name`.
+  // Opens the bytes of a map file, which begin at a multiple of 64 in memory and must outlive the
+  // map; errors call the file `name`.
   SealedMap(std::span<const std::byte> bytes, const std::string& name);
   SealedMap(SealedMap&&) noexcept;
   ~SealedMap();
@@ -34,9 +27,7 @@ class PROTOMARK_API SealedMap {
   const std::shared_ptr<const Encoder>& encoder() const;
   const Metadata& metadata() const;
   std::size_t dim() const;
-  // Number of landmarks.
-  std::size_t size() const;
-  // One prototype per landmark, or several if the learning map told appearances apart.
+  std::size_t size() const;  // number of landmarks
   std::size_t prototype_count() const;
   // Bits per number of a prototype: 8 or 4.
   int code_bits() const;
@@ -45,11 +36,11 @@ class PROTOMARK_API SealedMap {
   double bytes_per_landmark() const;
   // Bits per coordinate: 32, 16, or 0 if no landmark has a position.
   int position_bits() const;
-  // With 16 bits: how far a coordinate may be from that of the learning map, along each axis. With
-  // 32 bits coordinates are rounded to floats, relative to the middle of the map.
+  // With 16 bits, how far a position may be from that of the learning map along each axis. With 32
+  // bits, coordinates relative to the middle of the map are rounded to floats.
   std::optional<Position> position_error() const;
-  // Returns the ids of all landmarks in ascending order. Throws FileError if the file breaks that
-  // order, which nothing else checks.
+  // Returns the ids of all landmarks in ascending order. Throws FileError if those of a broken file
+  // do not ascend, which only this call checks.
   std::vector<std::int64_t> ids() const;
 
   // Number of inverted lists; 0 means no index.
@@ -58,16 +49,14 @@ class PROTOMARK_API SealedMap {
   // when the map was sealed. Throws std::invalid_argument for another recall, and without an index.
   std::size_t nprobe(double recall) const;
 
-  // Return what the map knows of landmarks, and throw UnknownLandmark: positions; numbers of
-  // observations, at most 255; and rounded prototypes (n x dim), in code units, with 4 bits the
-  // levels nearest to these. If a landmark has several prototypes, their mean, each counting alike.
+  // Return positions; numbers of observations, at most 255; and prototypes as stored (n x dim, in
+  // code units), of a landmark with several their plain mean. Throw UnknownLandmark.
   std::vector<Position> positions(std::span<const std::int64_t> ids) const;
   std::vector<std::uint32_t> counts(std::span<const std::int64_t> ids) const;
   Matrix<float> prototypes(std::span<const std::int64_t> ids) const;
-  // Returns the prototypes of one landmark (n x dim); with an index they come in no particular
-  // order.
+  // Returns the prototypes of a landmark (appearances x dim, in code units), with an index in no
+  // particular order. Throws UnknownLandmark.
   Matrix<float> appearances(std::int64_t id) const;
-  // Reads all counts and positions once, and keeps nothing.
   MapSummary summary() const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).

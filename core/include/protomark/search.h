@@ -1,4 +1,4 @@
-// What a search in a map may be asked for.
+// Options of a search in a map.
 #pragma once
 
 #include <cstddef>
@@ -13,17 +13,15 @@ namespace protomark {
 // Distances are squared Euclidean distances in code units, which are integers. Where there is no
 // neighbour the id is -1 and the distance INT32_MAX.
 struct SearchOptions {
-  // Approximate search in a map with an index: searches as many of the inverted lists nearest to
-  // the query as bring this recall, above 0 and at most 1; or `nprobe` lists, at least 1. At most
-  // one of these may be set. If neither is, the search is exact.
+  // Make the search in a map with an index approximate: it visits the inverted lists nearest to the
+  // query, as many as this recall takes, above 0 and at most 1, or `nprobe` of them, at least 1. At
+  // most one of the two may be set. If neither is, the search is exact.
   std::optional<double> recall = std::nullopt;
   std::optional<std::size_t> nprobe = std::nullopt;
   // The largest squared distance at which a neighbour is reported.
   std::optional<std::int32_t> max_distance = std::nullopt;
-  // Lowe's ratio test, of root distances: a query keeps its neighbours only if its nearest landmark
-  // is nearer than `ratio` times the second nearest, or if there is no second. In (0, 1]. The test
-  // is `nearest < ratio * ratio * second` of squared distances, computed in doubles from left to
-  // right.
+  // Lowe's ratio test, in (0, 1]: a query keeps its neighbours only if there is one landmark, or if
+  // the squared distances fulfil nearest < ratio * ratio * second, in doubles from left to right.
   std::optional<double> ratio = std::nullopt;
   int threads = 1;
 };

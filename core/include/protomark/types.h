@@ -1,18 +1,21 @@
-// What all of Protomark speaks in: matrices, descriptors, codes, positions, matches, metadata,
-// errors.
+// The types that all of Protomark shares: matrices, positions, matches, metadata, errors.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
+// Exported: files that include this one need not include these.
+#include <array>      // IWYU pragma: export
+#include <cstddef>    // IWYU pragma: export
+#include <cstdint>    // IWYU pragma: export
+#include <optional>   // IWYU pragma: export
+#include <span>       // IWYU pragma: export
+#include <stdexcept>  // IWYU pragma: export
+#include <string>     // IWYU pragma: export
+#include <vector>     // IWYU pragma: export
+
 #include <map>
 #include <new>
-#include <stdexcept>
-#include <string>
 #include <type_traits>
-#include <vector>
 
-// What a shared library exports; everything else stays hidden.
+// Marks what a shared library exports.
 #ifdef PROTOMARK_SHARED
 #define PROTOMARK_API __attribute__((visibility("default")))
 #else
@@ -21,7 +24,7 @@
 
 namespace protomark {
 
-// A row-major matrix that somebody else owns.
+// A row-major matrix in memory of the caller.
 template <typename T>
 struct MatrixView {
   T* data = nullptr;
@@ -40,7 +43,7 @@ struct MatrixView {
 template <typename T>
 struct Matrix {
   Matrix() = default;
-  // All zeros. Throws std::bad_alloc if memory does not suffice.
+  // All zeros. Throws std::bad_alloc.
   Matrix(std::size_t n, std::size_t m) : rows(n), columns(m) {
     if (m > PTRDIFF_MAX || (m != 0 && n > PTRDIFF_MAX / sizeof(T) / m)) throw std::bad_alloc();
     data.resize(n * m);
@@ -74,39 +77,36 @@ struct Matches {
   bool operator==(const Matches&) const = default;
 };
 
-// Texts by name, all in UTF-8: what a map says of itself. Names are free but for two:
-//   "frame"    the coordinate frame of the positions and their unit, as in "ENU, metres" or
-//              "map (REP 105), metres"
-//   "created"  when the map was begun, in UTC: "2026-11-23T03:39:41Z" (ISO 8601)
-// The library writes none of them by itself, so that equal maps stay equal files.
+// The user's texts about a map, by name, in UTF-8. Two names have a meaning:
+//   "frame"    the coordinate frame and unit of the positions, as in "ENU, metres"
+//   "created"  when the map was begun, in UTC (ISO 8601): "2026-11-23T03:39:41Z"
+// The library itself writes none, so that equal maps are equal files.
 using Metadata = std::map<std::string, std::string>;
 
 inline constexpr std::size_t kMaxMetadata = 256;          // names
 inline constexpr std::size_t kMaxMetadataName = 128;      // bytes, at least 1
 inline constexpr std::size_t kMaxMetadataText = 1 << 16;  // bytes
 
-// Throws std::invalid_argument if something exceeds these limits or is not UTF-8, or if "created"
-// is no such time.
+// Throws std::invalid_argument if metadata exceed these limits or are not UTF-8, or if "created" is
+// not such a time.
 PROTOMARK_API void check_metadata(const Metadata& metadata);
 
-// A map at a glance.
 struct MapSummary {
   std::uint64_t observations = 0;  // a sealed map counts at most 255 per landmark
-  // How many landmarks have i observations, at index i; at the last index, that many or more.
-  std::array<std::uint64_t, 256> landmarks_by_count{};
+  // Number of landmarks with i observations, at index i; with 255 or more at the last index.
+  std::array<std::int64_t, 256> count_histogram{};
   std::size_t landmarks_with_position = 0;
-  // The bounding box of the positions; zeros if there are none.
-  Position low{};
-  Position high{};
+  // Lowest and highest coordinates; nullopt if no landmark has a position.
+  std::optional<std::array<Position, 2>> extent;
 };
 
-// A file that cannot be read or written, or that is not what it should be. Wrong arguments are
-// std::invalid_argument.
+// Thrown if a file cannot be read or written, or is broken. (Wrong arguments throw
+// std::invalid_argument.)
 struct PROTOMARK_API FileError : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// A landmark id that the map does not hold.
+// Thrown for a landmark id that the map does not hold.
 struct PROTOMARK_API UnknownLandmark : std::out_of_range {
   explicit UnknownLandmark(std::int64_t unknown)
       : std::out_of_range("landmark " + std::to_string(unknown) + " is not in the map"),
@@ -114,9 +114,9 @@ struct PROTOMARK_API UnknownLandmark : std::out_of_range {
   std::int64_t id;
 };
 
-// The instruction set that the kernels use, such as "avx512", "avx2", "neon" or "portable": the
+// Returns the instruction set of the kernels, such as "avx512", "avx2", "neon" or "portable": the
 // best that this CPU runs, or the one that the environment variable PROTOMARK_ISA names. Throws
-// std::invalid_argument if that is unknown or does not run here. All give the same bytes.
+// std::invalid_argument if that does not run here. Results are the same with all of them.
 PROTOMARK_API const char* instruction_set();
 
 }  // namespace protomark

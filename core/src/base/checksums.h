@@ -1,4 +1,4 @@
-// Checksums of files: CRC-32 against damage, SHA-256 for identity.
+// CRC-32 against damage, SHA-256 for identity.
 #pragma once
 
 #include <cstddef>
@@ -8,11 +8,10 @@
 
 namespace protomark {
 
-// The CRC-32 of zlib, PNG and Ethernet (IEEE 802.3), so that any language can check a file.
-// Continues `crc`, 0 at the start, over more bytes.
+// Returns the CRC-32 (IEEE 802.3, as in zlib) of bytes that follow others whose CRC-32 is `crc`.
 std::uint32_t crc32(std::span<const std::byte> bytes, std::uint32_t crc = 0);
 
-// The SHA-256 (FIPS 180-4), as 64 lower-case hexadecimal digits.
+// Returns the SHA-256 (FIPS 180-4) as 64 lower-case hexadecimal digits.
 std::string sha256(std::span<const std::byte> bytes);
 
 }  // namespace protomark

@@ -1,4 +1,4 @@
-// A lock for many readers or one writer that serves them in the order in which they came.
+// A lock for many readers or one writer that serves threads in the order in which they came.
 #pragma once
 
 #include <atomic>
@@ -7,8 +7,8 @@
 
 namespace protomark {
 
-// glibc's std::shared_mutex admits new readers while others hold it, so that a writer waits for
-// ever if a few threads search all the time.
+// glibc's std::shared_mutex admits new readers while others hold it, so that a writer would wait
+// for ever if a few threads search all the time.
 class FairSharedMutex {
  public:
   void lock() {

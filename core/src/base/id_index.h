@@ -1,5 +1,4 @@
-// A hash table from landmark ids to indices, of 4 bytes per slot: the ids stay in the caller's
-// array.
+// A hash table from landmark ids to indices, of 4 bytes per slot: the caller keeps the ids.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +12,7 @@
 
 namespace protomark {
 
-// Each process draws its own, so that nobody can choose ids in a file that all hash to one slot.
+// Each process draws its own seed, so that nobody can write a file whose ids all hash to one slot.
 inline std::uint64_t hash_seed() {
   static const std::uint64_t seed = [] {
     std::random_device random;
@@ -22,17 +21,17 @@ inline std::uint64_t hash_seed() {
   return seed;
 }
 
-// Open addressing with linear probing, at most two thirds full, no tombstones. Slots differ from
-// process to process; no result may depend on their order.
+// Open addressing with linear probing, at most two thirds full, no tombstones. The order of slots
+// differs from process to process, so no result may depend on it.
 class IdIndex {
  public:
   using Ids = LargeVector<std::int64_t>;  // the array that indices point into
 
-  // The index of `id`, or kNoLandmark.
+  // Returns the index of `id`, or kNoLandmark.
   LandmarkIndex find(const Ids& ids, std::int64_t id) const {
     return slots_.empty() ? kNoLandmark : slots_[slot_of(ids, id)];
   }
-  // Slots that `find` reads.
+  // Returns how many slots `find` reads.
   std::size_t probe_length(const Ids& ids, std::int64_t id) const {
     return slots_.empty() ? 0 : ((slot_of(ids, id) - home(id)) & mask()) + 1;
   }
@@ -49,7 +48,7 @@ class IdIndex {
   }
 
   bool has_room(std::size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }
-  // A copy with room for `more` further ids.
+  // Returns a copy with room for `more` further ids.
   IdIndex with_room(const Ids& ids, std::size_t more) const {
     IdIndex result;
     result.used_ = used_;
@@ -57,18 +56,22 @@ class IdIndex {
     while (3 * (used_ + more) > 2 * size) size *= 2;
     result.slots_.assign(size, kNoLandmark);
     for (const LandmarkIndex index : slots_) {
-      if (index != kNoLandmark) result.place(ids, index);
+      if (index != kNoLandmark) result.put(ids, index);
     }
     return result;
   }
 
-  // Takes an index whose id is not there yet.
+  void make_room(const Ids& ids, std::size_t more) {
+    if (!has_room(more)) *this = with_room(ids, more);
+  }
+
+  // Inserts an index whose id is not in the table yet.
   void insert(const Ids& ids, LandmarkIndex index) {
-    if (!has_room(1)) *this = with_room(ids, 1);
-    place(ids, index);
+    make_room(ids, 1);
+    put(ids, index);
     ++used_;
   }
-  // Changes the index of an id that is there.
+  // Changes the index of an id that is in the table.
   void move(const Ids& ids, std::int64_t id, LandmarkIndex to) { slots_[slot_of(ids, id)] = to; }
   // Gives every index i the new value to[i].
   void renumber(std::span<const Row> to) {
@@ -76,14 +79,14 @@ class IdIndex {
       if (index != kNoLandmark) index.value = to[index.value].value;
     }
   }
-  // Removes an id that is there; `ids` must still hold it.
+  // Removes an id that is in the table and still in `ids`.
   void erase(const Ids& ids, std::int64_t id) {
     std::size_t hole = slot_of(ids, id);
-    // Close the gap: each entry that follows without a break moves back if the hole is no further
-    // from its home than the slot that it is in.
+    // Each entry that follows without a break moves back if the hole is no further from its home
+    // than the slot that it is in.
     for (std::size_t s = next(hole); slots_[s] != kNoLandmark; s = next(s)) {
-      const std::size_t wanted = home(ids[slots_[s].value]);
-      if (((s - wanted) & mask()) >= ((s - hole) & mask())) {
+      const std::size_t from = home(ids[slots_[s].value]);
+      if (((s - from) & mask()) >= ((s - hole) & mask())) {
         slots_[hole] = slots_[s];
         hole = s;
       }
@@ -104,14 +107,14 @@ class IdIndex {
     return static_cast<std::size_t>(x ^ (x >> 31)) & mask();
   }
 
-  // The slot of the id, or the free one at which the search for it ends.
+  // Returns the slot of the id, or the free one at which the search for it ends.
   std::size_t slot_of(const Ids& ids, std::int64_t id) const {
     std::size_t s = home(id);
     while (slots_[s] != kNoLandmark && ids[slots_[s].value] != id) s = next(s);
     return s;
   }
 
-  void place(const Ids& ids, LandmarkIndex index) {
+  void put(const Ids& ids, LandmarkIndex index) {
     std::size_t s = home(ids[index.value]);
     while (slots_[s] != kNoLandmark) s = next(s);
     slots_[s] = index;
@@ -122,24 +125,18 @@ class IdIndex {
   std::uint64_t seed_ = hash_seed();
 };
 
-// A set of landmark ids.
 class IdSet {
  public:
   bool empty() const { return ids_.empty(); }
   bool contains(std::int64_t id) const { return index_.find(ids_, id) != kNoLandmark; }
-  // Each id once, in the order in which they came.
   const LargeVector<std::int64_t>& ids() const { return ids_; }
 
   // Leaves the set as it was if memory runs out.
   void insert(std::int64_t id) {
     if (contains(id)) return;
+    index_.make_room(ids_, 1);
     ids_.push_back(id);
-    try {
-      index_.insert(ids_, landmark_at(ids_.size() - 1));
-    } catch (...) {
-      ids_.pop_back();
-      throw;
-    }
+    index_.insert(ids_, landmark_at(ids_.size() - 1));
   }
 
  private:

@@ -1,5 +1,5 @@
-// A vector for random access: it begins at a cache line, and a large one stands in huge pages,
-// which spares most reads a page-table walk.
+// A vector for random access: it begins at a cache line, and a large one lies in huge pages, which
+// spares most reads a page-table walk.
 #pragma once
 
 #include <cstddef>
@@ -25,7 +25,7 @@ struct LargePageAllocator {
     const std::size_t size = n * sizeof(T);
     void* memory = ::operator new(size, alignment(size));
 #ifdef __linux__
-    // Only advice. Memory that was in use before keeps its small pages unless they are dropped.
+    // Memory that was in use before keeps its small pages unless they are dropped.
     if (size >= kLarge) {
       madvise(memory, size, MADV_HUGEPAGE);
       madvise(memory, size / kPage * kPage, MADV_DONTNEED);
@@ -35,10 +35,7 @@ struct LargePageAllocator {
   }
   void deallocate(T* memory, std::size_t n) { ::operator delete(memory, alignment(n * sizeof(T))); }
 
-  template <typename U>
-  bool operator==(const LargePageAllocator<U>&) const {
-    return true;
-  }
+  bool operator==(const LargePageAllocator&) const = default;
 
  private:
   static constexpr std::size_t kPage = std::size_t{1} << 21, kLarge = 4 * kPage;

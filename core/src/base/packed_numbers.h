@@ -4,13 +4,8 @@
 
 #include <algorithm>
 #include <atomic>
-#include <cstddef>
-#include <cstdint>
 #include <memory>
-#include <span>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "base/checksums.h"
 #include "base/text.h"
@@ -42,13 +37,13 @@ class BitPacker {
     filled_ -= 64;
     word_ = filled_ == 0 ? 0 : value >> (width - filled_);
   }
-  // Fills the last word up with zeros.
+  // Pads the last word with zeros.
   void align() {
     if (filled_ > 0) words_.push_back(word_);
     word_ = 0;
     filled_ = 0;
   }
-  // The words that are full; the caller may clear them.
+  // The full words, which the caller may remove.
   std::vector<std::uint64_t>& words() { return words_; }
 
  private:
@@ -57,17 +52,16 @@ class BitPacker {
   unsigned filled_ = 0;  // bits of word_
 };
 
-// Packed numbers in a mapped file, which are checked against checksums as they are read.
-//
-// Opening a map reads none of these numbers. A block of them is checked when the first number of it
-// is read, so that a broken block never answers. Any number of threads may read.
+// Packed numbers in a mapped file. A block of them is checked against its checksum when the first
+// number of it is read, so that opening reads none and a broken block never answers. Any number of
+// threads may read.
 class CheckedNumbers {
  public:
-  static constexpr std::size_t kBlock = 512;  // words that have a CRC-32 together
+  static constexpr std::size_t kBlock = 512;  // words per CRC-32
 
   static constexpr std::size_t blocks(std::size_t words) { return (words + kBlock - 1) / kBlock; }
 
-  // `checksums` are those of the blocks. Errors begin with `name`.
+  // `checksums` has one per block. Errors begin with `name`.
   CheckedNumbers(std::span<const std::uint64_t> words, int bits,
                  std::span<const std::uint32_t> checksums, std::string name)
       : words_(words),
@@ -95,7 +89,6 @@ class CheckedNumbers {
       throw FileError(text(name_, " does not match its checksum, in the block at byte ",
                            first * sizeof(words[0]), " of it"));
     }
-    // Mapped bytes do not change: any thread that sees this may read them.
     checked_[block].store(true, std::memory_order_relaxed);
   }
 

@@ -2,7 +2,6 @@
 
 #include <unistd.h>
 
-#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <deque>
@@ -14,10 +13,9 @@
 namespace protomark {
 namespace {
 
-// Threads stay once started, so a mistyped number must not start thousands.
+// Threads stay once started; a mistyped number must not start thousands.
 constexpr std::size_t kMaxThreads = 256;
 
-// Whether this thread is running a task.
 thread_local bool inside_task = false;
 
 struct Job {
@@ -52,7 +50,7 @@ class Pool {
     try {
       for (; threads_ < n; ++threads_) std::thread([this] { help(); }).detach();
     } catch (const std::system_error&) {
-      return;  // the system gives no more threads: work goes on with those there are
+      return;  // the system gives no more threads: those that exist do the work
     }
   }
 
@@ -86,13 +84,12 @@ class Pool {
 
   std::mutex mutex_;
   std::condition_variable wake_, done_;
-  std::deque<Job*> jobs_;  // that still want helpers
+  std::deque<Job*> jobs_;  // those that still want helpers
   std::size_t threads_ = 0;
 };
 
-// The pool is never destroyed and its threads are detached, so that at exit they sleep in memory
-// that stays valid. A child of fork() makes a pool of its own: its copy of the parent's has no
-// threads and may be locked.
+// The pool is never destroyed, as its detached threads sleep in it at exit. A child of fork() makes
+// a pool of its own: its copy of the parent's has no threads and may be locked.
 Pool& pool() {
   static std::atomic<Pool*> shared = nullptr;
   Pool* current = shared.load();

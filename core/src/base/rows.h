@@ -7,13 +7,13 @@
 
 namespace protomark {
 
-// Where a prototype stands among the packed prototypes of a map.
+// The index of a prototype among the packed prototypes of a map.
 struct Row {
   std::uint32_t value = 0;
   friend constexpr auto operator<=>(Row, Row) = default;
 };
 
-// A landmark's index in a map; its id is the user's.
+// The index of a landmark in a map; its id is the user's.
 struct LandmarkIndex {
   std::uint32_t value = 0;
   friend constexpr auto operator<=>(LandmarkIndex, LandmarkIndex) = default;

@@ -1,4 +1,4 @@
-// Sorts the indices of a large set piece by piece, so that sorting takes little memory.
+// Sorts a large set of indices piece by piece, in little memory.
 #pragma once
 
 #include <algorithm>
@@ -8,9 +8,9 @@
 
 namespace protomark {
 
-// `each(take)` calls take(index) for n indices (Row or LandmarkIndex) each time that it is called,
-// and key(index) differs between them. Calls visit(std::span<const Index>) for pieces that hold all
-// of them by ascending key. Takes 5 bits per index, and runs through all keys about ten times.
+// Calls visit(std::span<const Index>) for pieces of n indices (Row or LandmarkIndex) that together
+// hold all of them by ascending key(index), which differs between them. `each(take)` calls
+// take(index) for all indices. Takes 5 bits per index, and calls `each` about ten times.
 template <typename Index, typename Each, typename Key, typename Visit>
 void visit_sorted(std::size_t n, const Each& each, const Key& key, const Visit& visit) {
   using Value = decltype(key(Index{}));
@@ -48,8 +48,8 @@ void visit_sorted(std::size_t n, const Each& each, const Key& key, const Visit& 
     return;
   }
 
-  // A piece holds the keys above `last`, that of the piece before, up to `end`; the first has no
-  // `last`, and the final one no `end`.
+  // A piece holds the keys above `last`, that of the piece before, up to `end`, where there are
+  // such.
   Value last{}, end{};
   bool bounded = false;
   auto bound = bounds.begin();

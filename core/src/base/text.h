@@ -1,9 +1,12 @@
-// Texts of errors.
+// Texts: composes errors, and checks for UTF-8.
 #pragma once
 
+#include <cstddef>
+#include <cstdint>
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 
 namespace protomark {
 
@@ -19,6 +22,29 @@ std::string text(const Parts&... parts) {
 template <typename... Parts>
 [[noreturn]] void invalid(const Parts&... parts) {
   throw std::invalid_argument(text(parts...));
+}
+
+// Whether a text is well-formed UTF-8 (Unicode 15, table 3-7).
+inline bool is_utf8(std::string_view text) {
+  const auto byte = [&](std::size_t i) {
+    return i < text.size() ? static_cast<std::uint8_t>(text[i]) : std::uint8_t{0};
+  };
+  for (std::size_t i = 0; i < text.size();) {
+    const std::uint8_t lead = byte(i);
+    const bool leads = lead < 0x80 || (lead >= 0xc2 && lead <= 0xf4);
+    if (!leads) return false;
+    const std::size_t size = lead < 0x80 ? 1 : lead < 0xe0 ? 2 : lead < 0xf0 ? 3 : 4;
+    // The range of the second byte excludes overlong forms, surrogates and what is beyond U+10FFFF.
+    std::uint8_t low = lead == 0xe0 ? 0xa0 : lead == 0xf0 ? 0x90 : 0x80;
+    std::uint8_t high = lead == 0xed ? 0x9f : lead == 0xf4 ? 0x8f : 0xbf;
+    for (std::size_t j = 1; j < size; ++j) {
+      if (byte(i + j) < low || byte(i + j) > high) return false;
+      low = 0x80;
+      high = 0xbf;
+    }
+    i += size;
+  }
+  return true;
 }
 
 }  // namespace protomark

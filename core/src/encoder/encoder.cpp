@@ -4,13 +4,11 @@
 #include <cmath>
 #include <cstring>
 #include <functional>
-#include <memory>
 #include <string_view>
 
 #include "base/checksums.h"
 #include "base/parallel.h"
 #include "base/text.h"
-#include "base/utf8.h"
 #include "encoder/layers.h"
 #include "file/journal.h"
 #include "file/sections.h"
@@ -25,12 +23,11 @@ constexpr std::size_t kMaxDim = 256;
 constexpr std::size_t kMaxWidth = 4096;
 constexpr std::size_t kMaxLayers = 16;
 
-// Largest number of descriptors that go through the network together; their activations stay in the
-// L2 cache.
+// Descriptors that go through the network together, at most: activations stay in the L2 cache.
 constexpr std::size_t kBatch = 512;
-// Threads take multiples of so many descriptors.
+// Threads take multiples of this many descriptors.
 constexpr std::size_t kGrain = 64;
-// The texts that are always there.
+
 struct Field {
   std::string_view key;
   std::string EncoderInfo::* text;
@@ -40,8 +37,8 @@ constexpr Field kFields[] = {{"name", &EncoderInfo::name},
                              {"data", &EncoderInfo::data},
                              {"licence", &EncoderInfo::licence}};
 
-void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t number) {
-  const std::string where = text("encoder: layer ", number);
+void check_layer(const Layer& layer, std::size_t inputs, std::size_t index) {
+  const std::string where = text("encoder: layer ", index);
   if (layer.inputs != inputs) {
     invalid(where, " has ", layer.inputs, " inputs, ", inputs, " are needed");
   }
@@ -56,7 +53,7 @@ void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t
   if (std::ranges::any_of(layer.multipliers, [](std::int32_t m) { return m <= 0; })) {
     invalid(where, ": multipliers must be positive");
   }
-  const std::int64_t largest = first ? 1 : 255;
+  const std::int64_t largest = index == 0 ? 1 : 255;
   for (std::size_t o = 0; o < layer.outputs; ++o) {
     const auto [low, high] = sum_range(layer, o);
     if (layer.bias[o] + largest * low < INT32_MIN || layer.bias[o] + largest * high > INT32_MAX) {
@@ -65,7 +62,7 @@ void check_layer(const Layer& layer, std::size_t inputs, bool first, std::size_t
   }
 }
 
-// The field of a key, or the end of kFields for a note.
+// Returns the field of a key, or the end of kFields for a note.
 const Field* field_of(std::string_view key) { return std::ranges::find(kFields, key, &Field::key); }
 
 ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network) {
@@ -103,8 +100,8 @@ struct Encoder::Packed {
 Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims,
                  float scale)
     : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
-  const auto check = [](bool right, const auto&... what) {
-    if (!right) invalid("encoder: ", what...);
+  const auto check = [](bool ok, const auto&... what) {
+    if (!ok) invalid("encoder: ", what...);
   };
   check(!info_.name.empty() && !info_.descriptor.empty(), "name and descriptor must be given");
   for (const Field& field : kFields) {
@@ -120,7 +117,7 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::s
   check(bits >= kMinBits && bits <= kMaxBits && bits % 8 == 0,
         "a descriptor has 64 to 1024 bits, a multiple of 8, not ", bits);
   for (std::size_t l = 0; l < layers_.size(); ++l) {
-    check_layer(layers_[l], l == 0 ? bits : layers_[l - 1].outputs, l == 0, l);
+    check_layer(layers_[l], l == 0 ? bits : layers_[l - 1].outputs, l);
   }
   check(!dims_.empty() && dims_.front() != 0 && dims_.back() == layers_.back().outputs &&
             std::ranges::adjacent_find(dims_, std::greater_equal<>()) == dims_.end(),
@@ -145,9 +142,9 @@ Matrix<std::int8_t> Encoder::encode(Descriptors descriptors, std::size_t dimensi
 }
 
 void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads) const {
-  // What OpenCV gives for an image without keypoints has no columns either.
-  const bool none = descriptors.rows == 0 && descriptors.columns == 0;
-  if (descriptors.columns != bytes() && !none) {
+  // OpenCV's descriptors of an image without keypoints have neither rows nor columns.
+  const bool empty = descriptors.rows == 0 && descriptors.columns == 0;
+  if (descriptors.columns != bytes() && !empty) {
     invalid("descriptors have ", descriptors.columns, " bytes, encoder '", info_.name, "' takes ",
             bytes());
   }
@@ -165,27 +162,27 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
     // Batches of equal size, as a small last one would cost as much as a large one.
     const std::size_t batches = (last - first + kBatch - 1) / kBatch;
     const std::size_t limit = std::min(kBatch, last - first);
-    auto x = std::make_unique_for_overwrite<std::uint8_t[]>(limit * width);
-    auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? limit * width : 0);
+    const auto room = std::make_unique_for_overwrite<std::uint8_t[]>(2 * limit * width);
     for (std::size_t b = 0; b < batches; ++b) {
       const std::size_t begin = first + (last - first) * b / batches;
       const std::size_t n = first + (last - first) * (b + 1) / batches - begin;
-      const auto wanted = [&](std::size_t l) {
+      MatrixView<std::uint8_t> x{room.get(), n, width}, next{room.get() + limit * width, n, width};
+      const auto outputs = [&](std::size_t l) {
         return l + 1 < depth ? layers_[l].outputs : codes.columns;
       };
-      network.first.run(kernel, descriptors.row(begin), n, wanted(0), {x.get(), width});
+      network.first.run(kernel, {descriptors.row(begin), n, bytes()}, outputs(0), x);
       for (std::size_t l = 1; l < depth; ++l) {
-        network.later[l - 1].run(kernel, x.get(), width, n, wanted(l), {next.get(), width});
+        network.later[l - 1].run(kernel, x, outputs(l), next);
         std::swap(x, next);
       }
       for (std::size_t i = 0; i < n; ++i) {
-        std::memcpy(codes.row(begin + i), x.get() + i * width, codes.columns);
+        std::memcpy(codes.row(begin + i), x.row(i), codes.columns);
       }
     }
   });
 }
 
-// All that decides the codes; its SHA-256 is the encoder's identity.
+// Returns all that decides the codes; its SHA-256 is the encoder's identity.
 std::vector<std::byte> Encoder::network_bytes() const {
   SectionWriter out;
   out.value(scale_);
@@ -213,8 +210,7 @@ void Encoder::save(const std::filesystem::path& path) const {
 }
 
 Encoder Encoder::load(const std::filesystem::path& path) {
-  const MappedFile file(path);
-  return parse(file.bytes(), path.string());
+  return parse(MappedFile(path).bytes(), path.string());
 }
 
 Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name) {

@@ -2,30 +2,19 @@
 // block padded with zeros.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <utility>
-#include <vector>
 
 #include "kernels/kernels.h"
 #include "protomark/encoder.h"
 
 namespace protomark {
 
-// The bytes that a layer gives, n x stride; a row has room for whole blocks of outputs.
-struct LayerOutput {
-  std::uint8_t* data;
-  std::size_t stride;
-};
-
-// The least and the largest sum that the weights of an output may have.
+// Returns the least and the largest sum of an output's weights over any subset of its inputs.
 std::pair<std::int64_t, std::int64_t> sum_range(const Layer& layer, std::size_t output);
 
-// Turns sums into bytes.
+// Turns sums into bytes by a table, in a last layer, too.
 class PackedActivation {
  public:
-  // The codes of a last layer come from a table, too.
   PackedActivation(const Layer& layer, bool last);
 
   std::size_t outputs() const { return bias_.size(); }
@@ -42,22 +31,22 @@ class PackedActivation {
   int shift_;
 };
 
-// A first layer, whose inputs are bits. For many descriptors, the sums of all subsets of every 4
-// inputs are tabulated once per block of outputs: one load and one 16-bit addition then stand for 4
-// inputs ("four Russians"). For a few, the weights of the bits that are set are added.
+// A first layer, whose inputs are bits. For many descriptors it tabulates the sums of all subsets
+// of every 4 inputs per block of outputs, so that one load and one 16-bit addition serve 4 inputs
+// ("four Russians"). For fewer it adds the weights of the bits that are set.
 class BitLayer {
  public:
   BitLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // Computes the first `wanted` outputs of n descriptors (n x bytes).
-  void run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
-           std::size_t wanted, LayerOutput next) const;
+  // Computes the first `outputs` outputs of descriptors (n x bytes) as the first columns of `next`,
+  // whose rows have room for whole blocks of outputs.
+  void run(const kernels::Kernels& kernel, Descriptors descriptors, std::size_t outputs,
+           MatrixView<std::uint8_t> next) const;
 
  private:
   class Input;
 
-  std::size_t bytes_;
   std::size_t words_;                 // 64 bits each
   std::size_t span_;                  // words whose sums stay within 16 bits
   std::vector<std::int8_t> weights_;  // blocks x inputs x 64
@@ -70,9 +59,9 @@ class DenseLayer {
   DenseLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // Computes the first `wanted` outputs of n inputs.
-  void run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride, std::size_t n,
-           std::size_t wanted, LayerOutput next) const;
+  // Computes the first `outputs` outputs of inputs (n x bytes), as BitLayer does.
+  void run(const kernels::Kernels& kernel, MatrixView<const std::uint8_t> x, std::size_t outputs,
+           MatrixView<std::uint8_t> next) const;
 
  private:
   std::size_t inputs_;

@@ -5,21 +5,107 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <fstream>
+#include <new>
 #include <sstream>
+#include <utility>
 
 #include "file/sections.h"
-#include "protomark/types.h"
 
 namespace protomark {
 namespace {
 
+constexpr std::size_t kIdentitySize = 64;  // hexadecimal digits
+// Size of a journal's first container: header, table and the section `base`.
+constexpr std::size_t kFirstSize = 128 + kIdentitySize;
+
+// Returns the header and table that bytes begin with, if their checksum is right.
+std::optional<ContainerHead> intact_head(Bytes bytes) {
+  const auto head = ContainerHead::parse(bytes);
+  return head && head->has_right_checksum() ? head : std::nullopt;
+}
+
+// Returns the container that bytes begin with; nullopt if it is broken or cut off.
+std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& name) {
+  const auto head = ContainerHead::parse(bytes);
+  if (!head) return std::nullopt;
+  const std::uint64_t size = head->header.file_size;
+  if (size > bytes.size() || size % kSectionAlignment != 0) return std::nullopt;
+  try {
+    ContainerReader result(bytes.first(size), name);
+    result.verify();
+    return result;
+  } catch (const FileError&) {
+    return std::nullopt;
+  }
+}
+
+// Throws FileError if bytes begin with a container that is whole and yet unreadable, such as one of
+// a later version, which no power cut leaves.
+void check_known(Bytes bytes, const std::string& name) {
+  const auto head = intact_head(bytes);
+  if (!head || head->header.file_size > bytes.size()) return;
+  ContainerReader(bytes.first(head->header.file_size), name);
+}
+
+bool is_record(FileKind kind) { return kind == FileKind::commit || kind == FileKind::fold; }
+
+// Returns the number of the record that bytes begin with; 0 if they begin with none.
+std::uint64_t record_number(Bytes bytes) {
+  const auto head = intact_head(bytes);
+  if (!head || head->header.file_size > bytes.size()) return 0;
+  try {
+    const ContainerReader file(bytes.first(head->header.file_size), "");
+    // The size first, as reading the sections of many nested containers would take long.
+    if (!is_record(file.kind()) || file.map(section::kChain).size() != sizeof(ChainLink)) return 0;
+    return read_value<ChainLink>(file, section::kChain).record;
+  } catch (const FileError&) {
+    return 0;
+  }
+}
+
+// Returns where a container begins that was written after the broken record at `broken`, or the
+// size of the bytes if there is none. As that record may itself contain anything, even a container,
+// the search begins behind it; if its header does not tell where that is, only a record with a
+// number above those of the whole records counts.
+std::size_t find_later(Bytes bytes, std::size_t broken, std::uint64_t records) {
+  const auto head = intact_head(bytes.subspan(broken));
+  const std::uint64_t size = head ? head->header.file_size : kSectionAlignment;
+  if (size > bytes.size() - broken) return bytes.size();
+  const std::uint64_t aligned =
+      (size + kSectionAlignment - 1) / kSectionAlignment * kSectionAlignment;
+  for (std::size_t at = broken + aligned; at < bytes.size(); at += kSectionAlignment) {
+    const Bytes rest = bytes.subspan(at);
+    if (head ? intact_head(rest).has_value() : record_number(rest) > records) return at;
+  }
+  return bytes.size();
+}
+
+// Whether the creation of this journal was interrupted, so that it has no commits yet.
+bool is_unfinished(Bytes bytes) {
+  return bytes.size() <= kFirstSize &&
+         (has_magic(bytes) || std::ranges::all_of(bytes, [](auto b) { return b == std::byte{0}; }));
+}
+
+// Throws FileError with what is wrong with the beginning of a journal.
+[[noreturn]] void refuse(Bytes bytes, const std::string& name) {
+  ContainerReader(bytes.first(std::min(bytes.size(), kFirstSize)), name).verify();
+  fail_file(name, "not a journal");
+}
+
+std::string read_base(const ContainerReader& file) {
+  const Bytes bytes = file.read(section::kBase);
+  if (bytes.size() != kIdentitySize) file.fail_size(section::kBase);
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
+
 constexpr char kSaveElsewhere[] = "; save to another path to keep what is in memory";
-// Openings of a journal that somebody else deletes at the same moment.
+// Attempts to open a journal, or a map file and its journal, while others replace them.
 constexpr int kTries = 100;
 
-// Who has locked a file, which Linux tells.
+// Names who has locked a file, as far as Linux tells.
 std::string holder(const FileDescriptor& file) {
   struct stat status;
   if (::fstat(file.get(), &status) == 0) {
@@ -48,24 +134,60 @@ void add_base(ContainerWriter& file, const std::string& identity) {
 
 std::uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
 
-// Locks the journal of a map file that is to be written over, if there is one.
+// Returns the bytes of an open journal, which its writer may cut off meanwhile. Throws FileError if
+// it is not a journal.
+std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path) {
+  const auto fail = [&](const auto&... why) { fail_file(path, "cannot be read: ", why...); };
+  struct stat status;
+  if (::fstat(file.get(), &status) != 0) fail(system_error());
+  if (!S_ISREG(status.st_mode)) fail_file(path, "not a file");
+  const auto size = static_cast<std::size_t>(status.st_size);
+  const auto read = [&](std::span<std::byte> to) {
+    const auto bytes = file.read(to);
+    if (!bytes) fail(system_error());
+    return *bytes;
+  };
+  // A file that does not begin as a journal is not read, however large.
+  std::array<std::byte, kMaxHead> space;
+  const Bytes head = read(std::span(space).first(std::min(size, space.size())));
+  if (head.size() > kFirstSize && !intact_head(head)) refuse(head, path.string());
+  std::vector<std::byte> result;
+  try {
+    result.resize(size);
+  } catch (const std::bad_alloc&) {
+    fail("its ", size, " bytes do not fit into memory");
+  }
+  result.resize(read(result).size());
+  return result;
+}
+
+// Returns the identity of the map file at `path`; empty if that cannot be read.
+std::string identity_of(const std::filesystem::path& path) {
+  const auto file = FileDescriptor::open_to_read(path);
+  std::array<std::byte, kMaxHead> space;
+  const auto bytes = file ? file.read(space) : std::nullopt;
+  const auto head = bytes ? ContainerHead::parse(*bytes) : std::nullopt;
+  return head ? head->identity() : "";
+}
+
+// Locks the journal of a map file that is to be replaced, if there is one.
 FileDescriptor guard(const std::filesystem::path& map) {
   const auto path = journal_path(map);
   FileDescriptor file;
   for (int tries = 0; tries < kTries; ++tries) {
     file = FileDescriptor::open_to_read(path);
     if (!file && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return file;
-    if (!file) throw FileError(text(path.string(), ": cannot be read: ", system_error()));
+    if (!file) fail_file(path, "cannot be read: ", system_error());
     if (::flock(file.get(), LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
-      throw FileError(text(map.string(), ": cannot be written: its journal is held by ",
-                           holder(file), "; close it there, or save to another path"));
+      fail_file(map, "cannot be written: its journal is held by ", holder(file),
+                "; close it there, or save to another path");
     }
     const auto bytes = read_journal(file, path);
     const auto commits = JournalContent(bytes, path.string()).commits(identity_of(map)).size();
     if (commits > 0) {
-      throw FileError(text(map.string(), ": cannot be written: its journal holds ", commits,
-                           " commits, which would be lost; open it with journal and compact it, "
-                           "or save to another path"));
+      fail_file(map, "cannot be written: its journal holds ", commits,
+                " commits, which would be lost; open it with journal and compact it, or save to "
+                "another path");
     }
     if (file.is_at(path)) break;
   }
@@ -74,17 +196,93 @@ FileDescriptor guard(const std::filesystem::path& map) {
 
 }  // namespace
 
+std::filesystem::path journal_path(const std::filesystem::path& map) {
+  return link_target(map).string() + ".journal";
+}
+
+JournaledFile::JournaledFile(const std::filesystem::path& map) {
+  const auto path = journal_path(map);
+  // The map may be compacted while the two are read, even to an equal file. Not every file system
+  // gives a file the same inode each time.
+  for (int tries = 0;; ++tries) {
+    const auto open = FileDescriptor::open_to_read(map);
+    mapped_ = std::make_unique<MappedFile>(open, map);
+    file_.emplace(mapped_->bytes(), map.string());
+    const auto journal = FileDescriptor::open_to_read(path);
+    if (!journal && errno != ENOENT && errno != ENAMETOOLONG) {
+      fail_file(path, "cannot be read: ", system_error());
+    }
+    bytes_ = journal ? read_journal(journal, path) : std::vector<std::byte>();
+    if (identity_of(map) == file_->identity() && (open.is_at(map) || tries >= kTries)) break;
+  }
+  journal_ = JournalContent(bytes_, path.string());
+}
+
+JournalContent::JournalContent(Bytes bytes, std::string name)
+    : name_(std::move(name)), size_(bytes.size()) {
+  if (bytes.empty()) return;
+  const auto first = whole_container(bytes, name_);
+  if (!first) {
+    if (!is_unfinished(bytes)) refuse(bytes, name_);
+    check_known(bytes, name_);
+    return;
+  }
+  first->expect(FileKind::journal);
+  bases_.push_back({read_base(*first), 0});
+  last_.previous = first->checksum();
+  end_ = first->size();
+  while (end_ < size_) {
+    const std::string where = text(name_, ": record at byte ", end_);
+    const auto record = whole_container(bytes.subspan(end_), where);
+    if (!record) {
+      check_known(bytes.subspan(end_), where);
+      const std::size_t next = find_later(bytes, end_, last_.record);
+      if (next == size_) return;
+      throw FileError(text(where, " is broken, and another one follows at byte ", next,
+                           ", which no power cut leaves; to keep the commits before it, cut the "
+                           "journal off (truncate --size=",
+                           end_, ")"));
+    }
+    if (!is_record(record->kind())) record->fail("it is ", describe(record->kind()));
+    const auto link = read_value<ChainLink>(*record, section::kChain);
+    if (link.record != last_.record + 1 || link.previous != last_.previous) {
+      record->fail("it does not follow the one before it");
+    }
+    if (record->kind() == FileKind::commit) {
+      commits_.push_back({bytes.subspan(end_, record->size()), end_});
+    } else {
+      bases_.push_back({read_base(*record), commits_.size()});
+    }
+    last_ = {link.record, record->checksum(), 0};
+    end_ += record->size();
+  }
+}
+
+std::span<const JournalContent::Commit> JournalContent::commits(const std::string& identity) const {
+  // The last base of this identity counts, as a later map file may equal an earlier one.
+  for (auto base = bases_.rbegin(); base != bases_.rend(); ++base) {
+    if (base->identity == identity) return std::span(commits_).subspan(base->commits);
+  }
+  const std::size_t folded = bases_.empty() ? 0 : bases_.back().commits;
+  if (commits_.size() == folded) return {};
+  const std::string maybe =
+      folded == 0 ? "" : text(", of which the first ", folded, " may be in that file already");
+  throw FileError(text(name_, ": holds ", commits_.size(),
+                       " commits to another map file than the one beside it", maybe,
+                       ": bring that one back, or move the journal away to do without them"));
+}
+
 Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   std::error_code error;
   map_ = std::filesystem::canonical(map, error);
-  if (error) throw FileError(map.string() + ": cannot be read: " + error.message());
+  if (error) fail_file(map, "cannot be read: ", error.message());
   path_ = journal_path(map_);
-  // Who may not read the map may not read what is committed to it.
+  // The journal is as readable as the map file.
   const mode_t mode = permissions(map_).value_or(0) | S_IRUSR | S_IWUSR;
   for (int tries = 0; tries < kTries; ++tries) {
     file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, mode));
     made_ = bool(file_);
-    if (made_) ::fchmod(file_.get(), mode);  // the umask may have taken something away
+    if (made_) ::fchmod(file_.get(), mode);  // the umask may have removed some
     if (!made_) file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, mode));
     if (!file_) fail_write();
     if (::flock(file_.get(), LOCK_EX | LOCK_NB) != 0) {
@@ -97,14 +295,16 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   fail("is deleted again and again, or its file system does not number files");
 }
 
+std::vector<std::byte> Journal::read() const { return read_journal(file_, path_); }
+
 void Journal::resume(const JournalContent& content, const std::string& identity) {
   base_ = identity;
   end_ = content.end();
   last_ = content.last();
   tail_ = content.end() != content.size();
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
-  // Whoever made the journal, or compacted, may have been killed before this: the new map file's
-  // name must be durable before what it replaces is forgotten.
+  // A process that compacted may have been killed before this: the name of the new map file must be
+  // durable before the commits that it has are dropped.
   if (!sync_folder(path_)) fail("its folder cannot be synced: ", system_error());
   if (end_ == 0) {
     begin();
@@ -119,7 +319,7 @@ bool Journal::cut(std::size_t size) {
   return true;
 }
 
-// Writes an empty file, then a header, so that nothing of before is left behind that.
+// Empties the file and syncs it before writing a header, so that no older record follows that.
 void Journal::begin() {
   tail_ = true;
   if (!cut(0)) fail_write();
@@ -191,12 +391,13 @@ void Journal::restart(const std::string& identity) noexcept {
 }
 
 void Journal::abandon() noexcept {
-  // Whoever has opened it meanwhile finds it gone once they have the lock, and makes another one.
+  // A process that opened it meanwhile sees this once it has the lock, and makes another one.
   if (made_ && file_.is_at(path_)) ::unlink(path_.c_str());
 }
 
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path) {
-  const FileDescriptor before = guard(path);
+  // Once more before the file is replaced, as another map may have opened it meanwhile.
+  const FileDescriptor first = guard(path);
   FileDescriptor last;
   file.write(path, [&](const std::string&) { last = guard(path); });
 }

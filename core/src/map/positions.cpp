@@ -9,28 +9,27 @@
 
 namespace protomark {
 
-void PositionBox::add(const Position& p) {
-  if (std::isnan(p[0])) return;
+void add_to_summary(MapSummary& summary, std::uint32_t observations, const Position& position) {
+  summary.observations += observations;
+  ++summary.count_histogram[std::min(observations, 255u)];
+  if (std::isnan(position[0])) return;
+  ++summary.landmarks_with_position;
+  if (!summary.extent) summary.extent = {position, position};
+  auto& [low, high] = *summary.extent;
   for (std::size_t i = 0; i < 3; ++i) {
-    low[i] = positions != 0 ? std::min(low[i], p[i]) : p[i];
-    high[i] = positions != 0 ? std::max(high[i], p[i]) : p[i];
+    low[i] = std::min(low[i], position[i]);
+    high[i] = std::max(high[i], position[i]);
   }
-  ++positions;
 }
 
-Position PositionBox::middle() const {
-  return {low[0] / 2 + high[0] / 2, low[1] / 2 + high[1] / 2, low[2] / 2 + high[2] / 2};
-}
-
-PositionCodec::PositionCodec(const PositionBox& box, int bits) : bits_(bits) {
-  const Position middle = box.middle();
-  origin_ = bits == 16 ? box.low : middle;
+PositionCodec::PositionCodec(const std::array<Position, 2>& extent, int bits) : bits_(bits) {
   for (std::size_t i = 0; i < 3; ++i) {
-    const double reach = std::max(box.high[i] - middle[i], middle[i] - box.low[i]);
-    if (reach > std::numeric_limits<float>::max()) {
+    const double low = extent[0][i], high = extent[1][i], middle = low / 2 + high / 2;
+    if (std::max(high - middle, middle - low) > std::numeric_limits<float>::max()) {
       invalid("positions are too far apart for a sealed map");
     }
-    if (bits == 16) step_[i] = (box.high[i] - box.low[i]) / kLast;
+    origin_[i] = bits == 16 ? low : middle;
+    if (bits == 16) step_[i] = (high - low) / kLast;
   }
 }
 
@@ -47,48 +46,35 @@ PositionCodec::PositionCodec(const ContainerReader& file, const Position& origin
 }
 
 void PositionCodec::encode(const Position& p, std::byte* to) const {
-  const auto put = [&](auto number) {
-    std::array<decltype(number(0)), 3> numbers;
-    for (std::size_t i = 0; i < 3; ++i) numbers[i] = number(i);
-    std::memcpy(to, &numbers, sizeof(numbers));
-  };
-  if (bits_ == 32) {
-    put([&](std::size_t i) { return static_cast<float>(p[i] - origin_[i]); });
-  } else {
-    put([&](std::size_t i) {
-      if (std::isnan(p[0])) return kNone;
-      const double steps = step_[i] > 0 ? std::round((p[i] - origin_[i]) / step_[i]) : 0;
-      return static_cast<std::uint16_t>(std::clamp(steps, 0.0, double{kLast}));
-    });
+  for (std::size_t i = 0; i < 3; ++i) {
+    const double distance = p[i] - origin_[i];
+    if (bits_ == 32) {
+      const auto number = static_cast<float>(distance);
+      std::memcpy(to + i * sizeof(number), &number, sizeof(number));
+    } else {
+      const double steps = step_[i] > 0 ? std::round(distance / step_[i]) : 0;
+      const auto number = std::isnan(p[0])
+                              ? kNone
+                              : static_cast<std::uint16_t>(std::clamp(steps, 0.0, double{kLast}));
+      std::memcpy(to + i * sizeof(number), &number, sizeof(number));
+    }
   }
 }
 
 Position PositionCodec::decode(const std::byte* from) const {
   Position p = origin_;
-  if (bits_ == 32) {
-    std::array<float, 3> floats;
-    std::memcpy(&floats, from, sizeof(floats));
-    for (std::size_t i = 0; i < 3; ++i) p[i] += floats[i];
-  } else {
-    std::array<std::uint16_t, 3> steps;
-    std::memcpy(&steps, from, sizeof(steps));
-    for (std::size_t i = 0; i < 3; ++i)
-      p[i] = steps[i] == kNone ? kNaN : p[i] + step_[i] * steps[i];
+  for (std::size_t i = 0; i < 3; ++i) {
+    if (bits_ == 32) {
+      float number;
+      std::memcpy(&number, from + i * sizeof(number), sizeof(number));
+      p[i] += number;
+    } else {
+      std::uint16_t number;
+      std::memcpy(&number, from + i * sizeof(number), sizeof(number));
+      p[i] = number == kNone ? kNaN : p[i] + step_[i] * number;
+    }
   }
   return std::ranges::all_of(p, [](double x) { return std::isfinite(x); }) ? p : kNoPosition;
-}
-
-void SummaryBuilder::add(std::uint32_t observations, const Position& position) {
-  summary_.observations += observations;
-  ++summary_.landmarks_by_count[std::min(observations, 255u)];
-  box_.add(position);
-}
-
-MapSummary SummaryBuilder::take() {
-  summary_.landmarks_with_position = box_.positions;
-  summary_.low = box_.low;
-  summary_.high = box_.high;
-  return summary_;
 }
 
 }  // namespace protomark

@@ -1,10 +1,5 @@
-// How far positions reach, and how a sealed map stores them.
+// Sums up maps, and stores the positions of sealed ones.
 #pragma once
-
-#include <array>
-#include <cstddef>
-#include <cstdint>
-#include <string>
 
 #include "file/container.h"
 #include "map/row_table.h"
@@ -12,37 +7,29 @@
 
 namespace protomark {
 
-// A bounding box.
-struct PositionBox {
-  Position low{};
-  Position high{};
-  std::size_t positions = 0;  // in it; of none, low and high are zero
+// Adds a landmark to the summary of its map; NaN means that it has no position.
+void add_to_summary(MapSummary& summary, std::uint32_t observations, const Position& position);
 
-  // Takes a position, or NaN for none.
-  void add(const Position& p);
-  Position middle() const;
-};
-
-// Positions in 32 or 16 bits per coordinate. With 32 they are floats relative to an origin. With 16
-// they are steps of a grid over the bounding box, which has a step of its own along each axis:
-// along the longest one that is what a common step would be, and less along the others.
+// Positions in 32 or 16 bits per coordinate: floats relative to an origin, or steps of a grid over
+// the bounding box, with a step of its own along each axis.
 class PositionCodec {
  public:
   PositionCodec() = default;
-  // Throws std::invalid_argument if positions are too far apart for floats.
-  PositionCodec(const PositionBox& box, int bits);
-  // Reads the steps, if the file has any; `origin` is that of its shape. Throws FileError.
+  // For positions between these lowest and highest coordinates. Throws std::invalid_argument if
+  // they are too far apart for floats.
+  PositionCodec(const std::array<Position, 2>& extent, int bits);
+  // Reads the steps if the file has any; `origin` is that of its shape. Throws FileError.
   PositionCodec(const ContainerReader& file, const Position& origin);
 
   int bits() const { return bits_; }
   std::size_t size() const { return 3 * static_cast<std::size_t>(bits_) / 8; }  // bytes
   const Position& origin() const { return origin_; }
-  // Steps along each axis; zeros with 32 bits.
+  // The step along each axis; zeros with 32 bits.
   const Position& step() const { return step_; }
 
   // `to` and `from` are size() bytes.
   void encode(const Position& position, std::byte* to) const;
-  // NaN if there is no position, or in a broken file no number.
+  // Returns NaN if there is no position, or no number in a broken file.
   Position decode(const std::byte* from) const;
 
  private:
@@ -52,17 +39,6 @@ class PositionCodec {
   int bits_ = 32;
   Position origin_{};
   Position step_{};
-};
-
-// Sums a map up.
-class SummaryBuilder {
- public:
-  void add(std::uint32_t observations, const Position& position);
-  MapSummary take();
-
- private:
-  MapSummary summary_;
-  PositionBox box_;
 };
 
 }  // namespace protomark

@@ -1,4 +1,4 @@
-// What a learning map tells of its landmarks, its index, and search.
+// Answers of a learning map, its index, and search.
 #include "protomark/prototype_map.h"
 
 #include <algorithm>
@@ -16,7 +16,7 @@ constexpr char kRemedy[] = "call build_index first";
 // The recall table is measured again once this part of the rows has changed.
 constexpr std::size_t kStalePart = 10;
 
-// From prototypes by id, so that centroids do not depend on how the map came about.
+// Learns from prototypes by id, so that centroids do not depend on the history of the map.
 CoarseQuantizer learn(const PrototypeStore& store, std::size_t nlist, int threads) {
   const std::size_t rows = store.prototype_count();
   std::vector<std::size_t> sample(std::min(rows, CoarseQuantizer::sample_size(nlist)));
@@ -85,19 +85,17 @@ Metadata PrototypeMap::metadata() const {
 
 std::vector<Position> PrototypeMap::positions(std::span<const std::int64_t> ids) const {
   const std::shared_lock lock(state_->searching);
-  std::vector<Position> result(ids.size());
   const PrototypeStore& store = state_->store;
-  std::ranges::transform(ids, result.begin(),
-                         [&](auto id) { return store.position(store.at(id)); });
+  std::vector<Position> result;
+  for (const std::int64_t id : ids) result.push_back(store.position(store.at(id)));
   return result;
 }
 
 std::vector<std::uint32_t> PrototypeMap::counts(std::span<const std::int64_t> ids) const {
   const std::shared_lock lock(state_->searching);
-  std::vector<std::uint32_t> result(ids.size());
   const PrototypeStore& store = state_->store;
-  std::ranges::transform(ids, result.begin(),
-                         [&](auto id) { return store.observations(store.at(id)); });
+  std::vector<std::uint32_t> result;
+  for (const std::int64_t id : ids) result.push_back(store.observations(store.at(id)));
   return result;
 }
 
@@ -142,12 +140,8 @@ std::vector<std::uint32_t> PrototypeMap::appearance_counts(std::int64_t id) cons
 }
 
 MapSummary PrototypeMap::summary() const {
-  const PrototypeStore& store = state_->store;
   const std::shared_lock lock(state_->changing);
-  SummaryBuilder result;
-  store.each_landmark(
-      [&](LandmarkIndex l) { result.add(store.observations(l), store.position(l)); });
-  return result.take();
+  return state_->store.summary();
 }
 
 void PrototypeMap::build_index(const IndexOptions& options, int threads) {
@@ -173,15 +167,13 @@ void MapChange::set_quantizer(CoarseQuantizer quantizer, int threads, bool in_pl
   if (in_place) {
     store.make_room_for(arrangement, state_->searching);
     const auto lock = write();
-    store.rearrange(arrangement);
+    store.rearrange(std::move(arrangement));
     return;
   }
   PrototypeStore other = store;
-  FairSharedMutex nobody_searches;
-  other.make_room_for(arrangement, nobody_searches);
-  other.rearrange(arrangement);
+  other.rearrange(std::move(arrangement));
   const auto lock = write();
-  std::swap(store, other);  // what was there before is freed after the lock is released
+  std::swap(store, other);  // after the lock is released the old one is freed
 }
 
 std::size_t PrototypeMap::nlist() const {
@@ -191,8 +183,7 @@ std::size_t PrototypeMap::nlist() const {
 
 std::size_t PrototypeMap::nprobe(double recall, int threads) const {
   std::shared_lock lock(state_->searching);
-  const auto table = state_->recall(lock, recall, threads);
-  return nprobe_for(table->table, recall, state_->store.quantizer().nlist());
+  return state_->nprobe(lock, recall, threads);
 }
 
 Matches PrototypeMap::search(Descriptors queries, std::size_t k,
@@ -202,30 +193,21 @@ Matches PrototypeMap::search(Descriptors queries, std::size_t k,
 
 Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
                                    const SearchOptions& options) const {
-  Matches matches{{queries.rows, k}, {queries.rows, k}};
   std::shared_lock lock(state_->searching);
   const PrototypeStore& store = state_->store;
-  auto nprobe = requested_nprobe(options, store.quantizer().nlist(), kRemedy);
-  if (options.recall) {
-    const auto table = state_->recall(lock, *options.recall, options.threads);
-    nprobe = nprobe_for(table->table, *options.recall, store.quantizer().nlist());
-  }
-  if (!nprobe) {
-    search_exact(store.view(), queries, options, matches.ids.view(), matches.distances.view());
-  } else {
-    search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(), *nprobe,
-                 queries, options, matches.ids.view(), matches.distances.view());
-  }
-  return matches;
+  check_lists(options, store.quantizer().nlist(), kRemedy);
+  std::size_t nprobe = options.nprobe.value_or(SIZE_MAX);
+  if (options.recall) nprobe = state_->nprobe(lock, *options.recall, options.threads);
+  return search_lists(store.view(), InvertedLists(store.lists()), store.quantizer().packed(),
+                      nprobe, queries, k, options);
 }
 
-// Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.
 RecallTable measure_recall_of(const PrototypeStore& store,
                               const std::function<int(std::int8_t)>& value,
                               const SearchTwo& search_two) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
-  std::vector<std::int64_t> own;
-  for (const Row row : rows) own.push_back(store.id(store.owner(row)));
+  std::vector<std::int64_t> owners;
+  for (const Row row : rows) owners.push_back(store.id(store.owner(row)));
   const std::vector<std::int8_t> codes = store.rounded(rows);
   std::vector<std::int8_t> prototype(store.dim());
   const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
@@ -244,21 +226,23 @@ RecallTable measure_recall_of(const PrototypeStore& store,
     }
     return list;
   };
-  return measure_recall({codes.data(), rows.size(), store.dim()}, own, store.quantizer(),
+  return measure_recall({codes.data(), rows.size(), store.dim()}, owners, store.quantizer(),
                         search_two, list_of);
 }
 
-std::shared_ptr<const MeasuredRecall> MapState::recall(std::shared_lock<FairSharedMutex>& lock,
-                                                       double recall, int threads) {
+std::size_t MapState::nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads) {
   for (bool tried = false;; tried = true) {
-    check_recall(recall, store.quantizer().nlist(), kRemedy);
-    std::shared_ptr<const MeasuredRecall> known;
+    const std::size_t nlist = store.quantizer().nlist();
+    check_recall(recall, nlist, kRemedy);
+    std::shared_ptr<const MeasuredRecall> measured;
     {
       const std::scoped_lock reading(recall_mutex);
-      known = recall_table;
+      measured = recall_table;
     }
-    const bool of_these = known && known->lists_version == store.lists_version();
-    if (of_these && (tried || !is_stale(*known))) return known;
+    const bool of_these = measured && measured->lists_version == store.lists_version();
+    if (of_these && (tried || !is_stale(*measured))) {
+      return nprobe_for(measured->table, recall, nlist);
+    }
     lock.unlock();
     measure(threads, !of_these);
     lock.lock();
@@ -270,25 +254,21 @@ bool MapState::is_stale(const MeasuredRecall& table) const {
          (store.changes() - table.changes) * kStalePart >= store.prototype_count();
 }
 
-// Without `wait` only if nobody else measures or changes the map.
+// Does nothing without `wait` if others measure or change the map.
 void MapState::measure(int threads, bool wait) {
-  std::unique_lock one(measuring, std::defer_lock);
-  std::shared_lock still(changing, std::defer_lock);
+  std::unique_lock alone(measuring, std::defer_lock);
+  std::shared_lock unchanged(changing, std::defer_lock);
   if (wait) {
-    one.lock();
-    still.lock();
-  } else if (!one.try_lock() || !still.try_lock()) {
+    alone.lock();
+    unchanged.lock();
+  } else if (!alone.try_lock() || !unchanged.try_lock()) {
     return;
   }
   if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
   auto measured = std::make_shared<MeasuredRecall>();
   measured->table = measure_recall_of(
       store, [](std::int8_t code) { return int{code}; },
-      [&](Codes queries, MatrixView<std::int64_t> ids, MatrixView<std::int32_t> distances) {
-        SearchOptions options;
-        options.threads = threads;
-        search_exact(store.view(), queries, options, ids, distances);
-      });
+      [&](Codes queries) { return search_exact(store.view(), queries, 2, {.threads = threads}); });
   measured->lists_version = store.lists_version();
   measured->changes = store.changes();
   const std::scoped_lock writing(recall_mutex);

@@ -6,7 +6,7 @@
 #include <queue>
 #include <utility>
 
-#include "base/rounded_mean.h"
+#include "base/quantize.h"
 #include "search/inverted_lists.h"
 #include "search/recall.h"
 #include "search/scan.h"
@@ -19,24 +19,20 @@ constexpr std::size_t kGroupProbes = 4;
 // Codes that are assigned at a time.
 constexpr std::size_t kAssignChunk = 1 << 14;
 
-// Returns the id that find(codes, ids, distances) finds for each code.
-template <typename Find>
-std::vector<std::uint32_t> nearest_ids(Codes codes, const Find& find) {
-  std::vector<std::uint32_t> result(codes.rows);
-  std::vector<std::int64_t> ids(std::min(codes.rows, kAssignChunk));
-  std::vector<std::int32_t> distances(ids.size());
+// Returns the id that search(codes) finds for each code.
+template <typename Search>
+std::vector<std::uint32_t> nearest_ids(Codes codes, const Search& search) {
+  std::vector<std::uint32_t> result;
+  result.reserve(codes.rows);
   for (std::size_t first = 0; first < codes.rows; first += kAssignChunk) {
     const std::size_t n = std::min(kAssignChunk, codes.rows - first);
-    find(Codes{codes.row(first), n, codes.columns}, MatrixView<std::int64_t>{ids.data(), n, 1},
-         MatrixView<std::int32_t>{distances.data(), n, 1});
-    std::transform(ids.begin(), ids.begin() + static_cast<std::ptrdiff_t>(n),
-                   result.begin() + static_cast<std::ptrdiff_t>(first),
-                   [](std::int64_t id) { return static_cast<std::uint32_t>(id); });
+    const Matches nearest = search(Codes{codes.row(first), n, codes.columns});
+    for (const std::int64_t id : nearest.ids.data) result.push_back(static_cast<std::uint32_t>(id));
   }
   return result;
 }
 
-// Gives each centroid without codes one code of the largest lists.
+// Replaces each centroid without codes by a code of the largest lists.
 void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
             const std::vector<std::uint32_t>& counts, std::vector<std::int8_t>& centroids) {
   const std::size_t nlist = counts.size(), dim = codes.columns;
@@ -58,7 +54,7 @@ void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
     if (counts[c] != 0) continue;
     Large from = largest.top();
     largest.pop();
-    // A different code each time, spread over the list.
+    // Another code each time, spread over the list.
     const std::size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
     std::copy_n(codes.row(members[at]), dim, &centroids[c * dim]);
     ++from.parts;
@@ -67,7 +63,7 @@ void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
   }
 }
 
-// `assign(centroids)` gives the list of each code.
+// `assign(centroids)` returns the list of each code.
 template <typename Assign>
 std::vector<std::int8_t> k_means(Codes codes, std::size_t nlist, const Assign& assign) {
   const std::size_t dim = codes.columns;
@@ -123,15 +119,14 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
       std::min(n, static_cast<std::size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
   const auto assign = [&](const std::vector<std::int8_t>& to) {
     const std::vector<CodeVector> packed = pack_codes({to.data(), groups, dim_});
-    return nearest_ids(all, [&](Codes codes, auto ids, auto distances) {
-      search_exact(packed_view(packed, groups), codes, {}, ids, distances);
-    });
+    return nearest_ids(
+        all, [&](Codes codes) { return search_exact(packed_view(packed, groups), codes, 1, {}); });
   };
   const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
   std::vector<Row> group_of;
   for (const std::uint32_t group : assign(group_centroids)) group_of.push_back({group});
   const ListOrder order(std::move(group_of), groups);
-  // Leave out groups that are nearest to no centroid, as a broken file may have them.
+  // Leave out groups without centroids, which a broken file may bring about.
   std::vector<std::int8_t> used;
   for (std::size_t g = 0; g < groups; ++g) {
     if (order.sizes[g] == 0) continue;
@@ -163,12 +158,12 @@ std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t d
   const auto n = static_cast<double>(prototypes), k = static_cast<double>(packed_dim(dim));
   constexpr double kBytes = 4;
   // A sealed map stores the landmark of each row, the recall table, and for each list its centroid,
-  // its number of rows and half a block of padding, somewhat rounded up.
+  // its number of rows and half a block of padding, rounded up.
   const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
   const double sealed =
       (n * (kBytes - static_cast<double>(std::bit_width(prototypes)) / 8) - table) / (9.5 * k + 4);
-  // A learning map keeps for each list its centroid three times, some numbers, half a block of rows
-  // and half of the 12 bytes of a block.
+  // A learning map keeps for each list its centroid three times, 16 bytes, and half a block of rows
+  // and of the 12 bytes of a block.
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
   const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
   const double nlist = std::min({4 * std::sqrt(n), sealed, learning});
@@ -181,9 +176,9 @@ std::vector<std::uint32_t> CoarseQuantizer::assign(Codes codes, int threads) con
   const InvertedLists groups(group_sizes_, group_blocks_);
   SearchOptions options;
   options.threads = threads;
-  return nearest_ids(codes, [&](Codes some, auto ids, auto distances) {
-    search_lists(grouped, groups, packed_view(group_centroids_, group_sizes_.size()), kGroupProbes,
-                 some, options, ids, distances);
+  const PackedPrototypes centroids = packed_view(group_centroids_, group_sizes_.size());
+  return nearest_ids(codes, [&](Codes chunk) {
+    return search_lists(grouped, groups, centroids, kGroupProbes, chunk, 1, options);
   });
 }
 

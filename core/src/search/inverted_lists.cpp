@@ -2,49 +2,156 @@
 
 #include <algorithm>
 
+#include "base/parallel.h"
+
 namespace protomark {
 namespace {
 
-// Queries that go through the lists together; the probes of more would take much memory.
+// Queries that go through the lists together, so that their visits take little memory.
 constexpr std::size_t kQueries = 1 << 14;
 
-// A list that a query looks into.
-struct Probe {
+// Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
+// which, or a nearer one, limits the distance.
+constexpr std::size_t kMinStep = 16, kMaxSampled = 64;
+// Up to this many lists a heap is faster than selection.
+constexpr std::size_t kFewProbes = 16;
+// Queries that are compared with centroids together.
+constexpr std::size_t kBatch = 256;
+
+// The centroids that a query has found: distance in the upper bits, index in the lower ones, so
+// that ties go to the smaller index.
+using Found = std::vector<std::int64_t>;
+
+// Selects the lists nearest to a batch of queries, on one thread. (TopK is for a few neighbours;
+// these may be hundreds.)
+class Selection {
+ public:
+  // `found` has room for each query of the batch.
+  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch,
+            std::vector<Found>& found)
+      : centroids_(centroids),
+        scan_(queries, batch),
+        limits_(batch.size(), CodeScan::kNoLimit),
+        found_(found) {
+    for (Found& of_query : found_) of_query.clear();
+  }
+
+  void nearest(std::size_t nprobe, std::uint32_t* to) {
+    guess_limits(nprobe);
+    const auto limit_of = [&](std::size_t q) { return limits_[q]; };
+    const auto take = [&](std::size_t q, std::int32_t distance, std::size_t list) {
+      found_[q].push_back(std::int64_t{distance} * (std::int64_t{1} << 32) +
+                          static_cast<std::int64_t>(list));
+    };
+    const std::size_t chunk = scan_.chunk_rows();
+    for (std::size_t row = 0; row < centroids_.rows; row += chunk) {
+      compare(row, std::min(chunk, centroids_.rows - row), limit_of, take);
+    }
+    for (std::uint32_t q = 0; q < limits_.size(); ++q) {
+      if (found_[q].size() < nprobe) {
+        found_[q].clear();
+        scan_.select({&q, 1});
+        compare(
+            0, centroids_.rows, [](std::size_t) { return CodeScan::kNoLimit; },
+            [&](std::size_t, std::int32_t distance, std::size_t list) { take(q, distance, list); });
+      }
+      select(found_[q], nprobe, to + q * nprobe);
+    }
+  }
+
+ private:
+  // Sets limits that probably leave a few more than `nprobe` centroids.
+  void guess_limits(std::size_t nprobe) {
+    const std::size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
+    Neighbours sample(nprobe * 3 / 2 / step + 5, limits_);
+    for (std::size_t row = 0; row < centroids_.rows; row += step * kPackedRows) {
+      compare(
+          row, std::min(kPackedRows, centroids_.rows - row),
+          [&](std::size_t q) { return sample.limit(q); },
+          [&](std::size_t q, std::int32_t distance, std::size_t list) {
+            sample[q].offer(distance, static_cast<std::int64_t>(list));
+          });
+    }
+    for (std::size_t q = 0; q < limits_.size(); ++q) limits_[q] = sample.limit(q);
+  }
+
+  static void select(Found& found, std::size_t nprobe, std::uint32_t* to) {
+    const auto end = found.begin() + static_cast<std::ptrdiff_t>(nprobe);
+    if (nprobe <= kFewProbes) {
+      std::partial_sort(found.begin(), end, found.end());
+    } else {
+      std::nth_element(found.begin(), end - 1, found.end());
+      std::iter_swap(found.begin(), std::min_element(found.begin(), end));
+    }
+    for (std::size_t i = 0; i < nprobe; ++i) to[i] = static_cast<std::uint32_t>(found[i]);
+  }
+
+  // Compares all queries with centroids from `first` on, a multiple of 16.
+  template <typename LimitOf, typename Take>
+  void compare(std::size_t first, std::size_t n, const LimitOf& limit_of, const Take& take) {
+    const auto* codes = static_cast<const std::int8_t*>(centroids_.data);
+    scan_.compare(
+        codes + packed_size(first, centroids_.dim), n, limit_of,
+        [&](std::size_t q, std::int32_t distance, std::size_t i) { take(q, distance, first + i); });
+  }
+
+  const PackedPrototypes& centroids_;
+  CodeScan scan_;
+  std::vector<std::int32_t> limits_;
+  std::vector<Found>& found_;
+};
+
+// A query visits a list.
+struct Visit {
   std::uint32_t list;
   std::uint32_t query;
 };
 
-// Returns those of a range of each query's `nprobe` nearest lists, sorted by list.
-std::vector<Probe> sorted_probes(const std::vector<std::uint32_t>& nearest, std::size_t nprobe,
+// Returns the visits to a range of each query's `nprobe` nearest lists, sorted by list.
+std::vector<Visit> sorted_visits(const std::vector<std::uint32_t>& nearest, std::size_t nprobe,
                                  Range range, std::size_t nlist) {
   const std::size_t queries = nearest.size() / nprobe;
   std::vector<std::uint32_t> next(nlist + 1, 0);
-  const auto each_probe = [&](const auto& take) {
+  const auto each_visit = [&](const auto& take) {
     for (std::size_t q = 0; q < queries; ++q) {
       for (std::size_t p = range.begin; p < range.end; ++p) take(q, nearest[q * nprobe + p]);
     }
   };
-  each_probe([&](std::size_t, std::uint32_t list) { ++next[list + 1]; });
+  each_visit([&](std::size_t, std::uint32_t list) { ++next[list + 1]; });
   for (std::size_t list = 0; list < nlist; ++list) next[list + 1] += next[list];
-  std::vector<Probe> result(queries * range.size());
-  each_probe([&](std::size_t q, std::uint32_t list) {
+  std::vector<Visit> result(queries * range.size());
+  each_visit([&](std::size_t q, std::uint32_t list) {
     result[next[list]++] = {list, static_cast<std::uint32_t>(q)};
   });
   return result;
 }
 
-void scan_probes(const InvertedLists& lists, std::span<const Probe> probes, PrototypeScan& scan) {
+void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, PrototypeScan scan) {
   std::vector<std::uint32_t> blocks, queries;
-  for (std::size_t i = 0; i < probes.size();) {
-    const std::uint32_t list = probes[i].list;
+  for (std::size_t i = 0; i < visits.size();) {
+    const std::uint32_t list = visits[i].list;
     queries.clear();
-    for (; i < probes.size() && probes[i].list == list; ++i) queries.push_back(probes[i].query);
+    for (; i < visits.size() && visits[i].list == list; ++i) queries.push_back(visits[i].query);
     lists.read(list, blocks);
     scan.scan(queries, blocks, lists.rows(list));
   }
 }
 
 }  // namespace
+
+std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
+                                         const PreparedCodes& queries, std::size_t nprobe,
+                                         int threads) {
+  std::vector<std::uint32_t> result(queries.queries() * nprobe);
+  parallel_for(threads, queries.queries(), 16, [&](std::size_t first, std::size_t last) {
+    std::vector<Found> found(std::min(kBatch, last - first));
+    for (std::size_t q = first; q < last; q += kBatch) {
+      Selection(centroids, queries, {q, std::min(last, q + kBatch)}, found)
+          .nearest(nprobe, &result[q * nprobe]);
+    }
+  });
+  return result;
+}
 
 void InvertedLists::read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const {
   blocks.clear();
@@ -58,30 +165,29 @@ void InvertedLists::read(std::uint32_t list, std::vector<std::uint32_t>& blocks)
   }
 }
 
-void search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
-                  const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
-                  const SearchOptions& options, MatrixView<std::int64_t> ids,
-                  MatrixView<std::int32_t> distances) {
-  if (nprobe >= lists.nlist()) return search_exact(prototypes, queries, options, ids, distances);
-  check_search(prototypes.dim, queries, options, ids, distances);
+Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
+                     const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
+                     std::size_t k, const SearchOptions& options) {
+  if (nprobe >= lists.nlist()) return search_exact(prototypes, queries, k, options);
+  Matches matches = check_search(prototypes.dim, queries, k, options);
   for (std::size_t begin = 0; begin < queries.rows; begin += kQueries) {
     const std::size_t n = std::min(kQueries, queries.rows - begin);
     const PreparedCodes prepared({queries.row(begin), n, queries.columns});
     const std::vector<std::uint32_t> nearest_to =
         nearest_lists(centroids, prepared, nprobe, options.threads);
-    Neighbours nearest = prepared.places(ids.columns, options);
+    Neighbours nearest = prepared.neighbours(k, options);
     // The nearest list goes first, as it leaves little for the others to find.
     for (const Range& range : {Range{0, 1}, Range{1, nprobe}}) {
-      const std::vector<Probe> probes = sorted_probes(nearest_to, nprobe, range, lists.nlist());
-      run_search(options.threads, Division::of_lists(options.threads, probes.size()), probes.size(),
-                 nearest, [&](Range all, Range some, Neighbours& part) {
-                   PrototypeScan scan(prototypes, prepared, all, part);
-                   scan_probes(lists, std::span(probes).subspan(some.begin, some.size()), scan);
+      const std::vector<Visit> visits = sorted_visits(nearest_to, nprobe, range, lists.nlist());
+      run_search(options.threads, Division::of_lists(options.threads, visits.size()), visits.size(),
+                 nearest, [&](Range all, Range work, Neighbours& part) {
+                   scan_visits(lists, std::span(visits).subspan(work.begin, work.size()),
+                               {prototypes, prepared, all, part});
                  });
     }
-    write_answer(nearest, prepared.norms(), options.max_distance, options.ratio,
-                 {ids.row(begin), n, ids.columns}, {distances.row(begin), n, distances.columns});
+    write_answer(nearest, prepared.norms(), options, begin, matches);
   }
+  return matches;
 }
 
 }  // namespace protomark

@@ -2,16 +2,14 @@
 
 #include <algorithm>
 #include <cmath>
-#include <stdexcept>
-#include <string>
 
 #include "search/scan.h"
 
 namespace protomark {
 namespace {
 
-// Moves codes as far as observations are from their prototypes, by 0.4 of the difference of two
-// others: that has 0.32 times the variance of all codes, observations have 0.2 to 0.5 times.
+// Moves codes about as far as observations are from their prototypes, by 0.4 of the difference of
+// two others, which has 0.32 times the variance of all codes; observations have 0.2 to 0.5 times.
 std::vector<std::int8_t> like_observations(Codes codes) {
   std::vector<std::int8_t> result(codes.rows * codes.columns);
   for (std::size_t i = 0; i < codes.rows; ++i) {
@@ -30,16 +28,14 @@ template <typename Owner>
 RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& quantizer,
                     const SearchTwo& search_two, const ListOf& list_of) {
   const std::size_t n = queries.rows, dim = queries.columns;
-  std::vector<std::int64_t> ids(2 * n);
-  std::vector<std::int32_t> distances(2 * n);
-  search_two(queries, {ids.data(), n, 2}, {distances.data(), n, 2});
-  // The list of the landmark that a query looks for, and how far away its centroid is.
+  const Matrix<std::int64_t> ids = search_two(queries).ids;
+  // The list of the landmark that a query searches for, and the distance of its centroid.
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
   std::vector<std::int32_t> limits(n, INT32_MIN);
   for (std::size_t q = 0; q < n; ++q) {
-    // If others are as near, the owner may come second, or not at all.
-    const std::int64_t nearest = ids[2 * q] == owner(q) ? ids[2 * q + 1] : ids[2 * q];
+    // If others are as near, the owner may be second, or not among the two.
+    const std::int64_t nearest = ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0];
     if (nearest < 0) continue;
     lists[q] = list_of(nearest, queries.row(q));
     const std::int8_t* centroid = &quantizer.centroids()[lists[q] * dim];
@@ -48,7 +44,7 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
       limits[q] += centroid[d] * (centroid[d] - 2 * queries.row(q)[d]);
     }
   }
-  RecallTable table(n, 0);  // the lists up to that one
+  RecallTable table(n, 0);  // counts the lists up to that one
   const PackedPrototypes centroids = quantizer.packed();
   CodeScan(prepared, {0, n})
       .compare(
@@ -67,8 +63,8 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
 std::vector<std::size_t> test_rows(std::size_t rows) {
   const std::size_t n = std::min(rows, kTestQueries);
   std::vector<std::size_t> result(n);
-  // Multiples of the golden ratio are evenly spread, but in no step with the rows that lists are
-  // learned from.
+  // Multiples of the golden ratio are evenly spread, but not in step with the rows from which lists
+  // are learned.
   for (std::size_t i = 0; i < n; ++i) {
     const std::uint64_t x = (i + 1) * std::uint64_t{0x9e3779b97f4a7c15};
     result[i] = static_cast<std::size_t>((x >> 32) * rows >> 32);
@@ -92,33 +88,24 @@ RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& ow
 
 std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlist) {
   if (recall >= 1 || table.empty()) return nlist;
-  // Add two standard errors, as the share that n test queries show is uncertain.
+  // Two standard errors more, as the share that n test queries show is uncertain.
   const auto n = static_cast<double>(table.size());
   const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
   if (enough > n) return nlist;
   return table[static_cast<std::size_t>(std::ceil(enough)) - 1];
 }
 
-std::optional<std::size_t> requested_nprobe(const SearchOptions& options, std::size_t nlist,
-                                            const char* remedy) {
-  if (!options.recall && !options.nprobe) return std::nullopt;
-  if (options.recall && options.nprobe) {
-    throw std::invalid_argument("recall and nprobe exclude each other");
-  }
-  if (options.recall) {
-    check_recall(*options.recall, nlist, remedy);
-    return 0;
-  }
-  if (nlist == 0) throw std::invalid_argument(std::string("nprobe needs an index: ") + remedy);
-  if (*options.nprobe == 0) throw std::invalid_argument("nprobe must be at least 1");
-  return std::min(*options.nprobe, nlist);
+void check_recall(double recall, std::size_t nlist, const char* remedy) {
+  if (!(recall > 0 && recall <= 1)) invalid("recall must be above 0 and at most 1");
+  if (nlist == 0) invalid("recall needs an index: ", remedy);
 }
 
-void check_recall(double recall, std::size_t nlist, const char* remedy) {
-  if (!(recall > 0 && recall <= 1)) {
-    throw std::invalid_argument("recall must be above 0 and at most 1");
-  }
-  if (nlist == 0) throw std::invalid_argument(std::string("recall needs an index: ") + remedy);
+void check_lists(const SearchOptions& options, std::size_t nlist, const char* remedy) {
+  if (options.recall && options.nprobe) invalid("recall and nprobe exclude each other");
+  if (options.recall) check_recall(*options.recall, nlist, remedy);
+  if (!options.nprobe) return;
+  if (nlist == 0) invalid("nprobe needs an index: ", remedy);
+  if (*options.nprobe == 0) invalid("nprobe must be at least 1");
 }
 
 }  // namespace protomark
