@@ -1,4 +1,4 @@
-// NumPy arrays in and out.
+// Converts NumPy arrays.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -27,15 +27,15 @@ inline nb::object numpy(const char* name) { return nb::module_::import_("numpy")
 
 [[noreturn]] inline void type_error(const std::string& what) { throw nb::type_error(what.c_str()); }
 
-// As in "float64 (3, 2)", for error messages.
+// Describes an array in errors, as in "float64 (3, 2)".
 inline std::string describe(nb::handle array) {
   const nb::object dtype = array.attr("dtype");
   const nb::object shape = array.attr("shape");
   return std::string(nb::str(nb::handle(dtype)).c_str()) + " " + nb::str(nb::handle(shape)).c_str();
 }
 
-// An array of exactly this type and number of dimensions; an error says what it should be. Copies
-// only memory that is not contiguous.
+// Returns an array of exactly this type and number of dimensions, or throws an error that begins
+// with `what`. Copies only memory that is not contiguous.
 template <typename Array>
 Array array_of(nb::handle object, const char* type, int dimensions, const char* what) {
   nb::object array = numpy("asarray")(object);
@@ -54,7 +54,7 @@ inline Array2<std::int8_t> codes(nb::handle object) {
   return array_of<Array2<std::int8_t>>(object, "int8", 2, "codes: a (n, dim) int8");
 }
 
-// Landmark ids: integers of any type, one or many.
+// Converts one integer or an array of integers of any type.
 inline Array1<std::int64_t> landmark_ids(nb::handle object) {
   nb::object array = numpy("atleast_1d")(numpy("asarray")(object));
   const auto kind = nb::cast<std::string>(array.attr("dtype").attr("kind"));
@@ -93,7 +93,7 @@ std::span<const T> view(const Array1<T>& array) {
   return {array.data(), array.shape(0)};
 }
 
-// A NumPy array of this shape that owns `elements`, each of them as many T as the shape says.
+// Returns a NumPy array of this shape that owns `elements`, each of one or more T.
 template <typename T, std::size_t Dimensions, typename Element>
 nb::object to_array(std::vector<Element> elements, const std::size_t (&shape)[Dimensions]) {
   auto* held = new std::vector<Element>(std::move(elements));

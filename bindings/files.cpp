@@ -1,4 +1,4 @@
-// Files of any kind.
+// Opens and checks files.
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/vector.h>
 
@@ -15,9 +15,9 @@ void check_map(const Path& path, const Encoder* encoder,
                const std::optional<std::string>& descriptor) {
   if (encoder == nullptr && !descriptor) return;
   without_gil([&] {
-    const auto own = map_encoder(path);
-    if (encoder != nullptr) expect_encoder(*own, *encoder, path.string());
-    if (descriptor) expect_descriptor(*own, *descriptor, path.string());
+    const auto of_map = map_encoder(path);
+    if (encoder != nullptr) expect_encoder(*of_map, *encoder, path.string());
+    if (descriptor) expect_descriptor(*of_map, *descriptor, path.string());
   });
 }
 
@@ -45,12 +45,12 @@ elsewhere, or come from a detector that the map has not seen, say what you have:
 Args:
     path: the map file.
     journal: let the map commit to the journal beside the file, which is made if there is none. No
-        other map can be opened so until this one is closed or gone.
+        other map can be opened with it until this one is closed or destroyed.
     encoder: the map must have been made with this encoder, or one of equal identity.
     descriptor: the map must be one of this descriptor, for example "orb".
 
 Raises:
-    FileError: the file is not a map, or is broken; with journal also if it is sealed, or if another
+    FileError: the file is not a map, or is broken; with journal also if it is sealed, or another
         map has the journal.
     ValueError: the map is of another encoder or descriptor.)");
   m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),

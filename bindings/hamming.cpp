@@ -11,14 +11,10 @@ void bind_hamming(nb::module_& m) {
          std::optional<nb::object> landmarks, std::optional<int> max_distance, int threads) {
         const auto q = descriptors(queries);
         const auto d = descriptors(database);
-        const HammingOptions options{max_distance, threads};
-        if (!landmarks) {
-          return to_numpy(
-              without_gil([&] { return hamming_search(view(q), view(d), k, options); }));
-        }
-        const auto l = landmark_ids(*landmarks);
-        return to_numpy(
-            without_gil([&] { return hamming_search(view(q), view(d), view(l), k, options); }));
+        std::optional<Array1<std::int64_t>> ids;
+        HammingOptions options{std::nullopt, max_distance, threads};
+        if (landmarks) options.landmarks = view(ids.emplace(landmark_ids(*landmarks)));
+        return to_numpy(without_gil([&] { return hamming_search(view(q), view(d), k, options); }));
       },
       "queries"_a, "database"_a, "k"_a = 2, "landmarks"_a = nb::none(),
       "max_distance"_a = nb::none(), "threads"_a = 1,

@@ -1,4 +1,5 @@
-// The Python module protomark._core: arrays in, arrays out, the GIL released while C++ works.
+// The Python module protomark._core, which takes and returns arrays and releases the GIL while C++
+// works.
 #include "module.h"
 
 namespace protomark::python {
@@ -6,7 +7,7 @@ namespace {
 
 nb::object file_error;
 
-// A path need not be UTF-8; its other bytes come back as Python keeps them.
+// A path in an error need not be UTF-8.
 void raise(PyObject* type, const std::exception& error) {
   const auto text = nb::steal(PyUnicode_DecodeFSDefault(error.what()));
   if (text.is_valid()) PyErr_SetObject(type, text.ptr());
@@ -28,7 +29,7 @@ void bind_errors(nb::module_& m) {
       raise(PyExc_ValueError, error);
     }
   });
-  // At exit Python must not have gone before the last reference.
+  // The last reference must be dropped before Python ends.
   nb::module_::import_("atexit").attr("register")(nb::cpp_function([] { file_error.reset(); }));
 }
 

@@ -1,4 +1,4 @@
-// What the files of the module share.
+// Declarations that the files of the module share.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -14,10 +14,10 @@
 namespace protomark::python {
 
 using Path = std::filesystem::path;
-// For whatever may wait for another thread or a disk: other threads run Python meanwhile.
+// For calls that may wait for another thread or a disk, so that others run Python meanwhile.
 using ReleaseGil = nb::call_guard<nb::gil_scoped_release>;
 
-// Returns what `work` returns; the GIL is released while it runs.
+// Runs `work` without the GIL, and returns its result.
 template <typename Work>
 auto without_gil(const Work& work) {
   const nb::gil_scoped_release release;

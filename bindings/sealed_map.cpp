@@ -22,8 +22,7 @@ nb::dict from_summary(const MapSummary& summary) {
 void bind_sealed_map(nb::module_& m) {
   nb::class_<SealedMap> map(
       m, "SealedMap",
-      "A map that only answers, mapped from its file. Processes that have it open share its "
-      "memory.");
+      "A map that only answers, mapped from its file into memory that processes share.");
   bind_answers(map);
   map.def("nprobe", &SealedMap::nprobe, "recall"_a, ReleaseGil(),
           "Number of inverted lists that a search with this recall, in (0, 1], visits, as measured "

@@ -1,4 +1,4 @@
-// What learning and sealed maps have in common: they answer.
+// Binds what learning and sealed maps have in common.
 #pragma once
 
 #include <algorithm>
@@ -56,8 +56,7 @@ auto bind_search(Queries (*to_queries)(nb::handle), Search search) {
   };
 }
 
-// Bind a function from ids to something per landmark, or from one id to something of its
-// appearances.
+// Bind a method that takes ids of landmarks, or one id.
 template <typename Map, typename Of>
 auto bind_of_landmarks(Of of) {
   return [of](const Map& map, nb::object ids) {
@@ -145,7 +144,7 @@ Args:
         fulfil nearest < ratio * ratio * second.
     threads: threads to use.
     recall: in (0, 1]: an approximate search in a map with an index that finds the nearest landmark
-        of this part of the queries, as measured on the map (nprobe()). None: an exact search.
+        of this share of the queries, as measured on the map (nprobe()). None: an exact search.
     nprobe: instead of recall, the number of inverted lists to search.
     among: the landmarks to search: ids (n,), or a mask (landmarks,) bool in the order of `ids`.
         Neighbours are those that a map of these landmarks alone would give, at a cost that follows

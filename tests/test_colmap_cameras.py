@@ -66,5 +66,5 @@ def test_a_map_with_such_a_camera_is_not_continued(camera: Any, tmp_path: Path) 
         told = {"options": options, "cameras": cameras, "camera_id": 1}
         header = {"format": "protomark-mapping", "version": "1", "state": json.dumps(told)}
         (tmp_path / STATE).write_bytes(save({"positions": np.zeros((1, 3))}, header))
-        with pytest.raises(pm.FileError, match=r"state\.safetensors: .*broken one \(cameras"):
+        with pytest.raises(pm.FileError, match=r"state\.safetensors: .*broken \(cameras"):
             load_state(tmp_path)

@@ -91,7 +91,7 @@ def test_precision_is_the_same_in_every_run_and_on_any_threads(
         (["none.safetensors"], "none.safetensors: no such tracks file"),
         (["TRACKS", "--methods", "median"], "there is no method 'median'"),
         (["TRACKS", "--encoder", "none"], "none: neither a model file nor a bundled encoder"),
-        (["TRACKS", "--plot", "plot.txt"], "plot.txt: a picture's name must end in"),
+        (["TRACKS", "--plot", "plot.txt"], "plot.txt: name a picture that ends in"),
         (["TRACKS", "--json", "no/such/r.json"], "no/such: no such folder to write r.json to"),
         (["TRACKS", "--json", "."], "is a folder: name a file"),
         (["TRACKS", "--discriminant-from", "none"], "none: no such tracks file"),

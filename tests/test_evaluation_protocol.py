@@ -49,7 +49,7 @@ def test_split_against_its_definition(tracks: Tracks, seed: int, most: int) -> N
     support_rows = np.flatnonzero(supported & np.isin(landmark, in_map))
     askable = np.flatnonzero(~supported & np.isin(landmark, in_map))
     if not len(askable):
-        with pytest.raises(ValueError, match="no query keyframe sees a landmark with 2"):
+        with pytest.raises(ValueError, match="no query keyframe observes a landmark with 2"):
             split(tracks, seed, max_queries=most)
         return
     part = split(tracks, seed, max_queries=most)
@@ -93,12 +93,12 @@ def test_either_side_has_a_keyframe(share: float) -> None:
 
 
 def test_one_keyframe_cannot_be_split() -> None:
-    with pytest.raises(ValueError, match="at least 2 are needed"):
+    with pytest.raises(ValueError, match="give tracks of at least 2"):
         split(ring_scene(keyframes=1), 0)
 
 
 def test_tracks_without_queries_are_refused() -> None:
     tracks = ring_scene()
     lonely = replace(tracks, landmark_of_keypoint=np.full(len(tracks.keypoints), -1))
-    with pytest.raises(ValueError, match="no query keyframe sees a landmark with 2"):
+    with pytest.raises(ValueError, match="no query keyframe observes a landmark with 2"):
         split(lonely, 0)

@@ -136,5 +136,5 @@ def test_plots(tmp_path: Path, ending: str) -> None:
 
 
 def test_a_plot_needs_the_ending_of_a_picture(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"must end in \.png, \.svg or \.pdf"):
+    with pytest.raises(ValueError, match=r"ends in \.png, \.svg or \.pdf"):
         save_precision_plot(result().rows(), tmp_path / "plot.txt")

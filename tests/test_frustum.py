@@ -59,7 +59,7 @@ def test_what_is_far_outside_is_not_visible() -> None:
 
 @pytest.mark.parametrize(("distance", "degrees"), [(-1, 0), (0, -1), (np.nan, 0), (0, np.nan)])
 def test_priors_that_are_none(distance: float, degrees: float) -> None:
-    with pytest.raises(ValueError, match="must not be negative"):
+    with pytest.raises(ValueError, match="must be 0 or more"):
         PosePrior(np.eye(3, 4), distance, degrees)
     with pytest.raises(ValueError, match="finite"):
         PosePrior(np.full((3, 4), np.nan), 1, 1)

@@ -187,7 +187,7 @@ def test_a_broken_record_with_others_behind_it_is_refused(
     whole[before - 64 * 8] ^= 1
     journal.write_bytes(whole)
     for read in (pm.open, opened, pm.verify_file, pm.file_journal):
-        message = f"{journal}: record at byte {first} is broken, and there are others behind it"
+        message = f"{journal}: record at byte {first} is broken, and another one follows"
         with pytest.raises(pm.FileError, match=message):
             read(path)
     assert journal.read_bytes() == whole

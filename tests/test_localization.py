@@ -203,7 +203,7 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     with pytest.raises(ValueError, match="none of the map's 1 landmarks has a position"):
         Localizer(bare)
     localizer = Localizer(scene)
-    with pytest.raises(ValueError, match="320 x 240 pixels, its camera 640 x 480"):
+    with pytest.raises(ValueError, match="320 x 240 pixels, but its camera 640 x 480"):
         localizer.localize(images[0], replace(PINHOLE, width=640, height=480))
     with pytest.raises(ValueError, match="undistort"):
         localizer.localize(images[0], replace(PINHOLE, model="FOV"))
@@ -344,7 +344,7 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
     ("arguments", "message"),
     [
         (["{q}/scene.pmk", "{q}/nowhere"], "no such image or folder"),
-        (["{q}/scene.pmk", "{q}/true"], "no image in this folder"),
+        (["{q}/scene.pmk", "{q}/true"], "this folder holds no image"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "{q}/gone.txt"], "no cameras.txt"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 300"], "has 4 parameters"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 a"], "is not a number"),
@@ -356,9 +356,9 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
         (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/true/cameras.txt"], "is not a number"),
         (
             ["{q}/scene.pmk", "{q}/images", "--poses", "{q}/else.txt"],
-            "belongs to one of the images",
+            "to an image",
         ),
-        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/long.txt"], "is not of length 1"),
+        (["{q}/scene.pmk", "{q}/images", "--poses", "{q}/long.txt"], "is not 1"),
         (["{q}/images/1.png", "{q}/images"], "1.png"),
     ],
 )

@@ -261,7 +261,7 @@ def test_black_blurred_and_broken_frames_are_named_and_cost_nothing_else(
     assert set(reasons) == {"img5.png", "img8.png", "img11.png", "img13.png"}
     assert "keypoints" in reasons["img5.png"]
     assert "keypoints" in reasons["img8.png"]
-    assert "not a readable image" in reasons["img11.png"]
+    assert "truncated, or of an unknown format" in reasons["img11.png"]
     assert "100x100 pixels" in reasons["img13.png"]
     assert error_of(tmp_path / "scene", walk(COUNT)) < 0.01
 
@@ -309,10 +309,10 @@ def test_refusals(images: Path, finished: Path, tmp_path: Path) -> None:
     fails(run(images, "-o", tmp_path / "mine"), "holds other files")
     fails(run(images), "-o", "--into")
     fails(run(tmp_path / "nothing", "-o", tmp_path / "x"), "no such folder of images or video")
-    fails(run(images, "--into", tmp_path / "mine"), "is this the folder of a map?")
+    fails(run(images, "--into", tmp_path / "mine"), "name a folder that `protomark map` wrote")
     fails(run(images, "-o", tmp_path / "x", "--resume"), "no interrupted map")
     fails(run(images, "-o", tmp_path / "x", "--dim", "17"), "--dim 17")
-    fails(run(images, "-o", tmp_path / "x", "-d", "sift"), "unknown descriptor")
+    fails(run(images, "-o", tmp_path / "x", "-d", "sift"), "is not a descriptor of OpenCV")
     assert not (tmp_path / "x").exists()
 
 

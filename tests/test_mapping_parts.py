@@ -103,11 +103,11 @@ def test_camera_as_text(tmp_path):
 @pytest.mark.parametrize(
     ("content", "say"),
     [
-        ("1 PINHOLE 640 480 300 300 160 120\n", "has 320 x 240 pixels, and none of the cameras"),
-        ("1 PINHOLE 320 240 300 300 160\n", "line 1: not a COLMAP camera"),
-        ("1 PINHOLE 320 240 0 0 160 120\n", "line 1: not a COLMAP camera"),
-        ("1 LENS 320 240 300 300 160 120\n", "line 1: not a COLMAP camera"),
-        ("1 PINHOLE 320 240 nan 300 160 120\n", "line 1: not a COLMAP camera"),
+        ("1 PINHOLE 640 480 300 300 160 120\n", "has 320 x 240 pixels, and no camera does"),
+        ("1 PINHOLE 320 240 300 300 160\n", "line 1: write a COLMAP camera"),
+        ("1 PINHOLE 320 240 0 0 160 120\n", "line 1: write a COLMAP camera"),
+        ("1 LENS 320 240 300 300 160 120\n", "line 1: write a COLMAP camera"),
+        ("1 PINHOLE 320 240 nan 300 160 120\n", "line 1: write a COLMAP camera"),
         ("", "no cameras"),
     ],
 )
@@ -145,7 +145,7 @@ def test_poses_as_tum_and_as_colmap_agree(tmp_path):
 @pytest.mark.parametrize(
     ("content", "say"),
     [
-        ("1 2 3\n", "neither a line"),
+        ("1 2 3\n", "write a line"),
         ("1 0 0 0 0 0 0 0\n", "quaternion"),
         ("1 a 0 0 0 0 0 1\n", "not a number"),
         ("1 inf 0 0 0 0 0 1\n", "not finite"),
@@ -188,7 +188,7 @@ def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
     pictures = list(open_source(tmp_path).images())
     assert pictures[0].image is not None
     assert pictures[1].image is None
-    assert "not a readable image" in pictures[1].problem
+    assert "truncated, or of an unknown format" in pictures[1].problem
 
 
 def video_of(path, frames):

@@ -50,7 +50,7 @@ def test_what_is_told_apart_without_exception_has_finite_weights() -> None:
     assert np.isfinite(found).all()
     assert found[1] > 1
     for same in (np.zeros(100, bool), np.ones(100, bool)):
-        with pytest.raises(ValueError, match="nothing to tell apart"):
+        with pytest.raises(ValueError, match="needs right and wrong ones"):
             fit_logistic(x, same, np.ones(100))
 
 

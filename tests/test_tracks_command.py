@@ -168,7 +168,7 @@ class TestBadInput:
 
     def test_not_an_image(self, copy: Path, out: Path) -> None:
         (copy / "images" / "img4.png").write_text("hello")
-        self.check(copy, out, "img4.png", "not a readable image")
+        self.check(copy, out, "img4.png", "truncated, or of an unknown format")
 
     def test_image_of_another_size(self, copy: Path, out: Path) -> None:
         import cv2
@@ -201,7 +201,7 @@ class TestBadInput:
         same = np.repeat(poses(5)[:1], 5, axis=0)
         shutil.rmtree(copy / "sparse")
         write_model(copy / "sparse", PINHOLE, [f"img{i}.png" for i in range(1, 6)], same)
-        self.check(copy, out, "same place")
+        self.check(copy, out, "same position")
 
     def test_images_of_another_scene(self, copy: Path, out: Path) -> None:
         import cv2

@@ -106,7 +106,7 @@ def test_database_of_another_model(scene: tuple[Path, Tracks], tmp_path: Path) -
     connection.execute(sql.format("descriptors"))
     connection.commit()
     connection.close()
-    with pytest.raises(ValueError, match=r"img1.png has 0 keypoints.*the model's database"):
+    with pytest.raises(ValueError, match=r"img1.png has 0 keypoints.*the database of this model"):
         tracks_from_database(path, scene[0] / "points", "orb")
 
 

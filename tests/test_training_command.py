@@ -100,7 +100,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
         (["a", "b"], ["b"], "not trained on"),
         (["tiny"], ["unseen"], "give more or longer tracks"),
         (["a", "short"], ["unseen"], "short.*3 or more views"),
-        (["a"], ["short"], "short.*support observations|short.*evaluated"),
+        (["a"], ["short"], "short.*support observations|too short"),
         (["narrow"], ["unseen"], "64 to 1024 bits"),
         ([], ["unseen"], "no training tracks"),
         (["a"], [], "--validation"),

@@ -1,4 +1,4 @@
-"""A folder of finished measurements, so that a run that was interrupted can go on."""
+"""Caches finished measurements in a folder, so that an interrupted run can continue."""
 
 from __future__ import annotations
 
@@ -13,23 +13,21 @@ from numpy.typing import NDArray
 
 from protomark.files import replacing, write_text
 
-# To be raised when the same key would no longer give the same results.
+# Increased whenever the same key would yield other results.
 _VERSION = 1
 
 
 def key_of(**settings: Any) -> str:
-    """A name for what these settings (JSON values) give, 20 hexadecimal digits."""
+    """A key for the result of these settings (JSON values), 20 hexadecimal digits."""
     text = json.dumps({"version": _VERSION, **settings}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 class ResultCache:
-    """Results by key, each in a file that is written whole or not at all.
-
-    A file that cannot be read counts as missing.
+    """Results by key, each in a file of its own; an unreadable file counts as missing.
 
     Args:
-        folder: created if it is missing.
+        folder: folder of the files, created if it does not exist.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -41,7 +39,7 @@ class ResultCache:
         write_text(self.folder / f"{key}.json", json.dumps(values) + "\n")
 
     def load(self, key: str) -> dict[str, Any] | None:
-        """JSON values that were stored, None if there are none."""
+        """The stored JSON values, None if there are none."""
         try:
             found = json.loads((self.folder / f"{key}.json").read_text())
         except (OSError, ValueError):
@@ -49,7 +47,7 @@ class ResultCache:
         return found if isinstance(found, dict) else None
 
     def get(self, key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """JSON values that were stored, or those that `make` gives, which are stored then."""
+        """The stored JSON values, or new ones that `make` returns, which are then stored."""
         found = self.load(key)
         if found is None:
             found = make()
@@ -66,7 +64,7 @@ class ResultCache:
             file.write(save(arrays, metadata={"values": json.dumps(values)}))
 
     def load_arrays(self, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | None:
-        """What `save_arrays` stored, None if there is nothing."""
+        """The values and arrays that `save_arrays` stored, None if there are none."""
         from safetensors import SafetensorError, safe_open
 
         try:

@@ -13,7 +13,7 @@ def bench(
         list[Path] | None,
         typer.Argument(
             metavar="TRACKS",
-            help="Tracks files of one descriptor, to make landmarks of; by default the sample.",
+            help="Tracks files of one descriptor to take landmarks from; by default the sample.",
         ),
     ] = None,
     output: Annotated[
@@ -22,32 +22,32 @@ def bench(
     only: Annotated[
         str,
         typer.Option(
-            help="Sections, for example encode,search; of encode, search, hamming, approximate, "
-            "real, frame, add, growth and large. By default all."
+            help="Sections to measure, for example encode,search: encode, search, hamming, "
+            "approximate, real, frame, add, growth and large. By default all."
         ),
     ] = "",
     scale: Annotated[
         str,
         typer.Option(
-            help="quick: tiny sizes, to see whether it runs; usual: a quarter of an hour; full: "
-            "also 10 and 100 million landmarks, which takes hours and much memory."
+            help="quick: tiny sizes, as a test; usual: a quarter of an hour; full: also 10 and 100 "
+            "million landmarks, which takes hours and much memory."
         ),
     ] = "usual",
     landmarks: Annotated[
         str,
         typer.Option(
-            help="Sizes of the maps, for example 10000,1000000, in place of the scale's. The "
-            "sections frame, add and large take the last one."
+            help="Sizes of the maps in place of the scale's, for example 10000,1000000. The "
+            "sections frame, add and large take the largest."
         ),
     ] = "",
     graphs: Annotated[
         str,
         typer.Option(
-            help="Which graphs are raced, as they take long to build: all, none, or some of faiss, "
+            help="Graphs to measure, which take long to build: all, none, or names of faiss, "
             "faiss-lists (65,536 inverted lists that a graph finds, beyond a million landmarks), "
-            "hnswlib, usearch-int8 and usearch-float32. Named ones are raced at any size, as are "
-            "all with --landmarks; else up to 100,000 (--scale full: a million) landmarks, and "
-            "hnswlib beyond."
+            "hnswlib, usearch-int8 and usearch-float32. Named graphs, and all with --landmarks, "
+            "are measured at any size; otherwise only hnswlib beyond 100,000 landmarks (--scale "
+            "full: a million)."
         ),
     ] = "all",
     indexes: Annotated[
@@ -57,16 +57,17 @@ def bench(
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every contender.")] = 1,
     source: Annotated[
         Path | None,
-        typer.Option("--from", help="Measure nothing; write the report of this JSON of a run."),
+        typer.Option("--from", help="Only write the report of the JSON of an earlier run."),
     ] = None,
 ) -> None:
     """Measure speed beside PyTorch, ONNX Runtime, FAISS, OpenCV, hnswlib and USearch.
 
-    All contenders take turns in one run, on the same data and as many threads. The report gives
-    ratios with their spread, beside the machine's own ceilings. Peers that are not installed are
-    left out. Ctrl-C ends the run and reports what was measured by then. TMPDIR says where temporary
-    maps lie. docs/results/benchmarks.md
-    holds a whole run.
+    All contenders take turns in one run, on the same data and the same number of threads. The
+    report has ratios with their spread, and the machine's ceilings. Peers that are not installed
+    are left out. Ctrl-C ends the run and reports what is measured by then. Temporary maps are
+    written to TMPDIR.
+
+    protomark bench --scale quick
     """
     from protomark.cli.terminal import comma_separated, comma_separated_numbers
     from protomark.threads import available_threads
@@ -121,8 +122,8 @@ def reproduce(
     scale: Annotated[
         str,
         typer.Option(
-            help="small: minutes, on some sequences; medium: all sequences, short trainings; full: "
-            "trained until the validation loss stagnates, hours."
+            help="small: minutes, on the smaller sequences; medium: short trainings on all "
+            "sequences; full: trainings until the validation loss stagnates, which take hours."
         ),
     ] = "small",
     descriptor: Annotated[
@@ -134,28 +135,30 @@ def reproduce(
     ] = None,
     validation: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Sequence to pick networks on; may be repeated."),
+        typer.Option(metavar="NAME", help="Sequence to select networks on; may be repeated."),
     ] = None,
     test: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Sequence to measure on; may be repeated."),
     ] = None,
     jobs: Annotated[
-        int, typer.Option(min=0, help="Trainings at a time, 0 for as many as cores allow.")
+        int, typer.Option(min=0, help="Trainings at a time; 0 for as many as fit the cores.")
     ] = 0,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of one training.")] = 1,
     source: Annotated[
         Path | None,
-        typer.Option("--from", help="Train nothing; write the report of this JSON of a run."),
+        typer.Option("--from", help="Only write the report of the JSON of an earlier run."),
     ] = None,
 ) -> None:
-    """Run the paper's whole evaluation again and report it beside the paper's numbers.
+    """Run the paper's evaluation again, and report it beside the paper's numbers.
 
     Trains 'fat' and 'funnel' networks of 2 to 5 layers as triplet and as prototypical networks,
     compares prototypes of 8 to 64 dimensions and the other methods of the paper's table, and
     writes a report with figures (needs PyTorch). Finished trainings are cached: after Ctrl-C the
-    same command goes on. Sequences of other names than the project's own need --train,
-    --validation and --test. docs/reproduction.md says more.
+    same command continues. Sequences with other names than the project's need --train,
+    --validation and --test.
+
+    protomark reproduce tracks/ --scale small
     """
     from protomark.extras import optional
     from protomark.threads import available_threads
@@ -168,7 +171,7 @@ def reproduce(
         results = PaperResults.load(source)
     else:
         if not data:
-            raise ValueError("name tracks files, or the JSON of a run with --from")
+            raise ValueError("name tracks files, or the JSON of an earlier run with --from")
         optional("torch")
         from protomark_bench.paper import command
         from protomark_bench.paper.scale import find_scale
@@ -201,41 +204,43 @@ def evaluate_mapping(
     memories: Annotated[
         str,
         typer.Option(
-            help="What maps remember of descriptors, of traditional (all of them), medoid, "
-            "prototypes-32 and prototypes-16, with commas between; by default all."
+            help="What maps keep of descriptors, for example traditional,medoid: traditional "
+            "(all descriptors), medoid, prototypes-32 and prototypes-16. By default all."
         ),
     ] = "",
     colmap: Annotated[
-        bool, typer.Option(help="Also COLMAP's own incremental reconstruction with SIFT.")
+        bool, typer.Option(help="Also run COLMAP's incremental reconstruction with SIFT.")
     ] = True,
     every: Annotated[int, typer.Option(min=1, help="Take every n-th image only.")] = 1,
     frames: Annotated[
-        int, typer.Option(min=0, help="Take the first so many of those only, 0 for all.")
+        int, typer.Option(min=0, help="Take only so many of these images; 0 for all.")
     ] = 0,
     descriptor: Annotated[
         str,
         typer.Option(
-            "--descriptor", "-d", help="As `protomark map` takes them; the paper's is freak."
+            "--descriptor", "-d", help="Descriptor of `protomark map`; the paper's is freak."
         ),
     ] = "akaze",
     encoder: Annotated[
-        str, typer.Option(help="Name or file of the encoder; by default the descriptor's own.")
+        str,
+        typer.Option(help="Name or file of the encoder; by default the one for the descriptor."),
     ] = "",
     max_keypoints: Annotated[
-        int, typer.Option(help="Keypoints per frame, the strongest first, spread over it.")
+        int, typer.Option(help="Limit on keypoints per image, the strongest, spread over it.")
     ] = 2000,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of every run.")] = 1,
     source: Annotated[
         Path | None,
-        typer.Option("--from", help="Map nothing; write the report of this JSON of a run."),
+        typer.Option("--from", help="Only write the report of the JSON of an earlier run."),
     ] = None,
 ) -> None:
-    """Map sequences with all descriptors, medoids and prototypes, and compare, with COLMAP too.
+    """Compare mapping with all descriptors, medoids and prototypes, and with COLMAP.
 
-    Reports frames registered, trajectory error against the true poses, landmarks, time and
-    descriptor bytes, all memories in the same code, poses unknown and the camera known. Finished
-    runs are cached and reported: after Ctrl-C the same command goes on. A short run: --frames 60
-    --no-colmap.
+    Reports registered frames, trajectory errors, landmarks, time and descriptor bytes. All memories
+    run in the same code, with unknown poses and a known camera. Finished runs are cached and
+    reported: after Ctrl-C the same command continues.
+
+    protomark evaluate-mapping kitchen/ --frames 60 --no-colmap
     """
     from protomark_bench import report
     from protomark_bench.mapping.results import MappingResults
@@ -246,7 +251,7 @@ def evaluate_mapping(
         results = MappingResults.load(source)
     else:
         if not sequences:
-            raise ValueError("name folders of sequences, or the JSON of a run with --from")
+            raise ValueError("name folders of sequences, or the JSON of an earlier run with --from")
         from protomark_bench.mapping import command
 
         again = command_line(

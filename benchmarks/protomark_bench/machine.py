@@ -1,4 +1,4 @@
-"""The machine that a measurement runs on: its description, free memory, and ceilings."""
+"""Describes the machine of a measurement: its CPU, free memory and ceilings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def describe(*distributions: str) -> dict[str, str]:
 
 
 def cpu_model() -> str:
-    """The name that the CPU gives itself."""
+    """The model name of the CPU."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -50,7 +50,7 @@ def cpu_model() -> str:
 
 
 def last_level_cache() -> int:
-    """Bytes of the largest cache that a core uses; 64 MiB where the system does not say."""
+    """Bytes of the largest cache of a core; 64 MiB if the system does not tell."""
     sizes = []
     for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size"):
         size = path.read_text().strip()
@@ -60,7 +60,7 @@ def last_level_cache() -> int:
 
 
 def memory_bytes(field: str) -> int | None:
-    """A field of /proc/meminfo in bytes, None where there is none."""
+    """A field of /proc/meminfo in bytes, None if it does not exist."""
     if not sys.platform.startswith("linux"):
         return None
     for line in Path("/proc/meminfo").read_text().splitlines():
@@ -70,7 +70,7 @@ def memory_bytes(field: str) -> int | None:
 
 
 class _MallocInfo(ctypes.Structure):
-    """struct mallinfo2 of glibc; what lies in between is of no use here."""
+    """struct mallinfo2 of glibc."""
 
     _fields_ = (
         ("arena", ctypes.c_size_t * 4),
@@ -82,7 +82,7 @@ class _MallocInfo(ctypes.Structure):
 
 
 def allocated_bytes() -> int | None:
-    """Memory that this process has allocated and not freed; None without glibc 2.33 or newer."""
+    """Bytes that this process has allocated and not freed; None without glibc 2.33 or newer."""
     gc.collect()
     try:
         mallinfo = ctypes.CDLL(None).mallinfo2
@@ -94,7 +94,7 @@ def allocated_bytes() -> int | None:
 
 
 def shortage(memory: float, disk: float = 0) -> str | None:
-    """Says which of these bytes of memory and temporary disk are not free, None if all are."""
+    """A sentence if so much memory or temporary disk is not free, None if it is."""
     free = memory_bytes("MemAvailable")
     if free is not None and free < memory:
         return f"needs {memory / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free"
@@ -105,11 +105,11 @@ def shortage(memory: float, disk: float = 0) -> str | None:
 
 
 def ceilings(seconds: float) -> dict[str, float]:
-    """What one thread can do at most, measured for `seconds` each.
+    """Measure the highest rates of one thread, for `seconds` each.
 
     Returns:
         int8 multiply-adds per second for each instruction set of this CPU, and under "read" the
-        bytes per second read from memory that no cache holds; without "read" if memory is short.
+        bytes per second that are read from beyond all caches, unless memory is short.
     """
     from protomark_bench import _ceilings
 

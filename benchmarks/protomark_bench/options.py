@@ -1,4 +1,4 @@
-"""What the commands do with their options."""
+"""Command lines of reports, and resumable commands."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import typer
 
 
 def command_line(command: str, paths: Sequence[Path] | None, **options: object) -> str:
-    """The command that does the same again, as a report tells it: files by name alone.
+    """The command line that repeats a run, for its report: files have no folders.
 
     Args:
-        command: its name.
+        command: name of the command.
         paths: arguments.
         options: values, or pairs of a value and its default; empty and default ones are left out.
     """
@@ -30,11 +30,11 @@ def command_line(command: str, paths: Sequence[Path] | None, **options: object) 
 
 @contextmanager
 def resumable(output: Path) -> Iterator[None]:
-    """Ctrl-C inside ends the command with exit code 130 and says how to go on."""
+    """On Ctrl-C end the command with exit code 130, and tell how to continue."""
     try:
         yield
     except KeyboardInterrupt:
         from protomark.cli.terminal import note
 
-        note(f"stopped; what is finished is cached in {output}, and the same command goes on")
+        note(f"stopped: results so far are cached in {output}, and the same command continues")
         raise typer.Exit(130) from None

@@ -1,4 +1,4 @@
-"""Plots: panels of lines and of bars, in one style."""
+"""Draws panels of lines and bars in one style."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ TEAL, AMBER, VIOLET, BLUE, RED = "#0f766e", "#b45309", "#7c3aed", "#0369a1", "#b
 
 @dataclass(frozen=True)
 class Series:
-    """One line, or one bar per place of the x axis.
+    """One line, or one bar per tick of the x axis.
 
     Attributes:
-        label: its name in the legend; empty: not in the legend.
+        label: name in the legend; empty for none.
         x, y: values; bars take the y values in the order of the panel's `ticks`.
-        color: of line and marker.
+        color: color of line and markers.
         style: line style and marker of Matplotlib, such as "-o", ":D" or "--".
-        width: of the line.
+        width: width of the line.
         hollow: whether markers are white inside.
     """
 
@@ -45,12 +45,12 @@ class Panel:
 
     Attributes:
         title, x, y: texts.
-        series: what is drawn.
-        ticks: names of places on the x axis; bars need them.
-        log: axes with a logarithmic scale, of "x", "y" and "2" (x to base 2).
+        series: lines or bars.
+        ticks: names of values on the x axis, which bars need.
+        log: axes with a logarithmic scale: "x", "y" and "2" (x to base 2).
         levels: horizontal lines, (height, label, color).
         bottom, top: limits of the y axis.
-        square: whether both axes have one scale and no ticks, as maps from above.
+        square: whether both axes have the same scale and no ticks.
     """
 
     title: str
@@ -66,7 +66,7 @@ class Panel:
 
 
 def draw_lines(panels: Sequence[Panel], columns: int = 3, height: float = 4.2) -> Figure:
-    """Draw panels of lines beside each other; one legend serves panels with the same labels."""
+    """Draw panels of lines side by side, with one legend for all of them."""
     figure, axes = _grid(len(panels), columns, height)
     for panel, one in zip(panels, axes, strict=True):
         for s in panel.series:
@@ -92,8 +92,8 @@ def draw_bars(panels: Sequence[Panel], columns: int = 2, height: float = 2.8) ->
         width = 0.8 / max(len(panel.series), 1)
         for i, s in enumerate(panel.series):
             offset = (i - (len(panel.series) - 1) / 2) * width
-            places = [place + offset for place in range(len(panel.ticks))]
-            one.bar(places, list(s.y), width, color=s.color, label=s.label)
+            positions = [tick + offset for tick in range(len(panel.ticks))]
+            one.bar(positions, list(s.y), width, color=s.color, label=s.label)
         _finish(one, panel)
     _legend(figure, axes)
     return figure
@@ -105,16 +105,16 @@ def draw_ratios(
     """Draw a bar per row from 1 to its median ratio, on a log scale, with its spread as a line.
 
     Args:
-        rows: label, and median, least and greatest ratio.
-        title: of the plot.
+        rows: labels with the median, least and greatest ratio.
+        title: title of the plot.
         x: label of the x axis.
     """
     figure, (axes,) = _grid(1, 1, 1 + 0.24 * len(rows))
-    for place, (_, (median, low, high)) in enumerate(rows):
+    for i, (_, (median, low, high)) in enumerate(rows):
         color = TEAL if median >= 1 else MUTED
-        axes.barh(place, median - 1, left=1, height=0.62, color=color)
-        axes.hlines(place, low, high, color=INK, linewidth=1)
-        at = (max(median, high), place)
+        axes.barh(i, median - 1, left=1, height=0.62, color=color)
+        axes.hlines(i, low, high, color=INK, linewidth=1)
+        at = (max(median, high), i)
         axes.annotate(f" {median:.1f}", at, va="center", color=INK, fontsize=7)
     axes.set_xscale("log")
     axes.axvline(1, color=INK, linewidth=1)
@@ -126,7 +126,7 @@ def draw_ratios(
 
 
 def save_svg(figure: Figure, path: Path, made_by: str) -> None:
-    """Write a figure as SVG, whole or not at all; the same figure gives the same bytes."""
+    """Write a figure as SVG atomically; the same figure yields the same bytes."""
     import matplotlib
 
     options: Any = {"svg.hashsalt": "protomark", "svg.fonttype": "none"}
@@ -146,7 +146,7 @@ def _grid(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def _finish(axes: Axes, panel: Panel) -> None:
-    """Apply what a panel says of its axes."""
+    """Apply a panel's texts, scales and limits to its axes."""
     axes.set_title(panel.title, loc="left", color=INK, fontsize=11, fontweight="bold")
     axes.set_xlabel(panel.x, color=INK)
     axes.set_ylabel(panel.y, color=INK)
@@ -181,7 +181,7 @@ def _legend(figure: Figure, axes: Sequence[Axes]) -> None:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if handles:
-        # About so many labels of this length fit into a row.
+        # Number of labels of this length that fit into a row.
         columns = int(13 * figure.get_figwidth() / (6 + max(map(len, handles))))
         figure.legend(
             list(handles.values()),

@@ -1,4 +1,4 @@
-"""Reports: tables for Markdown and the terminal, and the files that a command leaves."""
+"""Writes reports: Markdown pages with plots, JSON, and tables for the terminal."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table of texts; a row whose first cell is bold in Markdown stands out in the terminal.
+    """A table of texts; rows with a bold first cell in Markdown stand out in the terminal.
 
     Attributes:
         heads: names of the columns.
         rows: cells as Markdown.
-        words: how many leading columns hold text; the others are aligned to the right.
+        words: number of leading columns with text; the others align right.
     """
 
     heads: Sequence[str]
@@ -37,7 +37,7 @@ class ReportTable:
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
     def rich(self, title: str = "", columns: Sequence[int] | None = None) -> Table:
-        """The same table for a terminal; `columns` picks some of its columns."""
+        """The table for a terminal, with the columns of these indices; None: all."""
         from rich.box import SIMPLE_HEAD
         from rich.table import Table
 
@@ -65,16 +65,16 @@ _NUMBERS = re.compile(r"(?<=\[)\s+(?:[-+.\deE]+,\s+)*[-+.\deE]+\s+(?=\])")
 
 @dataclass(frozen=True)
 class Report:
-    """What a command writes into its output folder.
+    """The files that a command writes into its output folder.
 
     Attributes:
         name: stem of all files: `<name>.md`, `<name>.json` and `<name>-<plot>.svg`.
-        command: the command that made it, for the metadata of plots.
+        command: the command, for the metadata of plots.
         results: JSON values.
-        parts: paragraphs and tables of the page, in order; empty ones are left out.
-        plots: name -> figure.
+        parts: paragraphs and tables of the page in order, without empty ones.
+        plots: figures by name.
         summary: tables for the terminal.
-        notes: sentences for the terminal, after them.
+        notes: sentences for the terminal, after the tables.
     """
 
     name: str
@@ -87,12 +87,12 @@ class Report:
 
     @property
     def markdown(self) -> str:
-        """The page."""
+        """The page as Markdown."""
         texts = (part if isinstance(part, str) else part.markdown() for part in self.parts)
         return "\n\n".join(text for text in texts if text) + "\n"
 
     def publish(self, folder: Path) -> None:
-        """Write all files into `folder`, each whole or not at all, and print the summary."""
+        """Write all files into `folder`, each atomically, and print the summary."""
         from protomark.cli.terminal import console
         from protomark_bench.plot import save_svg
 
@@ -109,18 +109,18 @@ class Report:
 
 
 def save_json(path: Path, results: Mapping[str, Any]) -> None:
-    """Write results as JSON, whole or not at all; a list of numbers takes one line."""
+    """Write results as JSON atomically, with lists of numbers on one line."""
     text = json.dumps(results, indent=1)
     text = _NUMBERS.sub(lambda match: re.sub(r"\s+", " ", match[0]), text)
     write_text(path, text + "\n")
 
 
 def load_json(path: Path, format_name: str) -> dict[str, Any]:
-    """Results that `save_json` wrote.
+    """Read results that `save_json` wrote.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it does not hold results of this format.
+        ValueError: the file holds no results of this format.
     """
     try:
         results = json.loads(path.read_text(encoding="utf-8"))
@@ -134,11 +134,11 @@ def load_json(path: Path, format_name: str) -> dict[str, Any]:
 def check_folder(output: Path) -> None:
     """Raise before any work if `output` cannot be a folder."""
     if output.exists() and not output.is_dir():
-        raise NotADirectoryError(f"{output}: not a folder, name one for the report with -o")
+        raise NotADirectoryError(f"{output} is not a folder: name one for the report with -o")
 
 
 def picture(report: str, plot: str, alt: str) -> str:
-    """The Markdown that shows a plot of a report."""
+    """Markdown of a report's plot."""
     return f"![{alt}]({report}-{plot}.svg)"
 
 
@@ -158,7 +158,7 @@ def number(value: float | None, spec: str = ".3f") -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in the unit that suits them, with three digits."""
+    """Seconds in s, ms, µs or ns, with three digits."""
     scale, unit = next(
         (pair for pair in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if seconds >= pair[0]),
         (1e-9, "ns"),

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the true one, after the best similarity."""
+"""Measures the error of an estimated trajectory after the best similarity."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Similarity:
-    """x' = scale * rotation @ x + shift.
+    """The similarity x' = scale * rotation @ x + shift.
 
     Attributes:
         scale: factor.
@@ -25,7 +25,7 @@ class Similarity:
     shift: Array
 
     def __call__(self, points: Array) -> Array:
-        """Points (n, 3) moved."""
+        """Move points (n, 3)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
 
@@ -51,29 +51,26 @@ class TrajectoryError:
 
 
 def align(source: Array, target: Array) -> Similarity:
-    """The similarity that brings points closest to others, in least squares.
+    """The similarity that brings source points (n, 3) closest to target points (n, 3).
 
-    Umeyama, Least-squares estimation of transformation parameters between two point patterns
-    (1991), Eq. 40 to 43.
-
-    Args:
-        source: (n, 3) points.
-        target: (n, 3) the same points elsewhere.
+    It is the least-squares solution of Umeyama, Least-squares estimation of transformation
+    parameters between two point patterns (1991), Eq. 40 to 43.
 
     Raises:
-        ValueError: fewer than three points, other numbers of them, or all at one place.
+        ValueError: there are fewer than three points, the numbers differ, or all source points
+            coincide.
     """
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
         raise ValueError(
-            f"trajectories of shape {source.shape} and {target.shape}, expected two of (n, 3)"
+            f"trajectories have shapes {source.shape} and {target.shape}: give two of (n, 3)"
         )
     if len(source) < 3:
-        raise ValueError(f"{len(source)} common poses, at least three are needed to align")
+        raise ValueError(f"{len(source)} poses are common, but alignment needs three")
     middle_a, middle_b = source.mean(0), target.mean(0)
     a, b = source - middle_a, target - middle_b
     variance = float((a * a).sum() / len(a))
     if variance <= 1e-24:
-        raise ValueError("all estimated cameras stand at one place, so no scale can be found")
+        raise ValueError("all estimated cameras have the same position, so the scale is undefined")
     u, d, vt = np.linalg.svd(b.T @ a / len(a))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])
     rotation = u @ np.diag(sign) @ vt

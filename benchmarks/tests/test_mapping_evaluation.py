@@ -104,7 +104,7 @@ def test_a_run_that_was_cut_goes_on(room, tmp_path, monkeypatch):
     words += ("--memories", "medoid,prototypes-16")
     stopped = run(*words)
     assert stopped.exit_code == 130
-    assert "the same command goes on" in stopped.output.replace("\n", " ")
+    assert "the same command continues" in stopped.output.replace("\n", " ")
     report = tmp_path / "out" / "mapping.md"
     assert "**Not run:** room, prototypes-16." in report.read_text()
     assert run(*words).exit_code == 0

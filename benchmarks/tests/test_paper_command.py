@@ -103,7 +103,7 @@ def test_a_run_that_was_cut_goes_on(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "train", cut)
     stopped = run(folder, *ROLES, "-o", out)
     assert stopped.exit_code == 130
-    assert "the same command goes on" in stopped.output.replace("\n", " ")
+    assert "the same command continues" in stopped.output.replace("\n", " ")
     assert len(list((out / "cache").iterdir())) == 3
     assert not (out / "reproduction.md").exists()
     assert run(folder, *ROLES, "-o", out).exit_code == 0

@@ -36,14 +36,14 @@ def test_what_holds_no_sequence_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"holds no \*\.freak\.safetensors"):
         find([tmp_path], "freak")
     make(tmp_path, "x/a.freak.safetensors", "y/a.freak.safetensors")
-    with pytest.raises(ValueError, match="same sequence a; give one"):
+    with pytest.raises(ValueError, match="sequence a: give one"):
         find([tmp_path / "x", tmp_path / "y"], "freak")
 
 
 def test_own_sequences_have_roles_and_small_takes_some(capsys):
     every = there(*(name for role in ROLES.values() for name in role), "mine")
     assert assign(every, SCALES["full"], NONE) == {k: list(v) for k, v in ROLES.items()}
-    assert "left out, as they have no role at this scale: mine" in capsys.readouterr().err
+    assert "without a role at this scale: mine" in capsys.readouterr().err
     assert assign(every, SCALES["small"], NONE) == {
         "training": ["viking", "conch", "seneca"],
         "validation": ["caliterra"],

@@ -61,7 +61,7 @@ def test_error_of_known_offsets():
     ("estimated", "true", "say"),
     [
         (np.zeros((2, 3)), np.zeros((2, 3)), "at least three"),
-        (np.zeros((5, 3)), np.ones((5, 3)), "one place"),
+        (np.zeros((5, 3)), np.ones((5, 3)), "same position"),
         (np.zeros((5, 3)), np.ones((4, 3)), "shape"),
     ],
 )

@@ -107,7 +107,7 @@ void targets(const PrototypeMap& old_map, const PrototypeMap& new_map, const fs:
   const fs::path pipe = folder / "pipe";
   ::mkfifo(pipe.c_str(), 0600);
   for (const fs::path& path : {pipe, folder, fs::path("/dev/null")}) {
-    const std::string why = path.string() + ": cannot be written: it is there and is no regular";
+    const std::string why = path.string() + ": cannot be written: it exists and is not a regular";
     CHECK(check::throws<FileError>([&] { old_map.save(path); }, why));
     CHECK(check::throws<FileError>([&] { old_map.seal(path); }, why));
     CHECK(check::throws<FileError>([&] { old_map.encoder()->save(path); }, why));

@@ -8,7 +8,7 @@
 #include <set>
 #include <string>
 
-#include "base/rounded_mean.h"
+#include "base/quantize.h"
 #include "check.h"
 #include "file/container.h"
 #include "protomark/protomark.h"

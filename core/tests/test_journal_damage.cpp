@@ -113,9 +113,9 @@ void refused() {
   fails(joined({head, record(0), record(0)}), second + ": it does not follow");
   fails(joined({head, record(0), record(2)}), second + ": it does not follow");
   fails(joined({head, record(0), head}), second + ": it is a journal");
-  fails(joined({head, record(0), std::vector<char>(64), record(2)}),
-        second + " is broken, and there are others behind it, at byte " +
-            std::to_string(c.lengths[1] + 64));
+  fails(
+      joined({head, record(0), std::vector<char>(64), record(2)}),
+      second + " is broken, and another one follows at byte " + std::to_string(c.lengths[1] + 64));
   fails(joined({record(0)}), "it holds a record of a journal, not a journal");
   fails(joined({c.base}), "it holds a learning map, not a journal");
   fails(Content(1000, 'x'), "not a Protomark file");
@@ -177,7 +177,7 @@ void containers_within_a_torn_record() {
     CHECK(c.opened(joined({all, broken})) == c.states[3]);
     CHECK(check::throws<FileError>(
         [&] { c.opened(joined({all, broken, later})); },
-        "there are others behind it, at byte " + std::to_string(all.size() + record.size())));
+        "another one follows at byte " + std::to_string(all.size() + record.size())));
   }
   // Where its header did not reach the disk, no record of before stands behind it.
   Content broken = commit(4, earlier);

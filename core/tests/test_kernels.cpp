@@ -280,10 +280,9 @@ void compare_code_scans(const Kernels& set, test::Random& random) {
 int main() {
   test::Random random(7);
   int sets = 0;
-  for (const char* const* name = kernels::names(); *name != nullptr; ++name) {
-    const Kernels* set = kernels::find(*name);
-    CHECK(set != nullptr);
-    std::printf("%s\n", *name);
+  for (const Kernels* set = kernels::all(); set->name != nullptr; ++set) {
+    CHECK(kernels::find(set->name) == set);
+    std::printf("%s\n", set->name);
     ++sets;
     for (int style = 0; style < 3; ++style) {
       for (const std::size_t count : {1, 4, 8, 16}) {
@@ -294,7 +293,7 @@ int main() {
           compare_dense(*set, random, inputs, n, style);
         }
       }
-      for (int shift = std::strcmp(*name, "portable") == 0 ? 1 : 32; shift <= 62; ++shift) {
+      for (int shift = std::strcmp(set->name, "portable") == 0 ? 1 : 32; shift <= 62; ++shift) {
         for (const std::size_t n : {0, 1, 6}) {
           compare_activation(set->activate16, random, shift, n, style);
           compare_activation(set->activate32, random, shift, n, style);

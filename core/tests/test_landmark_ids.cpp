@@ -21,7 +21,7 @@ using Ids = std::vector<std::int64_t>;
 
 std::vector<std::byte> file_of(const Ids& ids) {
   ContainerWriter file(FileKind::sealed_map);
-  const bool indices = ids.empty() || ids_are_indices(ids.size(), ids.back());
+  const bool indices = ids.empty() || ids.back() + 1 == static_cast<std::int64_t>(ids.size());
   if (indices) return file.serialize();
   file.add_together({{section::kIdBlocks, IdBlockWriter::blocks_size(ids.size())},
                      {section::kIdGaps, ContainerWriter::kUnknownSize}},

@@ -466,9 +466,11 @@ void test_hamming() {
   options.max_distance = -1;
   CHECK(refused([&] { hamming_search(queries, database, 2, options); }, "max_distance"));
   const Ids three = {1, 2, 3}, negative = {1, 2, 3, -4}, repeated = {7, 7, 5, 7};
-  CHECK(refused([&] { hamming_search(queries, database, three); }, "4 rows, landmarks has 3"));
-  CHECK(refused([&] { hamming_search(queries, database, negative); }, "negative"));
-  CHECK(hamming_search(queries, database, repeated).ids.data == Ids{5, 7, 5, 7});
+  CHECK(refused([&] { hamming_search(queries, database, 2, {.landmarks = three}); },
+                "4 rows, landmarks has 3"));
+  CHECK(
+      refused([&] { hamming_search(queries, database, 2, {.landmarks = negative}); }, "negative"));
+  CHECK(hamming_search(queries, database, 2, {.landmarks = repeated}).ids.data == Ids{5, 7, 5, 7});
   const Matches none = hamming_search(queries, {rows.data(), 0, 8});
   CHECK(none.ids.data == Ids{-1, -1, -1, -1} && none.distances.data[0] == INT32_MAX);
 }

@@ -1,4 +1,3 @@
-#include "map/merge_cost.h"
 
 #include <algorithm>
 #include <map>

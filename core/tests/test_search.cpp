@@ -5,7 +5,7 @@
 #include <bit>
 #include <map>
 
-#include "base/sq4.h"
+#include "base/quantize.h"
 #include "check.h"
 #include "protomark/hamming.h"
 #include "random.h"
@@ -195,8 +195,9 @@ void check_hamming(test::Random& random, std::size_t rows, std::size_t bytes, st
     if (threads % 2 == 0) options.max_distance = static_cast<std::int32_t>(bytes);
     for (const bool distinct : {false, true}) {
       const Descriptors all{database.data(), rows, bytes}, some{queries.data(), n, bytes};
-      const Matches matches = distinct ? hamming_search(some, all, landmarks, k, options)
-                                       : hamming_search(some, all, k, options);
+      options.landmarks.reset();
+      if (distinct) options.landmarks = landmarks;
+      const Matches matches = hamming_search(some, all, k, options);
       int differences = 0;
       for (std::size_t q = 0; q < n; ++q) {
         const Ranking expected =

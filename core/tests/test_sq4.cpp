@@ -1,4 +1,4 @@
-#include "base/sq4.h"
+#include "base/quantize.h"
 
 #include <cstdlib>
 

@@ -1,4 +1,4 @@
-"""COLMAP's own incremental reconstruction with SIFT on the same images."""
+"""Runs COLMAP's incremental reconstruction with SIFT on the same images."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from protomark_bench.mapping.results import COLMAP, MappingRun
 if TYPE_CHECKING:
     from protomark_bench.mapping.sequences import ImageSequence
 
-# Up to so many images all pairs are matched; of more, pairs that lie up to ten apart or a power of
-# two.
+# All pairs of up to so many images are matched; of more images, those that are up to ten, or a
+# power of two, apart.
 EXHAUSTIVE = 40
 
 
@@ -26,8 +26,8 @@ def run(
 
     Args:
         sequence: the images.
-        threads: of each step.
-        advance: called after each image that is registered.
+        threads: threads of each step.
+        advance: called after each registered image.
     """
     source, seconds = sequence.source, {}
     began, since = time.perf_counter(), time.process_time()
@@ -84,8 +84,8 @@ def _mapping_options(threads: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
     options.random_seed = options.mapper.random_seed = 0
-    # The camera is known, as it is to the pipeline, whatever its coefficients are: by default
-    # COLMAP takes those above 1 for nonsense and registers nothing.
+    # The camera is known, as in the pipeline, but by default COLMAP rejects coefficients above 1
+    # and registers nothing.
     for bounds in (options, options.mapper, options.triangulation):
         bounds.max_extra_param = 1e12
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
@@ -101,7 +101,7 @@ def _run_of(
     if best is not None:
         posed = (image for image in best.images.values() if image.has_pose)
         centers = {i.name: [float(x) for x in i.projection_center()] for i in posed}
-    left = images - len(centers)
+    unregistered = images - len(centers)
     return MappingRun(
         memory=COLMAP,
         registered=len(centers),
@@ -116,6 +116,6 @@ def _run_of(
         wall_seconds=wall,
         search_ms=None,
         error_pixels=0.0 if best is None else float(best.compute_mean_reprojection_error()),
-        not_registered={"not in the largest model": left} if left else {},
+        not_registered={"not in the largest model": unregistered} if unregistered else {},
         events=[f"{models} models, the largest counts"] if models > 1 else [],
     )

@@ -1,4 +1,4 @@
-"""What `protomark evaluate-mapping` does: runs of the pipeline and of COLMAP, and a report."""
+"""Runs `protomark evaluate-mapping`: the pipeline with several memories, and COLMAP."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from protomark_bench.mapping.results import (
 )
 from protomark_bench.mapping.sequences import ImageSequence, error, open_sequences
 
-# Name -> what makes the memory, and dimensions of its prototypes.
+# Constructors of memories by name, and numbers per prototype.
 MEMORIES: dict[str, tuple[Callable[[MappingOptions], Memory], int]] = {
     TRADITIONAL: (Descriptors.of, 32),
     "medoid": (Medoids.of, 32),
@@ -43,18 +43,18 @@ MEMORIES: dict[str, tuple[Callable[[MappingOptions], Memory], int]] = {
 
 @dataclass(frozen=True)
 class MappingRequest:
-    """What is asked for.
+    """What to evaluate, and how.
 
     Attributes:
         sequences: folders with images/ and sparse/.
         output: folder of the cache.
         memories: names of `MEMORIES`.
-        descriptor, encoder, max_keypoints: as `protomark map` takes them.
-        colmap: whether COLMAP runs beside them.
+        descriptor, encoder, max_keypoints: see `protomark map`.
+        colmap: whether COLMAP runs, too.
         every: take every n-th image only.
-        frames: take the first so many of them only; 0: all.
-        threads: of every run.
-        command: the command line, as the report tells it.
+        frames: take only so many of these images; 0: all.
+        threads: threads of every run.
+        command: the command line, for the report.
     """
 
     sequences: Sequence[Path]
@@ -70,7 +70,7 @@ class MappingRequest:
     command: str = "protomark evaluate-mapping"
 
     def options(self, memory: str) -> MappingOptions:
-        """How to make a map with a memory."""
+        """Options of a map with this memory."""
         return MappingOptions(
             descriptor=self.descriptor,
             encoder=self.encoder,
@@ -80,7 +80,7 @@ class MappingRequest:
 
 
 def choose_memories(text: str) -> list[str]:
-    """The memories of a list such as traditional,medoid, in the order of tables; empty: all.
+    """The memories of a list such as traditional,medoid; all of them if it is empty.
 
     Raises:
         ValueError: there is no memory of some name.
@@ -126,9 +126,11 @@ def _mapped(s: ImageSequence, runs: dict[str, MappingRun]) -> MappedSequence:
     for memory, run in runs.items():
         errors = None
         if other is not None:
-            own = error(run.centers, true, other.centers)
-            others = error(other.centers, true, run.centers)
-            errors = None if own is None or others is None else (own, others)
+            ours, theirs = (
+                error(run.centers, true, other.centers),
+                error(other.centers, true, run.centers),
+            )
+            errors = None if ours is None or theirs is None else (ours, theirs)
         runs[memory] = replace(run, error=error(run.centers, true), common_errors=errors)
     plane = ground_plane(np.array(list(s.poses.values()))).tolist()
     return MappedSequence(s.name, len(s.source), s.available, s.truth, s.extent, runs, true, plane)
@@ -141,10 +143,10 @@ def _make_runs(
     cache: ResultCache,
     runs: dict[str, dict[str, MappingRun]],
 ) -> None:
-    """Fills in sequence -> memory -> its run, from the cache or made now."""
-    wanted = [(sequence, memory) for sequence in sequences for memory in order]
+    """Add the runs of every memory by sequence, from the cache or new."""
+    pairs = [(sequence, memory) for sequence in sequences for memory in order]
     with progress_bar() as progress:
-        for sequence, memory in wanted:
+        for sequence, memory in pairs:
             title, done = f"{sequence.name} by {memory}", 0
 
             def one_more(title: str = title, frames: int = len(sequence.source)) -> None:
@@ -171,7 +173,7 @@ def _make_runs(
 
 
 def _key(request: MappingRequest, sequence: ImageSequence, memory: str) -> str:
-    """The key of a run in the cache: everything that decides it."""
+    """The key of a run in the cache, from everything that determines it."""
     files = [(n, (sequence.source.path / n).stat().st_size) for n in sequence.source.names()]
     made_of: dict[str, Any] = {"version": pycolmap.__version__, "exhaustive": colmap.EXHAUSTIVE}
     if memory != COLMAP:
@@ -203,12 +205,12 @@ def _conditions(request: MappingRequest) -> dict[str, str]:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     return {
         "scale": f"{taken}, {limit}",
-        "pipeline": f"{request.descriptor.upper()}, at most {request.max_keypoints} keypoints an "
+        "pipeline": f"{request.descriptor.upper()}, at most {request.max_keypoints} keypoints per "
         f"image, window of {MappingOptions().window} keyframes; poses unknown, camera known and "
         "fixed",
         "COLMAP": "SIFT on the CPU, its default options but with any distortion, camera known and "
-        f"fixed; of more than {colmap.EXHAUSTIVE} images pairs are matched that lie up to ten "
-        "apart or a power of two"
+        f"fixed; of more than {colmap.EXHAUSTIVE} images it matches pairs that are up to ten, or a "
+        "power of two, apart"
         if request.colmap
         else "left out",
         "time": f"CPU seconds of the process, {request.threads} thread(s); load of the machine at "

@@ -1,4 +1,4 @@
-"""Memories to compare prototypes with: all descriptors, and one medoid per landmark."""
+"""Memories to compare prototypes with: all descriptors, or one medoid per landmark."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from protomark.features.descriptors import descriptor_kind
 from protomark.mapping.memory import Memory
 from protomark.mapping.options import MappingOptions
 
-# Rows of removed landmarks are dropped when they are this share of all.
+# Rows of removed landmarks are dropped once they are this share of all rows.
 _MAX_REMOVED_SHARE = 0.25
 _PAIRS = 4096
 _SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
@@ -23,12 +23,12 @@ _SET_BITS = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 class Descriptors(Memory):
     """Every descriptor of every landmark: the traditional way."""
 
-    # A Hamming distance is a squared Euclidean one, so its ratios are squares.
+    # Hamming distances are squared Euclidean ones, so their ratios are squares.
     ratio, guided_ratio, max_distance = 0.8, 0.85, 0.6
 
     @classmethod
     def of(cls, options: MappingOptions) -> Descriptors:
-        """The memory of a map."""
+        """An empty memory for a map with these options."""
         return cls(descriptor_kind(options.descriptor).bytes)
 
     def __init__(self, width: int) -> None:
@@ -65,10 +65,10 @@ class Descriptors(Memory):
         """See `Memory.merge_landmarks`."""
         self._sorted = None
         order = np.argsort(source)
-        at = np.minimum(np.searchsorted(source[order], self._owners), max(len(source) - 1, 0))
+        row = np.minimum(np.searchsorted(source[order], self._owners), max(len(source) - 1, 0))
         if len(source):
-            hit = source[order][at] == self._owners
-            self._owners[hit] = into[order][at[hit]]
+            merged = source[order][row] == self._owners
+            self._owners[merged] = into[order][row[merged]]
 
     def remove(self, ids: NDArray[np.int64]) -> None:
         """See `Memory.remove`."""
@@ -82,7 +82,7 @@ class Descriptors(Memory):
             self._owners, self._descriptors = self._owners[existing], self._descriptors[existing]
 
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Owners (n,), ascending, and descriptors (n, bytes) that matching compares with."""
+        """Ascending owners (n,) and descriptors (n, B) that matching compares."""
         if self._sorted is None:
             order = np.argsort(self._owners, kind="stable")
             order = order[np.searchsorted(self._owners[order], 0) :]
@@ -106,11 +106,11 @@ class Descriptors(Memory):
         if not len(rows):
             return np.zeros(0, np.float32)
         owners, _ = self.table()
-        many = np.bincount(owners, minlength=int(ids.max()) + 1)
-        counts = many[ids]
+        per_id = np.bincount(owners, minlength=int(ids.max()) + 1)
+        counts = per_id[ids]
         starts = np.cumsum(counts) - counts
         pair = np.repeat(np.arange(len(ids)), counts)
-        row = np.arange(len(pair)) + np.repeat((np.cumsum(many) - many)[ids] - starts, counts)
+        row = np.arange(len(pair)) + np.repeat((np.cumsum(per_id) - per_id)[ids] - starts, counts)
         words, others = _words(encoded), self._table_words()
         bits = np.empty(len(pair), np.int32)
         for a in range(0, len(pair), _PAIRS):
@@ -130,19 +130,19 @@ class Descriptors(Memory):
 
     @property
     def bytes(self) -> int:
-        """Bytes of all descriptors, without what assigns them to landmarks."""
+        """Bytes of all descriptors, without their assignment to landmarks."""
         return int((self._owners >= 0).sum()) * int(self._descriptors.shape[1])
 
 
 class Medoids(Descriptors):
-    """Of each landmark the descriptor that is closest to its others, as ORB-SLAM matches.
+    """The medoid of each landmark's descriptors, which ORB-SLAM matches.
 
-    To update a medoid takes all descriptors, so they are kept; `bytes` counts the medoids, which
-    matching needs.
+    All descriptors are kept, as an update of a medoid needs them, but `bytes` counts the medoids
+    only, which matching needs.
     """
 
-    # A medoid is further from a new view than the nearest of all descriptors: with the bounds of
-    # these, mapping with medoids loses `hololens` in the middle.
+    # A medoid is farther from a new view than the nearest of all descriptors: with their limits,
+    # mapping with medoids loses the camera in the middle of `hololens`.
     ratio, guided_ratio, max_distance = 0.9, 0.92, 0.75
 
     def __init__(self, width: int) -> None:

@@ -1,7 +1,4 @@
-"""One run of the pipeline on one sequence, and whether its prototypes drift.
-
-All that this distribution takes from `protomark.mapping` stands in this file.
-"""
+"""Runs the pipeline on a sequence, and measures the drift of its prototypes."""
 
 from __future__ import annotations
 
@@ -30,13 +27,13 @@ from protomark_bench.mapping.results import Drift, MappingRun
 from protomark_bench.mapping.sequences import ImageSequence
 
 Ids = NDArray[np.int64]
-# Frames whose search of the whole map is timed, and how often each; the quickest counts.
+# Number of frames whose search of the whole map is timed, and of repetitions; the fastest counts.
 _TIMED_FRAMES, _TIMES = 9, 3
-_COUNT_LIMIT = 255  # observations that a prototype counts before it is halved
+_COUNT_LIMIT = 255  # count at which a prototype's sums are halved
 
 
 def code_digest() -> str:
-    """A digest of the pipeline's code: cached runs of other code are not used."""
+    """A digest of the pipeline's code, so that cached runs of other code do not count."""
     digest = hashlib.sha256(pm.__version__.encode())
     for path in sorted(Path(mapping.__path__[0]).glob("*.py")):
         digest.update(path.read_bytes())
@@ -51,19 +48,19 @@ def run(
     threads: int,
     advance: Callable[[], None] = lambda: None,
 ) -> MappingRun:
-    """Maps a sequence, its poses unknown and its camera known.
+    """Maps a sequence with unknown poses and a known camera.
 
     Args:
         sequence: the images.
         memory: name of the memory.
-        new_memory: makes it.
-        options: of the map.
+        new_memory: creates the memory.
+        options: options of the map.
         threads: threads to search and adjust on.
         advance: called after each frame.
     """
     begin = time.perf_counter()
     mapper = Mapper(options, sequence.camera, threads, new_memory)
-    # Time that other programs on the machine take does not count.
+    # Processor time leaves out other programs on the machine.
     mapper.clock = Clock(time.process_time)
     for image in sequence.source.images():
         mapper.add(image)
@@ -102,7 +99,7 @@ def run(
 
 
 def _search_ms(mapper: Mapper, sequence: ImageSequence) -> float:
-    """Median over frames spread over the sequence."""
+    """Median milliseconds of a search, over frames that are spread over the sequence."""
     names = sequence.source.names()
     chosen = {names[i] for i in np.linspace(0, len(names) - 1, _TIMED_FRAMES).astype(int)}
     extractor = Extractor(mapper.options.descriptor, mapper.options.max_keypoints)
@@ -121,9 +118,9 @@ def _search_ms(mapper: Mapper, sequence: ImageSequence) -> float:
 
 
 class RecordedPrototypes(Prototypes):
-    """A memory of prototypes that records what was done to it, so that the map can be made again.
+    """A memory of prototypes that records all changes, so that the map can be rebuilt.
 
-    Recording costs next to nothing while frames come in; `observations` replays the record later.
+    Recording costs little while mapping; `observations` replays the record afterwards.
     """
 
     def __init__(self, encoder: pm.Encoder, dim: int) -> None:
@@ -132,7 +129,7 @@ class RecordedPrototypes(Prototypes):
 
     @classmethod
     def of(cls, options: MappingOptions) -> RecordedPrototypes:
-        """The memory of a map."""
+        """An empty memory for a map with these options."""
         prototypes = prototypes_for(options)
         return cls(prototypes.encoder, prototypes.dim)
 
@@ -157,18 +154,18 @@ class RecordedPrototypes(Prototypes):
         self._record.append(("remove", ids.copy(), ids[:0]))
 
     def observations(self) -> tuple[Ids, NDArray[np.int8]]:
-        """Landmark (n,) and code (n, dim) of all observations that are in the prototypes."""
+        """Landmarks (n,) and codes (n, dim) of all observations in the prototypes."""
         codes: dict[int, list[bytes]] = {}
-        for what, ids, given in self._record:
-            if what == "remove":
+        for change, ids, given in self._record:
+            if change == "remove":
                 for i in ids.tolist():
                     codes.pop(i, None)
-            elif what == "merge":
+            elif change == "merge":
                 for into, source in zip(ids.tolist(), given.tolist(), strict=True):
                     codes.setdefault(into, []).extend(codes.pop(source, []))
             else:
                 for i, code in zip(ids.tolist(), given, strict=True):
-                    if what == "add":
+                    if change == "add":
                         codes.setdefault(i, []).append(code.tobytes())
                     else:
                         codes[i].remove(code.tobytes())
@@ -178,11 +175,11 @@ class RecordedPrototypes(Prototypes):
 
 
 def measure_drift(mapper: Mapper, memory: RecordedPrototypes, source: ImageFolder) -> Drift:
-    """Makes the map of prototypes anew, at once, and compares.
+    """Compares the map of prototypes with maps that are built at once.
 
-    The pipeline added and subtracted observations frame by frame, merged and removed landmarks. One
-    map is made of the observations that were added and not subtracted; another one from the images,
-    of what the frames see at the end.
+    The pipeline has added and subtracted observations frame by frame, and merged and removed
+    landmarks. One map is built of the observations that were added and not subtracted, another one
+    from the images, of the observations that the frames have at the end.
     """
     ids, codes = memory.observations()
     fresh = pm.PrototypeMap(memory.encoder, memory.dim)
@@ -202,15 +199,15 @@ def measure_drift(mapper: Mapper, memory: RecordedPrototypes, source: ImageFolde
 
 
 def _different(one: pm.PrototypeMap, other: pm.PrototypeMap) -> int:
-    """Landmarks that only one map has, or whose count or prototype differs."""
+    """Number of landmarks that only one map has, or whose count or prototype differs."""
     both = np.intersect1d(one.ids, other.ids)
-    off = one.counts(both) != other.counts(both)
-    off |= (one.prototypes(both) != other.prototypes(both)).any(axis=1)
-    return int(off.sum()) + len(one) + len(other) - 2 * len(both)
+    different = one.counts(both) != other.counts(both)
+    different |= (one.prototypes(both) != other.prototypes(both)).any(axis=1)
+    return int(different.sum()) + len(one) + len(other) - 2 * len(both)
 
 
 def _final_observations(mapper: Mapper, source: ImageFolder) -> tuple[Ids, NDArray[np.uint8]]:
-    """Landmark and descriptor of everything that the frames see at the end."""
+    """Landmarks and descriptors of the observations that the frames have at the end."""
     extractor = Extractor(mapper.options.descriptor, mapper.options.max_keypoints)
     frames = {frame.name: frame for frame in mapper.structure.frames}
     ids, descriptors = [np.zeros(0, np.int64)], [np.zeros((0, mapper.descriptor_bytes), np.uint8)]

@@ -1,4 +1,4 @@
-"""All figures of an evaluation of mapping, as JSON and as a page."""
+"""Results of an evaluation of mapping, as JSON and as a page."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ _COLORS = {
 
 @dataclass(frozen=True)
 class Drift:
-    """A map made step by step beside maps made at once.
+    """A map that was built frame by frame, beside maps that are built at once.
 
     Attributes:
-        landmarks: of the map that the pipeline made.
-        observations: that were added to it and not subtracted.
-        same_file: whether a map made at once of these observations is saved in the same bytes.
+        landmarks: landmarks of the map.
+        observations: observations that were added to the map and not subtracted.
+        same_file: whether a map of these observations, built at once, has the same bytes.
         different: landmarks whose count or prototype differs between the two.
-        dropped: of the observations, those that bundle adjustment showed to be wrong when their
-            descriptors were gone: no frame sees them any more, but they stay in the prototype.
-        different_from_frames: landmarks that differ from a map of what the frames see at the end,
-            made from the images: those with dropped observations.
-        halved: landmarks with more observations than a count holds (255), which were halved.
+        dropped: observations that proved wrong after their descriptors had been dropped: they have
+            left the geometry, but stay in the prototype.
+        different_from_frames: landmarks that differ from a map of the frames' observations at the
+            end: those with dropped observations.
+        halved: landmarks with more than 255 observations, whose sums were halved.
     """
 
     landmarks: int
@@ -64,28 +64,28 @@ class MappingRun:
     """One memory, or COLMAP, on one sequence.
 
     Attributes:
-        memory: its name.
-        registered: images with a pose.
+        memory: name of the memory.
+        registered: number of images with a pose.
         error: root mean square error of camera centres after the best similarity, in the unit of
-            the true poses; None: too few poses.
-        common_errors: the same on images that the traditional map registered too, and that map's
+            the true poses; None with too few poses.
+        common_errors: the error on images that the traditional map registered, too, and that map's
             error on them.
-        landmarks: points of the map.
-        observations: keypoints that see one.
-        memory_bytes: what matching needs of all landmarks at the end, positions apart; None for
-            COLMAP, which keeps every descriptor of every image.
-        peak_bytes: the most of that after any frame.
-        peak_window_bytes: the most of map and window together after any frame.
-        learning_bytes: of prototypes: what they take while they can still be updated.
-        seconds: CPU seconds by stage, all frames together.
-        wall_seconds: time by the clock on the wall.
+        landmarks: number of landmarks.
+        observations: number of observations.
+        memory_bytes: bytes that matching needs for all landmarks at the end, without positions;
+            None for COLMAP, which keeps every descriptor of every image.
+        peak_bytes: largest `memory_bytes` after any frame.
+        peak_window_bytes: largest bytes of map and window together after any frame.
+        learning_bytes: bytes of prototypes that can be updated.
+        seconds: CPU seconds of all frames by stage.
+        wall_seconds: elapsed seconds.
         search_ms: CPU milliseconds to encode and search a frame's descriptors in the whole map at
             the end, median over frames.
         error_pixels: mean reprojection error.
-        not_registered: reason -> number of images.
-        events: loops that were closed, initializations that were aborted, and the like.
-        drift: of prototypes.
-        centers: image name -> camera centre, of images with a pose.
+        not_registered: number of images by reason.
+        events: closed loops, aborted initialisations and the like.
+        drift: drift of prototypes.
+        centers: camera centres by name, of images with a pose.
         growth: bytes of the map after each frame.
     """
 
@@ -111,7 +111,7 @@ class MappingRun:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> MappingRun:
-        """Back from `dataclasses.asdict`.
+        """The run of values that `dataclasses.asdict` returned.
 
         Raises:
             TypeError, KeyError: these are not the values of a run.
@@ -121,17 +121,17 @@ class MappingRun:
 
     @property
     def label(self) -> str:
-        """What tables say."""
+        """The name in tables."""
         return LABELS.get(self.memory, self.memory)
 
     @property
     def total(self) -> float:
-        """CPU seconds in all."""
+        """CPU seconds of all stages."""
         return sum(self.seconds.values())
 
     @property
     def matching(self) -> float:
-        """CPU seconds of the stages that find a frame in the map: codes, matches and its pose."""
+        """CPU seconds to find frames in the map: codes, matches and poses."""
         return self.seconds.get("encode", 0.0) + self.seconds.get("match", 0.0)
 
 
@@ -140,13 +140,13 @@ class MappedSequence:
     """All runs on one sequence.
 
     Attributes:
-        name: of the sequence.
-        frames: images that took part, of `available`.
-        available: images that there are.
-        truth: where the true poses come from.
+        name: name of the sequence.
+        frames: number of images in the runs.
+        available: number of images of the sequence.
+        truth: origin of the true poses.
         extent: diagonal of the box around the true camera centres.
-        runs: memory -> its run.
-        true_centers: image name -> true camera centre.
+        runs: runs by memory.
+        true_centers: true camera centres by image name.
         plane: (2, 3) axes of the ground plane, for the view from above.
     """
 
@@ -162,12 +162,12 @@ class MappedSequence:
 
 @dataclass(frozen=True)
 class MappingResults:
-    """Everything that the report says.
+    """The content of the report.
 
     Attributes:
-        sequences: one after the other.
-        missing: runs that Ctrl-C left out, "sequence, memory".
-        conditions: name -> text.
+        sequences: results of each sequence.
+        missing: runs that Ctrl-C prevented, as "sequence, memory".
+        conditions: conditions of the runs, by name.
     """
 
     sequences: list[MappedSequence]
@@ -190,11 +190,11 @@ class MappingResults:
         return cls(sequences, **values)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
+        """The results as JSON values."""
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     def report(self) -> Report:
-        """The page, its plots and the JSON."""
+        """The report: page, plots and JSON."""
         plots = {"ratios": draw_ratios(self)}
         if all(s.true_centers for s in self.sequences):
             plots["trajectories"] = draw_trajectories(self)
@@ -256,20 +256,19 @@ class MappingResults:
             self._stages(),
             "## Drift of prototypes",
             "The pipeline adds observations to prototypes and subtracts them, merges and removes "
-            "landmarks, frame after frame. A fresh map is made at once of the observations that "
-            "were added and not subtracted. Sums are exact, so both must be saved in the same "
-            "bytes. An observation that proves wrong after its descriptor is gone (*dropped*) "
-            "leaves the geometry and stays in the prototype, so some landmarks differ from those "
-            "of a map made from the images of what the frames see at the end. Counts above 255 "
-            "halve a sum, which rounds.",
+            "landmarks, frame by frame. A new map is built at once of the observations that were "
+            "added and not subtracted. Sums are exact, so both files must have the same bytes. An "
+            "observation that proves wrong after its descriptor was dropped (*dropped*) leaves the "
+            "geometry but stays in the prototype, so some landmarks differ from those of a map of "
+            "the frames' observations at the end. Counts above 255 halve a sum, which rounds.",
             self._drift(),
             "## Conditions",
             facts(self.conditions),
         ]
         if any(s.truth.startswith("SfM") and COLMAP in s.runs for s in self.sequences):
             parts.append(
-                "Poses by SfM are an incremental reconstruction with SIFT on all of these very "
-                "images: there COLMAP is compared with its own kind, and its error says little."
+                "Poses by SfM come from an incremental reconstruction with SIFT on the same "
+                "images: there COLMAP is compared with its own method, and its error means little."
             )
         return parts
 
@@ -396,7 +395,7 @@ def _matching_ratio(run: MappingRun, other: MappingRun) -> float | None:
 
 
 def draw_ratios(results: MappingResults) -> Figure:
-    """Every memory as a share of all descriptors: frames, error, memory, matching."""
+    """Draw frames, error, memory and matching time of each memory relative to all descriptors."""
     used = [s for s in results.sequences if TRADITIONAL in s.runs]
     memories = list(dict.fromkeys(memory for s in used for memory in s.runs))
 
@@ -431,7 +430,7 @@ def draw_ratios(results: MappingResults) -> Figure:
 
 
 def draw_trajectories(results: MappingResults) -> Figure:
-    """Camera centres of all memories, aligned, on the true ones, from above."""
+    """Draw the aligned camera centres of all memories and the true ones, from above."""
     from protomark_bench.trajectory import trajectory_error
 
     panels = []
@@ -466,7 +465,7 @@ def draw_trajectories(results: MappingResults) -> Figure:
 
 
 def draw_memory(results: MappingResults) -> Figure:
-    """Bytes of each map after each frame, without the window."""
+    """Draw the bytes of each map after each frame, without the window."""
     panels = []
     for s in results.sequences:
         series = [

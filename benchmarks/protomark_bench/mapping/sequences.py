@@ -1,4 +1,4 @@
-"""Sequences of images with their camera and the true trajectory, and trajectory errors."""
+"""Opens image sequences with camera and true trajectory, and measures trajectory errors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from protomark.geometry.pose import camera_centers
 from protomark.mapping.source import ImageFolder
 from protomark_bench.trajectory import trajectory_error
 
-# Of the project's own sequences, those whose poses a device measured, in metres; the others' poses
-# come from an incremental reconstruction of the same images.
+# The project's sequences with poses that a device measured in metres, and those with poses from an
+# incremental reconstruction of the same images.
 _MEASURED = ("hololens", "desk_rpy", "kitchen")
 _RECONSTRUCTED = ("viking", "conch", "seneca", "caliterra", "toy", "castle", "kitti07")
 
 
 class FirstImages(ImageFolder):
-    """A folder of images of which only the first `frames` count, 0 for all."""
+    """The first images of a folder; all if `frames` is 0."""
 
     def __init__(self, path: Path, every: int, frames: int) -> None:
         super().__init__(path, every)
@@ -33,14 +33,14 @@ class FirstImages(ImageFolder):
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """Images in their order, of one camera, and where they were taken.
+    """Images of one camera in order, and their true poses.
 
     Attributes:
-        name: of its folder.
-        source: the images that take part.
-        available: how many images the folder holds.
-        camera: their camera.
-        poses: image name -> (3, 4) true cam_from_world, of those that have one.
+        name: name of the folder.
+        source: the images of the runs.
+        available: number of images in the folder.
+        camera: the camera of all images.
+        poses: true cam_from_world (3, 4) by image name, as far as it exists.
     """
 
     name: str
@@ -51,14 +51,14 @@ class ImageSequence:
 
     @property
     def truth(self) -> str:
-        """Where the true poses come from, for tables."""
+        """Origin of the true poses, for tables."""
         if self.name in _MEASURED:
             return "measured, metres"
         return "SfM, its own unit" if self.name in _RECONSTRUCTED else "as given"
 
     @property
     def centers(self) -> dict[str, list[float]]:
-        """Image name -> true camera centre, x, y, z."""
+        """True camera centres x, y, z by image name."""
         return {name: camera_centers(pose).tolist() for name, pose in self.poses.items()}
 
     @property
@@ -68,19 +68,19 @@ class ImageSequence:
 
 
 def open_sequence(folder: Path, every: int = 1, frames: int = 0) -> ImageSequence:
-    """A folder that holds images/ and sparse/.
+    """Open a folder with images/ and sparse/.
 
     Args:
         folder: the folder.
         every: take every n-th image only.
-        frames: take the first so many of those only; 0: all.
+        frames: take only so many of these images; 0: all.
 
     Raises:
         FileNotFoundError: images or model are missing.
         ValueError: there are several cameras, or fewer than three of the images have a pose.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; a sequence holds images/ and sparse/")
+        raise FileNotFoundError(f"{folder}: no such folder: name one with images/ and sparse/")
     images = folder / "images" if (folder / "images").is_dir() else folder
     source = FirstImages(images, every, frames)
     available = len(ImageFolder(images))
@@ -90,18 +90,18 @@ def open_sequence(folder: Path, every: int = 1, frames: int = 0) -> ImageSequenc
     poses = {name: true[name] for name in source.names() if name in true}
     if len(poses) < 3:
         raise ValueError(
-            f"{folder}: {len(poses)} of {len(source)} images have a pose in {path}, three are "
-            "needed to compare trajectories; are the names the same?"
+            f"{folder}: {len(poses)} of {len(source)} images have a pose in {path}, but the "
+            "comparison of trajectories needs three: give a model with the same image names"
         )
     camera = read_cameras(str(path)).find("", *source.size())
     return ImageSequence(folder.resolve().name, source, available, camera, poses)
 
 
 def open_sequences(folders: Sequence[Path], every: int, frames: int) -> list[ImageSequence]:
-    """All of them; see `open_sequence`.
+    """Open several sequences, see `open_sequence`.
 
     Raises:
-        ValueError: two have one name.
+        ValueError: two have the same name.
     """
     found = [open_sequence(folder, every, frames) for folder in folders]
     names = [s.name for s in found]
@@ -119,12 +119,12 @@ def error(
     """Root mean squared distance of camera centres after the best similarity (as evo's -as).
 
     Args:
-        centers: image name -> estimated camera centre.
-        true: image name -> true camera centre.
-        among: names that count; None: all.
+        centers: estimated camera centres by image name.
+        true: true camera centres by image name.
+        among: image names that count; None: all.
 
     Returns:
-        None where fewer than three images, or images of one place, have both.
+        None if fewer than three images, or images of one position, have both.
     """
     names = [n for n in centers if n in true and (among is None or n in among)]
     if len(names) < 3:

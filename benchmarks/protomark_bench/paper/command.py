@@ -1,4 +1,4 @@
-"""What `protomark reproduce` does: tracks, trainings, measurements, report."""
+"""Runs `protomark reproduce`: trainings, measurements and results."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class PaperSettings:
     """How a reproduction runs.
 
     Attributes:
-        scale: how long trainings are, and on what.
-        descriptor: of the tracks.
+        scale: length and data of the trainings.
+        descriptor: descriptor of the tracks.
         jobs: trainings at a time.
-        threads: threads of each.
-        roles: role -> names of sequences that the user gave that role.
+        threads: threads of each training.
+        roles: names of sequences by the role that the user gave them.
     """
 
     scale: Scale
@@ -70,7 +70,7 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
 
     Raises:
         FileNotFoundError, ValueError: sequences are missing, broken or too few.
-        KeyboardInterrupt: what is finished is in the cache; the same call goes on.
+        KeyboardInterrupt: finished results are cached, and the same call continues.
     """
     begin = time.perf_counter()
     keep_freed_memory()
@@ -99,8 +99,8 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
     rows = _rows(tests, picks, measured, descriptor, training.bits, together)
     seconds = {trainings.key(t): o.seconds for t, o in outcomes.items()}
     note(
-        f"{trainings.made} trainings made, {len(seconds) - trainings.made} were there; "
-        f"{(time.perf_counter() - begin) / 60:.1f} minutes in all"
+        f"{trainings.made} trainings ran, {len(seconds) - trainings.made} were cached; "
+        f"{(time.perf_counter() - begin) / 60:.1f} minutes in total"
     )
     return PaperResults(
         scale=settings.scale.name,
@@ -121,7 +121,7 @@ def reproduce(data: Sequence[Path], output: Path, settings: PaperSettings) -> Pa
 
 
 def _load(paths: dict[str, list[Path]]) -> tuple[PaperData, list[SequenceSize], str]:
-    """Training and validation sequences, checked."""
+    """Read and check training and validation sequences."""
     data = load_training(paths["training"], paths["validation"], max_queries=10_000)
     validation = [
         Views.from_tracks(Tracks.load(path), sequence_name(path)) for path in paths["validation"]
@@ -139,8 +139,8 @@ def _open_test(path: Path, cache: ResultCache, descriptor: str, bits: int) -> Me
     test = MeasuredSequence(path, cache)
     if (test.tracks.descriptor, test.tracks.bits) != (descriptor, bits):
         raise ValueError(
-            f"{path}: {test.tracks.descriptor} descriptors of {test.tracks.bits} bits, but the "
-            f"training tracks have {descriptor} of {bits}; give tracks of one descriptor"
+            f"{path} has {test.tracks.descriptor} descriptors of {test.tracks.bits} bits, but the "
+            f"training tracks have {descriptor} of {bits}: give tracks of one descriptor"
         )
     return test
 
@@ -163,11 +163,11 @@ def _measure(
     outcomes: dict[Training, TrainingOutcome],
     trainings: Trainings,
 ) -> dict[tuple[Training, str], float]:
-    """Precision on test of every network that the curves and the table ask for."""
-    wanted = [t for pick in picks for t in measured_trainings(pick)]
+    """Precision on the test sequences of every network in the curves and the table."""
+    measured = [t for pick in picks for t in measured_trainings(pick)]
     found = {}
     with progress_bar() as progress:
-        for training in tracked(wanted, progress, "measure networks"):
+        for training in tracked(measured, progress, "measure networks"):
             for test in tests:
                 key = trainings.key(training)
                 found[training, test.name] = test.of_network(training, key, outcomes[training])
@@ -182,7 +182,7 @@ def _rows(
     bits: int,
     threads: int,
 ) -> list[MethodRow]:
-    """The table, in the paper's order; what the paper does not have comes last."""
+    """The rows of the table in the paper's order, followed by rows that the paper lacks."""
     methods, encoder = compared(descriptor, bits, threads)
     by_sequence = {}
     with progress_bar() as progress:
@@ -232,7 +232,7 @@ def _conditions(settings: PaperSettings, half: bool, seconds: list[float]) -> di
     return {
         "schedule": f"Adam at 0.001, a tenth of it after {scale.patience} epochs of {scale.epoch} "
         f"steps without a lower validation loss{end}",
-        "trainings": f"{len(seconds)}, {sum(seconds) / 60:.1f} minutes of one process in all",
+        "trainings": f"{len(seconds)}, {sum(seconds) / 60:.1f} minutes of one process in total",
         "seeds": "sweeps 0; table " + ", ".join(map(str, SEEDS)),
         "jobs": f"{settings.jobs} training(s) at a time with {settings.threads} thread(s) each, "
         f"matrix products in {'bfloat16' if half else 'float32'}",

@@ -1,4 +1,4 @@
-"""Precision on the test sequences, of trained networks and of what they are compared with."""
+"""Measures precision on the test sequences, of trained networks and other methods."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ SHIPPED = ("protomark-32", "protomark-16")
 
 
 class MeasuredSequence:
-    """One test sequence, and what is measured on it, from the cache if it is there.
+    """A test sequence, and measurements on it, which are cached.
 
     Args:
-        path: of its tracks file.
-        cache: of figures.
+        path: its tracks file.
+        cache: cache of the measurements.
 
     Raises:
-        ValueError: some seed leaves no queries.
+        ValueError: there are no queries at some seed.
     """
 
     def __init__(self, path: Path, cache: ResultCache) -> None:
@@ -59,7 +59,7 @@ class MeasuredSequence:
     def of_methods(
         self, methods: Sequence[MethodChoice], encoder: str, threads: int
     ) -> dict[str, tuple[list[float], float]]:
-        """Method -> precision at each seed, and mean bytes per landmark."""
+        """Precision at each seed, and mean bytes per landmark, by method."""
         names = [choice.name for choice in methods]
         key = key_of(methods=names, seeds=SEEDS, encoder=encoder, sequence=self.fingerprint)
 
@@ -72,7 +72,7 @@ class MeasuredSequence:
 
 
 def compared(descriptor: str, bits: int, threads: int) -> tuple[list[MethodChoice], str]:
-    """The paper's other methods, and the encoder that ships for the descriptor, if one does.
+    """The paper's other methods, and the encoder that ships for the descriptor, if any.
 
     Returns:
         The methods, and the identity of the encoder ("" without one).

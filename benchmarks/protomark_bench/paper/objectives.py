@@ -14,9 +14,9 @@ from protomark.training.sampling import Views, random_views
 
 MARGIN = 1.0
 MAX_VIEWS = 6
-# Of the views of a landmark, this share is queries, at least one.
+# Share of a landmark's views that are queries; at least one is.
 QUERY_SHARE = 1 / 3
-# Keeps the gradient of a distance finite where two embeddings are equal.
+# Keeps the gradient of a distance finite if two embeddings are equal.
 _TINY = 1e-12
 
 
@@ -32,10 +32,10 @@ def draw_triplets(views: Views, count: int, rng: np.random.Generator) -> NDArray
     Raises:
         ValueError: there are fewer than two landmarks, or none with two views.
     """
-    often = np.flatnonzero(views.counts >= 2)
-    if len(views) < 2 or not len(often):
-        raise ValueError(f"{views.name}: no two landmarks to draw a triplet from")
-    chosen = rng.choice(often, min(count, len(often)), replace=False, shuffle=False)
+    repeated = np.flatnonzero(views.counts >= 2)
+    if len(views) < 2 or not len(repeated):
+        raise ValueError(f"{views.name}: there are no two landmarks to draw a triplet from")
+    chosen = rng.choice(repeated, min(count, len(repeated)), replace=False, shuffle=False)
     rows, _, _ = random_views(views, chosen, 2, rng)
     other = (chosen + rng.integers(1, len(views), len(chosen))) % len(views)
     negative = views.starts[other] + rng.integers(0, views.counts[other])
@@ -53,7 +53,7 @@ def triplet_loss(
         anchor: (m, k) float, embeddings.
         positive: (m, k) float, embeddings of other views of the anchors' landmarks.
         negative: (m, k) float, embeddings of views of other landmarks.
-        margin: of the hinge.
+        margin: margin of the hinge.
     """
 
     def distance(a: Tensor, b: Tensor) -> Tensor:
@@ -83,22 +83,22 @@ def draw_episode(views: Views, classes: int, rng: np.random.Generator) -> Episod
     Raises:
         ValueError: fewer than two landmarks have two views.
     """
-    often = np.flatnonzero(views.counts >= 2)
-    if len(often) < 2:
-        raise ValueError(f"{views.name}: no two landmarks with two views to make an episode of")
-    chosen = rng.choice(often, min(classes, len(often)), replace=False, shuffle=False)
+    repeated = np.flatnonzero(views.counts >= 2)
+    if len(repeated) < 2:
+        raise ValueError(f"{views.name}: an episode needs two landmarks with two views")
+    chosen = rng.choice(repeated, min(classes, len(repeated)), replace=False, shuffle=False)
     rows, group, rank = random_views(views, chosen, MAX_VIEWS, rng)
     queries = np.maximum((np.bincount(group) * QUERY_SHARE).astype(np.int64), 1)
     return Episode(rows, group, rank < queries[group])
 
 
 def prototypical_loss(embeddings: Tensor, classes: Tensor, is_query: Tensor) -> Tensor:
-    """Mean negative log-probability of the queries' own classes, a scalar.
+    """Mean negative log-probability of the queries' classes, a scalar.
 
-    A softmax over minus the distances to the means of the support sets classifies a query. The
-    paper leaves the distance open; this is the squared Euclidean one of Snell et al. (2017), for
-    which the mean is the point closest to a support set (a Bregman divergence). The loss is the
-    mean where the paper writes the sum, so that a learning rate means the same for any episode.
+    A softmax over negative distances to the means of the support sets classifies a query. The paper
+    does not state the distance; this is the squared Euclidean one of Snell et al. (2017), for which
+    the mean is the point closest to a support set (a Bregman divergence). The loss is a mean where
+    the paper has a sum, so that the learning rate does not depend on the size of an episode.
 
     Args:
         embeddings: (n, k) float.
@@ -106,11 +106,11 @@ def prototypical_loss(embeddings: Tensor, classes: Tensor, is_query: Tensor) -> 
         is_query: (n,) bool; every class has rows of both kinds.
     """
     support, target = embeddings[~is_query], classes[is_query]
-    of = classes[~is_query]
-    count = of.bincount()
-    total = support.new_zeros(len(count), support.shape[1]).index_add(0, of, support)
+    of_support = classes[~is_query]
+    count = of_support.bincount()
+    total = support.new_zeros(len(count), support.shape[1]).index_add(0, of_support, support)
     prototypes = total / count[:, None]
     query = embeddings[is_query]
-    # -|q - p|^2 without |q|^2, which is the same for all classes and cancels in the softmax.
+    # -|q - p|^2 without |q|^2, which cancels in the softmax.
     logits = 2 * query @ prototypes.T - prototypes.square().sum(1)
     return functional.cross_entropy(logits, target)

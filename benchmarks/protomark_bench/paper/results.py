@@ -1,4 +1,4 @@
-"""All figures of a reproduction, as JSON and as a page with the paper's numbers beside ours."""
+"""Results of a reproduction, as JSON and as a page beside the paper's numbers."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class DepthPoint:
     Attributes:
         training: the network and its objective.
         hidden: units of all layers but the last.
-        precision: on validation.
-        validation_loss: the lowest, of the training's own objective.
-        best_step: steps after which it was found; these weights are used.
-        steps: steps in all.
-        seconds: that the training took.
+        precision: precision on validation.
+        validation_loss: lowest validation loss of the training's objective.
+        best_step: step with that loss, whose weights are used.
+        steps: number of steps.
+        seconds: duration of the training.
     """
 
     training: Training
@@ -58,7 +58,7 @@ class DimensionCurve:
 
     Attributes:
         training: the network and its objective, at any dimension.
-        precision: dimension -> sequence -> precision.
+        precision: precision by dimension and sequence.
     """
 
     training: Training
@@ -74,10 +74,10 @@ class MethodRow:
     """One method of the table.
 
     Attributes:
-        name: as in `scale.TABLE` where the paper has it.
-        label: what the table says.
-        bytes_per_landmark: mean over the sequences, with the count of observations.
-        precision: sequence -> one number per seed.
+        name: its name, that of `scale.TABLE` if the paper has it.
+        label: its name in the table.
+        bytes_per_landmark: mean over the sequences, including the count of observations.
+        precision: one number per seed, by sequence.
     """
 
     name: str
@@ -93,7 +93,7 @@ class MethodRow:
 
 @dataclass(frozen=True)
 class SequenceSize:
-    """What a sequence holds, and its role: training, validation or test."""
+    """The size of a sequence, and its role: training, validation or test."""
 
     name: str
     role: str
@@ -104,19 +104,19 @@ class SequenceSize:
 
 @dataclass(frozen=True)
 class PaperResults:
-    """Everything that the report is made from.
+    """The content of the report.
 
     Attributes:
         scale: name of the scale.
-        max_steps: limit of a training, None where plateaus end it.
-        descriptor: its name.
-        bits: its length.
-        sequences: in the order training, validation, test.
-        depth: the comparison of architectures on validation.
-        curves: precision against dimension: the paper's network, then the best one on validation
-            if it is another.
-        rows: the table.
-        conditions: name -> value, what else one has to know to run it again.
+        max_steps: limit on the steps of a training, None if plateaus end it.
+        descriptor: name of the descriptor.
+        bits: length of the descriptor.
+        sequences: sizes of training, validation and test sequences.
+        depth: comparison of architectures on validation.
+        curves: precision against dimension of the paper's network, and of the best one on
+            validation if it is another.
+        rows: rows of the table.
+        conditions: conditions of the run, by name.
     """
 
     scale: str
@@ -155,7 +155,7 @@ class PaperResults:
         return cls(**values)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values; shares of the unaggregated precision and the paper's figures are added."""
+        """The results as JSON values, with shares of the unaggregated precision and the paper's."""
         values = asdict(self)
         for row, entry in zip(self.rows, values["rows"], strict=True):
             entry.update(
@@ -170,25 +170,25 @@ class PaperResults:
         return [s.name for s in self.sequences if s.role == role]
 
     def precision(self, objective: str, shape: str, layers: int) -> float:
-        """Precision on validation of one network of the comparison."""
-        wanted = (objective, shape, layers)
+        """Precision on validation of a network of the comparison."""
+        network = (objective, shape, layers)
         return next(
             p.precision
             for p in self.depth
-            if (p.training.objective, p.training.shape, p.training.layers) == wanted
+            if (p.training.objective, p.training.shape, p.training.layers) == network
         )
 
     @property
     def unaggregated(self) -> list[float]:
-        """Precision of the unaggregated map at each seed; the curves have the first one."""
+        """Precision of the unaggregated map at each seed, of which the curves use the first."""
         return next(row for row in self.rows if row.name == "unaggregated").by_seed
 
     def shares(self, row: MethodRow) -> list[float]:
-        """Precision as a share of the unaggregated one on the same queries, at each seed."""
+        """Precision at each seed as a share of the unaggregated one on the same queries."""
         return [a / max(b, 1e-9) for a, b in zip(row.by_seed, self.unaggregated, strict=True)]
 
     def report(self) -> Report:
-        """The page, its plots and the JSON."""
+        """The report: page, plots and JSON."""
         plots = {"depth": draw_depth(self), "dimension": draw_dimension(self)}
         title = f"Mean of {', '.join(self.names('test'))}"
         methods = self._methods().rich(title)
@@ -196,7 +196,7 @@ class PaperResults:
 
     def _parts(self) -> list[Part]:
         limit = (
-            f"at most {self.max_steps:,} steps a training"
+            f"at most {self.max_steps:,} steps per training"
             if self.max_steps
             else "trained until the validation loss stagnates for the third time"
         )
@@ -305,7 +305,7 @@ class PaperResults:
 
 
 def draw_depth(results: PaperResults) -> Figure:
-    """Precision on validation against depth, for both shapes and both objectives."""
+    """Draw precision on validation against depth, for both shapes and objectives."""
     series = [
         plot.Series(
             f"{shape}, {objective}",
@@ -325,7 +325,7 @@ def draw_depth(results: PaperResults) -> Figure:
 
 
 def draw_dimension(results: PaperResults) -> Figure:
-    """Precision on test against dimension, as it is and as a share of the unaggregated one."""
+    """Draw precision on test against dimension, absolute and as a share of the unaggregated."""
     whole, paper = results.unaggregated[0], TABLE["unaggregated"]
     panels = []
     for title, y, ours, theirs, levels in (

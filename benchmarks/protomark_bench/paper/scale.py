@@ -1,4 +1,4 @@
-"""Scales of a reproduction, the networks to train, and what the paper reports of them."""
+"""Scales of a reproduction, its networks, and the paper's figures."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PAPER = (
     "Komorowski and Trzciński, *Aggregation of binary feature descriptors for compact scene model "
     "representation in large scale structure-from-motion applications*"
 )
-# Section "Network architectures evaluation", on the paper's test sequence.
+# From section "Network architectures evaluation", on the paper's test sequence.
 PRECISION_BY_DIM = {8: 0.40, 16: 0.65, 32: 0.75, 64: 0.79}
-# The table of section "Final evaluation", by the names of our rows.
+# From the table of section "Final evaluation", by the names of our rows.
 TABLE = {
     "unaggregated": 0.796,
     "prototypes-32": 0.750,
@@ -38,11 +38,11 @@ class Scale:
     """How long a reproduction trains, and on which sequences.
 
     Attributes:
-        name: what `--scale` takes.
-        steps: batches of one training at most, None to go on until the plateaus end it.
+        name: name for `--scale`.
+        steps: limit on the batches of a training, None if plateaus end it.
         epoch: batches between two evaluations of the validation loss.
         patience: epochs without a lower validation loss after which the rate falls.
-        small: whether only the smaller ones of the project's own sequences take part.
+        small: whether to use only the smaller ones of the project's sequences.
     """
 
     name: str
@@ -66,10 +66,10 @@ def find_scale(name: str) -> Scale:
     """The scale of this name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is no such scale.
     """
     if name not in SCALES:
-        raise ValueError(f"--scale {name!r} is not known: give {', '.join(SCALES)}")
+        raise ValueError(f"--scale {name!r} is unknown: give {', '.join(SCALES)}")
     return SCALES[name]
 
 
@@ -80,9 +80,9 @@ class Training:
     Attributes:
         objective: "triplet" or "prototypical".
         shape: "funnel" or "fat".
-        layers: linear layers, the last one included, as the paper counts them.
+        layers: number of linear layers, including the last one, as in the paper.
         dim: units of the last layer.
-        seed: of weights and batches.
+        seed: seed of weights and batches.
     """
 
     objective: Objective
@@ -94,8 +94,8 @@ class Training:
     def hidden(self, bits: int) -> tuple[int, ...]:
         """Units of all layers but the last, for descriptors of `bits` bits.
 
-        'fat': all as wide as the input. 'funnel': the first as wide as the input, each next one
-        half as wide as the one before. With two layers both are the same network.
+        'fat': all are as wide as the input. 'funnel': the first is as wide as the input, each
+        further one half as wide as the previous one. With two layers both are the same network.
         """
         if self.shape == "fat":
             return (bits,) * (self.layers - 1)
@@ -112,8 +112,8 @@ class Training:
         return Training(self.objective, self.shape, self.layers, dim, seed)
 
 
+# The best network on the paper's validation sequence, which it used on its test sequence.
 PAPER_PICK = Training("triplet", "funnel", 3)
-"""What the paper found best on its validation sequence, and used on its test sequence."""
 
 
 def depth_trainings() -> list[Training]:
@@ -125,7 +125,7 @@ def depth_trainings() -> list[Training]:
 
 
 def measured_trainings(pick: Training) -> list[Training]:
-    """What the test sequences are measured with: every dimension once, the table's three times."""
+    """Networks to measure on the test sequences: every dimension once, the table's at each seed."""
     by_dim = [pick.like(dim) for dim in DIMS]
     by_seed = [pick.like(dim, seed) for dim, seed in product(TABLE_DIMS, SEEDS)]
     return list(dict.fromkeys(by_dim + by_seed))

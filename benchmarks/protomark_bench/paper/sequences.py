@@ -1,4 +1,4 @@
-"""Which tracks files there are, and what each is used for."""
+"""Finds tracks files and assigns their roles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from protomark.cli.terminal import note
 from protomark.tracks.file import sequence_name
 from protomark_bench.paper.scale import Scale
 
-# Role -> the project's own sequences, and those of them that the smallest scale uses.
+# The project's sequences by role, and those of them that the smallest scale uses.
 ROLES = {
     "training": ("hololens", "desk_rpy", "viking", "conch", "seneca"),
     "validation": ("caliterra",),
@@ -21,10 +21,10 @@ _SUFFIX = ".safetensors"
 
 
 def find(data: Sequence[Path], descriptor: str) -> dict[str, Path]:
-    """Name of the sequence -> its tracks file, of files and of folders of them.
+    """Tracks files by the name of their sequence, from files and folders of files.
 
     Raises:
-        FileNotFoundError: something is missing, or holds no tracks.
+        FileNotFoundError: a file or folder is missing, or a folder holds no tracks.
         ValueError: two files are of the same sequence.
     """
     files = []
@@ -33,19 +33,19 @@ def find(data: Sequence[Path], descriptor: str) -> dict[str, Path]:
             inside = sorted(path.glob(f"*.{descriptor}{_SUFFIX}"))
             if not inside:
                 raise FileNotFoundError(
-                    f"{path}: holds no *.{descriptor}{_SUFFIX}; make some with `protomark tracks`"
+                    f"{path} holds no *.{descriptor}{_SUFFIX}: make them with `protomark tracks`"
                 )
             files += inside
         elif path.is_file():
             files.append(path)
         else:
-            raise FileNotFoundError(f"{path}: no such tracks file, and no such folder")
+            raise FileNotFoundError(f"{path}: no such tracks file or folder")
     found: dict[str, Path] = {}
     for file in files:
         other = found.setdefault(sequence_name(file), file)
         if other.resolve() != file.resolve():
             raise ValueError(
-                f"{file}: {other} is of the same sequence {sequence_name(file)}; give one of them"
+                f"{file} and {other} are of the sequence {sequence_name(file)}: give one of them"
             )
     return found
 
@@ -53,32 +53,32 @@ def find(data: Sequence[Path], descriptor: str) -> dict[str, Path]:
 def assign(
     found: dict[str, Path], scale: Scale, given: dict[str, Sequence[str]]
 ) -> dict[str, list[str]]:
-    """Role -> names of its sequences: those that the user gave it, else the project's own.
+    """Names of sequences by role: those that the user gave, else the project's.
 
     Args:
-        found: name -> tracks file.
-        scale: a small one uses fewer of the project's own sequences.
-        given: role -> names that the user wants in it.
+        found: tracks files by name.
+        scale: a small scale uses fewer of the project's sequences.
+        given: names by the role that the user gave them.
 
     Raises:
-        ValueError: a name is missing or in two roles, or a role is left empty.
+        ValueError: a name is missing or has two roles, or a role has no sequence.
     """
     chosen: dict[str, list[str]] = {}
-    elsewhere = [name for names in given.values() for name in names]
-    for name in elsewhere:
+    assigned = [name for names in given.values() for name in names]
+    for name in assigned:
         if name not in found:
             raise ValueError(
                 f"no sequence is named {name}: there are {', '.join(sorted(found)) or 'none'}"
             )
-        if elsewhere.count(name) > 1:
+        if assigned.count(name) > 1:
             raise ValueError(f"{name} is given twice: a sequence has one role")
-    for role, own in ROLES.items():
-        usual = [
+    for role, names in ROLES.items():
+        default = [
             name
-            for name in own
-            if name in found and name not in elsewhere and (not scale.small or name in SMALL)
+            for name in names
+            if name in found and name not in assigned and (not scale.small or name in SMALL)
         ]
-        chosen[role] = list(given.get(role) or usual)
+        chosen[role] = list(given.get(role) or default)
         if not chosen[role]:
             raise ValueError(
                 f"no {role} sequence among {', '.join(sorted(found))}: name one with "
@@ -86,5 +86,5 @@ def assign(
             )
     unused = sorted(set(found) - {name for names in chosen.values() for name in names})
     if unused:
-        note(f"left out, as they have no role at this scale: {', '.join(unused)}")
+        note(f"without a role at this scale: {', '.join(unused)}")
     return chosen

@@ -1,4 +1,4 @@
-"""One training: the paper's objectives, Adam, and the plateau schedule."""
+"""Trains a network with the paper's objectives, Adam, and the plateau schedule."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from protomark_bench.paper.objectives import (
 )
 from protomark_bench.paper.scale import Objective, Scale, Training
 
-# About 1500 descriptors a step for either objective, so that a step costs the same.
+# A step has about 1500 descriptors for either objective, so that it costs the same.
 TRIPLETS = 512
 CLASSES = 320
 _VALIDATION_BATCHES = 8
@@ -31,20 +31,20 @@ _VALIDATION_BATCHES = 8
 RATE = 0.001
 FACTOR = 0.1
 DROPS = 2
-# With a limit of steps the rate falls at the latest when this share of them is done.
+# With a limit on the steps, the rate falls after this share of them at the latest.
 _LATEST_DROP = 0.8
 
 
 @dataclass(frozen=True)
 class PaperData:
-    """What trainings read.
+    """The data of trainings.
 
     Attributes:
         training: views of the training sequences.
         validation: views of the validation sequences, for the validation loss.
         trials: splits of the validation sequences, for the precision.
         bits: length of a descriptor.
-        fingerprint: of all this.
+        fingerprint: digest of the data.
     """
 
     training: list[Views]
@@ -60,11 +60,11 @@ class TrainingOutcome:
 
     Attributes:
         weights: state of the network at the lowest validation loss, by name.
-        precision: on validation.
-        validation_loss: the lowest.
-        best_step: steps after which it was found.
-        steps: steps in all.
-        seconds: that they took, with the validations.
+        precision: precision on validation.
+        validation_loss: lowest validation loss.
+        best_step: step with that loss.
+        steps: number of steps.
+        seconds: duration, including validation.
     """
 
     weights: dict[str, NDArray[np.float32]]
@@ -82,21 +82,21 @@ class TrainingOutcome:
 
 
 class Plateau:
-    """The learning rate, epoch by epoch: a tenth when the validation loss stagnates.
+    """The learning rate, which falls to a tenth whenever the validation loss stagnates.
 
-    The paper names the first rate, the factor and the reason to fall. When to end is left open:
-    here at the third plateau, at a rate of 0.00001. A training that is limited to some steps ends
-    there, and its last fifth runs at a tenth of the rate at least, so that its end is not noisy.
+    The paper states the first rate, the factor and the reason to fall, but not when to end: here at
+    the third plateau, at a rate of 0.00001. A training with a limit on its steps ends there, and
+    its last fifth runs at a tenth of the rate or less, so that its end is not noisy.
 
     Args:
-        patience: epochs without a lower loss that make a plateau.
-        steps: limit of the training, None for none.
+        patience: number of epochs without a lower loss that make a plateau.
+        steps: limit on the steps, None for none.
 
     Attributes:
-        rate: the learning rate to use now.
-        drops: how often it fell.
+        rate: the current learning rate.
+        drops: how often the rate fell.
         best: the lowest loss so far.
-        finished: whether training is over.
+        finished: whether the training has ended.
     """
 
     def __init__(self, patience: int, steps: int | None = None) -> None:
@@ -109,7 +109,7 @@ class Plateau:
         self._stale = 0
 
     def update(self, step: int, loss: float) -> bool:
-        """Takes the validation loss after `step` steps; returns whether it is the lowest so far."""
+        """Record the loss after `step` steps; returns whether it is the lowest so far."""
         better = loss < self.best
         if better:
             self.best, self._stale = loss, 0
@@ -142,7 +142,7 @@ def train(
     Args:
         training: the network, its objective and seed.
         data: what to train and validate on.
-        scale: when to evaluate the validation loss, and when to end.
+        scale: schedule of evaluations, and limit on the steps.
         half: whether matrix products of the steps run in bfloat16.
 
     Raises:
@@ -159,7 +159,7 @@ def train(
     while not schedule.finished:
         for group in optimizer.param_groups:
             group["lr"] = schedule.rate
-        # A generator for each step: the same batches whatever ran before in this process.
+        # Each step has a generator of its own, so that batches do not depend on earlier trainings.
         rng = np.random.default_rng([training.seed, step])
         views = data.training[rng.choice(len(sizes), p=sizes / sizes.sum())]
         loss = batch_loss(network, training.objective, views, rng, half)
@@ -167,7 +167,9 @@ def train(
         loss.backward()  # type: ignore[no-untyped-call]
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise ValueError(f"{training.label}: the loss is {value} at step {step}")
+            raise ValueError(
+                f"{training.label}: the loss is {value} at step {step}: train another seed"
+            )
         optimizer.step()
         step += 1
         if step % scale.epoch == 0 or step == scale.steps:
@@ -195,7 +197,7 @@ def batch_loss(
     rng: np.random.Generator,
     half: bool,
 ) -> Tensor:
-    """The objective on one random batch of one sequence, a scalar."""
+    """The objective on a random batch of a sequence, a scalar."""
     if objective == "triplet":
         triplets = draw_triplets(views, TRIPLETS, rng)
         embeddings = _embed(network, views, triplets.reshape(-1), half)
@@ -213,7 +215,7 @@ def batch_loss(
 def validation_loss(
     network: EncoderNetwork, objective: Objective, sequences: Sequence[Views], half: bool
 ) -> float:
-    """Mean loss over batches of each sequence that are the same at every call."""
+    """Mean loss over fixed batches of each sequence."""
     rng = np.random.default_rng(0)
     return float(
         np.mean(

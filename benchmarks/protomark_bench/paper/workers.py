@@ -1,4 +1,4 @@
-"""Many trainings, in this process or in several, each one only if it is not in the cache."""
+"""Runs trainings that are not cached, in this process or in several."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class Trainings:
     """Runs trainings.
 
     Args:
-        data: what they read.
-        scale: how long they go on.
-        cache: of results.
+        data: data of all trainings.
+        scale: length of the trainings.
+        cache: cache of results.
         half: whether steps run in bfloat16.
-        jobs: trainings at a time, each in a process of its own; 1 trains in this one.
+        jobs: trainings at a time, each in a process of its own; 1: in this process.
         threads: threads of one training.
 
     Attributes:
-        made: how many trainings were run here rather than found.
+        made: number of trainings that ran, as they were not cached.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Trainings:
         self.made = 0
 
     def key(self, training: Training) -> str:
-        """The key of the result in the cache: everything that decides it."""
+        """The key of a result in the cache, from everything that determines it."""
         scale = {k: v for k, v in asdict(self.scale).items() if k not in ("name", "small")}
         return key_of(
             data=self.data.fingerprint,
@@ -60,10 +60,10 @@ class Trainings:
         )
 
     def run(self, trainings: Sequence[Training]) -> dict[Training, TrainingOutcome]:
-        """The results of all; the same network under two names is trained once.
+        """The results of all trainings; the same network under two names is trained once.
 
         Raises:
-            KeyboardInterrupt: what is finished is in the cache.
+            KeyboardInterrupt: finished results are cached.
             OSError: a training process ended by itself.
         """
         keys = {training: self.key(training) for training in trainings}
@@ -102,8 +102,8 @@ class Trainings:
                 yield waiting[future], future.result()
         except BrokenProcessPool:
             raise OSError(
-                "a training process ended by itself, perhaps for lack of memory; what is finished "
-                "is cached: run the same command with --jobs 1"
+                "a training process ended unexpectedly, perhaps for lack of memory: run the same "
+                "command with --jobs 1, finished trainings are cached"
             ) from None
         finally:
             pool.shutdown(cancel_futures=True)
@@ -113,7 +113,7 @@ _worker: dict[str, Any] = {}
 
 
 def _start(data: PaperData, scale: Scale, half: bool, threads: int) -> None:
-    """Prepares a worker process; Ctrl-C, which the terminal sends it too, ends it silently."""
+    """Prepare a worker process, which Ctrl-C ends silently."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     keep_freed_memory()
     torch.set_num_threads(threads)

@@ -1,4 +1,4 @@
-"""The sections approximate and real: every index at the fastest setting that finds enough."""
+"""The sections approximate and real: every index at its fastest setting with enough recall."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from protomark_bench.speed.sections import Bench, search_contender
 GOALS = (0.95, 0.98, 0.99)
 OURS = "Protomark, approximate"
 NOT_NAMED = "not named by --graphs"
-_BYTES = 1_000  # per landmark, about: all indexes together but graphs
-_SMALL = 1_000_000  # landmarks up to which FAISS's guide has few inverted lists
-# Recall is measured on so many queries, unless they take over `_PATIENCE` times a trial's time.
+_BYTES = 1_000  # per landmark, about, of all indexes together without graphs
+_SMALL = 1_000_000  # landmarks up to which FAISS's guide recommends lists without a graph
+# Number of queries to measure recall on, unless they take over `_PATIENCE` times a trial's time.
 _RECALL_QUERIES, _PATIENCE = 200, 4
 
 
 @dataclass(frozen=True)
 class _SearchedSet:
-    """What is searched.
+    """Landmarks to search, and queries.
 
     Attributes:
-        section, title: of its contests.
+        section, title: section and title of the contests.
         rows: (n, dim) prototypes.
         queries: (q, bits / 8) descriptors.
         scene: a learning map of the rows.
-        descriptors: makes all descriptors of the landmarks.
+        descriptors: returns all descriptors of the landmarks.
     """
 
     section: str
@@ -52,17 +52,17 @@ class _SearchedSet:
 
 @dataclass
 class _Candidate:
-    """An index to build, and how its answers are judged.
+    """An index to build, and a check of its answers.
 
     Attributes:
-        name: of the index.
-        build: makes it.
-        right: (q,) answers -> whether each is as near as the exact one.
-        least: fewest queries to time.
-        memory: bytes per landmark that must be free beside `_BYTES` while it is built.
+        name: name of the index.
+        build: builds the index.
+        right: tells whether each of the answers (q,) is as near as the exact one.
+        least: smallest number of queries to time.
+        memory: bytes per landmark beside `_BYTES` that building takes.
         ours: whether it is Protomark's.
-        comparable: whether it searches what the others search.
-        note: put before the index's own.
+        comparable: whether it searches the same vectors as the others.
+        note: text before the note of the index.
     """
 
     name: str
@@ -77,13 +77,13 @@ class _Candidate:
 
 @dataclass(frozen=True)
 class IndexTrial:
-    """What a setting of an index comes to.
+    """Recall and time of an index at a setting.
 
     Attributes:
-        setting: tried.
-        recall: share of queries whose nearest it finds.
-        seconds: per query.
-        queries: that recall was measured on.
+        setting: the setting.
+        recall: share of queries whose nearest vector it finds.
+        seconds: seconds per query.
+        queries: number of queries for the recall.
     """
 
     setting: Any
@@ -93,7 +93,7 @@ class IndexTrial:
 
 
 def approximate(bench: Bench) -> None:
-    """Synthetic landmarks of every size."""
+    """Race searches of synthetic landmarks of every size."""
     workload = bench.workload
     for n in bench.settings.approximate:
         if bench.fits(f"approximate, {n:,} landmarks", n * _BYTES):
@@ -109,7 +109,7 @@ def approximate(bench: Bench) -> None:
 
 
 def real(bench: Bench) -> None:
-    """Real landmarks of the tracks; queries are their held-out observations."""
+    """Race searches of the tracks' landmarks; queries are held-out observations."""
     workload, landmarks = bench.workload, bench.workload.real
     n = len(landmarks)
     if not bench.fits("real landmarks", n * _BYTES):
@@ -129,7 +129,7 @@ def real(bench: Bench) -> None:
 
 
 def _contests(bench: Bench, searched: _SearchedSet) -> None:
-    """Builds every index, tunes it to each recall of `GOALS`, and races all at each."""
+    """Build every index, tune it to each recall of `GOALS`, and race all of them at each."""
     settings, skipped = bench.settings, bench.results.skipped
     n, asked = len(searched.rows), len(searched.queries)
     codes = bench.workload.codes(searched.queries)
@@ -145,7 +145,7 @@ def _contests(bench: Bench, searched: _SearchedSet) -> None:
             continue
         try:
             tuned = _tuned(candidate, n, asked, settings.trial)
-        except Exception as error:  # whatever a peer raises: the others go on
+        except Exception as error:  # a peer may raise anything; the others continue
             skipped.append(f"{what}: failed ({error})")
             continue
         for goal, contender in tuned.items():
@@ -199,7 +199,7 @@ def _candidates(bench: Bench, searched: _SearchedSet, codes: NDArray[np.int8]) -
     if installed("usearch"):
         from protomark_bench.speed.peers import usearch_index
 
-        # Beside the graph, the rows as float32 while it is built.
+        # Building takes memory for the graph, and for the rows as float32.
         for dtype, label, memory in (("i8", "int8", 200), ("f32", "float32", 300 + 4 * dim)):
             name = f"USearch {label}"
             enter_graph(f"usearch-{label}", name, usearch_index.hnsw, memory, dtype=dtype)
@@ -216,9 +216,9 @@ def _candidates(bench: Bench, searched: _SearchedSet, codes: NDArray[np.int8]) -
 
 
 def _inverted_lists(bench: Bench, rows: NDArray[np.int8], asked: IndexQueries) -> TunableIndex:
-    """Protomark's own approximate search; setting: inverted lists that are searched."""
+    """Protomark's approximate search, whose setting is the number of lists to search."""
     scene = map_of(bench.workload.encoder, rows)
-    plain = _sealed_bytes(scene)
+    without_index = _sealed_bytes(scene)
     scene.build_index(threads=asked.build_threads)
     nlist = scene.nlist
 
@@ -230,12 +230,12 @@ def _inverted_lists(bench: Bench, rows: NDArray[np.int8], asked: IndexQueries) -
         return run
 
     size = _sealed_bytes(scene)
-    more = (size - plain) / len(rows)
+    more = (size - without_index) / len(rows)
     return TunableIndex(prepare, nlist, size, "nprobe", f"nlist {nlist:,}", more=more)
 
 
 def _sealed_bytes(scene: pm.PrototypeMap) -> int:
-    """Size of the sealed map less the encoder, which it holds whatever its size."""
+    """Size of the sealed map without the encoder, whose size is constant."""
     with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
         path = Path(folder) / "map.pmk"
         scene.seal(path)
@@ -243,7 +243,7 @@ def _sealed_bytes(scene: pm.PrototypeMap) -> int:
 
 
 def _hashed(bench: Bench, searched: _SearchedSet) -> _Candidate:
-    """FLANN's LSH, on all bits, against the exact answer among bits."""
+    """FLANN's LSH on all bits, compared with the exact Hamming search."""
     from protomark_bench.speed.peers import opencv_matchers
 
     rows, queries = searched.descriptors(), searched.queries
@@ -262,7 +262,7 @@ def _hashed(bench: Bench, searched: _SearchedSet) -> _Candidate:
 def _tuned(
     candidate: _Candidate, n: int, queries: int, seconds: float
 ) -> dict[float, Contender | None]:
-    """Builds an index and finds its setting for each goal."""
+    """Build an index and find its setting for each goal."""
     begin = time.perf_counter()
     index = candidate.build()
     built = time.perf_counter() - begin if index.seconds is None else index.seconds
@@ -281,7 +281,7 @@ def _tuned(
             facts["more"] = index.more
         result[goal] = Contender(
             candidate.name,
-            # Prepared anew at each call: an index has one setting at a time, and serves every goal.
+            # An index has one setting at a time, so each call prepares that of its goal.
             lambda q, setting=trial.setting: index.prepare(setting)(q),  # type: ignore[misc]
             ours=candidate.ours,
             least=candidate.least,
@@ -297,13 +297,13 @@ def tune(
     measure: Callable[[Any], IndexTrial],
     goals: Sequence[float],
 ) -> dict[float, IndexTrial | None]:
-    """The fastest setting for each least recall, None where none reaches it.
+    """The fastest setting for each recall goal, None if no setting reaches it.
 
     Args:
-        lines: settings, in lines along which recall and time grow; a line is left as soon as it
-            reaches the highest goal, or takes ten times what already reaches it.
-        measure: tries a setting.
-        goals: least recalls.
+        lines: settings, in lines along which recall and time increase; a line ends as soon as it
+            reaches the highest goal, or takes ten times as long as another setting that does.
+        measure: measures a setting.
+        goals: recalls to reach.
     """
     trials: list[IndexTrial] = []
     for line in lines:
@@ -322,7 +322,7 @@ def tune(
 def _trial(
     setting: Any, search: Search, candidate: _Candidate, queries: int, seconds: float
 ) -> IndexTrial:
-    """Recall and time of a setting, on as many queries as the time allows."""
+    """Measure recall and time of a setting, on as many queries as the time allows."""
     least = min(candidate.least, queries)
     begin = time.perf_counter()
     search(least)
@@ -338,7 +338,7 @@ def _trial(
 def _squared(
     rows: NDArray[np.int8], codes: NDArray[np.int8], answers: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Squared distance of each query to its answer."""
+    """Squared distance of each query from its answer."""
     difference = rows[answers].astype(np.int64) - codes[: len(answers)]
     result: NDArray[np.int64] = (difference * difference).sum(axis=1)
     return result
@@ -366,5 +366,5 @@ def _as_near_in_bits(
 
 
 def _valid(rows: NDArray[np.generic], answers: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which answers are rows: peers say in several ways that they found nothing."""
+    """Whether each answer is a row, as peers have different values for no answer."""
     return (answers >= 0) & (answers < len(rows))

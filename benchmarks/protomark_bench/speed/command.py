@@ -1,4 +1,4 @@
-"""What `protomark bench` does: tracks in, a report out."""
+"""Runs `protomark bench`: measures sections, and saves results after each."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ SECTION_FUNCTIONS: dict[str, Callable[[Bench], None]] = {
 def bench(
     paths: Sequence[Path], settings: BenchSettings, output: Path, repeat: str = "protomark bench"
 ) -> BenchResults:
-    """Measures what the settings name; after Ctrl-C, what there is by then.
+    """Measure the sections of the settings; Ctrl-C ends this with the results so far.
 
-    The JSON is written after every section, as a large map may end the process.
+    The JSON is written after every section, as a large map may kill the process.
 
     Args:
-        paths: tracks files of one descriptor; none: the sample that ships.
+        paths: tracks files of one descriptor; if empty, the bundled sample.
         settings: sections and sizes.
         output: folder of the report.
-        repeat: the command line that does the same again, for the report.
+        repeat: the command line that repeats the run, for the report.
 
     Raises:
-        FileNotFoundError, ValueError: a file is missing or broken, or no encoder ships for it.
+        FileNotFoundError, ValueError: a file is missing or broken, or has no encoder.
     """
     landmarks = RealLandmarks.load(paths)
     encoder = pm.Encoder.load(landmarks.descriptor)
@@ -65,7 +65,7 @@ def measure(
     settings: BenchSettings,
     after: Callable[[BenchResults], None] = lambda _: None,
 ) -> BenchResults:
-    """Runs the sections, and calls `after` each with what there is by then."""
+    """Run the sections, and call `after` with the results after each one."""
     real, encoder = workload.real, workload.encoder
     facts = machine.describe(*peers.DISTRIBUTIONS.values())
     facts["threads"] = f"{settings.threads} by default; {settings.build_threads} to build"
@@ -73,12 +73,12 @@ def measure(
     results.data = {
         "data": f"{', '.join(real.sequences)}: {len(real):,} landmarks, "
         f"{int(real.counts.sum()):,} observations of {real.descriptor.upper()}",
-        "synthetic landmarks": "crossed byte by byte from a real one and one of those nearest to "
-        "it; observations from their real observations, queries from held-out ones",
+        "synthetic landmarks": "crossed byte by byte from a real landmark and one of its nearest; "
+        "observations from their real observations, queries from held-out ones",
         "encoder": f"{encoder.name}, {workload.dim} dimensions",
     }
     for reason in results.skipped:
-        note(f"note: {reason}")
+        note(reason)
     total = len(settings.sections)
     with progress_bar() as progress, peers.threads(settings.threads):
         progress("ceilings", 0, total)
@@ -93,7 +93,9 @@ def measure(
                     progress(f"{name}, {label}", done, total)
 
                 SECTION_FUNCTIONS[name](Bench(workload, settings, results, advance))
-                results.interrupted = name != settings.sections[-1]  # if the process ends now
+                results.interrupted = (
+                    name != settings.sections[-1]
+                )  # true if the process is killed now
                 after(results)
         except KeyboardInterrupt:
             results.interrupted = True

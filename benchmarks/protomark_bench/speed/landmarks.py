@@ -1,15 +1,14 @@
-"""Real landmarks, as many synthetic ones as asked for, and queries.
+"""Real landmarks, synthetic landmarks in any number, and queries.
 
-A synthetic landmark has two parents: any real landmark, and one of those nearest to it. Each byte
-of its descriptors comes from one or the other parent, the same one in all its observations. An
-observation takes the bytes of one observation of each parent, drawn at random, so bytes have the
-values of real bytes, and appearances of a landmark differ as real ones do. One observation of each
-parent is held out and makes the landmark's query: a further observation, of which the map holds
-nothing.
+A synthetic landmark has two parents: a random real landmark, and one of its nearest. Each byte of
+its descriptors comes from one of the parents, the same one in all its observations. An observation
+takes the bytes of a random observation of each parent, so that bytes have the values of real bytes,
+and a landmark's observations differ as real ones do. One observation of each parent is held out and
+makes the landmark's query: a further observation, which the map does not contain.
 
-As parents are near each other, synthetic landmarks lie where real ones lie, as far from their
-neighbours as crowding makes them. Each run measures that FAISS finds as many neighbours among
-synthetic as among real landmarks (`sections.measure_resemblance`).
+As parents are near each other, synthetic landmarks have the distribution of real ones, but are
+denser. Each run verifies that FAISS finds as many neighbours among synthetic as among real
+landmarks (`sections.measure_resemblance`).
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from numpy.typing import NDArray
 import protomark as pm
 from protomark.tracks.file import Tracks, sequence_name
 
-OBSERVATIONS = 6  # of a synthetic landmark
-_CHUNK = 1 << 15  # landmarks made at a time
+OBSERVATIONS = 6  # per synthetic landmark
+_CHUNK = 1 << 15  # landmarks that are generated at a time
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class RealLandmarks:
         sequences: names of the sequences.
         descriptors: (n, bits / 8) uint8.
         starts: (l + 1,) int64; rows starts[i]:starts[i + 1], at least two, are of landmark i. The
-            last of them is held out: queries are made of it.
+            last of them is held out for queries.
     """
 
     descriptor: str
@@ -48,7 +47,7 @@ class RealLandmarks:
 
     @classmethod
     def load(cls, paths: Sequence[Path]) -> RealLandmarks:
-        """Reads tracks files of one descriptor; without any, the sample that ships.
+        """Load tracks files of one descriptor; without any, the bundled sample.
 
         Raises:
             FileNotFoundError, ValueError: a file is missing, broken, or of another descriptor.
@@ -61,7 +60,7 @@ class RealLandmarks:
 
     @classmethod
     def of(cls, tracks: Sequence[Tracks], names: Sequence[str]) -> RealLandmarks:
-        """Takes landmarks with at least two observations, which it shuffles reproducibly.
+        """Take landmarks with at least two observations, shuffled reproducibly.
 
         Raises:
             ValueError: the tracks have different descriptors, or too few landmarks.
@@ -69,7 +68,7 @@ class RealLandmarks:
         kinds = {(t.descriptor, t.bits) for t in tracks}
         if len(kinds) > 1:
             raise ValueError(
-                "tracks of one descriptor are needed, not of "
+                "give tracks of one descriptor, not of "
                 + ", ".join(sorted(f"{name} ({bits} bits)" for name, bits in kinds))
             )
         rng = np.random.default_rng(0)
@@ -84,7 +83,9 @@ class RealLandmarks:
             counts.append(count[count >= 2])
         starts = np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64)
         if len(starts) < 3:
-            raise ValueError("the tracks have fewer than two landmarks with two observations")
+            raise ValueError(
+                "the tracks have fewer than two landmarks with two observations: give longer ones"
+            )
         return cls(tracks[0].descriptor, tuple(names), np.concatenate(descriptors), starts)
 
     def __len__(self) -> int:
@@ -97,17 +98,17 @@ class RealLandmarks:
 
     @property
     def in_map(self) -> NDArray[np.bool_]:
-        """(n,) bool, which rows are not held out."""
+        """(n,) bool, whether each row is not held out."""
         used = np.ones(len(self.descriptors), bool)
         used[self.starts[1:] - 1] = False
         return used
 
     def queries(self, landmarks: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """(q,) landmarks -> (q, bits / 8), the held-out observation of each."""
+        """The held-out observation (q, bits / 8) of each landmark (q,)."""
         return self.descriptors[self.starts[landmarks + 1] - 1]
 
     def prototypes(self, encoder: pm.Encoder, dim: int, threads: int = 1) -> NDArray[np.int8]:
-        """(l, dim) rounded mean codes; held-out observations are left out."""
+        """Rounded mean codes (l, dim), without held-out observations."""
         codes = encoder.encode(self.descriptors, dim=dim, threads=threads).astype(np.int32)
         codes[~self.in_map] = 0
         return rounded_means(np.add.reduceat(codes, self.starts[:-1]), self.counts[:, None])
@@ -115,7 +116,7 @@ class RealLandmarks:
 
 @dataclass(frozen=True)
 class _Parents:
-    """Both parents of each landmark of a chunk, and which bytes come from the second one."""
+    """Both parents of each landmark in a chunk, and whether each byte is the second one's."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
@@ -123,15 +124,15 @@ class _Parents:
 
 
 class SyntheticLandmarks:
-    """Landmarks 0, 1, 2, ... without end; the first n are the same whatever n is.
+    """Landmarks 0, 1, 2, ... without end; the first n do not depend on n.
 
     Args:
-        real: what they are made of.
-        encoder: makes codes of descriptors.
-        dim: length of a code.
-        observations: of each landmark.
-        neighbours: the second parent is one of so many nearest to the first.
-        seed: another one gives other landmarks.
+        real: their parents.
+        encoder: encodes descriptors.
+        dim: code length.
+        observations: number of observations per landmark.
+        neighbours: number of landmarks, nearest to the first parent, to draw the second from.
+        seed: seed of the landmarks.
         threads: threads to encode on.
     """
 
@@ -155,16 +156,16 @@ class SyntheticLandmarks:
         self._nearest = _nearest(real.prototypes(encoder, dim), encoder, neighbours, threads)
 
     def descriptors(self, n: int) -> NDArray[np.uint8]:
-        """(n * observations, bits / 8) descriptors of the first n landmarks, by landmark."""
+        """Descriptors (n * observations, bits / 8) of the first n landmarks, by landmark."""
         result = np.empty((n * self.observations, self.encoder.bits // 8), np.uint8)
         for begin in range(0, n, _CHUNK):
             rows = self._chunk(begin // _CHUNK)[: (n - begin) * self.observations]
-            at = begin * self.observations
-            result[at : at + len(rows)] = rows
+            start = begin * self.observations
+            result[start : start + len(rows)] = rows
         return result
 
     def prototypes(self, n: int, first: int = 0) -> NDArray[np.int8]:
-        """(n, dim) rounded mean codes of n landmarks from `first` on."""
+        """Rounded mean codes (n, dim) of n landmarks from `first` on."""
         result = np.empty((n, self.dim), np.int8)
         at = 0
         while at < n:
@@ -178,7 +179,7 @@ class SyntheticLandmarks:
         return result
 
     def queries(self, landmarks: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """(q, bits / 8), one further observation of each of these landmarks."""
+        """A further observation (q, bits / 8) of each landmark."""
         result = np.empty((len(landmarks), self.encoder.bits // 8), np.uint8)
         chunks = landmarks // _CHUNK
         for chunk in np.unique(chunks):
@@ -206,7 +207,7 @@ class SyntheticLandmarks:
         return np.where(from_second, second, first)
 
     def _draw(self, parents: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Draws observations of each parent at random from those that are not held out."""
+        """Draw random observations of each parent, without held-out ones."""
         share = rng.random((len(parents), self.observations), np.float32)
         counts = self.real.counts[parents][:, None]
         number = np.minimum((share * counts).astype(np.int64), counts - 1)
@@ -218,9 +219,9 @@ class Workload:
 
     Attributes:
         real: real landmarks.
-        encoder: the one that ships for their descriptor.
-        dim: length of a code.
-        build_threads: threads to make data on.
+        encoder: the encoder that ships for their descriptor.
+        dim: code length.
+        build_threads: threads to generate data on.
     """
 
     def __init__(
@@ -235,45 +236,45 @@ class Workload:
 
     @cached_property
     def synthetic(self) -> SyntheticLandmarks:
-        """Synthetic landmarks of the usual number of observations."""
+        """Synthetic landmarks with the default number of observations."""
         return SyntheticLandmarks(self.real, self.encoder, self.dim, threads=self.build_threads)
 
     def prototypes(self, n: int) -> NDArray[np.int8]:
-        """(n, dim) prototypes of the first n synthetic landmarks; the largest set is cached."""
+        """Prototypes (n, dim) of the first n synthetic landmarks; the largest set is cached."""
         if len(self._prototypes) < n:
             self._prototypes = self.synthetic.prototypes(n)
         return self._prototypes[:n]
 
     def map(self, n: int) -> pm.PrototypeMap:
-        """A learning map of them, not to be changed; the last one is cached."""
+        """A learning map of these prototypes, which is cached and must not be changed."""
         if self._map is None or self._map[0] != n:
             self._map = None
             self._map = (n, map_of(self.encoder, self.prototypes(n)))
         return self._map[1]
 
     def forget(self) -> None:
-        """Frees what is cached."""
+        """Clear the caches."""
         self._prototypes = self._prototypes[:0].copy()
         self._map = None
 
     def queries(self, n: int, count: int) -> NDArray[np.uint8]:
-        """(count, bits / 8), further observations of some of the first n landmarks."""
+        """Further observations (count, bits / 8) of random ones of the first n landmarks."""
         landmarks = np.random.default_rng([7, n]).integers(0, n, count)
         return self.synthetic.queries(landmarks)
 
     def codes(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int8]:
-        """(n, dim) codes."""
+        """Codes (n, dim) of descriptors."""
         return self.encoder.encode(descriptors, dim=self.dim)
 
 
 def rounded_means(sums: NDArray[np.int32], counts: int | NDArray[np.int64]) -> NDArray[np.int8]:
-    """Sums over counts, to the nearest integer, halves away from zero."""
+    """Sums over counts, rounded to integers, halves away from zero."""
     means = (2 * np.abs(sums) + counts) // (2 * np.asarray(counts))
     return (np.sign(sums) * means).astype(np.int8)
 
 
 def map_of(encoder: pm.Encoder, prototypes: NDArray[np.int8]) -> pm.PrototypeMap:
-    """A learning map whose landmark i has prototype i, (n, dim), from one observation."""
+    """A learning map whose landmark i has one observation, prototype i of (n, dim)."""
     result = pm.PrototypeMap(encoder, dim=prototypes.shape[1])
     for begin in range(0, len(prototypes), 1 << 20):
         part = prototypes[begin : begin + (1 << 20)]
@@ -284,10 +285,10 @@ def map_of(encoder: pm.Encoder, prototypes: NDArray[np.int8]) -> pm.PrototypeMap
 def _nearest(
     prototypes: NDArray[np.int8], encoder: pm.Encoder, neighbours: int, threads: int
 ) -> NDArray[np.int64]:
-    """(l, neighbours) landmarks nearest to each, itself left out."""
-    wanted = min(neighbours, len(prototypes) - 1)
-    found, _ = map_of(encoder, prototypes).search_codes(prototypes, k=wanted + 1, threads=threads)
+    """The nearest landmarks (l, neighbours) of each one, without itself."""
+    count = min(neighbours, len(prototypes) - 1)
+    found, _ = map_of(encoder, prototypes).search_codes(prototypes, k=count + 1, threads=threads)
     others = found != np.arange(len(prototypes))[:, None]
-    # An equal landmark with a smaller id may have pushed the landmark itself out.
+    # Equal landmarks with smaller ids may have displaced the landmark itself.
     others[others.all(axis=1), -1] = False
-    return found[others].reshape(-1, wanted)
+    return found[others].reshape(-1, count)

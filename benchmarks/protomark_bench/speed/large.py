@@ -1,4 +1,4 @@
-"""The section large: the largest map, sealed with its index, opened and searched."""
+"""The section large: the largest map is sealed with its index, opened and searched."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from protomark_bench.speed.sections import Bench
 
 RECALL, THREADS = 0.95, 2
 CODE_BITS = (8, 4)
-# About, per landmark: a learning map while it is built and sealed; files of both kinds together.
+# Bytes per landmark, about, of a learning map while it is built and sealed, and of both files.
 _LEARNING_BYTES, _FILE_BYTES = 140, 70
-_OBSERVATIONS = 2  # of a landmark here, so that making them takes minutes, not hours
+_OBSERVATIONS = 2  # per landmark, so that generating them takes minutes, not hours
 _PART = 1 << 20
 _FINER = f"recall of the nearest of 8 bits, asked for {sections.RECALL}"
 
 
 def large(bench: Bench) -> None:
-    """File size, opening, and 1,000 queries at a stated recall, with 8 and with 4 bits a number."""
+    """Measure file size, opening, and 1,000 queries at a recall, with 8 and 4 bits per number."""
     workload, settings, n = bench.workload, bench.settings, bench.settings.large
     if n == 0:
         return
@@ -85,10 +85,10 @@ def _measured(
     """Figures of one sealed map.
 
     Args:
-        path: its file.
+        path: the file of the map.
         codes: (q, dim) queries.
-        nearest: (q,) what an exact search finds among prototypes of 8 bits.
-        landmarks: (q,) what the queries observe.
+        nearest: (q,) nearest landmarks of an exact search among prototypes of 8 bits.
+        landmarks: (q,) landmarks that the queries observe.
     """
     begin = time.perf_counter()
     scene = pm.open(path)
@@ -114,7 +114,7 @@ def _measured(
 
 
 def _extend_growth(bench: Bench, path: Path, codes: NDArray[np.int8], recall: float) -> None:
-    """Adds the sealed map to the curves of `sections.growth`, if they have no map of its size."""
+    """Add the sealed map to the curves of `sections.growth` if they have no map of its size."""
     scene, settings = pm.open(path), bench.settings
     if any(point["landmarks"] == len(scene) for point in bench.results.growth):
         return

@@ -1,4 +1,4 @@
-"""Contenders that take turns, and their times."""
+"""Times contenders that take turns."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from statistics import median
 
 Advance = Callable[[str], None]
 
-_LONG = 0.1  # seconds of a call beside which it costs little to fill the caches
-_REPEATS = 3  # of a shorter one, at least
+_LONG = 0.1  # seconds of a call that needs no warm caches
+_REPEATS = 3  # smallest number of repetitions of a shorter call
 
 
 @dataclass
 class Timing:
-    """One contender's times in one contest.
+    """The times of a contender in a contest.
 
     Attributes:
-        name: of the contender.
+        name: name of the contender.
         ours: whether it is Protomark's.
-        seconds: per unit, in each round.
-        units: how many units one call had; fewer where a contender is slow.
-        facts: what else was measured, such as recall, bytes per landmark or building time.
-        note: what a reader should know.
-        comparable: whether it does the work that the others do, so that a ratio has a meaning.
+        seconds: seconds per unit in each round.
+        units: number of units per call, fewer if the contender is slow.
+        facts: further measurements, such as recall, bytes per landmark or building time.
+        note: further text for the reader.
+        comparable: whether it does the same work as the others, so that a ratio is meaningful.
     """
 
     name: str
@@ -37,23 +37,23 @@ class Timing:
 
     @property
     def median(self) -> float:
-        """Seconds per unit."""
+        """Median seconds per unit."""
         return median(self.seconds)
 
 
 @dataclass
 class Contest:
-    """Contenders that did the same work in the same rounds.
+    """Contenders that do the same work in the same rounds.
 
     Attributes:
         section: encode, search, hamming, approximate, real, frame or add.
-        title: what was done.
-        unit: what `seconds` are for: a descriptor, a query, a frame.
-        threads: of every contender.
-        landmarks: in the map, 0 where there is none.
-        recall: least recall@1 of every contender, None where all are exact.
-        work: multiply-adds, and bytes read, per unit of ours, where a ceiling applies to them.
-        timings: the contenders, ours first.
+        title: description of the work.
+        unit: unit of the work: a descriptor, a query, a frame.
+        threads: threads of every contender.
+        landmarks: landmarks of the map, 0 without a map.
+        recall: recall@1 that every contender reaches, None if all are exact.
+        work: our multiply-adds and bytes read per unit, if a ceiling applies to them.
+        timings: times of the contenders, ours first.
     """
 
     section: str
@@ -67,14 +67,14 @@ class Contest:
 
     @property
     def ours(self) -> Timing | None:
-        """The fastest of Protomark's."""
-        own = [timing for timing in self.timings if timing.ours]
-        return min(own, key=lambda timing: timing.median, default=None)
+        """The fastest of Protomark's contenders."""
+        ours = [timing for timing in self.timings if timing.ours]
+        return min(ours, key=lambda timing: timing.median, default=None)
 
     def ratio(self, peer: Timing) -> tuple[float, float, float] | None:
-        """How many times as fast as the peer ours is: median, least and greatest of the rounds.
+        """The peer's time over ours: median, least and greatest of the rounds.
 
-        None for ours itself and where the work differs.
+        None for ours itself, and for a peer that does other work.
         """
         ours = self.ours
         if ours is None or peer is ours or not peer.comparable:
@@ -85,12 +85,12 @@ class Contest:
 
 @dataclass
 class Contender:
-    """Who takes part in a race.
+    """A participant of a race.
 
     Attributes:
         name, ours, facts, note, comparable: see `Timing`.
-        run: does the work for the number of units it is given, from the start of the data.
-        least: fewest units that are worth timing.
+        run: does the work for the first n units of the data.
+        least: smallest number of units to time.
     """
 
     name: str
@@ -104,12 +104,12 @@ class Contender:
 
 @dataclass(frozen=True)
 class Pace:
-    """How much time a race may take.
+    """The time that a race takes.
 
     Attributes:
-        rounds: how often each contender runs.
-        shortest: seconds that a turn takes at least; quick work is done several times in it.
-        longest: seconds that a turn takes at most, by doing fewer units, about.
+        rounds: number of turns per contender.
+        shortest: smallest duration of a turn in seconds, in which fast work is repeated.
+        longest: approximate limit on the duration of a turn, in which slow work has fewer units.
     """
 
     rounds: int = 7
@@ -123,16 +123,16 @@ def race(
     pace: Pace,
     advance: Advance = lambda _: None,
 ) -> list[Timing]:
-    """Times contenders in turns: each runs once in every round, so that all meet the same machine.
+    """Time contenders in turns: each runs once per round, so that all find the same machine.
 
-    A turn of less than a tenth of a second begins with a call that is not timed, and has three at
-    least that are: the contender before may have left the caches full of other things.
+    A turn of less than a tenth of a second starts with a call that is not timed, as the previous
+    contender has filled the caches, and has at least three timed calls.
 
     Args:
-        contenders: who takes part.
-        units: how many units the work has; a contender that is too slow does fewer in a turn.
+        contenders: the participants.
+        units: number of units of the work; slow contenders do fewer per turn.
         pace: rounds and time.
-        advance: called with a contender's name before each of its turns, and its warm-up.
+        advance: called with a contender's name before its warm-up and each of its turns.
     """
     plans = []
     for contender in contenders:
@@ -152,7 +152,7 @@ def race(
 
 
 def _plan(contender: Contender, units: int, pace: Pace) -> tuple[int, int]:
-    """Units of a call and calls in a turn, found by a warm-up."""
+    """Units per call and calls per turn, by a warm-up."""
     least = min(contender.least, units)
     _turn(contender, least, 1)
     each = _turn(contender, least, 1) / least
@@ -164,7 +164,7 @@ def _plan(contender: Contender, units: int, pace: Pace) -> tuple[int, int]:
 
 
 def _turn(contender: Contender, count: int, repeats: int) -> float:
-    """Seconds of one call: median of `repeats`."""
+    """Median seconds of `repeats` calls."""
     seconds = []
     for _ in range(repeats):
         begin = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Everything that a bench measured, as JSON and as a page."""
+"""Results of a bench, as JSON and as a page."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAME, FORMAT, VERSION = "benchmarks", "protomark-bench", 1
-DRAWN_RECALL = 0.99  # of the approximate searches whose ratios are drawn
+DRAWN_RECALL = 0.99  # recall of the approximate searches in the plot of ratios
 
-# Sections in which ours does not do all multiply-adds that count as its work.
+# Sections in which ours does fewer multiply-adds than count as its work.
 _EQUIVALENT = ("encode", "search", "hamming")
 _SECTIONS = {
     "encode": (
@@ -90,19 +90,19 @@ _FACTS = {
 
 @dataclass
 class BenchResults:
-    """All figures of one run.
+    """All results of a run.
 
     Attributes:
-        machine: CPU, instruction set, versions and so on, name -> text.
-        data: what was measured on, name -> text.
+        machine: CPU, instruction set, versions and so on, by name.
+        data: descriptions of the data, by name.
         ceilings: see `machine.ceilings`.
-        contests: in the order in which they were run.
-        resemblance: recall of FAISS, index -> [on real landmarks, on synthetic ones].
+        contests: contests in their order.
+        resemblance: recall of FAISS on real and on synthetic landmarks, by index.
         growth: points {landmarks, method, seconds (per query), bytes (per landmark), ...}.
-        large: figures of the largest map, name -> value; empty where it was not made.
-        skipped: what was left out, and why.
+        large: figures of the largest map by name; empty without one.
+        skipped: measurements that were left out, and why.
         interrupted: whether the run ended early.
-        command: the command line that does the same again.
+        command: the command line that repeats the run.
     """
 
     machine: dict[str, str] = field(default_factory=dict)
@@ -132,14 +132,14 @@ class BenchResults:
         return cls(contests=contests, **values)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
+        """The results as JSON values."""
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     def share(self, contest: Contest) -> float | None:
-        """Ours as a part of the ceiling that applies to the contest's work, None where none does.
+        """Our share of the ceiling that applies to the contest's work, None without a ceiling.
 
-        Of multiply-adds: of the best vector instructions of all threads, tiles left out. Of bytes:
-        of what one thread reads.
+        The ceiling of multiply-adds is that of the best vector instructions (not tiles) on all
+        threads; the ceiling of bytes is that of one reading thread.
         """
         ours = contest.ours
         rates = [rate for name, rate in self.ceilings.items() if name not in ("read", "amx")]
@@ -153,7 +153,7 @@ class BenchResults:
         return None
 
     def summary(self) -> ReportTable:
-        """A row per contest: ours beside the fastest peer."""
+        """One row per contest, with ours and the fastest peer."""
         rows = []
         for contest in self.contests:
             ours = contest.ours
@@ -173,12 +173,12 @@ class BenchResults:
         return ReportTable(heads, rows, words=3)
 
     def report(self) -> Report:
-        """The page, its plots and the JSON."""
+        """The report: page, plots and JSON."""
         plots = {"ratios": draw_ratios(self), "growth": draw_growth(self)}
         drawn = {name: figure for name, figure in plots.items() if figure is not None}
         notes = [f"left out: {note}" for note in self.skipped]
         if self.interrupted:
-            notes.append("interrupted: only what was measured by then")
+            notes.append("interrupted: later sections were not measured")
         return Report(
             NAME,
             "protomark bench",
@@ -196,7 +196,7 @@ class BenchResults:
             "the same number of threads. To repeat it "
             "([tracks](../tracks.md) come from `protomark tracks`):",
             f"    pip install . ./benchmarks\n    {self.command}",
-            "**The run ended early; what is missing was not measured.**"
+            "**The run ended early, so later sections were not measured.**"
             if self.interrupted
             else "",
             "## Summary",
@@ -247,7 +247,7 @@ class BenchResults:
 
 
 def draw_ratios(results: BenchResults) -> Figure | None:
-    """How many times as fast ours is as each peer."""
+    """Draw the ratio of each peer's time to ours."""
     rows = []
     for contest in results.contests:
         if contest.section == "add" or contest.recall not in (None, DRAWN_RECALL):
@@ -263,7 +263,7 @@ def draw_ratios(results: BenchResults) -> Figure | None:
 
 
 def draw_growth(results: BenchResults) -> Figure | None:
-    """Time of a query and memory against landmarks."""
+    """Draw time per query and memory against landmarks."""
     times, memory = [], []
     for method, color in (("exact", plot.TEAL), ("approximate", plot.AMBER)):
         points = [p for p in results.growth if p["method"] == method]
@@ -291,7 +291,7 @@ def draw_growth(results: BenchResults) -> Figure | None:
 
 
 def _contest_table(contest: Contest) -> ReportTable:
-    """All contenders of a contest, with those facts that any of them has."""
+    """All contenders of a contest, with the facts that any of them has."""
     shown = [key for key in _FACTS if any(key in t.facts for t in contest.timings)]
     notes = any(timing.note for timing in contest.timings)
     heads = [

@@ -1,4 +1,4 @@
-"""The sections encode, search, hamming, frame, add and growth, and the resemblance of the data."""
+"""The sections encode, search, hamming, frame, add and growth, and the resemblance of data."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from protomark_bench.speed.results import BenchResults
 from protomark_bench.speed.settings import BenchSettings
 
 ENCODERS, BATCH = ("freak", "orb"), 1_000
-THREADS = (1, 2)  # of the sections frame and add
+THREADS = (1, 2)  # threads of the sections frame and add
 FRAME, RATIO, RECALL = 1_000, 0.8, 0.98
-CACHES = 4  # a map of so many times the last-level cache is read from memory, nearly all of it
-LEARNING_BYTES = 200  # per landmark of a learning map with its index, at most, about
+CACHES = 4  # a map this many times as large as the last-level cache is mostly read from memory
+LEARNING_BYTES = 200  # approximate limit per landmark of a learning map with its index
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What every section gets.
+    """The data, settings and results of all sections.
 
     Attributes:
         workload: landmarks and queries.
         settings: sizes and time.
-        results: where a section puts its figures.
-        advance: says what comes next.
+        results: results to which a section adds its figures.
+        advance: called with the name of the next step.
     """
 
     workload: Workload
@@ -45,12 +45,12 @@ class Bench:
     advance: Advance
 
     def contest(self, contest: Contest, contenders: list[Contender], units: int) -> None:
-        """Races the contenders of a contest and adds it to the results."""
+        """Race the contenders of a contest, and add it to the results."""
         contest.timings = race(contenders, units, self.settings.pace, self.advance)
         self.results.contests.append(contest)
 
     def fits(self, what: str, memory: float) -> bool:
-        """Whether there is enough memory; says so in the results if there is not."""
+        """Whether there is enough memory; if not, the results tell so."""
         reason = shortage(memory)
         if reason:
             self.results.skipped.append(f"{what}: {reason}")
@@ -58,7 +58,7 @@ class Bench:
 
 
 def encode(bench: Bench) -> None:
-    """The shipped FREAK and ORB networks, in batches of 1,000 and a whole set at once."""
+    """Race the shipped FREAK and ORB networks, in batches of 1,000 and on a whole set."""
     workload, settings = bench.workload, bench.settings
     for name in ENCODERS:
         encoder = pm.Encoder.load(name)
@@ -74,7 +74,7 @@ def encode(bench: Bench) -> None:
 
 
 def _descriptors(workload: Workload, encoder: pm.Encoder, count: int) -> NDArray[np.uint8]:
-    """Real ones where they are of this encoder's descriptor, else random bits."""
+    """Real descriptors if they are of this encoder's kind, else random bits."""
     rng = np.random.default_rng(0)
     if encoder.descriptor == workload.encoder.descriptor:
         return workload.real.descriptors[rng.integers(0, len(workload.real.descriptors), count)]
@@ -109,7 +109,7 @@ def _networks(
 
 
 def search(bench: Bench) -> None:
-    """Exact search, k = 2, beside FAISS IndexFlatL2 on the same prototypes as float32."""
+    """Race exact search, k = 2, with FAISS IndexFlatL2 on the same prototypes as float32."""
     workload, settings = bench.workload, bench.settings
     for n in settings.exact:
         contenders = _exact_searches(bench, n)
@@ -118,7 +118,7 @@ def search(bench: Bench) -> None:
         contest = Contest("search", title, "query", settings.threads, n)
         contest.work = {"multiply_adds": size}
         bench.contest(contest, contenders, settings.queries)
-    # The largest map, by single queries: each reads the whole map.
+    # A single query reads the whole map, here the largest one.
     alone = replace(contest, title=f"{title}, one query at a time", work={})
     if size >= CACHES * last_level_cache():
         alone.work = {"bytes": size}
@@ -144,7 +144,7 @@ def search_contender(
     threads: int,
     recall: float | None = None,
 ) -> Contender:
-    """A map that is searched for the first codes, exactly or at a recall."""
+    """A contender that searches a map for the first codes, exactly or at a recall."""
 
     def run(q: int) -> None:
         scene.search_codes(codes[:q], k=K, threads=threads, recall=recall)
@@ -153,7 +153,7 @@ def search_contender(
 
 
 def hamming(bench: Bench) -> None:
-    """Prototypes beside all descriptors in our search, OpenCV's and FAISS's; k = 2."""
+    """Race prototypes with all descriptors in our search, OpenCV's and FAISS's; k = 2."""
     settings, observations = bench.settings, bench.workload.synthetic.observations
     for n in settings.exact:
         size = 3.0 * n * observations * bench.workload.encoder.bits // 8
@@ -161,7 +161,7 @@ def hamming(bench: Bench) -> None:
             continue
         title = f"exact, {n:,} landmarks with {observations} descriptors each"
         contest = Contest("hamming", title, "query", settings.threads, n)
-        # Of prototypes, the fastest of ours.
+        # The work is that of prototypes, our fastest contender.
         contest.work = {"multiply_adds": float(n * bench.workload.dim)}
         bench.contest(contest, _hamming_searches(bench, n), settings.queries)
 
@@ -198,7 +198,7 @@ def _hamming_searches(bench: Bench, n: int) -> list[Contender]:
 
 
 def frame(bench: Bench) -> None:
-    """A frame of 1,000 descriptors encoded, searched exactly and at a recall, and ratio-tested."""
+    """Race a frame of 1,000 descriptors: encoded, searched exactly or at a recall, ratio-tested."""
     workload, n = bench.workload, bench.settings.map
     bench.advance("map and index")
     indexed = map_of(workload.encoder, workload.prototypes(n))
@@ -221,7 +221,7 @@ def frame(bench: Bench) -> None:
 
 
 def add(bench: Bench) -> None:
-    """Descriptors of random landmarks, all in the map already, beside encoding alone."""
+    """Race the addition of descriptors of random landmarks of the map with encoding alone."""
     workload, n, count = bench.workload, bench.settings.map, bench.settings.encoded
     bench.advance("map")
     scene = map_of(workload.encoder, workload.prototypes(n))
@@ -244,7 +244,7 @@ def add(bench: Bench) -> None:
 
 
 def growth(bench: Bench) -> None:
-    """Time and memory of learning maps of every size, searched exactly and approximately."""
+    """Measure time and memory of learning maps by size, searched exactly and approximately."""
     workload, settings = bench.workload, bench.settings
     for n in settings.growth:
         if not bench.fits(f"growth, {n:,} landmarks", n * LEARNING_BYTES):
@@ -278,7 +278,7 @@ def growth(bench: Bench) -> None:
         if used is not None and plain is not None:
             approximate["index"] = used - plain
         bench.results.growth.append(point | approximate)
-        del scene, rows  # what is freed later would be missing from the next map's memory
+        del scene, rows  # memory that is freed later would distort the next map's
 
 
 def seconds_per_query(
@@ -287,19 +287,19 @@ def seconds_per_query(
     settings: BenchSettings,
     recall: float | None = None,
 ) -> float:
-    """Seconds per query of many, exactly or at a recall, on `settings.threads`."""
+    """Seconds per query of a batch, exactly or at a recall, on `settings.threads`."""
     contender = search_contender("search", scene, codes, settings.threads, recall)
     return race([contender], len(codes), replace(settings.pace, rounds=3))[0].median
 
 
 def _since(before: int | None, landmarks: int) -> float | None:
-    """Bytes per landmark that the process has allocated since."""
+    """Bytes per landmark that the process has allocated since `before`."""
     now = allocated_bytes()
     return None if before is None or now is None else max(now - before, 0) / landmarks
 
 
 def measure_resemblance(workload: Workload, limit: int = 100_000) -> dict[str, list[float]]:
-    """Recall@1 of FAISS with the same parameters, index -> [on real, on synthetic landmarks]."""
+    """Recall@1 of FAISS on real and on synthetic landmarks, by index."""
     if not installed("faiss"):
         return {}
     real = workload.real
@@ -320,7 +320,7 @@ def _faiss_recalls(
     n, dim = rows.shape
     codes = workload.codes(queries)
     nearest = map_of(workload.encoder, rows).search_codes(codes, k=1)[0][:, 0]
-    # Which of two equally near rows is found does not matter.
+    # Either of two equally near rows is right.
     exact = np.square(rows[nearest].astype(np.int32) - codes).sum(axis=1)
     values, asked = rows.astype(np.float32), codes.astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""What a bench is asked to measure."""
+"""Settings of a bench: sections, sizes and time."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ class BenchSettings:
     """Sizes and time.
 
     Attributes:
-        sections: what to measure.
-        threads: of every contender, where a section does not say otherwise.
-        build_threads: to build indexes and data with, which is not compared.
-        pace: of races.
-        encoded: descriptors of a whole set.
-        queries: of every search.
-        trial: seconds that a trial of an index's setting may take.
-        exact: landmarks of exact searches.
-        approximate: landmarks of approximate searches.
-        lsh_limit: most landmarks whose bits go into FLANN's LSH.
-        graphs: which of `GRAPHS` are raced, memory allowing.
-        graphs_limit: most synthetic landmarks for which all these are; beyond it only hnswlib's.
-        map: landmarks of the map of the sections frame and add.
-        growth: landmarks of the maps along the curve.
-        large: landmarks of the largest map, 0 for none.
-        indexes: folder that caches peers' indexes which take long to build, None for no cache.
+        sections: sections to measure.
+        threads: threads of every contender, unless a section has its own.
+        build_threads: threads to build indexes and data on, which is not compared.
+        pace: pace of the races.
+        encoded: number of descriptors in a whole set.
+        queries: number of queries per search.
+        trial: limit on the seconds of a trial of an index's setting.
+        exact: numbers of landmarks for exact searches.
+        approximate: numbers of landmarks for approximate searches.
+        lsh_limit: limit on the landmarks for FLANN's LSH.
+        graphs: names of `GRAPHS` to race, if memory suffices.
+        graphs_limit: limit on the synthetic landmarks for all of them, beyond which only hnswlib
+            is raced.
+        map: number of landmarks in the map of the sections frame and add.
+        growth: numbers of landmarks of the maps along the curve.
+        large: number of landmarks in the largest map, 0 for none.
+        indexes: folder that caches peers' indexes, None for no cache.
     """
 
     sections: tuple[str, ...] = SECTIONS
@@ -52,7 +53,7 @@ class BenchSettings:
     indexes: Path | None = None
 
     def at(self, landmarks: tuple[int, ...]) -> BenchSettings:
-        """The same with maps of these sizes, and all graphs at any of them.
+        """These settings with maps of these sizes, and all graphs at any of them.
 
         Raises:
             ValueError: a map would have no landmark.
@@ -60,7 +61,7 @@ class BenchSettings:
         if not landmarks:
             return self
         if min(landmarks) < 1:
-            raise ValueError(f"--landmarks {min(landmarks)}: a map needs at least 1")
+            raise ValueError(f"--landmarks {min(landmarks)}: give at least 1")
         sizes = tuple(sorted(set(landmarks)))
         named = self.sections != SECTIONS and "large" in self.sections
         return replace(
@@ -74,7 +75,7 @@ class BenchSettings:
         )
 
     def with_graphs(self, graphs: str) -> BenchSettings:
-        """The same with the graphs that `--graphs` names, at any size.
+        """These settings with the graphs that `--graphs` names, at any size.
 
         Raises:
             ValueError: there is no such graph.
@@ -84,8 +85,8 @@ class BenchSettings:
         names = () if graphs == "none" else tuple(graphs.split(","))
         for name in names:
             if name not in GRAPHS:
-                known = ", ".join(GRAPHS)
-                raise ValueError(f"--graphs {name}: no such graph ({known}; all, none)")
+                names_text = ", ".join(GRAPHS)
+                raise ValueError(f"--graphs {name}: no such graph ({names_text}; all, none)")
         return replace(self, graphs=names, graphs_limit=max(self.approximate))
 
 

@@ -1,15 +1,9 @@
 // The encoder: an integer network from packed bits to int8 codes, the same bytes on every machine.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <span>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "protomark/types.h"
 

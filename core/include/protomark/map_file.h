@@ -1,13 +1,9 @@
 // What a file holds, and whether it is whole.
 #pragma once
 
-#include <cstddef>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/types.h"
@@ -22,8 +18,8 @@ PROTOMARK_API MapKind map_kind(const std::filesystem::path& path);
 // Reads only the encoder of a map file. Throws FileError.
 PROTOMARK_API std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path);
 
-// Throw std::invalid_argument, in a sentence that begins with `map`, unless `encoder`, that of the
-// map, has the identity of `expected`, or takes descriptors of this name ("freak").
+// Throw std::invalid_argument unless a map's `encoder` has the identity of `expected`, or takes
+// descriptors of this name ("freak"); errors begin with `map`.
 PROTOMARK_API void expect_encoder(const Encoder& encoder, const Encoder& expected,
                                   const std::string& map);
 PROTOMARK_API void expect_descriptor(const Encoder& encoder, const std::string& descriptor,

@@ -1,15 +1,8 @@
 // The learning map: exact prototypes of landmarks under any history of changes.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/search.h"
@@ -55,10 +48,9 @@ struct SealOptions {
 //
 // Search compares codes with prototypes rounded to int8, halves away from zero.
 //
-// Every function does all that it was asked, or throws and changes nothing (unless memory runs out
-// during a change). Any number of threads may use a map; docs/sharing.md says which calls wait for
-// which. A search sees a change of up to 2048 observations or landmarks as a whole, a larger one in
-// pieces of that size.
+// A function that throws changes nothing (unless memory runs out during a change). Any number of
+// threads may use a map (docs/sharing.md). A search sees a change of up to 2048 observations or
+// landmarks as a whole, a larger one in pieces of that size.
 class PROTOMARK_API PrototypeMap {
  public:
   static constexpr int kMaxCount = 255;
@@ -74,10 +66,8 @@ class PROTOMARK_API PrototypeMap {
   const std::shared_ptr<const Encoder>& encoder() const;
   std::size_t dim() const;
   std::size_t appearance_bits() const;
-  // Number of landmarks.
-  std::size_t size() const;
-  // One prototype per appearance of each landmark.
-  std::size_t prototype_count() const;
+  std::size_t size() const;             // number of landmarks
+  std::size_t prototype_count() const;  // one per appearance of each landmark
   // Returns the ids of all landmarks in ascending order.
   std::vector<std::int64_t> ids() const;
 

@@ -1,14 +1,8 @@
 // The sealed map: answers searches from a small file that it maps into memory.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "protomark/encoder.h"
 #include "protomark/search.h"
@@ -33,8 +27,7 @@ class PROTOMARK_API SealedMap {
   const std::shared_ptr<const Encoder>& encoder() const;
   const Metadata& metadata() const;
   std::size_t dim() const;
-  // Number of landmarks.
-  std::size_t size() const;
+  std::size_t size() const;  // number of landmarks
   std::size_t prototype_count() const;
   // Bits per number of a prototype: 8 or 4.
   int code_bits() const;

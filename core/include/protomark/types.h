@@ -1,16 +1,19 @@
 // The types that all of Protomark shares: matrices, positions, matches, metadata, errors.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
+// Exported: files that include this one need not include these.
+#include <array>      // IWYU pragma: export
+#include <cstddef>    // IWYU pragma: export
+#include <cstdint>    // IWYU pragma: export
+#include <optional>   // IWYU pragma: export
+#include <span>       // IWYU pragma: export
+#include <stdexcept>  // IWYU pragma: export
+#include <string>     // IWYU pragma: export
+#include <vector>     // IWYU pragma: export
+
 #include <map>
 #include <new>
-#include <optional>
-#include <stdexcept>
-#include <string>
 #include <type_traits>
-#include <vector>
 
 // Marks what a shared library exports.
 #ifdef PROTOMARK_SHARED

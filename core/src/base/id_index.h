@@ -61,9 +61,13 @@ class IdIndex {
     return result;
   }
 
+  void make_room(const Ids& ids, std::size_t more) {
+    if (!has_room(more)) *this = with_room(ids, more);
+  }
+
   // Inserts an index whose id is not in the table yet.
   void insert(const Ids& ids, LandmarkIndex index) {
-    if (!has_room(1)) *this = with_room(ids, 1);
+    make_room(ids, 1);
     put(ids, index);
     ++used_;
   }
@@ -121,7 +125,6 @@ class IdIndex {
   std::uint64_t seed_ = hash_seed();
 };
 
-// A set of landmark ids.
 class IdSet {
  public:
   bool empty() const { return ids_.empty(); }
@@ -131,13 +134,9 @@ class IdSet {
   // Leaves the set as it was if memory runs out.
   void insert(std::int64_t id) {
     if (contains(id)) return;
+    index_.make_room(ids_, 1);
     ids_.push_back(id);
-    try {
-      index_.insert(ids_, landmark_at(ids_.size() - 1));
-    } catch (...) {
-      ids_.pop_back();
-      throw;
-    }
+    index_.insert(ids_, landmark_at(ids_.size() - 1));
   }
 
  private:

@@ -35,10 +35,7 @@ struct LargePageAllocator {
   }
   void deallocate(T* memory, std::size_t n) { ::operator delete(memory, alignment(n * sizeof(T))); }
 
-  template <typename U>
-  bool operator==(const LargePageAllocator<U>&) const {
-    return true;
-  }
+  bool operator==(const LargePageAllocator&) const = default;
 
  private:
   static constexpr std::size_t kPage = std::size_t{1} << 21, kLarge = 4 * kPage;

@@ -2,7 +2,6 @@
 
 #include <unistd.h>
 
-#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <deque>
@@ -14,7 +13,7 @@
 namespace protomark {
 namespace {
 
-// Threads stay once started, so that a mistyped number must not start thousands.
+// Threads stay once started; a mistyped number must not start thousands.
 constexpr std::size_t kMaxThreads = 256;
 
 thread_local bool inside_task = false;

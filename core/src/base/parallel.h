@@ -1,4 +1,4 @@
-// Loops that share their work among the threads of one pool.
+// Loops whose work the threads of one pool share.
 #pragma once
 
 #include <algorithm>
@@ -12,6 +12,18 @@ namespace protomark {
 // calls this runs the inner tasks by itself. After an exception no further task begins, and the
 // first exception is rethrown. Several threads may call this at once, and so may a child of fork().
 void run_tasks(int threads, std::size_t n, const std::function<void(std::size_t)>& task);
+
+struct Range {
+  std::size_t begin;
+  std::size_t end;
+  std::size_t size() const { return end - begin; }
+};
+
+// Returns the i-th of n elements' `ranges` ranges, all but the last with a multiple of `grain`.
+inline Range range_of(std::size_t n, std::size_t ranges, std::size_t i, std::size_t grain) {
+  const std::size_t grains = (n + grain - 1) / grain;
+  return {std::min(n, grains * i / ranges * grain), std::min(n, grains * (i + 1) / ranges * grain)};
+}
 
 // Calls body(begin, end) for ranges that cover [0, n), on up to `threads` threads. All ranges but
 // the last have a multiple of `grain` elements.
@@ -27,7 +39,8 @@ void parallel_for(int threads, std::size_t n, std::size_t grain, const Body& bod
   // With several ranges per thread, others take over from a thread that is held up.
   const std::size_t ranges = std::min(grains, 4 * static_cast<std::size_t>(threads));
   run_tasks(threads, ranges, [&](std::size_t i) {
-    body(grains * i / ranges * grain, std::min(n, grains * (i + 1) / ranges * grain));
+    const Range range = range_of(n, ranges, i, grain);
+    body(range.begin, range.end);
   });
 }
 

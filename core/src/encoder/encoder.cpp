@@ -4,7 +4,6 @@
 #include <cmath>
 #include <cstring>
 #include <functional>
-#include <memory>
 #include <string_view>
 
 #include "base/checksums.h"
@@ -26,7 +25,7 @@ constexpr std::size_t kMaxLayers = 16;
 
 // Descriptors that go through the network together, at most: activations stay in the L2 cache.
 constexpr std::size_t kBatch = 512;
-// Threads take multiples of so many descriptors.
+// Threads take multiples of this many descriptors.
 constexpr std::size_t kGrain = 64;
 
 struct Field {
@@ -163,21 +162,21 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
     // Batches of equal size, as a small last one would cost as much as a large one.
     const std::size_t batches = (last - first + kBatch - 1) / kBatch;
     const std::size_t limit = std::min(kBatch, last - first);
-    auto x = std::make_unique_for_overwrite<std::uint8_t[]>(limit * width);
-    auto next = std::make_unique_for_overwrite<std::uint8_t[]>(depth > 1 ? limit * width : 0);
+    const auto room = std::make_unique_for_overwrite<std::uint8_t[]>(2 * limit * width);
     for (std::size_t b = 0; b < batches; ++b) {
       const std::size_t begin = first + (last - first) * b / batches;
       const std::size_t n = first + (last - first) * (b + 1) / batches - begin;
+      MatrixView<std::uint8_t> x{room.get(), n, width}, next{room.get() + limit * width, n, width};
       const auto outputs = [&](std::size_t l) {
         return l + 1 < depth ? layers_[l].outputs : codes.columns;
       };
-      network.first.run(kernel, descriptors.row(begin), n, outputs(0), {x.get(), width});
+      network.first.run(kernel, {descriptors.row(begin), n, bytes()}, outputs(0), x);
       for (std::size_t l = 1; l < depth; ++l) {
-        network.later[l - 1].run(kernel, x.get(), width, n, outputs(l), {next.get(), width});
+        network.later[l - 1].run(kernel, x, outputs(l), next);
         std::swap(x, next);
       }
       for (std::size_t i = 0; i < n; ++i) {
-        std::memcpy(codes.row(begin + i), x.get() + i * width, codes.columns);
+        std::memcpy(codes.row(begin + i), x.row(i), codes.columns);
       }
     }
   });
@@ -211,8 +210,7 @@ void Encoder::save(const std::filesystem::path& path) const {
 }
 
 Encoder Encoder::load(const std::filesystem::path& path) {
-  const MappedFile file(path);
-  return parse(file.bytes(), path.string());
+  return parse(MappedFile(path).bytes(), path.string());
 }
 
 Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name) {

@@ -56,8 +56,7 @@ PackedActivation::PackedActivation(const Layer& layer, bool last)
 }
 
 BitLayer::BitLayer(const Layer& layer, bool last)
-    : bytes_(layer.inputs / 8),
-      words_((layer.inputs + 63) / 64),
+    : words_((layer.inputs + 63) / 64),
       span_(fits_16_bits(layer) ? words_ : kSafeWords),
       weights_(words_ * 64 * round_up(layer.outputs, kOutputs)),
       activation_(layer, last) {
@@ -72,14 +71,14 @@ BitLayer::BitLayer(const Layer& layer, bool last)
 // Descriptors as bit_sums or bit_sum take them.
 class BitLayer::Input {
  public:
-  Input(const BitLayer& layer, const std::uint8_t* descriptors, std::size_t n)
-      : layer_(layer), n_(n), words_(n * layer.words_) {
-    for (std::size_t i = 0; i < n; ++i, descriptors += layer.bytes_) {
-      for (std::size_t b = 0; b < layer.bytes_; ++b) {
-        words_[b / 8 * n + i] |= std::uint64_t{descriptors[b]} << (b % 8 * 8);
+  Input(const BitLayer& layer, Descriptors descriptors)
+      : layer_(layer), n_(descriptors.rows), words_(n_ * layer.words_) {
+    for (std::size_t i = 0; i < n_; ++i) {
+      for (std::size_t b = 0; b < descriptors.columns; ++b) {
+        words_[b / 8 * n_ + i] |= std::uint64_t{descriptors.row(i)[b]} << (b % 8 * 8);
       }
     }
-    if (n < kMinTabulated) list_set_bits();
+    if (n_ < kMinTabulated) list_set_bits();
   }
 
   // Sums up the words of a span from `first` on, with the weights of a block.
@@ -122,9 +121,10 @@ class BitLayer::Input {
   std::vector<std::size_t> counts_;   // n x words
 };
 
-void BitLayer::run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
-                   std::size_t outputs, LayerOutput next) const {
-  const Input input(*this, descriptors, n);
+void BitLayer::run(const kernels::Kernels& kernel, Descriptors descriptors, std::size_t outputs,
+                   MatrixView<std::uint8_t> next) const {
+  const Input input(*this, descriptors);
+  const std::size_t n = descriptors.rows;
   const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
   const auto sums = std::make_unique_for_overwrite<std::int16_t[]>(n * kOutputs);
   std::vector<std::int32_t> wide(span_ < words_ ? n * kOutputs : 0);
@@ -132,7 +132,7 @@ void BitLayer::run(const kernels::Kernels& kernel, const std::uint8_t* descripto
     const std::int8_t* weights = &weights_[o * words_ * 64];
     if (wide.empty()) {
       input.sums(kernel, weights, 0, sums.get());
-      activate.activate16(activation_.block(o), sums.get(), n, next.data + o, next.stride);
+      activate.activate16(activation_.block(o), sums.get(), n, next.data + o, next.columns);
       continue;
     }
     std::fill(wide.begin(), wide.end(), 0);
@@ -140,7 +140,7 @@ void BitLayer::run(const kernels::Kernels& kernel, const std::uint8_t* descripto
       input.sums(kernel, weights, first, sums.get());
       for (std::size_t i = 0; i < wide.size(); ++i) wide[i] += sums[i];
     }
-    activate.activate32(activation_.block(o), wide.data(), n, next.data + o, next.stride);
+    activate.activate32(activation_.block(o), wide.data(), n, next.data + o, next.columns);
   }
 }
 
@@ -156,17 +156,16 @@ DenseLayer::DenseLayer(const Layer& layer, bool last)
   }
 }
 
-void DenseLayer::run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride,
-                     std::size_t n, std::size_t outputs, LayerOutput next) const {
+void DenseLayer::run(const kernels::Kernels& kernel, MatrixView<const std::uint8_t> x,
+                     std::size_t outputs, MatrixView<std::uint8_t> next) const {
   const kernels::Kernels& activate = activation_.is_for_vectors() ? kernel : kernels::portable;
-  std::vector<std::int32_t> sums(std::min(n, kDenseBatch) * kOutputs);
-  for (std::size_t i = 0; i < n; i += kDenseBatch) {
-    const std::size_t batch = std::min(kDenseBatch, n - i);
+  std::vector<std::int32_t> sums(std::min(x.rows, kDenseBatch) * kOutputs);
+  for (std::size_t i = 0; i < x.rows; i += kDenseBatch) {
+    const std::size_t batch = std::min(kDenseBatch, x.rows - i);
     for (std::size_t o = 0; o < outputs; o += kOutputs) {
-      kernel.dense(&weights_[o * inputs_], inputs_, x + i * stride, stride, batch,
+      kernel.dense(&weights_[o * inputs_], inputs_, x.row(i), x.columns, batch,
                    round_up(std::min(outputs - o, kOutputs), 16), sums.data());
-      activate.activate32(activation_.block(o), sums.data(), batch, next.data + i * next.stride + o,
-                          next.stride);
+      activate.activate32(activation_.block(o), sums.data(), batch, next.row(i) + o, next.columns);
     }
   }
 }

@@ -2,22 +2,12 @@
 // block padded with zeros.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <utility>
-#include <vector>
 
 #include "kernels/kernels.h"
 #include "protomark/encoder.h"
 
 namespace protomark {
-
-// The bytes that a layer gives, n x stride; a row has room for whole blocks of outputs.
-struct LayerOutput {
-  std::uint8_t* data;
-  std::size_t stride;
-};
 
 // Returns the least and the largest sum of an output's weights over any subset of its inputs.
 std::pair<std::int64_t, std::int64_t> sum_range(const Layer& layer, std::size_t output);
@@ -49,14 +39,14 @@ class BitLayer {
   BitLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // Computes the first `outputs` outputs of n descriptors (n x bytes).
-  void run(const kernels::Kernels& kernel, const std::uint8_t* descriptors, std::size_t n,
-           std::size_t outputs, LayerOutput next) const;
+  // Computes the first `outputs` outputs of descriptors (n x bytes) as the first columns of `next`,
+  // whose rows have room for whole blocks of outputs.
+  void run(const kernels::Kernels& kernel, Descriptors descriptors, std::size_t outputs,
+           MatrixView<std::uint8_t> next) const;
 
  private:
   class Input;
 
-  std::size_t bytes_;
   std::size_t words_;                 // 64 bits each
   std::size_t span_;                  // words whose sums stay within 16 bits
   std::vector<std::int8_t> weights_;  // blocks x inputs x 64
@@ -69,9 +59,9 @@ class DenseLayer {
   DenseLayer(const Layer& layer, bool last);
 
   std::size_t outputs() const { return activation_.outputs(); }
-  // Computes the first `outputs` outputs of n inputs.
-  void run(const kernels::Kernels& kernel, const std::uint8_t* x, std::size_t stride, std::size_t n,
-           std::size_t outputs, LayerOutput next) const;
+  // Computes the first `outputs` outputs of inputs (n x bytes), as BitLayer does.
+  void run(const kernels::Kernels& kernel, MatrixView<const std::uint8_t> x, std::size_t outputs,
+           MatrixView<std::uint8_t> next) const;
 
  private:
   std::size_t inputs_;

@@ -1,19 +1,14 @@
 #include "file/container.h"
 
 #include <algorithm>
-#include <array>
 #include <bit>
-#include <cstring>
-#include <stdexcept>
 
 #include "base/checksums.h"
 
 namespace protomark {
 namespace {
 
-static_assert(std::endian::native == std::endian::little,
-              "the file format is little-endian; a big-endian machine needs byte swaps here");
-static_assert(sizeof(std::size_t) == 8, "sizes of maps and their products need 64 bits");
+static_assert(std::endian::native == std::endian::little && sizeof(std::size_t) == 8);
 
 constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
 constexpr std::uint32_t kVersion = 1;
@@ -158,7 +153,6 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   if (header.version != kVersion) {
     fail("format version ", header.version, ", this Protomark reads version ", kVersion);
   }
-  if (header.sections > kMaxSections) fail("its header is broken");
   if (header.file_size != file_.size()) {
     fail("it should have ", header.file_size, " bytes and has ", file_.size(),
          file_.size() < header.file_size ? ": it is cut off" : "");
@@ -181,7 +175,7 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
       fail("its section table is broken");
     }
     end = entry.offset + entry.size;
-    // Names go into errors and lists, where they must not send commands to a terminal.
+    // Errors print names, which must not send commands to a terminal.
     if (!std::ranges::all_of(entry.name(), [](char c) { return c >= ' ' && c <= '~'; })) {
       fail("its section table is broken: a name is not printable ASCII");
     }
@@ -199,24 +193,18 @@ const SectionEntry* ContainerReader::find(std::string_view name) const {
   return found == sections_.end() ? nullptr : &*found;
 }
 
-const SectionEntry& ContainerReader::get(std::string_view name) const {
-  if (const SectionEntry* found = find(name)) return *found;
-  fail("it lacks the section '", name, "'");
-}
-
-Bytes ContainerReader::checked(const SectionEntry& section) const {
-  const Bytes bytes = file_.subspan(section.offset, section.size);
-  if (crc32(bytes) != section.crc) {
-    fail("its section '", section.name(), "' does not match its checksum");
+Bytes ContainerReader::read(std::string_view section) const {
+  const Bytes bytes = map(section);
+  if (crc32(bytes) != find(section)->crc) {
+    fail("its section '", section, "' does not match its checksum");
   }
   return bytes;
 }
 
-Bytes ContainerReader::read(std::string_view section) const { return checked(get(section)); }
-
 Bytes ContainerReader::map(std::string_view section) const {
-  const SectionEntry& found = get(section);
-  return file_.subspan(found.offset, found.size);
+  const SectionEntry* found = find(section);
+  if (found == nullptr) fail("it lacks the section '", section, "'");
+  return file_.subspan(found->offset, found->size);
 }
 
 std::vector<std::pair<std::string, std::size_t>> ContainerReader::sections() const {
@@ -226,7 +214,7 @@ std::vector<std::pair<std::string, std::size_t>> ContainerReader::sections() con
 }
 
 void ContainerReader::verify() const {
-  for (const SectionEntry& entry : sections_) checked(entry);
+  for (const SectionEntry& entry : sections_) read(entry.name());
 }
 
 }  // namespace protomark

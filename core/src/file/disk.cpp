@@ -11,13 +11,10 @@
 #include <ctime>
 #include <random>
 
-#include "protomark/types.h"
-
 namespace protomark {
 namespace {
 
-// The path of a temporary file beside `target`, with a number of its own and no name that is too
-// long.
+// Returns the path of a temporary file beside `target`.
 std::filesystem::path beside(const std::filesystem::path& target) {
   constexpr std::size_t kMaxName = 255;  // bytes
   std::random_device random;
@@ -55,7 +52,7 @@ std::optional<std::span<std::byte>> FileDescriptor::read(std::span<std::byte> to
 }
 
 bool FileDescriptor::write(Bytes bytes) const {
-  // At a limit on file sizes the system would end the program; blocked, the write fails instead.
+  // At a limit on file sizes SIGXFSZ would end the program; while it is blocked, the write fails.
   sigset_t size_signal, before;
   ::sigemptyset(&size_signal);
   ::sigaddset(&size_signal, SIGXFSZ);
@@ -76,9 +73,9 @@ bool FileDescriptor::write(Bytes bytes) const {
 }
 
 bool FileDescriptor::is_at(const std::filesystem::path& path) const {
-  struct stat own, there;
-  return ::fstat(descriptor_, &own) == 0 && ::stat(path.c_str(), &there) == 0 &&
-         own.st_dev == there.st_dev && own.st_ino == there.st_ino;
+  struct stat open, named;
+  return ::fstat(descriptor_, &open) == 0 && ::stat(path.c_str(), &named) == 0 &&
+         open.st_dev == named.st_dev && open.st_ino == named.st_ino;
 }
 
 std::filesystem::path link_target(std::filesystem::path path) {
@@ -112,9 +109,9 @@ TemporaryFile::TemporaryFile(const std::filesystem::path& target)
   const auto type = std::filesystem::status(target_, error).type();
   using enum std::filesystem::file_type;
   if (type != not_found && type != none && type != regular) {
-    throw FileError(name_.string() + ": cannot be written: it is there and is no regular file");
+    fail_file(name_, "cannot be written: it exists and is not a regular file");
   }
-  // Not mkstemp, whose files only their owner may read: a map is as readable as any file.
+  // Only the owner may read the files of mkstemp.
   const auto mode = permissions(target_);
   do {
     path_ = beside(target_);
@@ -125,7 +122,7 @@ TemporaryFile::TemporaryFile(const std::filesystem::path& target)
     path_.clear();
     fail();
   }
-  // Restores what the umask took away; if that fails, fewer may read the file, never more.
+  // Restores what the umask removed; if that fails, fewer may read the file, never more.
   if (mode) ::fchmod(file_.get(), *mode);
 }
 
@@ -148,37 +145,28 @@ void TemporaryFile::replace_target() {
   if (::rename(path_.c_str(), target_.c_str()) != 0) fail();
   path_.clear();
   if (!sync_folder(target_)) {
-    throw FileError(name_.string() +
-                    ": is written, but its folder cannot be synced: " + system_error());
+    fail_file(name_, "is written, but its folder cannot be synced: ", system_error());
   }
 }
 
-void TemporaryFile::fail() const {
-  throw FileError(name_.string() + ": cannot be written: " + system_error());
-}
+void TemporaryFile::fail() const { fail_file(name_, "cannot be written: ", system_error()); }
 
-MappedFile::MappedFile(const std::filesystem::path& path) {
-  const auto fail = [&](const std::string& why) { throw FileError(path.string() + ": " + why); };
-  const auto file = FileDescriptor::open_to_read(path);
+MappedFile::MappedFile(const std::filesystem::path& path)
+    : MappedFile(FileDescriptor::open_to_read(path), path) {}
+
+MappedFile::MappedFile(const FileDescriptor& file, const std::filesystem::path& path) {
   struct stat status;
-  if (!file) fail("cannot be read: " + system_error());
-  if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail("not a file");
+  if (!file) fail_file(path, "cannot be read: ", system_error());
+  if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail_file(path, "not a file");
   const auto size = static_cast<std::size_t>(status.st_size);
-  device_ = status.st_dev;
-  inode_ = status.st_ino;
   if (size == 0) return;
   void* data = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.get(), 0);
-  if (data == MAP_FAILED) fail("cannot be read: " + system_error());
+  if (data == MAP_FAILED) fail_file(path, "cannot be read: ", system_error());
   bytes_ = {static_cast<const std::byte*>(data), size};
 }
 
 MappedFile::~MappedFile() {
   if (!bytes_.empty()) ::munmap(const_cast<std::byte*>(bytes_.data()), bytes_.size());
-}
-
-bool MappedFile::is_at(const std::filesystem::path& path) const {
-  struct stat status;
-  return ::stat(path.c_str(), &status) == 0 && status.st_dev == device_ && status.st_ino == inode_;
 }
 
 }  // namespace protomark

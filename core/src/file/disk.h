@@ -1,29 +1,31 @@
-// Writes files that are there whole or not at all and outlast a power cut, and maps files to read
-// them.
+// Writes files so that they exist whole or not at all, and maps files to read them.
 #pragma once
 
 #include <sys/types.h>
 
-#include <cstddef>
 #include <filesystem>
-#include <optional>
-#include <span>
-#include <string>
 #include <utility>
+
+#include "base/text.h"
+#include "protomark/types.h"
 
 namespace protomark {
 
 using Bytes = std::span<const std::byte>;
 
-// Returns what errno says.
 std::string system_error();
 
-// An open file; closed when this goes.
+template <typename... Parts>
+[[noreturn]] void fail_file(const std::filesystem::path& path, const Parts&... what) {
+  throw FileError(text(path.string(), ": ", what...));
+}
+
+// Owns an open file.
 class FileDescriptor {
  public:
   FileDescriptor() = default;
   explicit FileDescriptor(int descriptor) : descriptor_(descriptor) {}
-  // Opens a file to read it; does not wait for the writer of a named pipe.
+  // Opens a file to read it, without waiting for the writer of a named pipe.
   static FileDescriptor open_to_read(const std::filesystem::path& path);
   FileDescriptor(FileDescriptor&& other) noexcept : descriptor_(other.release()) {}
   FileDescriptor& operator=(FileDescriptor&& other) noexcept {
@@ -36,50 +38,48 @@ class FileDescriptor {
   int get() const { return descriptor_; }
   int release() { return std::exchange(descriptor_, -1); }
 
-  // Reads from the beginning up to to.size() bytes, or to the end of the file. nullopt, with errno
-  // set, if that fails.
+  // Reads from the beginning up to to.size() bytes. Returns nullopt, with errno set, on failure.
   std::optional<std::span<std::byte>> read(std::span<std::byte> to) const;
-  // Writes all of the bytes at the current offset. False, with errno set, if that fails; so does a
+  // Writes all bytes at the current offset. Returns false, with errno set, on failure, also at a
   // limit on file sizes, which raises no signal.
   bool write(Bytes bytes) const;
-  // Whether the file still has that name.
+  // Whether the file still has this name.
   bool is_at(const std::filesystem::path& path) const;
 
  private:
   int descriptor_ = -1;
 };
 
-// Follows a path that is a symbolic link to the path that the link leads to, there or not.
+// Returns the path, existing or not, to which a path leads if it is a symbolic link.
 std::filesystem::path link_target(std::filesystem::path path);
 
-// Syncs the folder of `path`: without this a power cut may bring the old name back. False, with
-// errno set, if that fails; true if the file system cannot do it or the folder cannot be read.
+// Syncs the folder of `path`, as otherwise a power cut may bring the old name back. Returns false,
+// with errno set, on failure, but true if the file system or the folder's permissions rule it out.
 bool sync_folder(const std::filesystem::path& path);
 
-// The permission bits of a file; nullopt if there is none.
+// Returns the permission bits of a file; nullopt if it does not exist.
 std::optional<mode_t> permissions(const std::filesystem::path& path);
 
-// A file that is written beside its target, or beside the file that the target links to, with the
-// permissions of an existing target. Removed unless it takes the target's place. All functions
-// throw FileError.
+// A file that is written beside its target (if that is a link, beside the file that it leads to),
+// with the permissions of an existing target, and removed unless it replaces the target. All
+// functions throw FileError.
 class TemporaryFile {
  public:
-  // Refuses a target that is there and is no regular file.
+  // The target must be a regular file if it exists.
   explicit TemporaryFile(const std::filesystem::path& target);
   ~TemporaryFile();
   TemporaryFile(const TemporaryFile&) = delete;
   TemporaryFile& operator=(const TemporaryFile&) = delete;
 
   void write(std::size_t offset, Bytes bytes);
-  // Ends the writing and makes it outlast a power cut.
   void sync();
-  // Renames the synced file over its target, and syncs the folder.
+  // Renames the synced file to its target, and syncs the folder.
   void replace_target();
 
  private:
   [[noreturn]] void fail() const;
 
-  std::filesystem::path name_, target_;  // what errors call the target, and what it leads to
+  std::filesystem::path name_, target_;  // as errors call the target, and where it leads
   std::filesystem::path path_;
   FileDescriptor file_;
   std::size_t offset_ = 0;  // of the descriptor
@@ -88,20 +88,17 @@ class TemporaryFile {
 // A file mapped read-only.
 class MappedFile {
  public:
-  // Throws FileError if the file cannot be read.
+  // Throw FileError if the file cannot be read; errors call an open one `path`.
   explicit MappedFile(const std::filesystem::path& path);
+  MappedFile(const FileDescriptor& file, const std::filesystem::path& path);
   ~MappedFile();
   MappedFile(const MappedFile&) = delete;
   MappedFile& operator=(const MappedFile&) = delete;
 
   Bytes bytes() const { return bytes_; }
-  // Whether the file still has that name.
-  bool is_at(const std::filesystem::path& path) const;
 
  private:
   Bytes bytes_;
-  dev_t device_ = 0;
-  ino_t inode_ = 0;
 };
 
 }  // namespace protomark

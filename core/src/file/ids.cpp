@@ -4,7 +4,6 @@
 #include <bit>
 
 #include "file/sections.h"
-#include "protomark/types.h"
 
 namespace protomark {
 namespace {
@@ -15,10 +14,6 @@ int bits_of(const IdBlock& block) { return static_cast<int>(block.gaps % 64); }
 std::size_t first_word(const IdBlock& block) { return block.gaps / 64; }
 
 }  // namespace
-
-bool ids_are_indices(std::size_t n, std::int64_t last) {
-  return n == 0 || last == static_cast<std::int64_t>(n) - 1;
-}
 
 void IdBlockWriter::add(std::int64_t id) {
   ids_.push_back(id);
@@ -59,7 +54,7 @@ LandmarkIds::LandmarkIds(const ContainerReader& file, std::size_t n) : file_(&fi
   check_blocks();
 }
 
-// Checks that gaps are where they should be, and that ids can ascend.
+// Checks that blocks of gaps follow each other, and that ids can ascend.
 void LandmarkIds::check_blocks() const {
   std::size_t words = 0;
   for (std::size_t b = 0; b < blocks_.size(); ++b) {
@@ -78,7 +73,7 @@ std::size_t LandmarkIds::block_size(std::size_t b) const {
   return std::min(kIdBlock, n_ - b * kIdBlock);
 }
 
-// All ids of a block are below.
+// Returns a number that all ids of a block are below.
 std::uint64_t LandmarkIds::end_of(std::size_t b) const {
   return b + 1 < blocks_.size() ? static_cast<std::uint64_t>(blocks_[b + 1].first_id)
                                 : std::uint64_t{1} << 63;

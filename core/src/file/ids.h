@@ -1,11 +1,7 @@
-// The ids of a sealed map's landmarks, which ascend, in few bytes and with random access.
+// The ascending ids of a sealed map's landmarks, in little space and with random access.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
-#include <span>
 #include <utility>
-#include <vector>
 
 #include "base/packed_numbers.h"
 #include "base/rows.h"
@@ -13,15 +9,15 @@
 
 namespace protomark {
 
-// Landmark j of a block has the id first_id + j + gap j, where gap j counts the ids that are
-// missing up to there. A run of ids has no gaps and takes no bits for them.
+// Landmark j of a block has the id first_id + j + gap j, where gap j counts the ids missing up to
+// there. Ids without gaps take no bits.
 struct IdBlock {
   std::int64_t first_id;
   std::uint64_t gaps;  // 64 * their first word + bits per gap, 0 to 63
 };
 inline constexpr std::size_t kIdBlock = 128;  // landmarks; the last block may have fewer
 
-// Writes sections `idblocks` and `idgaps` while ids come in ascending order.
+// Writes the sections `idblocks` and `idgaps` from ascending ids.
 class IdBlockWriter {
  public:
   IdBlockWriter(ContainerWriter::Sink blocks, ContainerWriter::Sink gaps)
@@ -30,7 +26,7 @@ class IdBlockWriter {
   void add(std::int64_t id);
   void finish();
 
-  // Size of the section `idblocks` in bytes.
+  // Returns the size of the section `idblocks` in bytes.
   static constexpr std::size_t blocks_size(std::size_t landmarks) {
     return (landmarks + kIdBlock - 1) / kIdBlock * sizeof(IdBlock);
   }
@@ -46,19 +42,16 @@ class IdBlockWriter {
   std::size_t words_ = 0;  // of all gaps
 };
 
-// Whether ids are 0 to n - 1, which are not stored; `last` is the largest.
-bool ids_are_indices(std::size_t n, std::int64_t last);
-
 class LandmarkIds {
  public:
   LandmarkIds() = default;
-  // Checks everything but the gaps, which are checked when they are read. `file` must outlive this.
+  // Checks everything but the gaps, which are checked as they are read. `file` must outlive this.
   // Throws FileError.
   LandmarkIds(const ContainerReader& file, std::size_t n);
 
   // Whether each landmark's id is its index.
   bool are_indices() const { return blocks_.empty(); }
-  // Throws FileError if the id is impossible.
+  // Throws FileError if the id is not below those of the next block.
   std::int64_t operator[](LandmarkIndex landmark) const;
   // Throws UnknownLandmark.
   LandmarkIndex find(std::int64_t id) const;

@@ -6,7 +6,6 @@
 #include <unistd.h>
 
 #include <algorithm>
-#include <array>
 #include <cerrno>
 #include <fstream>
 #include <new>
@@ -14,22 +13,21 @@
 #include <utility>
 
 #include "file/sections.h"
-#include "protomark/types.h"
 
 namespace protomark {
 namespace {
 
 constexpr std::size_t kIdentitySize = 64;  // hexadecimal digits
-// Size of the container that a journal begins with: head and the section `base`.
+// Size of a journal's first container: header, table and the section `base`.
 constexpr std::size_t kFirstSize = 128 + kIdentitySize;
 
-// The head that bytes begin with, if its checksum is right.
+// Returns the header and table that bytes begin with, if their checksum is right.
 std::optional<ContainerHead> intact_head(Bytes bytes) {
   const auto head = ContainerHead::parse(bytes);
   return head && head->has_right_checksum() ? head : std::nullopt;
 }
 
-// The container that bytes begin with; nullopt if it is broken or cut off.
+// Returns the container that bytes begin with; nullopt if it is broken or cut off.
 std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& name) {
   const auto head = ContainerHead::parse(bytes);
   if (!head) return std::nullopt;
@@ -45,7 +43,7 @@ std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& n
 }
 
 // Throws FileError if bytes begin with a container that is whole and yet unreadable, such as one of
-// a later version: no power cut made it so.
+// a later version, which no power cut leaves.
 void check_known(Bytes bytes, const std::string& name) {
   const auto head = intact_head(bytes);
   if (!head || head->header.file_size > bytes.size()) return;
@@ -54,13 +52,13 @@ void check_known(Bytes bytes, const std::string& name) {
 
 bool is_record(FileKind kind) { return kind == FileKind::commit || kind == FileKind::fold; }
 
-// The number of the record that bytes begin with; 0 if they begin with none.
+// Returns the number of the record that bytes begin with; 0 if they begin with none.
 std::uint64_t record_number(Bytes bytes) {
   const auto head = intact_head(bytes);
   if (!head || head->header.file_size > bytes.size()) return 0;
   try {
     const ContainerReader file(bytes.first(head->header.file_size), "");
-    // The size first: to check many sections that overlap would take long.
+    // The size first, as reading the sections of many nested containers would take long.
     if (!is_record(file.kind()) || file.map(section::kChain).size() != sizeof(ChainLink)) return 0;
     return read_value<ChainLink>(file, section::kChain).record;
   } catch (const FileError&) {
@@ -68,10 +66,10 @@ std::uint64_t record_number(Bytes bytes) {
   }
 }
 
-// Where a container begins that was written after the record at `broken`, which is not whole; the
-// size of the bytes if there is none. Anything may stand within that record, even a text that is a
-// container. So the search begins behind it; if its head does not say where that is, only a record
-// with a number above those of the whole records counts.
+// Returns where a container begins that was written after the broken record at `broken`, or the
+// size of the bytes if there is none. As that record may itself contain anything, even a container,
+// the search begins behind it; if its header does not tell where that is, only a record with a
+// number above those of the whole records counts.
 std::size_t find_later(Bytes bytes, std::size_t broken, std::uint64_t records) {
   const auto head = intact_head(bytes.subspan(broken));
   const std::uint64_t size = head ? head->header.file_size : kSectionAlignment;
@@ -85,7 +83,7 @@ std::size_t find_later(Bytes bytes, std::size_t broken, std::uint64_t records) {
   return bytes.size();
 }
 
-// Whether the creation of this journal was interrupted, so that nothing was committed to it yet.
+// Whether the creation of this journal was interrupted, so that it has no commits yet.
 bool is_unfinished(Bytes bytes) {
   return bytes.size() <= kFirstSize &&
          (has_magic(bytes) || std::ranges::all_of(bytes, [](auto b) { return b == std::byte{0}; }));
@@ -94,7 +92,7 @@ bool is_unfinished(Bytes bytes) {
 // Throws FileError with what is wrong with the beginning of a journal.
 [[noreturn]] void refuse(Bytes bytes, const std::string& name) {
   ContainerReader(bytes.first(std::min(bytes.size(), kFirstSize)), name).verify();
-  throw FileError(name + ": not a journal");
+  fail_file(name, "not a journal");
 }
 
 std::string read_base(const ContainerReader& file) {
@@ -104,10 +102,10 @@ std::string read_base(const ContainerReader& file) {
 }
 
 constexpr char kSaveElsewhere[] = "; save to another path to keep what is in memory";
-// Openings of a journal that somebody else deletes at the same moment.
+// Attempts to open a journal, or a map file and its journal, while others replace them.
 constexpr int kTries = 100;
 
-// Who has locked a file, which Linux tells.
+// Names who has locked a file, as far as Linux tells.
 std::string holder(const FileDescriptor& file) {
   struct stat status;
   if (::fstat(file.get(), &status) == 0) {
@@ -136,24 +134,60 @@ void add_base(ContainerWriter& file, const std::string& identity) {
 
 std::uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
 
-// Locks the journal of a map file that is to be written over, if there is one.
+// Returns the bytes of an open journal, which its writer may cut off meanwhile. Throws FileError if
+// it is not a journal.
+std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path) {
+  const auto fail = [&](const auto&... why) { fail_file(path, "cannot be read: ", why...); };
+  struct stat status;
+  if (::fstat(file.get(), &status) != 0) fail(system_error());
+  if (!S_ISREG(status.st_mode)) fail_file(path, "not a file");
+  const auto size = static_cast<std::size_t>(status.st_size);
+  const auto read = [&](std::span<std::byte> to) {
+    const auto bytes = file.read(to);
+    if (!bytes) fail(system_error());
+    return *bytes;
+  };
+  // A file that does not begin as a journal is not read, however large.
+  std::array<std::byte, kMaxHead> space;
+  const Bytes head = read(std::span(space).first(std::min(size, space.size())));
+  if (head.size() > kFirstSize && !intact_head(head)) refuse(head, path.string());
+  std::vector<std::byte> result;
+  try {
+    result.resize(size);
+  } catch (const std::bad_alloc&) {
+    fail("its ", size, " bytes do not fit into memory");
+  }
+  result.resize(read(result).size());
+  return result;
+}
+
+// Returns the identity of the map file at `path`; empty if that cannot be read.
+std::string identity_of(const std::filesystem::path& path) {
+  const auto file = FileDescriptor::open_to_read(path);
+  std::array<std::byte, kMaxHead> space;
+  const auto bytes = file ? file.read(space) : std::nullopt;
+  const auto head = bytes ? ContainerHead::parse(*bytes) : std::nullopt;
+  return head ? head->identity() : "";
+}
+
+// Locks the journal of a map file that is to be replaced, if there is one.
 FileDescriptor guard(const std::filesystem::path& map) {
   const auto path = journal_path(map);
   FileDescriptor file;
   for (int tries = 0; tries < kTries; ++tries) {
     file = FileDescriptor::open_to_read(path);
     if (!file && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return file;
-    if (!file) throw FileError(text(path.string(), ": cannot be read: ", system_error()));
+    if (!file) fail_file(path, "cannot be read: ", system_error());
     if (::flock(file.get(), LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
-      throw FileError(text(map.string(), ": cannot be written: its journal is held by ",
-                           holder(file), "; close it there, or save to another path"));
+      fail_file(map, "cannot be written: its journal is held by ", holder(file),
+                "; close it there, or save to another path");
     }
     const auto bytes = read_journal(file, path);
     const auto commits = JournalContent(bytes, path.string()).commits(identity_of(map)).size();
     if (commits > 0) {
-      throw FileError(text(map.string(), ": cannot be written: its journal holds ", commits,
-                           " commits, which would be lost; open it with journal and compact it, "
-                           "or save to another path"));
+      fail_file(map, "cannot be written: its journal holds ", commits,
+                " commits, which would be lost; open it with journal and compact it, or save to "
+                "another path");
     }
     if (file.is_at(path)) break;
   }
@@ -166,55 +200,20 @@ std::filesystem::path journal_path(const std::filesystem::path& map) {
   return link_target(map).string() + ".journal";
 }
 
-std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path) {
-  const auto fail = [&](const std::string& why) {
-    throw FileError(path.string() + ": cannot be read: " + why);
-  };
-  struct stat status;
-  if (::fstat(file.get(), &status) != 0) fail(system_error());
-  if (!S_ISREG(status.st_mode)) throw FileError(path.string() + ": not a file");
-  const auto size = static_cast<std::size_t>(status.st_size);
-  const auto read = [&](std::span<std::byte> to) {
-    const auto bytes = file.read(to);
-    if (!bytes) fail(system_error());
-    return *bytes;
-  };
-  // A file that does not begin as a journal is not read, however large.
-  std::array<std::byte, kMaxHead> head_space;
-  const Bytes head = read(std::span(head_space).first(std::min(size, head_space.size())));
-  if (head.size() > kFirstSize && !intact_head(head)) refuse(head, path.string());
-  std::vector<std::byte> result;
-  try {
-    result.resize(size);
-  } catch (const std::bad_alloc&) {
-    fail(text("its ", size, " bytes do not fit into memory"));
-  }
-  result.resize(read(result).size());
-  return result;
-}
-
-std::string identity_of(const std::filesystem::path& path) {
-  const auto file = FileDescriptor::open_to_read(path);
-  std::array<std::byte, kMaxHead> space;
-  const auto bytes = file ? file.read(space) : std::nullopt;
-  const auto head = bytes ? ContainerHead::parse(*bytes) : std::nullopt;
-  return head ? head->identity() : "";
-}
-
 JournaledFile::JournaledFile(const std::filesystem::path& map) {
-  constexpr int kTries = 100;
   const auto path = journal_path(map);
-  // The map may be compacted while the two are read, and again to an equal file whose journal was
-  // another in between. Not every file system gives a file the same inode each time.
+  // The map may be compacted while the two are read, even to an equal file. Not every file system
+  // gives a file the same inode each time.
   for (int tries = 0;; ++tries) {
-    mapped_ = std::make_unique<MappedFile>(map);
+    const auto open = FileDescriptor::open_to_read(map);
+    mapped_ = std::make_unique<MappedFile>(open, map);
     file_.emplace(mapped_->bytes(), map.string());
     const auto journal = FileDescriptor::open_to_read(path);
     if (!journal && errno != ENOENT && errno != ENAMETOOLONG) {
-      throw FileError(path.string() + ": cannot be read: " + system_error());
+      fail_file(path, "cannot be read: ", system_error());
     }
     bytes_ = journal ? read_journal(journal, path) : std::vector<std::byte>();
-    if (identity_of(map) == file_->identity() && (mapped_->is_at(map) || tries >= kTries)) break;
+    if (identity_of(map) == file_->identity() && (open.is_at(map) || tries >= kTries)) break;
   }
   journal_ = JournalContent(bytes_, path.string());
 }
@@ -239,7 +238,7 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
       check_known(bytes.subspan(end_), where);
       const std::size_t next = find_later(bytes, end_, last_.record);
       if (next == size_) return;
-      throw FileError(text(where, " is broken, and there are others behind it, at byte ", next,
+      throw FileError(text(where, " is broken, and another one follows at byte ", next,
                            ", which no power cut leaves; to keep the commits before it, cut the "
                            "journal off (truncate --size=",
                            end_, ")"));
@@ -260,7 +259,7 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
 }
 
 std::span<const JournalContent::Commit> JournalContent::commits(const std::string& identity) const {
-  // The last base of this identity counts, as equal map files may come again.
+  // The last base of this identity counts, as a later map file may equal an earlier one.
   for (auto base = bases_.rbegin(); base != bases_.rend(); ++base) {
     if (base->identity == identity) return std::span(commits_).subspan(base->commits);
   }
@@ -276,14 +275,14 @@ std::span<const JournalContent::Commit> JournalContent::commits(const std::strin
 Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   std::error_code error;
   map_ = std::filesystem::canonical(map, error);
-  if (error) throw FileError(map.string() + ": cannot be read: " + error.message());
+  if (error) fail_file(map, "cannot be read: ", error.message());
   path_ = journal_path(map_);
-  // Who may not read the map may not read what is committed to it.
+  // The journal is as readable as the map file.
   const mode_t mode = permissions(map_).value_or(0) | S_IRUSR | S_IWUSR;
   for (int tries = 0; tries < kTries; ++tries) {
     file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, mode));
     made_ = bool(file_);
-    if (made_) ::fchmod(file_.get(), mode);  // the umask may have taken something away
+    if (made_) ::fchmod(file_.get(), mode);  // the umask may have removed some
     if (!made_) file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, mode));
     if (!file_) fail_write();
     if (::flock(file_.get(), LOCK_EX | LOCK_NB) != 0) {
@@ -296,14 +295,16 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
   fail("is deleted again and again, or its file system does not number files");
 }
 
+std::vector<std::byte> Journal::read() const { return read_journal(file_, path_); }
+
 void Journal::resume(const JournalContent& content, const std::string& identity) {
   base_ = identity;
   end_ = content.end();
   last_ = content.last();
   tail_ = content.end() != content.size();
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
-  // Whoever made the journal, or compacted, may have been killed before this: the new map file's
-  // name must be durable before what it replaces is forgotten.
+  // A process that compacted may have been killed before this: the name of the new map file must be
+  // durable before the commits that it has are dropped.
   if (!sync_folder(path_)) fail("its folder cannot be synced: ", system_error());
   if (end_ == 0) {
     begin();
@@ -318,7 +319,7 @@ bool Journal::cut(std::size_t size) {
   return true;
 }
 
-// Writes an empty file, then a header, so that nothing of before is left behind that.
+// Empties the file and syncs it before writing a header, so that no older record follows that.
 void Journal::begin() {
   tail_ = true;
   if (!cut(0)) fail_write();
@@ -390,12 +391,13 @@ void Journal::restart(const std::string& identity) noexcept {
 }
 
 void Journal::abandon() noexcept {
-  // Whoever has opened it meanwhile finds it gone once they have the lock, and makes another one.
+  // A process that opened it meanwhile sees this once it has the lock, and makes another one.
   if (made_ && file_.is_at(path_)) ::unlink(path_.c_str());
 }
 
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path) {
-  const FileDescriptor before = guard(path);
+  // Once more before the file is replaced, as another map may have opened it meanwhile.
+  const FileDescriptor first = guard(path);
   FileDescriptor last;
   file.write(path, [&](const std::string&) { last = guard(path); });
 }

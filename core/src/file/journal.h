@@ -1,28 +1,20 @@
-// The journal of a learning map: a file beside the map's that holds what was committed since that
-// was written (docs/format.md).
-//
-// It is a container of kind `journal`, followed by one per commit and one per time that the map was
-// folded into a new map file. Each names the checksum of the one before it.
+// The journal of a learning map: a file beside the map file with the commits made since that was
+// written. It is a container of kind `journal`, followed by one for each commit and for each time
+// that the map was folded into a new map file; each names the checksum of the one before it.
 #pragma once
 
 #include <sys/types.h>
 
-#include <cstddef>
-#include <cstdint>
 #include <filesystem>
 #include <memory>
-#include <optional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "file/container.h"
 
 namespace protomark {
 
-// What a record says of itself and the one before it.
+// The section `chain` of a record.
 struct ChainLink {
-  std::uint64_t record;    // its number, from 1 on
+  std::uint64_t record;    // counted from 1
   std::uint32_t previous;  // checksum of the container before it
   std::uint32_t reserved;
 };
@@ -30,14 +22,7 @@ struct ChainLink {
 // Returns the path of the journal beside a map file, or beside the file that it links to.
 std::filesystem::path journal_path(const std::filesystem::path& map);
 
-// Returns the bytes of a journal that is open, which its writer may cut off meanwhile. Throws
-// FileError, with `path`, if that is not a journal.
-std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path);
-
-// Returns the identity of the map file at `path`, by its head; empty if that cannot be read.
-std::string identity_of(const std::filesystem::path& path);
-
-// What a journal holds.
+// The records of a journal.
 class JournalContent {
  public:
   struct Commit {
@@ -45,30 +30,29 @@ class JournalContent {
     std::size_t offset;  // in the journal
   };
 
-  // A journal without commits.
   JournalContent() = default;
-  // Takes what is whole; the bytes stay the caller's. A last record that is not whole, as a killed
-  // process or a power cut leaves it, is left out. Throws FileError if another record stands behind
-  // it, and for anything else that no journal holds.
+  // Reads all records but a torn last one, which a killed process or a power cut leaves. The bytes
+  // stay the caller's. Throws FileError if another record follows a torn one, and for anything else
+  // that no writer leaves.
   JournalContent(Bytes bytes, std::string name);
 
   // Returns the commits to apply to a map file of this identity, in order. Throws FileError if they
-  // belong to another one.
+  // belong to another file.
   std::span<const Commit> commits(const std::string& identity) const;
 
   const std::string& name() const { return name_; }
-  // Where the whole records end; 0 if there is not even a header.
+  // Returns where the last whole record ends; 0 if there is not even a header.
   std::size_t end() const { return end_; }
   std::size_t size() const { return size_; }
-  // The number of records, and the checksum of the last one or of the header.
+  // Returns the number of records, and the checksum of the last one or of the header.
   ChainLink last() const { return last_; }
-  // Whether the journal was begun for a map file of this identity and has no records.
+  // Whether the journal has no records and was begun for a map file of this identity.
   bool is_new(const std::string& identity) const {
     return last_.record == 0 && end_ != 0 && bases_.front().identity == identity;
   }
 
  private:
-  // A map file that holds the first `commits` commits.
+  // A map file that has the first `commits` commits.
   struct Base {
     std::string identity;
     std::size_t commits;
@@ -82,7 +66,7 @@ class JournalContent {
   std::vector<Base> bases_;
 };
 
-// A map file and its journal, read without a lock: they fit each other even if a map commits and
+// A map file and its journal, read without a lock, that fit each other even if a map commits and
 // compacts meanwhile.
 class JournaledFile {
  public:
@@ -99,35 +83,31 @@ class JournaledFile {
   JournalContent journal_;
 };
 
-// A journal that one map writes to; no other map, in this process or another, can at the same time.
-// Functions throw FileError.
+// A journal to which one map, of all processes, writes. Functions throw FileError.
 class Journal {
  public:
-  // Locks the journal of a map file, and makes it if there is none. Throws FileError, which names
-  // the process that holds the lock.
+  // Locks the journal of a map file, which it makes if there is none. The error for a locked
+  // journal names the process that holds the lock.
   explicit Journal(const std::filesystem::path& map);
   Journal(const Journal&) = delete;
   Journal& operator=(const Journal&) = delete;
 
   const std::filesystem::path& map() const { return map_; }
-  std::vector<std::byte> read() const { return read_journal(file_, path_); }
-  // Goes on behind what the journal holds, for a map file of this identity. Cuts off a torn tail,
-  // and begins anew if nothing is to be applied to the map file.
+  std::vector<std::byte> read() const;
+  // Prepares to append to this content, for a map file of this identity: cuts off a torn record,
+  // and begins anew if no commit is to be applied to the map file.
   void resume(const JournalContent& content, const std::string& identity);
 
   // Begins the next record, with its chain link.
   ContainerWriter record(FileKind kind);
-  // Returns once the record is durable. If that fails the journal is as before, and one may try
-  // again.
+  // Returns once the record is durable. If that fails the journal is as before.
   void append(Bytes record);
-  // Appends that everything so far is in a map file of this identity, which is about to take the
-  // place of the present one.
+  // Appends that a map file of this identity, about to replace the present one, has everything.
   void fold(const std::string& identity);
-  // Forgets all commits, as the map file now is the one of this identity. If that fails, the
-  // commits stay behind a fold that ends them, or half a header stays, neither of which counts, and
-  // the next commit tries again.
+  // Drops all commits, as the map file now is the one of this identity. If that fails, a fold ends
+  // them or half a header is left, so that they do not count, and the next commit tries again.
   void restart(const std::string& identity) noexcept;
-  // Removes the file if it was made here, as no map will commit after all.
+  // Removes the file if this made it, as no map will commit after all.
   void abandon() noexcept;
 
  private:
@@ -142,17 +122,17 @@ class Journal {
 
   std::filesystem::path map_, path_;
   FileDescriptor file_;  // locked while it is open, also in a forked child
-  bool made_ = false;    // the file was not there
+  bool made_ = false;    // by this
   pid_t process_;
   std::string base_;    // identity of the map file
-  std::string folded_;  // and of the one that may have taken its place
+  std::string folded_;  // and of the one that may have replaced it
   std::size_t end_ = 0;
   ChainLink last_{};
-  bool tail_ = false;  // something may stand behind the end
+  bool tail_ = false;  // bytes may follow the end
 };
 
-// Writes a file over any that is there, unless that is open as a map with a journal, or its journal
-// holds commits, which would be lost; also if that begins meanwhile. Throws FileError.
+// Writes a file, replacing any other, unless a map has the journal of that or the journal holds
+// commits, which would be lost. Throws FileError.
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path);
 
 }  // namespace protomark

@@ -1,13 +1,8 @@
-// The sections of files, and how plain values and texts are read and written in them.
+// Reads and writes plain values and texts in sections of files.
 #pragma once
 
 #include <algorithm>
-#include <cstddef>
-#include <cstdint>
-#include <span>
-#include <string>
 #include <string_view>
-#include <vector>
 
 #include "base/text.h"
 #include "file/container.h"
@@ -48,8 +43,7 @@ inline constexpr char kChain[] = "chain";
 inline constexpr char kRemoved[] = "removed";
 }  // namespace section
 
-// Reads plain values from a section, front to back. All functions throw FileError if the section
-// is too short.
+// Reads plain values from a section, from front to back. All functions throw FileError.
 class SectionReader {
  public:
   SectionReader(const ContainerReader& file, std::string_view section)
@@ -74,7 +68,7 @@ class SectionReader {
     if (n > 0) std::memcpy(to, rest_.data(), n * sizeof(T));
     rest_ = rest_.subspan(n * sizeof(T));
   }
-  // A u32 length and that many bytes of UTF-8.
+  // Reads a u32 length and that many bytes of UTF-8.
   std::string text() {
     const std::vector<char> bytes = values<char>(value<std::uint32_t>());
     std::string result(bytes.begin(), bytes.end());
@@ -107,13 +101,11 @@ std::vector<T> read_section(const ContainerReader& file, const char* name, std::
   return result;
 }
 
-// Reads a section that is a single value.
 template <typename T>
 T read_value(const ContainerReader& file, const char* name) {
   return read_section<T>(file, name, 1)[0];
 }
 
-// Collects plain values for a section.
 class SectionWriter {
  public:
   template <typename T>
@@ -125,7 +117,6 @@ class SectionWriter {
     const Bytes bytes = std::as_bytes(std::span(v, n));
     bytes_.insert(bytes_.end(), bytes.begin(), bytes.end());
   }
-  // As SectionReader reads it.
   void text(const std::string& v) {
     value(static_cast<std::uint32_t>(v.size()));
     values(v.data(), v.size());
@@ -137,7 +128,6 @@ class SectionWriter {
   std::vector<std::byte> bytes_;
 };
 
-// Adds a section that is a single value.
 template <typename T>
 void add_value(ContainerWriter& file, const char* name, const T& value) {
   SectionWriter out;
@@ -160,7 +150,7 @@ void put_values(const ContainerWriter::Sink& sink, std::size_t n, std::size_t wi
   }
 }
 
-// Hands a value of type T for each element of a span to a sink.
+// Hands value(element), a T, to a sink for each element of a span.
 template <typename T, typename Element, typename Value>
 void put_each(const ContainerWriter::Sink& sink, std::span<const Element> elements,
               const Value& value) {

@@ -29,9 +29,9 @@ constexpr std::size_t kTileDim = 64;  // dimensions of a full tile
 // Blocks compared at a time: four independent products hide the latency of a tile product.
 constexpr std::size_t kStep = 4;
 
-// Packed blocks are tiles as they stand, and so are queries. Tiles 0 to 3 hold the results of four
-// blocks, 4 and 5 queries, 6 and 7 a block; the first of each pair is for 64 dimensions, the second
-// for the rest.
+// Packed blocks and queries are tiles without further packing. Tiles 0 to 3 hold the results of
+// four blocks, 4 and 5 queries, 6 and 7 a block; the first of each pair is for 64 dimensions, the
+// second for the rest.
 TileConfig configuration(std::size_t queries, std::size_t dim) {
   TileConfig config;
   for (int tile = 0; tile < 4; ++tile) config.set(tile, queries, 4 * kCodeRows);

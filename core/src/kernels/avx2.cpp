@@ -1,7 +1,7 @@
 // AVX2: x86 since Haswell and Zen.
 #include <immintrin.h>
 
-#include "kernels/generic.h"
+#include "kernels/generic_search.h"
 
 namespace protomark::kernels {
 namespace {
@@ -43,7 +43,7 @@ struct Avx2 : ByPairs<Avx2, 32> {
     return (Ints)_mm256_sra_epi32(upper, _mm_cvtsi32_si128(shift - 32));
   }
   // Looks bytes up in 256 entries, 16 at a time: in step k of each half, only bytes that are not
-  // negative after 16 k was taken away choose an entry. Entries are stored as differences to those
+  // negative after subtracting 16 k choose an entry. Entries are stored as differences from those
   // 16 before, so that the steps up to the right one add up to it.
   class Table {
    public:
@@ -114,10 +114,10 @@ struct Avx2 : ByPairs<Avx2, 32> {
     }
   }
   static unsigned near_words(const Words& counts, std::int32_t limit) {
-    const __m256i most = _mm256_set1_epi64x(limit);
+    const __m256i limits = _mm256_set1_epi64x(limit);
     const auto far = [&](auto half) {
       return static_cast<unsigned>(
-          _mm256_movemask_pd((__m256d)_mm256_cmpgt_epi64((__m256i)half, most)));
+          _mm256_movemask_pd((__m256d)_mm256_cmpgt_epi64((__m256i)half, limits)));
     };
     return 0xff ^ (far(counts.v[0]) | far(counts.v[1]) << 4);
   }

@@ -1,7 +1,7 @@
 // AVX-512 with VBMI, VNNI (byte dot products) and VPOPCNTDQ: Ice Lake, Zen 4 and later.
 #include <immintrin.h>
 
-#include "kernels/generic.h"
+#include "kernels/generic_search.h"
 
 namespace protomark::kernels {
 namespace {
@@ -19,7 +19,7 @@ struct Avx512 {
   static Codes load_codes(const std::int8_t* codes) { return load<Codes>(codes); }
   using Step = std::uint8_t[4];
   static Ints query(const std::uint8_t* codes) { return Ints{} + load<std::int32_t>(codes); }
-  // _mm512_dpbusd_epi32 in place: of that, GCC makes two copies of every accumulator a step.
+  // GCC copies every accumulator of _mm512_dpbusd_epi32 twice per step.
   static void dot(Sums& sums, Ints u, Codes s) {
     __asm__("vpdpbusd %2, %1, %0" : "+v"(sums.v[0]) : "v"(u), "v"(s));
   }

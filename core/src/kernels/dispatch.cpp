@@ -1,9 +1,8 @@
-// Which kernels run on this CPU.
-#include <array>
+// Finds the kernels that run on this CPU.
 #include <cstdlib>
 #include <cstring>
-#include <stdexcept>
 #include <string>
+#include <vector>
 
 #if defined(__aarch64__) && defined(__linux__)
 #include <sys/auxv.h>
@@ -15,6 +14,7 @@
 #endif
 #endif
 
+#include "base/text.h"
 #include "kernels/kernels.h"
 #include "protomark/types.h"
 
@@ -31,7 +31,7 @@ bool has_avx512() {
 }
 
 #if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
-// Linux gives a process room for tiles if it asks for it. Elsewhere AMX is not used.
+// A process must ask Linux for room for tiles. Elsewhere AMX is not used.
 bool has_amx() {
   constexpr unsigned kTile = 1u << 24, kInt8 = 1u << 25;
   unsigned a = 0, b = 0, c = 0, d = 0;
@@ -55,64 +55,50 @@ bool has_dot_product() {
 }
 #endif
 
-// All that run here, best first.
-struct Sets {
-  std::array<Kernels, 4> kernels;
-  std::array<const char*, 5> names{};
-  std::size_t size = 0;
-
-  Sets() {
+std::vector<Kernels> find_all() {
+  std::vector<Kernels> found;
 #if defined(__x86_64__)
 #if defined(PROTOMARK_HAS_AMX) && defined(__linux__)
-    if (has_amx()) {
-      Kernels set = avx512;
-      set.name = amx.name;
-      set.code_scan = amx.code_scan;
-      add(set);
-    }
+  if (has_amx()) {
+    found.push_back(avx512);
+    found.back().name = amx.name;
+    found.back().code_scan = amx.code_scan;
+  }
 #endif
-    if (has_avx512()) add(avx512);
-    if (has_avx2()) add(avx2);
+  if (has_avx512()) found.push_back(avx512);
+  if (has_avx2()) found.push_back(avx2);
 #elif defined(__aarch64__)
-    if (has_dot_product()) add(neon);
+  if (has_dot_product()) found.push_back(neon);
 #endif
-    add(portable);
-  }
-
-  void add(const Kernels& set) {
-    kernels[size] = set;
-    names[size++] = set.name;
-  }
-};
-
-const Sets& sets() {
-  static const Sets found;
+  found.push_back(portable);
+  found.push_back({});
   return found;
 }
 
 const Kernels& choose() {
-  const char* wanted = std::getenv("PROTOMARK_ISA");
-  if (wanted == nullptr || *wanted == '\0') return sets().kernels.front();
-  if (const Kernels* found = find(wanted)) return *found;
+  const char* name = std::getenv("PROTOMARK_ISA");
+  if (name == nullptr || *name == '\0') return *all();
+  if (const Kernels* found = find(name)) return *found;
   std::string available;
-  for (const char* const* name = names(); *name != nullptr; ++name) {
-    available += (available.empty() ? "" : ", ") + std::string(*name);
+  for (const Kernels* set = all(); set->name != nullptr; ++set) {
+    available += (available.empty() ? "" : ", ") + std::string(set->name);
   }
-  throw std::invalid_argument("PROTOMARK_ISA=" + std::string(wanted) +
-                              ": no such instruction set on this machine; leave it unset or use " +
-                              available);
+  invalid("PROTOMARK_ISA=", name,
+          ": no such instruction set on this machine; leave it unset or use ", available);
 }
 
 }  // namespace
 
-const Kernels* find(const char* name) {
-  for (std::size_t i = 0; i < sets().size; ++i) {
-    if (std::strcmp(sets().names[i], name) == 0) return &sets().kernels[i];
-  }
-  return nullptr;
+const Kernels* all() {
+  static const std::vector<Kernels> found = find_all();
+  return found.data();
 }
 
-const char* const* names() { return sets().names.data(); }
+const Kernels* find(const char* name) {
+  const Kernels* set = all();
+  while (set->name != nullptr && std::strcmp(set->name, name) != 0) ++set;
+  return set->name != nullptr ? set : nullptr;
+}
 
 const Kernels& active() {
   static const Kernels& chosen = choose();

@@ -1,5 +1,5 @@
-// The encoder's kernels, written once over a set S of vector operations. What S has to offer stands
-// with the functions that use it. Everything here has internal linkage: see kernels.h.
+// The encoder's kernels over a set S of vector operations; comments with the functions say what S
+// needs. Everything has internal linkage: see kernels.h.
 #pragma once
 
 #include "kernels/kernels.h"
@@ -8,8 +8,8 @@
 namespace protomark::kernels {
 namespace {
 
-// The sums of all subsets of 4 inputs, for each 4 of 64 inputs.
-//   S::Sums16             16-bit sums of outputs, so many that a table fits the L1 cache: widen()
+// Tabulates the sums of all subsets of 4 inputs, for each 4 of 64 inputs.
+//   S::Sums16             16-bit sums of as many outputs as leave a table in the L1 cache: widen()
 //                         loads weights
 template <typename S>
 void fill_table(const std::int8_t* weights, typename S::Sums16* table) {
@@ -85,7 +85,7 @@ void dense_tile(const std::int8_t* weights, std::size_t inputs, const std::uint8
   }
 }
 
-//   S::dense_start(weights, inputs)  where S has it: sums of no inputs at all, for 16 outputs
+//   S::dense_start(weights, inputs)  optional: what sums of 16 outputs start from
 template <typename S, int Groups>
 void dense_groups(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
                   std::size_t stride, std::size_t n, std::int32_t* sums) {
@@ -132,12 +132,21 @@ void activate(const Activation& a, const Sum* sums, std::size_t n, std::uint8_t*
     }
     for (std::size_t i = 0; i < n; ++i) {
       const auto part = [&](std::size_t q) {
-        const Sum* some = sums + i * kOutputs + o + q * kLanes;
-        return S::scaled(S::load_ints(some), bias[q], multipliers[q], shift);
+        const Sum* from = sums + i * kOutputs + o + q * kLanes;
+        return S::scaled(S::load_ints(from), bias[q], multipliers[q], shift);
       };
       store(next + i * stride + o, table(part(0), part(1), part(2), part(3)));
     }
   }
+}
+
+// Returns S::activate where S has its own.
+template <typename S, typename Sum>
+constexpr auto activation_of() {
+  if constexpr (requires { &S::template activate<Sum>; })
+    return &S::template activate<Sum>;
+  else
+    return &activate<S, Sum>;
 }
 
 }  // namespace

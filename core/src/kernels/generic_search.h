@@ -1,7 +1,8 @@
-// The search kernels, written once over a set S of vector operations. What S has to offer stands
-// with the functions that use it. Everything here has internal linkage: see kernels.h.
+// The search kernels, and the table of all kernels, over a set S of vector operations; comments
+// with the functions say what S needs. Everything has internal linkage: see kernels.h.
 #pragma once
 
+#include "kernels/generic_encoder.h"
 #include "kernels/kernels.h"
 #include "kernels/vectors.h"
 
@@ -20,8 +21,8 @@ namespace {
 constexpr int kTileQueries = 4;
 
 // A negated distance is 2 p . q + bias. Sums start from half the bias and end as half the negated
-// distance, both rounded down; the bit that was lost is in the bias. A row may be a hit where its
-// half is above this.
+// distance, both rounded down; the lost bit is in the bias. A row whose half is above this
+// threshold may be a hit.
 std::int32_t threshold(std::int32_t limit) { return -((limit >> 1) + (limit & 1)) - 1; }
 
 // Appends the hits among those of a block's 16 rows whose bits are set in `near`.
@@ -38,8 +39,8 @@ std::size_t append_hits(unsigned near, const std::int32_t* halves, const std::in
   return found;
 }
 
-// Decides whether to compare the dimension prefix (PackedCodes::prefix) first. That pays if it
-// leaves few queries; if not, some steps are compared in full before it is tried again.
+// Decides whether to compare the prefix of the dimensions first, which pays if it leaves few
+// queries. If not, some steps are compared in full before it is tried again.
 class Prefix {
  public:
   Prefix(const CodeQueries& queries, const PackedCodes& rows)
@@ -71,7 +72,7 @@ class Prefix {
   std::int32_t thresholds_[kScanQueries];
 };
 
-// Queries, and the rows from one on to compare them with.
+// Queries and rows to compare.
 //   S::Step               4 dimensions of a query, as S reads them best
 template <typename S>
 struct CodeTile {
@@ -87,8 +88,8 @@ struct CodeTile {
   std::size_t first_row;
 };
 
-// Half the negated distances of the queries from `query` on over the first `dims` dimensions.
-// Inlined, so that they stay in registers.
+// Computes half the negated distances of the queries from `query` on over the first `dims`
+// dimensions. Inlined, so that they stay in registers.
 //   S::Sums               16 numbers of 32 bits
 //   S::Codes              4 dimensions of 16 rows: load_codes()
 //   S::dot(sums, query(step), codes)  adds the products of 4 dimensions
@@ -117,8 +118,8 @@ PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std:
   }
 }
 
-// The same over all dimensions, and the biases on the way. Reads rows in order, as memory is
-// fastest at that.
+// Computes the same over all dimensions, and the biases. Reads rows in order, which memory is
+// fastest at.
 //   S::Norms              sums for the biases of 16 rows: add(codes), biases()
 template <typename S, int Queries, int Blocks>
 PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query,
@@ -147,7 +148,7 @@ PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query
   }
 }
 
-// Tells whether some blocks may have hits.
+// Returns whether some blocks may have hits.
 //   S::Flags              of above(sums, threshold), joined by |, asked by any()
 //   S::max(a, b)          where S compares several blocks at a time
 template <typename S, int Blocks>
@@ -227,7 +228,7 @@ std::size_t near_by_prefix(const CodeTile<S>& t, std::size_t n, std::uint8_t* qu
     sum_up(t, query, t.prefix_biases, t.prefix, acc);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) {
-      // No branch: which queries are near cannot be foretold.
+      // Without a branch, as none could be predicted.
       queries[size] = static_cast<std::uint8_t>(query + static_cast<std::size_t>(q));
       size += S::any(near<S>(acc[q], t.prefix_thresholds[query + static_cast<std::size_t>(q)]));
     }
@@ -397,6 +398,20 @@ std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, st
     for (; q < queries.n; ++q) scan.template operator()<1>(q);
   }
   return found;
+}
+
+template <typename S>
+constexpr Kernels kernels_of(const char* name) {
+  return {.name = name,
+          .bit_sums = bit_sums<S>,
+          .bit_sum = bit_sum<S>,
+          .dense = dense<S>,
+          .activate16 = activation_of<S, std::int16_t>(),
+          .activate32 = activation_of<S, std::int32_t>(),
+          .code_biases = code_biases<S>,
+          .code_unpack4 = code_unpack4<S>,
+          .code_scan = code_scan<S>,
+          .hamming_scan = hamming_scan<S>};
 }
 
 }  // namespace

@@ -1,9 +1,8 @@
 // The inner loops: a table of functions for each instruction set. All sets give the same bytes.
 //
-// This header has plain types only, and no function with a body. A kernel file is compiled with
-// flags of its own, and the linker could pick a function that was instantiated there for a CPU that
-// lacks its instructions. For the same reason all that kernel files share (generic_*.h, vectors.h)
-// is in anonymous namespaces.
+// A kernel file is compiled for one instruction set, and the linker might use a function that was
+// instantiated there on a CPU without it. So this header has plain types only and no function with
+// a body, and all that kernel files share (generic_*.h, vectors.h) is in anonymous namespaces.
 #pragma once
 
 #include <cstddef>
@@ -11,7 +10,7 @@
 
 namespace protomark::kernels {
 
-// Rows in a block share a vector register: 16 rows of 32-bit results, 8 rows of 64-bit words.
+// The rows of a block share a vector register: 16 rows of 32-bit results, 8 rows of 64-bit words.
 inline constexpr std::size_t kCodeRows = 16;
 inline constexpr std::size_t kWordRows = 8;
 
@@ -28,7 +27,7 @@ struct Activation {
   int shift;
 };
 
-// A row within the limit of a query. Queries and rows are counted from the first that the scan got.
+// A row within the limit of a query, both counted from the first of the scan.
 struct Hit {
   std::uint32_t query;
   std::uint32_t row;
@@ -37,10 +36,10 @@ struct Hit {
 
 // Queries that a scan takes at a time, so that they share its loads.
 inline constexpr std::size_t kScanQueries = 16;
-// Up to so many queries a scan computes the biases itself: that costs less than to read them.
+// Up to this many queries a scan computes the biases itself, which costs less than reading them.
 inline constexpr std::size_t kFewQueries = 4;
-// A scan pauses once it has this many hits, so that the caller can tighten the limits. Its last
-// step may exceed that by what kScanQueries queries can hit in 64 rows.
+// A scan pauses after this many hits, so that the caller can tighten the limits. Its last step may
+// exceed that by what kScanQueries queries can hit in 64 rows.
 inline constexpr std::size_t kHitsEnough = 64;
 inline constexpr std::size_t kHitRoom = kHitsEnough + kScanQueries * 64;
 
@@ -50,15 +49,14 @@ struct CodeQueries {
   const std::int32_t* limits;
   const std::int32_t* rest_norms;  // squared norm of each query behind the dimension prefix
   std::size_t n;
-  std::size_t* steps_in_full;  // what scans tell later scans of the prefix; 0 at first
+  std::size_t* steps_in_full;  // for scans to pass on to later ones; 0 at first
 };
 
 // Codes p, -127 to 127, in blocks of 16 rows: for every 4 dimensions, 16 rows x 4 codes. `dim` is a
 // multiple of 4, 256 at most.
 //
-// `prefix`, a multiple of 4 up to dim, is the number of dimensions over which the distance usually
-// shows that a row is too far away; a set may compare these first. Where it equals dim, nobody
-// reads or writes prefix_biases.
+// `prefix`, a multiple of 4 up to dim, is the number of dimensions that usually show that a row is
+// too far away; a set may compare these first. prefix_biases are not used where it equals dim.
 struct PackedCodes {
   const std::int8_t* codes;
   const std::int32_t* biases;  // from code_biases of the same set; nullptr: at most kFewQueries
@@ -86,8 +84,8 @@ struct Kernels {
   const char* name = nullptr;
 
   // Inputs that are bits: sums[i * 64 + o] is the sum of weights[j * 64 + o] over the bits j that
-  // are set in descriptor i, for 64 outputs and n descriptors. Bit j % 64 of words[j / 64 * n + i]
-  // is bit j of descriptor i; a descriptor has `count` words. No sum may leave 16 bits.
+  // are set in descriptor i, for 64 outputs and n descriptors of `count` words. Bit j % 64 of
+  // words[j / 64 * n + i] is bit j of descriptor i. No sum may leave 16 bits.
   void (*bit_sums)(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
                    std::size_t n, std::int16_t* sums) = nullptr;
 
@@ -109,21 +107,21 @@ struct Kernels {
   void (*activate32)(const Activation& activation, const std::int32_t* sums, std::size_t n,
                      std::uint8_t* next, std::size_t stride) = nullptr;
 
-  // Computes what code_scan of the same set starts from, for all dimensions and for the prefix.
+  // Computes the biases for code_scan of the same set, for all dimensions and for the prefix.
   void (*code_biases)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
                       std::size_t prefix, std::int32_t* biases,
                       std::int32_t* prefix_biases) = nullptr;
 
-  // sq4 numbers u as codes scale * (2 u - 15), packed as code_scan takes them, `dim` rounded up to
-  // a multiple of 4 with zeros, whatever `packed` holds there. They are packed in blocks of 16
-  // rows: for every 8 dimensions, 16 rows x 4 bytes; byte j holds dimension j in its low four bits,
-  // 4 + j in its high ones. `scale` is 1 to 8.
+  // Unpacks sq4 numbers u to codes scale * (2 u - 15), packed as code_scan takes them, with zeros
+  // up to a multiple of 4 dimensions. They come in blocks of 16 rows: for every 8 dimensions, 16
+  // rows x 4 bytes; byte j holds dimension j in its low four bits, 4 + j in its high ones. `scale`
+  // is 1 to 8.
   void (*code_unpack4)(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
                        std::int8_t* codes) = nullptr;
 
-  // Finds the rows with |p|^2 - 2 p . q <= limits[q], and that value, from block *block on. Stops
-  // at the end, or after a step that brings kHitsEnough hits; *block is then where to go on.
-  // Returns the number of hits, which are in no order.
+  // Finds the rows with |p|^2 - 2 p . q <= limits[q], and that value as their distance, from block
+  // *block on. Stops at the end, or after a step that reaches kHitsEnough hits, and sets *block to
+  // where to continue. Returns the number of hits, which are in no order.
   std::size_t (*code_scan)(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
                            Hit* hits) = nullptr;
 
@@ -132,17 +130,17 @@ struct Kernels {
                               std::size_t* block, Hit* hits) = nullptr;
 };
 
-// The best set that this CPU runs, or the one that the environment variable PROTOMARK_ISA names.
-// Throws std::invalid_argument if that is unknown or does not run here.
+// Returns the best set that this CPU runs, or the one that the environment variable PROTOMARK_ISA
+// names. Throws std::invalid_argument if that does not run here.
 const Kernels& active();
 
-// The set of that name, or nullptr if it is not built in or does not run on this CPU.
+// Returns the set of that name, or nullptr if it does not run here.
 const Kernels* find(const char* name);
 
-// The names of the sets that run on this CPU, best first, up to nullptr.
-const char* const* names();
+// Returns the sets that run on this CPU, best first, up to one without a name.
+const Kernels* all();
 
-// The sets as their files define them; use the functions above. amx has only code_scan of its own.
+// The sets as their files define them, for the functions above. amx has only a code_scan.
 extern const Kernels portable;
 #if defined(__x86_64__)
 extern const Kernels avx2;

@@ -1,12 +1,12 @@
 // NEON with dot products (ARMv8.2 and later): phones since 2018, Apple silicon, Graviton 2.
 #include <arm_neon.h>
 
-#include "kernels/generic.h"
+#include "kernels/generic_search.h"
 
 namespace protomark::kernels {
 namespace {
 
-// Bit r of the result is set where lane r is, of 16 lanes of 32 bits or 8 of 64 bits.
+// Sets bit r of the result where lane r is set, of 16 lanes of 32 bits or 8 of 64 bits.
 unsigned bits_of(uint32x4_t a, uint32x4_t b, uint32x4_t c, uint32x4_t d) {
   const uint8x16_t lanes = vcombine_u8(vmovn_u16(vcombine_u16(vmovn_u32(a), vmovn_u32(b))),
                                        vmovn_u16(vcombine_u16(vmovn_u32(c), vmovn_u32(d))));
@@ -28,7 +28,7 @@ struct Neon {
   static void dot(Sums& sums, int8x16_t q, const Codes& codes) {
     for (int i = 0; i < 4; ++i) sums.v[i] = vdotq_s32(sums.v[i], codes.v[i], q);
   }
-  // Both factors of vdot have a sign, so queries lose the 128 that was added.
+  // Both factors of vdot are signed, so queries lose the 128 that was added.
   using Step = std::int8_t[4];
   static void convert(const std::uint8_t* codes, std::size_t n, Step* steps) {
     for (std::size_t i = 0; i < 4 * n; ++i) {
@@ -128,9 +128,9 @@ struct Neon {
     }
   }
   static unsigned near_words(const Words& counts, std::int32_t limit) {
-    const int64x2_t most = vdupq_n_s64(limit);
+    const int64x2_t limits = vdupq_n_s64(limit);
     const auto near = [&](int i) {
-      return vmovn_u64(vcleq_s64(vreinterpretq_s64_u64(counts.v[i]), most));
+      return vmovn_u64(vcleq_s64(vreinterpretq_s64_u64(counts.v[i]), limits));
     };
     const uint32x4_t none = vdupq_n_u32(0);
     return bits_of(vcombine_u32(near(0), near(1)), vcombine_u32(near(2), near(3)), none, none);

@@ -1,5 +1,5 @@
 // For every machine: 128-bit vectors as GCC and Clang translate them to what the target has.
-#include "kernels/generic.h"
+#include "kernels/generic_search.h"
 
 namespace protomark::kernels {
 namespace {

@@ -1,5 +1,5 @@
-// Vectors of GCC and Clang, which have the arithmetic of their elements, as all sets use them.
-// Everything here has internal linkage: see kernels.h.
+// Vectors of GCC and Clang, which have the arithmetic of their elements. Everything has internal
+// linkage: see kernels.h.
 #pragma once
 
 #include <cstddef>
@@ -16,7 +16,7 @@ struct VectorOf {
 template <typename T, std::size_t Bytes>
 using Vector = typename VectorOf<T, Bytes>::Type;
 
-// Numbers or vectors from and to any address. Not by memcpy, of which GCC makes copies in parts.
+// Numbers or vectors at any address. GCC would split a memcpy of them.
 template <typename V>
 struct Unaligned {
   typedef V Type __attribute__((aligned(1), may_alias));
@@ -30,7 +30,7 @@ void store(void* p, const V& v) {
   *static_cast<typename Unaligned<V>::Type*>(p) = v;
 }
 
-// Vectors that are used as one.
+// N vectors as one.
 template <typename V, int N>
 struct Pack {
   static constexpr std::size_t kLanes = N * sizeof(V) / sizeof(V{}[0]);
@@ -65,9 +65,9 @@ void store_pack(void* p, const P& pack) {
   }
 }
 
-// Byte products by 16-bit ones, for sets whose instruction for bytes saturates or that have none:
-// 4 dimensions of a row, a 32-bit lane, become 16-bit numbers (0, 2) and (1, 3). `Set` has
-// multiply_pairs(a, b), which sums up the two products of each lane.
+// Multiplies bytes as 16-bit numbers, for sets without an instruction for bytes or whose one
+// saturates: the 4 dimensions of a row, a 32-bit lane, become numbers (0, 2) and (1, 3), and
+// Set::multiply_pairs(a, b) sums up the two products of each lane.
 template <typename Set, std::size_t Bytes>
 struct ByPairs {
   static constexpr int kVectors = 64 / Bytes;

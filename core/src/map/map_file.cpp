@@ -15,8 +15,7 @@ MapKind kind_of(const ContainerReader& file) {
 }  // namespace
 
 MapKind map_kind(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  return kind_of(ContainerReader(mapped.bytes(), path.string()));
+  return kind_of(ContainerReader(MappedFile(path).bytes(), path.string()));
 }
 
 std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path) {
@@ -32,7 +31,7 @@ void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::
     return "'" + e.info().name + "' (identity " + e.identity().substr(0, 12) + ")";
   };
   invalid(map, ": it was made with encoder ", describe(encoder), ", not with ", describe(expected),
-          ": use the map's own encoder, or build the map with the other");
+          ": use the map's encoder, or build the map with the other");
 }
 
 void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
@@ -42,8 +41,7 @@ void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
 }
 
 std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path) {
-  const MappedFile mapped(path);
-  return ContainerReader(mapped.bytes(), path.string()).sections();
+  return ContainerReader(MappedFile(path).bytes(), path.string()).sections();
 }
 
 void verify_file(const std::filesystem::path& path) {

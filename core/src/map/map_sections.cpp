@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <string>
 #include <string_view>
 
 #include "base/text.h"
@@ -15,7 +14,7 @@ namespace {
 
 constexpr char kCreated[] = "created";
 
-// Times have exactly one form, so that the order of texts is that of times.
+// Times have exactly one form, so that texts are in the order of times.
 bool is_utc_time(std::string_view text) {
   constexpr std::string_view kForm = "0000-00-00T00:00:00Z";
   if (!std::ranges::equal(text, kForm, [](char c, char form) {
@@ -56,8 +55,8 @@ void check_metadata(const Metadata& metadata) {
   }
 }
 
-Metadata merged(const Metadata& own, const Metadata& other) {
-  Metadata result = own;
+Metadata merged(const Metadata& into, const Metadata& other) {
+  Metadata result = into;
   result.insert(other.begin(), other.end());
   if (const auto created = other.find(kCreated); created != other.end()) {
     result[kCreated] = std::min(result[kCreated], created->second);

@@ -1,11 +1,7 @@
 // The sections that learning and sealed maps share.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
 #include <memory>
-#include <span>
-#include <vector>
 
 #include "file/container.h"
 #include "protomark/encoder.h"
@@ -22,20 +18,18 @@ struct MapShape {
 // All functions that read throw FileError.
 MapShape read_shape(const ContainerReader& file, const Encoder& encoder);
 std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
-// Adds nothing if there is no metadata.
 void add_metadata(ContainerWriter& file, const Metadata& metadata);
 Metadata read_metadata(const ContainerReader& file);
-// Returns what a map says of itself once another was merged into it: its own texts, those of the
-// other under names that it lacks, the earlier creation. Throws std::invalid_argument if these are
-// too many.
-Metadata merged(const Metadata& own, const Metadata& other);
-// Centroids of inverted lists (lists x dim); empty without an index.
+// Returns the metadata of a map after merging another one into it (PrototypeMap::merge_map). Throws
+// std::invalid_argument if there are too many.
+Metadata merged(const Metadata& into, const Metadata& other);
+// Returns the centroids of inverted lists (nlist x dim); none without an index.
 std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim);
 // Fails unless ids ascend and are not negative.
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
 
-// Returns the number of rows of all landmarks. Fails if a landmark has none, or if these are more
-// than a map can hold.
+// Returns the number of rows of all landmarks. Fails if a landmark has none, or a map cannot hold
+// so many.
 template <typename T>
 std::size_t sum_rows(const ContainerReader& file, std::span<const T> row_counts) {
   std::uint64_t total = 0;

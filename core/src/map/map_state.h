@@ -1,16 +1,13 @@
-// What users do not see of a learning map, and the guard of its changes.
+// The state of a learning map, and the guard of its changes.
 #pragma once
 
 #include <algorithm>
-#include <cstddef>
 #include <filesystem>
 #include <functional>
 #include <memory>
 #include <mutex>
 #include <shared_mutex>
-#include <span>
 #include <utility>
-#include <vector>
 
 #include "base/fair_shared_mutex.h"
 #include "file/journal.h"
@@ -20,16 +17,15 @@
 
 namespace protomark {
 
-// Locks, in the order in which a thread takes them. What is held and by whom:
-//   journal_mutex  by commit, compact, close, and a save onto the map's own file
-//   measuring      by the one thread that measures the recall table
-//   changing       alone by a change, from its first look at the map to its end; shared by what
-//                  reads the map for long: save, seal, split, summary, commit while it copies, the
+// Locks, in the order in which a thread takes them, and who holds them:
+//   journal_mutex  commit, compact, close, and a save onto the map's own file
+//   measuring      the one thread that measures the recall table
+//   changing       a change, alone, from the moment it reads the map to its end; shared, all that
+//                  read the map for long: save, seal, split, summary, commit while it copies, the
 //                  source of a merge, measuring
-//   searching      alone by a change while it writes, a piece at a time; shared by searches and
-//                  short questions
-//   recall_mutex   to read or replace `recall_table`
-// So a search waits for nothing but a piece of a change.
+//   searching      a change, alone, while it writes a piece; shared, searches and short questions
+//   recall_mutex   whoever reads or replaces `recall_table`
+// So a search waits only for a piece of a change.
 struct MapState {
   MapState(std::shared_ptr<const Encoder> its_encoder, std::size_t dim, std::size_t appearance_bits)
       : encoder(std::move(its_encoder)), store(dim, appearance_bits) {}
@@ -41,8 +37,8 @@ struct MapState {
   FairSharedMutex changing, searching;
 
   std::unique_ptr<Journal> journal;  // nullptr without a journal
-  // The map file whose journal this is or was; empty if it never had one. Needs no lock, as it does
-  // not change once others have the map.
+  // The map file whose journal this is or was; empty if it never had one. Constant once others have
+  // the map.
   std::filesystem::path journaled;
 
   // Returns how many lists to search for this recall, as measured on the map now, or earlier if
@@ -50,7 +46,7 @@ struct MapState {
   // released while the recall table is measured.
   std::size_t nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads);
 
-  // A map of some of the landmarks.
+  // Returns a map of these landmarks.
   PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;
 
   // Throws std::invalid_argument without a journal.
@@ -66,18 +62,21 @@ struct MapState {
   std::shared_ptr<const MeasuredRecall> recall_table;
 };
 
+inline void check_pairs(std::size_t ids, std::size_t others, const char* what) {
+  if (ids != others) invalid(ids, " landmark ids for ", others, " ", what);
+}
+
 // Reads a map file and the commits to it. Throws FileError.
 std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal);
 
-// Measures which part of queries the inverted lists of a store serve, by lists visited. value(v)
-// tells what is searched in place of a rounded prototype's number v, and search_two finds the two
-// nearest landmarks of queries in that.
+// Measures the recall table of a store whose rounded prototypes are searched with value(v) in place
+// of each number v, where search_two finds the two nearest landmarks of queries.
 RecallTable measure_recall_of(const PrototypeStore& store,
                               const std::function<int(std::int8_t)>& value,
                               const SearchTwo& search_two);
 
-// A change of a map: while it is there no other one begins, and whatever reads the map for long
-// waits. Searches go on between its pieces.
+// A change of a map: while it exists no other one begins, and all that read the map for long wait.
+// Searches go on between its pieces.
 class MapChange {
  public:
   // Observations or landmarks that are changed at a time.
@@ -87,10 +86,11 @@ class MapChange {
   MapChange(MapState& state, std::unique_lock<FairSharedMutex> changing)
       : state_(&state), changing_(std::move(changing)) {}
 
-  // Lets a change write: as long as the lock is held no search reads the map.
+  // Lets the change write: while the lock is held no search reads the map.
   std::unique_lock<FairSharedMutex> write() { return std::unique_lock(state_->searching); }
 
-  // Calls write_one(i) for all i below n, in pieces that each end with all rows in their lists.
+  // Calls write_one(i) for all i below n, in pieces after each of which all rows are in their
+  // lists.
   template <typename WriteOne>
   void in_pieces(std::size_t n, const WriteOne& write_one) {
     for (std::size_t first = 0; first < n; first += kPiece) {
@@ -100,16 +100,11 @@ class MapChange {
     }
   }
 
-  void make_room_for_positions() { state_->store.make_room_for_positions(state_->searching); }
-  void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed) {
-    state_->store.make_room(landmarks, rows, changed, state_->searching);
-  }
   void set_metadata(Metadata metadata);
-  // Adds observations in pieces.
   void add(std::span<const std::int64_t> ids, Codes codes, int threads);
-  // Puts rows into the lists of other centroids; none drop the index. `in_place`: within the map,
-  // which takes 5 bytes per row and, if arrays have to grow, the largest of them once more, but
-  // makes searches wait. Otherwise in a copy of it.
+  // Puts rows into the lists of other centroids (without any, drops the index): in a copy of the
+  // map, or with `in_place` within it, which takes 5 bytes per row and, if arrays have to grow, the
+  // largest of them once more, but makes searches wait.
   void set_quantizer(CoarseQuantizer quantizer, int threads, bool in_place);
 
  private:

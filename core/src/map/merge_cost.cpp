@@ -1,5 +1,5 @@
 // Compiled without contraction of products and sums (core/CMakeLists.txt).
-#include "map/merge_cost.h"
+#include "map/sealed_store.h"
 
 #include <numeric>
 #include <utility>
@@ -7,16 +7,15 @@
 namespace protomark {
 namespace {
 
-// To compare all pairs of more rows would take seconds, and minutes in a file made to that end. A
-// sealed map keeps far fewer per landmark.
+// Comparing all pairs of more rows would take seconds to minutes. A sealed map keeps far fewer per
+// landmark.
 constexpr std::size_t kMaxCompared = 2048;
 
-// The prototypes that remain, and for each the partner behind it of least merge cost. (Muellner
-// 2011, "Modern hierarchical, agglomerative clustering algorithms", calls this the generic
-// algorithm.)
+// The prototypes that remain, each with the later one of least merge cost as partner: the generic
+// algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering algorithms".
 class Clusters {
  public:
-  // Merges on the way to a number of rows that can be compared go to `merges`.
+  // Adds to `merges` those that bring the number of rows down to kMaxCompared.
   Clusters(std::span<const std::int16_t> sums, std::span<const std::uint8_t> counts,
            std::size_t dim, std::vector<AppearanceMerge>& merges)
       : dim_(dim),
@@ -90,8 +89,8 @@ class Clusters {
     }
   }
 
-  // |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)). Below 2^53, which no real landmark
-  // exceeds, all but the division is an exact integer.
+  // |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)). All but the division is exact
+  // below 2^53, which no real landmark exceeds.
   double cost(std::size_t i, std::size_t j) const {
     const double *a = &sums_[i * dim_], *b = &sums_[j * dim_];
     const double n = counts_[i], m = counts_[j];
@@ -112,7 +111,7 @@ class Clusters {
   }
 
   std::size_t dim_;
-  std::vector<double> sums_;  // integers
+  std::vector<double> sums_;  // whole numbers
   std::vector<double> counts_;
   std::vector<std::size_t> remaining_;  // ascending
   std::vector<std::size_t> partner_;    // of all but the last that remains

@@ -46,33 +46,33 @@ PositionCodec::PositionCodec(const ContainerReader& file, const Position& origin
 }
 
 void PositionCodec::encode(const Position& p, std::byte* to) const {
-  const auto put = [&](auto number) {
-    std::array<decltype(number(0)), 3> numbers;
-    for (std::size_t i = 0; i < 3; ++i) numbers[i] = number(i);
-    std::memcpy(to, &numbers, sizeof(numbers));
-  };
-  if (bits_ == 32) {
-    put([&](std::size_t i) { return static_cast<float>(p[i] - origin_[i]); });
-  } else {
-    put([&](std::size_t i) {
-      if (std::isnan(p[0])) return kNone;
-      const double steps = step_[i] > 0 ? std::round((p[i] - origin_[i]) / step_[i]) : 0;
-      return static_cast<std::uint16_t>(std::clamp(steps, 0.0, double{kLast}));
-    });
+  for (std::size_t i = 0; i < 3; ++i) {
+    const double distance = p[i] - origin_[i];
+    if (bits_ == 32) {
+      const auto number = static_cast<float>(distance);
+      std::memcpy(to + i * sizeof(number), &number, sizeof(number));
+    } else {
+      const double steps = step_[i] > 0 ? std::round(distance / step_[i]) : 0;
+      const auto number = std::isnan(p[0])
+                              ? kNone
+                              : static_cast<std::uint16_t>(std::clamp(steps, 0.0, double{kLast}));
+      std::memcpy(to + i * sizeof(number), &number, sizeof(number));
+    }
   }
 }
 
 Position PositionCodec::decode(const std::byte* from) const {
   Position p = origin_;
-  if (bits_ == 32) {
-    std::array<float, 3> floats;
-    std::memcpy(&floats, from, sizeof(floats));
-    for (std::size_t i = 0; i < 3; ++i) p[i] += floats[i];
-  } else {
-    std::array<std::uint16_t, 3> steps;
-    std::memcpy(&steps, from, sizeof(steps));
-    for (std::size_t i = 0; i < 3; ++i)
-      p[i] = steps[i] == kNone ? kNaN : p[i] + step_[i] * steps[i];
+  for (std::size_t i = 0; i < 3; ++i) {
+    if (bits_ == 32) {
+      float number;
+      std::memcpy(&number, from + i * sizeof(number), sizeof(number));
+      p[i] += number;
+    } else {
+      std::uint16_t number;
+      std::memcpy(&number, from + i * sizeof(number), sizeof(number));
+      p[i] = number == kNone ? kNaN : p[i] + step_[i] * number;
+    }
   }
   return std::ranges::all_of(p, [](double x) { return std::isfinite(x); }) ? p : kNoPosition;
 }

@@ -1,4 +1,4 @@
-// What a learning map tells of its landmarks, its index, and search.
+// Answers of a learning map, its index, and search.
 #include "protomark/prototype_map.h"
 
 #include <algorithm>
@@ -17,7 +17,7 @@ constexpr char kRemedy[] = "call build_index first";
 // The recall table is measured again once this part of the rows has changed.
 constexpr std::size_t kStalePart = 10;
 
-// From prototypes by id, so that centroids do not depend on how the map came about.
+// Learns from prototypes by id, so that centroids do not depend on the history of the map.
 CoarseQuantizer learn(const PrototypeStore& store, std::size_t nlist, int threads) {
   const std::size_t rows = store.prototype_count();
   std::vector<std::size_t> sample(std::min(rows, CoarseQuantizer::sample_size(nlist)));
@@ -192,15 +192,13 @@ void MapChange::set_quantizer(CoarseQuantizer quantizer, int threads, bool in_pl
   if (in_place) {
     store.make_room_for(arrangement, state_->searching);
     const auto lock = write();
-    store.rearrange(arrangement);
+    store.rearrange(std::move(arrangement));
     return;
   }
   PrototypeStore other = store;
-  FairSharedMutex nobody_searches;
-  other.make_room_for(arrangement, nobody_searches);
-  other.rearrange(arrangement);
+  other.rearrange(std::move(arrangement));
   const auto lock = write();
-  std::swap(store, other);  // what was there before is freed after the lock is released
+  std::swap(store, other);  // after the lock is released the old one is freed
 }
 
 std::size_t PrototypeMap::nlist() const {
@@ -241,13 +239,12 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
   return search_among(selection, store.view(), lists, centroids, nprobe, queries, k, options);
 }
 
-// Test queries are prototypes of the map itself; of a landmark the row nearest to a query counts.
 RecallTable measure_recall_of(const PrototypeStore& store,
                               const std::function<int(std::int8_t)>& value,
                               const SearchTwo& search_two) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
-  std::vector<std::int64_t> own;
-  for (const Row row : rows) own.push_back(store.id(store.owner(row)));
+  std::vector<std::int64_t> owners;
+  for (const Row row : rows) owners.push_back(store.id(store.owner(row)));
   const std::vector<std::int8_t> codes = store.rounded(rows);
   std::vector<std::int8_t> prototype(store.dim());
   const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
@@ -266,7 +263,7 @@ RecallTable measure_recall_of(const PrototypeStore& store,
     }
     return list;
   };
-  return measure_recall({codes.data(), rows.size(), store.dim()}, own, store.quantizer(),
+  return measure_recall({codes.data(), rows.size(), store.dim()}, owners, store.quantizer(),
                         search_two, list_of);
 }
 
@@ -294,14 +291,14 @@ bool MapState::is_stale(const MeasuredRecall& table) const {
          (store.changes() - table.changes) * kStalePart >= store.prototype_count();
 }
 
-// Without `wait` only if nobody else measures or changes the map.
+// Does nothing without `wait` if others measure or change the map.
 void MapState::measure(int threads, bool wait) {
-  std::unique_lock one(measuring, std::defer_lock);
-  std::shared_lock still(changing, std::defer_lock);
+  std::unique_lock alone(measuring, std::defer_lock);
+  std::shared_lock unchanged(changing, std::defer_lock);
   if (wait) {
-    one.lock();
-    still.lock();
-  } else if (!one.try_lock() || !still.try_lock()) {
+    alone.lock();
+    unchanged.lock();
+  } else if (!alone.try_lock() || !unchanged.try_lock()) {
     return;
   }
   if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;

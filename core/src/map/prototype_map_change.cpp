@@ -1,4 +1,4 @@
-// Changes of a learning map: observations, landmarks, positions, metadata.
+// Changes observations, landmarks, positions and metadata of a learning map.
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
@@ -7,20 +7,15 @@
 
 #include "base/id_index.h"
 #include "base/parallel.h"
-#include "base/text.h"
 #include "map/map_state.h"
 
 namespace protomark {
 namespace {
 
-// Descriptors that are encoded at a time, to bound the memory for their codes.
+// Descriptors that are encoded at a time, so that their codes take little memory.
 constexpr std::size_t kEncodeChunk = 1 << 13;
 // Descriptors that a thread encodes at a time while another one adds.
 constexpr std::size_t kMinShare = 64, kMaxShare = 512;
-
-void check_pairs(std::size_t ids, std::size_t others, const char* what) {
-  if (ids != others) invalid(ids, " landmark ids for ", others, " ", what);
-}
 
 void check_codes(Codes codes, std::size_t dim) {
   if (codes.columns != dim) {
@@ -46,10 +41,9 @@ void MapChange::add(std::span<const std::int64_t> ids, Codes codes, int threads)
   std::vector<Row> rows;
   for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
     const std::size_t n = std::min(kPiece, codes.rows - begin);
-    const auto some = ids.subspan(begin, n);
     const Codes piece{codes.row(begin), n, codes.columns};
-    // Copied and checked once more, as a caller may write over them meanwhile.
-    piece_ids.assign(some.begin(), some.end());
+    // A copy, checked once more, as a caller may write over ids meanwhile.
+    piece_ids.assign(&ids[begin], &ids[begin] + n);
     check_new_ids(piece_ids);
     rows.resize(n);
     store.find_rows(piece_ids, piece, rows);
@@ -59,7 +53,7 @@ void MapChange::add(std::span<const std::int64_t> ids, Codes codes, int threads)
       ++new_rows;
       if (store.find(piece_ids[i]) == kNoLandmark) ++new_landmarks;
     }
-    make_room(new_landmarks, new_rows, n);
+    store.make_room(new_landmarks, new_rows, n, state_->searching);
     const auto lock = write();
     store.add(piece_ids, piece, rows);
     store.reassign(threads);
@@ -92,13 +86,13 @@ void PrototypeMap::add(std::span<const std::int64_t> ids, Descriptors descriptor
     const auto chunk = codes(begin);
     change.add(ids.subspan(begin, chunk.rows), chunk, threads);
   };
-  // Also if there are no descriptors, to check their length.
+  // Also without descriptors, to check their length.
   encode(0, codes(0), threads);
   std::size_t begin = 0;
   for (std::size_t next = kEncodeChunk; next < descriptors.rows; next += kEncodeChunk) {
     const auto chunk = codes(next);
     if (state_->store.quantizer().nlist() == 0) {
-      // One thread adds what is encoded, mostly waiting for memory, while the others encode.
+      // One thread adds encoded observations, mostly waiting for memory, while the others encode.
       const std::size_t share = std::clamp<std::size_t>(
           chunk.rows / (4 * static_cast<std::size_t>(threads)), kMinShare, kMaxShare);
       run_tasks(threads, 1 + (chunk.rows + share - 1) / share, [&](std::size_t task) {
@@ -136,18 +130,17 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
   MapChange change(*state_);
   PrototypeStore& store = state_->store;
 
-  // What is to be subtracted from each row, summed up first so that all can be checked before
-  // anything changes.
+  // Sums up what to subtract from each row, to check everything before anything changes.
   struct Difference {
     std::int64_t id;
     std::uint16_t appearance;
-    int count = 0;
+    int count;
     std::vector<int> sum;
   };
-  std::unordered_map<std::uint32_t, std::size_t> of_row;
   std::vector<Difference> differences;
+  std::unordered_map<std::uint32_t, std::size_t> of_row;
   const auto never_added = [](std::int64_t id) {
-    invalid("descriptors to be subtracted from landmark ", id, " were never added to it");
+    invalid("descriptors to subtract from landmark ", id, " were never added to it");
   };
   for (std::size_t i = 0; i < ids.size(); ++i) {
     const std::int64_t id = ids[i];
@@ -159,8 +152,8 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
     for (std::size_t d = 0; d < dim; ++d) difference.sum[d] += codes.row(i)[d];
     ++difference.count;
   }
-  for (const auto& [value, index] : of_row) {
-    const Row row{value};
+  for (const auto& [row_value, index] : of_row) {
+    const Row row{row_value};
     const Difference& difference = differences[index];
     const int left = store.count(row) - difference.count;
     if (left < 0) {
@@ -232,7 +225,9 @@ void PrototypeMap::set_positions(std::span<const std::int64_t> ids,
     const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
     if (!finite && has_position(p)) invalid("position of landmark ", ids[i], " is not finite");
   }
-  if (std::ranges::any_of(positions, has_position)) change.make_room_for_positions();
+  if (std::ranges::any_of(positions, has_position)) {
+    store.make_room_for_positions(state_->searching);
+  }
   change.in_pieces(ids.size(),
                    [&](std::size_t i) { store.set_position(store.at(ids[i]), positions[i]); });
 }

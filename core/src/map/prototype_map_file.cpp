@@ -1,9 +1,7 @@
-// A learning map as a file, and the journal beside it.
+// Writes and reads the file of a learning map, and its journal.
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
-#include <optional>
-#include <string>
 #include <utility>
 
 #include "file/sections.h"
@@ -13,17 +11,17 @@
 namespace protomark {
 namespace {
 
-// Adds the sections of all landmarks of a store, or of some by ascending id. The store must not
-// change until the file is written.
+// Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
+// must not change until the file is written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
-                   const std::optional<std::vector<LandmarkIndex>>& some = {}) {
+                   const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
   std::size_t n = store.landmark_count(), m = store.prototype_count();
-  // A map whose positions were all taken away equals one that never had any.
-  bool positions = !some && store.any_position();
-  if (some) {
-    n = some->size();
+  // A map whose positions were all removed equals one that never had any.
+  bool positions = !changed && store.any_position();
+  if (changed) {
+    n = changed->size();
     m = 0;
-    for (const LandmarkIndex landmark : *some) {
+    for (const LandmarkIndex landmark : *changed) {
       m += store.row_count(landmark);
       positions = positions || has_position(store.position(landmark));
     }
@@ -59,9 +57,9 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
     if (!positions) return;
     put_each<Position>(*sink, landmarks, [&](LandmarkIndex l) { return store.position(l); });
   };
-  file.add_together(std::move(parts), [&store, some, put_piece](auto sinks) {
+  file.add_together(std::move(parts), [&store, changed, put_piece](auto sinks) {
     const auto put = [&](std::span<const LandmarkIndex> landmarks) {
-      constexpr std::size_t kRows = 1 << 13;  // at a time, and those of one landmark
+      constexpr std::size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
       for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
         for (std::size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
           rows += store.row_count(landmarks[end]);
@@ -69,11 +67,11 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
         put_piece(sinks, landmarks.subspan(first, end - first));
       }
     };
-    some ? put(*some) : store.visit_sorted_landmarks(put);
+    changed ? put(*changed) : store.visit_sorted_landmarks(put);
   });
 }
 
-// The signs that tell appearances apart; 0 if the file has none.
+// Returns the signs that tell appearances apart; 0 if the file does not state any.
 std::size_t read_appearance_bits(const ContainerReader& file, std::size_t dim) {
   if (!file.has(section::kAppearanceBits)) return 0;
   const auto bits = read_value<std::uint32_t>(file, section::kAppearanceBits);
@@ -84,9 +82,9 @@ std::size_t read_appearance_bits(const ContainerReader& file, std::size_t dim) {
   return bits;
 }
 
-// Reads commits and the map file into an empty map, from the newest to the oldest, so that nothing
-// that was read has to be found and taken back: what is older counts only for landmarks that no
-// later commit names. The time is proportional to the bytes read, whatever these are.
+// Reads the map file and its commits into an empty map, the newest first, so that an older one
+// counts only for landmarks that no later one names, and nothing has to be removed again. The time
+// is proportional to the bytes read.
 class Reading {
  public:
   explicit Reading(MapState& state)
@@ -104,17 +102,17 @@ class Reading {
       const auto ids =
           read_section<std::int64_t>(commit, name, commit.map(name).size() / sizeof(std::int64_t));
       check_ids(commit, ids);
-      for (const std::int64_t id : ids) known_.insert(id);
+      for (const std::int64_t id : ids) read_.insert(id);
     }
     if (commit.has(section::kCentroids)) {
-      // Present and empty: there is no index any more.
-      auto own = commit.map(section::kCentroids).empty() ? std::vector<std::int8_t>()
-                                                         : read_centroids(commit, shape.dim);
-      if (!centroids_) centroids_ = std::move(own);
+      // Empty if the index was dropped.
+      auto centroids = commit.map(section::kCentroids).empty() ? std::vector<std::int8_t>()
+                                                               : read_centroids(commit, shape.dim);
+      if (!centroids_) centroids_ = std::move(centroids);
     }
     if (commit.has(section::kMetadata)) {
-      auto own = read_metadata(commit);
-      if (!metadata_) metadata_ = std::move(own);
+      auto metadata = read_metadata(commit);
+      if (!metadata_) metadata_ = std::move(metadata);
     }
   }
 
@@ -129,7 +127,7 @@ class Reading {
   }
 
  private:
-  // Checks all landmarks of a file, and takes those that are not known.
+  // Checks all landmarks of a file, and takes those that no later commit names.
   void read_landmarks(const ContainerReader& file, std::size_t n) {
     const std::size_t dim = store_.dim();
     const bool several = store_.several();
@@ -150,14 +148,14 @@ class Reading {
       positions = read_section<Position>(file, section::kPositions, n);
     }
 
-    // Before many small commits, each of which would move all that is there.
+    // Not for each of many small commits, which would move all rows each time.
     if (m > store_.prototype_count()) {
       store_.reserve(store_.landmark_count() + n, store_.prototype_count() + m);
     }
     std::vector<LandmarkIndex> landmarks;  // if there are positions
     landmarks.reserve(positions.size());
     for (std::size_t i = 0, row = 0; i < n; ++i) {
-      const bool wanted = known_.empty() || !known_.contains(ids[i]);
+      const bool is_newest = read_.empty() || !read_.contains(ids[i]);
       LandmarkIndex landmark = kNoLandmark;
       const std::size_t end = row + (several ? row_counts[i] : 1);
       for (const std::size_t first = row; row < end; ++row) {
@@ -168,7 +166,7 @@ class Reading {
             (row > first && appearance <= appearances[row - 1])) {
           file.fail("the appearances of landmark ", ids[i], " do not ascend");
         }
-        if (!wanted) continue;
+        if (!is_newest) continue;
         const Row to = store_.create_row(ids[i], landmark, appearance);
         std::copy_n(sum, dim, store_.sum(to));
         store_.set_count(to, counts[row]);
@@ -199,10 +197,65 @@ class Reading {
   const Encoder& encoder_;
   PrototypeStore& store_;
   MapState& state_;
-  IdSet known_;  // landmarks that came, changed or went in later commits
+  IdSet read_;  // landmarks that later commits name
   std::optional<Metadata> metadata_;
   std::optional<std::vector<std::int8_t>> centroids_;
 };
+
+std::unique_ptr<MapState> read_with_journal(const std::filesystem::path& path) {
+  // Before a journal is made, the file must be a learning map.
+  ContainerReader(MappedFile(path).bytes(), path.string()).expect(FileKind::learning_map);
+  auto journal = std::make_unique<Journal>(path);
+  try {
+    const MappedFile mapped(path);
+    const ContainerReader file(mapped.bytes(), path.string());
+    const auto bytes = journal->read();
+    const JournalContent commits(bytes, journal_path(path).string());
+    auto state = read_map(file, commits);
+    journal->resume(commits, file.identity());
+    state->store.uncommitted = std::make_shared<Uncommitted>();
+    state->journaled = journal->map();
+    state->journal = std::move(journal);
+    return state;
+  } catch (...) {
+    if (journal) journal->abandon();
+    throw;
+  }
+}
+
+// Returns the map as a file, which must be written before the map changes.
+ContainerWriter file_of(const MapState& state) {
+  ContainerWriter file(FileKind::learning_map);
+  file.add(section::kEncoder, state.encoder->serialize());
+  add_metadata(file, state.metadata);
+  const std::vector<std::int8_t>& centroids = state.store.quantizer().centroids();
+  if (!centroids.empty()) file.add(section::kCentroids, std::as_bytes(std::span(centroids)));
+  add_landmarks(file, state.store);
+  return file;
+}
+
+// Adds the changes to the record of a commit, and returns its bytes.
+std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
+                                 const Uncommitted& changes) {
+  std::vector<std::int64_t> ids(changes.ids().begin(), changes.ids().end()), removed;
+  std::ranges::sort(ids);
+  std::vector<LandmarkIndex> existing;
+  for (const std::int64_t id : ids) {
+    const LandmarkIndex landmark = state.store.find(id);
+    landmark == kNoLandmark ? removed.push_back(id) : existing.push_back(landmark);
+  }
+  add_landmarks(record, state.store, std::move(existing));
+  if (!removed.empty()) record.add(section::kRemoved, std::as_bytes(std::span(removed)));
+  if (changes.metadata) {
+    // An empty section means that metadata were removed, an absent one that they did not change.
+    state.metadata.empty() ? record.add(section::kMetadata, Bytes())
+                           : add_metadata(record, state.metadata);
+  }
+  if (changes.centroids) {
+    record.add(section::kCentroids, std::as_bytes(std::span(state.store.quantizer().centroids())));
+  }
+  return record.serialize();
+}
 
 }  // namespace
 
@@ -221,72 +274,11 @@ std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalCon
   return state;
 }
 
-namespace {
-
-std::unique_ptr<MapState> read_with_journal(const std::filesystem::path& path) {
-  {
-    const MappedFile mapped(path);  // no journal is made for a file that is no learning map
-    ContainerReader(mapped.bytes(), path.string()).expect(FileKind::learning_map);
-  }
-  auto journal = std::make_unique<Journal>(path);
-  try {
-    const MappedFile mapped(path);
-    const ContainerReader file(mapped.bytes(), path.string());
-    const auto bytes = journal->read();
-    const JournalContent commits(bytes, journal_path(path).string());
-    auto state = read_map(file, commits);
-    journal->resume(commits, file.identity());
-    state->store.uncommitted = std::make_shared<Uncommitted>();
-    state->journaled = journal->map();
-    state->journal = std::move(journal);
-    return state;
-  } catch (...) {
-    if (journal) journal->abandon();  // nor for one that is broken
-    throw;
-  }
-}
-
-// The map as a file, which must be written before the map changes.
-ContainerWriter file_of(const MapState& state) {
-  ContainerWriter file(FileKind::learning_map);
-  file.add(section::kEncoder, state.encoder->serialize());
-  add_metadata(file, state.metadata);
-  const std::vector<std::int8_t>& centroids = state.store.quantizer().centroids();
-  if (!centroids.empty()) file.add(section::kCentroids, std::as_bytes(std::span(centroids)));
-  add_landmarks(file, state.store);
-  return file;
-}
-
-// Adds what changed to the record of a commit, and returns its bytes.
-std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
-                                 const Uncommitted& changes) {
-  std::vector<std::int64_t> ids(changes.ids().begin(), changes.ids().end()), removed;
-  std::ranges::sort(ids);
-  std::vector<LandmarkIndex> existing;
-  for (const std::int64_t id : ids) {
-    const LandmarkIndex landmark = state.store.find(id);
-    landmark == kNoLandmark ? removed.push_back(id) : existing.push_back(landmark);
-  }
-  add_landmarks(record, state.store, std::move(existing));
-  if (!removed.empty()) record.add(section::kRemoved, std::as_bytes(std::span(removed)));
-  if (changes.metadata) {
-    // An empty section says that there is none any more, an absent one that it did not change.
-    state.metadata.empty() ? record.add(section::kMetadata, Bytes())
-                           : add_metadata(record, state.metadata);
-  }
-  if (changes.centroids) {
-    record.add(section::kCentroids, std::as_bytes(std::span(state.store.quantizer().centroids())));
-  }
-  return record.serialize();
-}
-
-}  // namespace
-
 void PrototypeMap::save(const std::filesystem::path& path) const {
   std::error_code error;
-  // Another name of the same file (a hard link) is another file to write.
+  // Another name of the same file (a hard link) counts as another file.
   if (std::filesystem::canonical(path, error) == state_->journaled && !error) {
-    const std::scoped_lock own(state_->journal_mutex);
+    const std::scoped_lock lock(state_->journal_mutex);
     if (state_->journal) return state_->fold();
   }
   const std::shared_lock lock(state_->changing);
@@ -306,23 +298,23 @@ PrototypeMap PrototypeMap::load(const std::filesystem::path& path, bool journal)
 }
 
 bool PrototypeMap::has_journal() const {
-  const std::scoped_lock own(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   return state_->journal != nullptr;
 }
 
 Journal& MapState::need_journal() const {
   if (journal) return *journal;
-  invalid("this map has no journal: open it with one to commit");
+  invalid("this map has no journal: open it with a journal to commit");
 }
 
 std::size_t PrototypeMap::commit() {
-  const std::scoped_lock own(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   Journal& journal = state_->need_journal();
   ContainerWriter file = journal.record(FileKind::commit);
   std::vector<std::byte> record;
   Uncommitted changes;
   {
-    // What is to be written is copied, so that changes do not wait for the disk.
+    // The record is a copy, so that changes do not wait for the disk.
     const std::shared_lock lock(state_->changing);
     Uncommitted& uncommitted = *state_->store.uncommitted;
     if (uncommitted.empty()) return 0;
@@ -346,26 +338,26 @@ std::size_t PrototypeMap::commit() {
 }
 
 void PrototypeMap::compact() {
-  const std::scoped_lock own(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   state_->fold();
 }
 
 void MapState::fold() {
-  Journal& own = need_journal();
+  Journal& of_map = need_journal();
   std::string identity;
   {
     const std::shared_lock lock(changing);
-    file_of(*this).write(own.map(), [&](const std::string& written) {
-      own.fold(written);
+    file_of(*this).write(of_map.map(), [&](const std::string& written) {
+      of_map.fold(written);
       identity = written;
     });
     *store.uncommitted = {};
   }
-  own.restart(identity);
+  of_map.restart(identity);
 }
 
 void PrototypeMap::close() {
-  const std::scoped_lock own(state_->journal_mutex);
+  const std::scoped_lock committing(state_->journal_mutex);
   const std::unique_lock lock(state_->changing);
   state_->store.uncommitted.reset();
   state_->journal.reset();

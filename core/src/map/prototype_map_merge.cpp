@@ -1,12 +1,10 @@
 // Merges maps into one, and splits one into parts.
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <functional>
 #include <unordered_map>
 #include <utility>
 
-#include "base/text.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
 #include "search/among.h"
@@ -16,7 +14,7 @@ namespace {
 
 using Cell = std::array<std::int64_t, 3>;
 
-// Beyond this, neighbouring cells are one in double precision.
+// Beyond this, neighbouring cells are the same in double precision.
 constexpr double kMaxCell = 9007199254740992;  // 2^53
 
 Cell cell_of(const Position& position, double size) {
@@ -53,21 +51,15 @@ void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int
                              std::span<const std::int64_t> source) {
   if (&other == this) invalid("a map cannot be merged into itself");
   check_alike(*this, other);
-  if (into.size() != source.size()) {
-    invalid(into.size(), " landmark ids for ", source.size(), " sources");
-  }
-  // Both wait for their turn, in one order for all pairs of maps, so that no two merges wait for
-  // each other.
-  std::unique_lock own(state_->changing, std::defer_lock);
-  std::shared_lock others(other.state_->changing, std::defer_lock);
-  if (std::less<>{}(state_.get(), other.state_.get())) {
-    own.lock();
-    others.lock();
-  } else {
-    others.lock();
-    own.lock();
-  }
-  MapChange change(*state_, std::move(own));
+  check_pairs(into.size(), source.size(), "sources");
+  // In one order for all pairs of maps, so that no two merges wait for each other.
+  std::unique_lock changing(state_->changing, std::defer_lock);
+  std::shared_lock reading(other.state_->changing, std::defer_lock);
+  const bool first_this = std::less<>{}(state_.get(), other.state_.get());
+  if (first_this) changing.lock();
+  reading.lock();
+  if (!first_this) changing.lock();
+  MapChange change(*state_, std::move(changing));
   PrototypeStore& to = state_->store;
   const PrototypeStore& from = other.state_->store;
   std::unordered_map<std::uint32_t, std::int64_t> renamed;
@@ -79,8 +71,8 @@ void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int
     }
   }
   Metadata metadata = merged(state_->metadata, other.state_->metadata);
-  if (!from.positions().empty()) change.make_room_for_positions();
-  // By id, so that the result does not depend on how the other map came about.
+  if (!from.positions().empty()) to.make_room_for_positions(state_->searching);
+  // By id, so that the result does not depend on the history of the other map.
   const std::vector<LandmarkIndex> landmarks = from.sorted_landmarks();
   std::vector<std::int64_t> ids;
   for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
@@ -92,7 +84,7 @@ void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int
       rows += from.row_count(landmarks[end]);
       if (to.find(ids.back()) == kNoLandmark) ++new_landmarks;
     }
-    change.make_room(new_landmarks, to.several() ? rows : new_landmarks, rows);
+    to.make_room(new_landmarks, to.several() ? rows : new_landmarks, rows, state_->searching);
     const auto lock = change.write();
     for (std::size_t i = 0; i < ids.size(); ++i) to.merge(ids[i], from, landmarks[first + i]);
     to.reassign(1);
@@ -153,7 +145,7 @@ std::vector<MapPart> PrototypeMap::split_by_space(double cell_size) const {
     all.emplace_back(std::nullopt, landmark);
     if (has_position(position)) all.back().first = cell_of(position, cell_size);
   }
-  // By cell, and those without a position at last.
+  // By cell, then those without a position.
   std::ranges::stable_sort(all, [](const auto& a, const auto& b) {
     return a.first && (!b.first || *a.first < *b.first);
   });

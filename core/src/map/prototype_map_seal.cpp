@@ -1,16 +1,10 @@
-// Seals a learning map. Sections come into being while they are written, so that this takes little
-// memory beside the map.
+// Seals a learning map, producing sections while they are written, in little memory.
 #include <algorithm>
-#include <array>
 #include <cstring>
-#include <optional>
-#include <span>
-#include <string>
 #include <utility>
-#include <vector>
 
 #include "base/packed_numbers.h"
-#include "base/sq4.h"
+#include "base/quantize.h"
 #include "file/ids.h"
 #include "file/sections.h"
 #include "map/map_sections.h"
@@ -25,11 +19,10 @@ namespace {
 using Sink = ContainerWriter::Sink;
 using Sinks = std::span<const Sink>;
 
-// Packs blocks of kPackedRows rows as search reads them, with numbers of 8 bits, or of 4 with a
-// scale.
+// Packs blocks of kPackedRows rows as search reads them.
 class BlockPacker {
  public:
-  // A scale of 0 means 8 bits per number.
+  // Numbers have 4 bits, or 8 if `scale` is 0.
   BlockPacker(const PrototypeStore& store, int scale) : store_(&store), scale_(scale) {
     for (int v = -128; v < 128 && scale_ != 0; ++v) {
       quantized_[static_cast<std::size_t>(v + 128)] = sq4_quantize(v, scale_);
@@ -42,10 +35,10 @@ class BlockPacker {
     return scale_ == 0 ? packed_size(kPackedRows, store_->dim())
                        : packed4_size(kPackedRows, store_->dim());
   }
-  // What remains of a number.
+  // Returns the number that a code is stored as.
   int value(std::int8_t code) const { return scale_ == 0 ? code : sq4_level(u(code), scale_); }
 
-  // `rows` are kPackedRows rows, kNoRow for padding.
+  // `rows` are kPackedRows, kNoRow for padding.
   void pack(const Row* rows, std::uint8_t* to) const {
     const std::size_t dim = store_->dim();
     std::array<std::int8_t, 256> code;
@@ -73,14 +66,14 @@ class BlockPacker {
   std::array<std::uint8_t, 256> quantized_{};
 };
 
-// Tells which landmark of a sealed map, by id, is which of the store, in little more than a byte
-// per landmark: the id tells which block of 256 a landmark is in.
+// Maps landmarks of a store to those of a sealed map, in little more than a byte per landmark: the
+// id tells the block of 256.
 class SealedLandmarks {
  public:
   explicit SealedLandmarks(const PrototypeStore& store)
       : store_(&store), in_block_(store.ids().size()) {}
 
-  // Takes all landmarks by ascending id.
+  // Landmarks come by ascending id.
   void add(LandmarkIndex landmark) {
     if (added_ % kBlock == 0) first_ids_.push_back(store_->id(landmark));
     in_block_[landmark.value] = static_cast<std::uint8_t>(added_++ % kBlock);
@@ -96,13 +89,12 @@ class SealedLandmarks {
   static constexpr std::size_t kBlock = 256;
 
   const PrototypeStore* store_;
-  std::vector<std::uint8_t> in_block_;  // where a landmark is in its block
+  std::vector<std::uint8_t> in_block_;  // the index of a landmark in its block
   std::vector<std::int64_t> first_ids_;
   std::size_t added_ = 0;
 };
 
-// Writes rows list after list, each list from a new block on, and their owners if there is a sink
-// for these.
+// Writes rows, each list beginning a new block, and their owners if there is a sink for these.
 class RowWriter {
  public:
   RowWriter(const BlockPacker& packer, std::size_t landmarks, const Sink& prototypes,
@@ -117,7 +109,7 @@ class RowWriter {
   void end_list() {
     while (filled_ != 0) add(kNoRow, landmarks_);
   }
-  // Returns the checksums of owners.
+  // Returns the checksums of the owners.
   std::vector<std::uint32_t> finish() {
     packed_owners_.align();
     flush_owners(1);
@@ -139,7 +131,7 @@ class RowWriter {
     prototypes_(std::as_bytes(std::span(packed_)));
     packed_.clear();
   }
-  // Writes owners by blocks as long as there are so many words.
+  // Writes owners in blocks while there are at least `least` words.
   void flush_owners(std::size_t least) {
     std::vector<std::uint64_t>& words = packed_owners_.words();
     while (words.size() >= least) {
@@ -162,14 +154,14 @@ class RowWriter {
   std::vector<std::uint32_t> checksums_;
 };
 
-// Finds the two nearest landmarks of each query among prototypes as they are packed, piece by
+// Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
 // piece.
 Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
-  // As much memory as is little beside the map.
+  // A piece is small compared with the map.
   const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
-  std::vector<LandmarkIndex> own_index(size);  // several rows may have the same id
-  for (std::size_t i = 0; i < size; ++i) own_index[i] = landmark_at(i);
+  std::vector<LandmarkIndex> indices(size);  // as several rows may have the same id
+  for (std::size_t i = 0; i < size; ++i) indices[i] = landmark_at(i);
   std::vector<std::int64_t> owners;
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
@@ -186,7 +178,7 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
       to += packer.size();
     }
     PackedPrototypes piece{packed.data(), owners.size(), store.dim(), packer.scale()};
-    piece.landmarks.of_row = own_index.data();
+    piece.landmarks.of_row = indices.data();
     piece.landmarks.ids = owners.data();
     PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, owners.size()});
   }
@@ -195,8 +187,8 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
   return matches;
 }
 
-// The sections that have something per landmark or row. They come into being in one pass over
-// landmarks by id and, with an index, another one over its lists.
+// Produces the sections of landmarks and rows in one pass over landmarks by id and, with an index,
+// another one over its lists.
 class SealedContent {
  public:
   // `store` has the prototypes, `map` everything else.
@@ -205,10 +197,11 @@ class SealedContent {
       : store_(store), map_(map), packer_(packer), codec_(codec) {
     std::int64_t largest = -1;
     for (const std::int64_t id : store.ids()) largest = std::max(largest, id);
-    ids_are_stored_ = !ids_are_indices(store.landmark_count(), largest);
+    // Ids 0 to n - 1 are not stored.
+    ids_are_stored_ = largest + 1 != static_cast<std::int64_t>(store.landmark_count());
   }
 
-  // Adds the sections to a file that is written as long as this is there.
+  // Adds the sections to a file that is written while this exists.
   void add_to(ContainerWriter& file) {
     const std::size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
     const ContainerWriter::Part prototypes{section::kPrototypes,
@@ -258,11 +251,11 @@ class SealedContent {
     if (ids_are_stored_) ids.emplace(sink[0], sink[1]);
     if (!prototypes && ids_are_stored_) landmarks_.emplace(store_);
     store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
-      const auto own = [&](LandmarkIndex l) {
+      const auto in_map = [&](LandmarkIndex l) {
         return &store_ == &map_ ? l : map_.at(store_.id(l));
       };
       put_each<std::uint8_t>(counts, landmarks, [&](LandmarkIndex l) {
-        return static_cast<std::uint8_t>(std::min(map_.observations(own(l)), 255u));
+        return static_cast<std::uint8_t>(std::min(map_.observations(in_map(l)), 255u));
       });
       if (row_counts != nullptr) {
         put_each<std::uint8_t>(*row_counts, landmarks, [&](LandmarkIndex l) {
@@ -271,19 +264,15 @@ class SealedContent {
       }
       if (positions != nullptr) {
         put_values<std::byte>(*positions, landmarks.size(), codec_->size(), [&](auto i, auto* to) {
-          codec_->encode(map_.position(own(landmarks[i])), to);
+          codec_->encode(map_.position(in_map(landmarks[i])), to);
         });
       }
       for (const LandmarkIndex landmark : landmarks) {
         if (ids) ids->add(store_.id(landmark));
         if (landmarks_) landmarks_->add(landmark);
-        if (!prototypes) continue;
-        if (!store_.several()) {
-          prototypes->add(store_.first_row(landmark));
-        } else {
-          for (const Row row : store_.sorted_rows(landmark)) prototypes->add(row);
-        }
       }
+      if (!prototypes) return;
+      for (const Row row : store_.sorted_rows(landmarks)) prototypes->add(row);
     });
     if (ids) ids->finish();
     if (!prototypes) return;
@@ -304,7 +293,7 @@ class SealedContent {
       writer.end_list();
     }
     owner_checksums_ = writer.finish();
-    landmarks_.reset();  // its memory is wanted for the test queries
+    landmarks_.reset();  // makes room for the test queries
   }
 
   const PrototypeStore &store_, &map_;

@@ -1,13 +1,11 @@
 #include "map/prototype_store.h"
 
 #include <algorithm>
-#include <array>
 #include <cstring>
 #include <mutex>
 #include <numeric>
-#include <stdexcept>
 
-#include "base/rounded_mean.h"
+#include "base/quantize.h"
 #include "base/sorted_pieces.h"
 #include "map/positions.h"
 #include "protomark/prototype_map.h"
@@ -15,7 +13,7 @@
 namespace protomark {
 namespace {
 
-// Adding to a large map mostly waits for memory, which is prefetched so many observations ahead.
+// Adding to a large map mostly waits for memory: prefetches it this many observations ahead.
 constexpr std::size_t kAhead = 16;
 
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
@@ -31,7 +29,7 @@ std::size_t PrototypeStore::row_bytes() const {
 }
 
 void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
-  // And the block that take_row wants to be free.
+  // One more block, as take_row wants one to be free.
   const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows + 1;
   for_each_array(landmarks, blocks * kPackedRows,
                  [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
@@ -40,7 +38,7 @@ void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
 
 void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                                FairSharedMutex& searching) {
-  // New rows begin in the first list, and each that moves on may be the first of a block.
+  // New rows begin in the first list, and each that moves may begin a block.
   const std::size_t moving = quantizer_.nlist() == 0 ? 0 : std::min(changed, quantizer_.nlist());
   const std::size_t blocks = 2 * ((rows + kPackedRows - 1) / kPackedRows) + moving;
   for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more, const auto&) {
@@ -67,18 +65,14 @@ Row PrototypeStore::find_or_create_row(std::int64_t id, std::uint16_t appearance
 }
 
 Row PrototypeStore::create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance) {
+  if (landmark == kNoLandmark) make_room_for_landmark();
   const Row row = take_row(0);
   if (landmark != kNoLandmark) {
     add_row(landmark, row, appearance);
-    return row;
-  }
-  try {
+  } else {
     add_landmark(id, row, appearance);
-  } catch (...) {
-    close_gap(row);
-    throw;
+    landmark = owner(row);
   }
-  landmark = owner(row);
   return row;
 }
 
@@ -95,7 +89,7 @@ Row PrototypeStore::take_row(std::uint32_t list) {
   ++prototype_count_;
   std::fill_n(sum(row), dim_, std::int16_t{0});
   counts_[row.value] = 0;
-  // No prototype has this number, so that the first one differs.
+  // No prototype has this number, so refresh sees a difference.
   packed()[packed_index(row.value, 0, dim_)] = -128;
   return row;
 }
@@ -127,8 +121,8 @@ void PrototypeStore::relocate(Row from, Row to) {
   vacate(from);
 }
 
-// The last row of its list takes the place of a row that is gone. If that empties a block, the last
-// block of all takes its place.
+// Moves the last row of a list to where one was removed, and the last of all blocks to a block that
+// this empties.
 void PrototypeStore::close_gap(Row row) {
   vacate(row);
   const std::uint32_t list = lists_.list_of(row);
@@ -183,24 +177,6 @@ std::vector<std::int8_t> PrototypeStore::rounded(std::span<const Row> rows) cons
 }
 
 void PrototypeStore::visit_sorted_landmarks(const VisitLandmarks& visit) const {
-  std::int64_t largest = -1;
-  bool ascending = true;
-  for (const std::int64_t id : ids_) {
-    ascending = ascending && (id < 0 || id > largest);
-    largest = std::max(largest, id);
-  }
-  // To look up all ids that there may be is quicker than to sort those that are there.
-  if (!ascending && static_cast<std::size_t>(largest) < 2 * landmark_count()) {
-    constexpr std::size_t kPiece = 1 << 13;
-    std::vector<LandmarkIndex> piece;
-    for (std::int64_t id = 0; id <= largest; ++id) {
-      if (const auto landmark = find(id); landmark != kNoLandmark) piece.push_back(landmark);
-      if (piece.size() < kPiece && id < largest) continue;
-      visit(piece);
-      piece.clear();
-    }
-    return;
-  }
   const auto each = [&](const auto& take) { each_landmark(take); };
   visit_sorted<LandmarkIndex>(
       landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
@@ -262,10 +238,9 @@ void PrototypeStore::add(std::span<const std::int64_t> ids, Codes codes,
     const Row row = rows[at];
     if (row == kNoRow) continue;
     add(row, codes.row(at));
-    // Once is enough if the next observation is of the same row.
     if (at + 1 == n || rows[at + 1] != row) refresh(row);
   }
-  // If memory runs out, what was added so far stays, and answers.
+  // If memory runs out, the observations added so far stay and answer.
   for (std::size_t i = 0; i < n; ++i) {
     if (rows[i] != kNoRow) continue;
     const std::uint16_t appearance = appearance_of(codes.row(i));
@@ -284,7 +259,7 @@ void PrototypeStore::add(Row row, const std::int8_t* code) {
     n /= 2;
     for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], n);
   }
-  // A caller may write over codes that were checked: even then no sum is impossible.
+  // A caller may write over codes after they were checked; even then no sum is impossible.
   for (std::size_t d = 0; d < dim_; ++d) {
     s[d] = static_cast<std::int16_t>(s[d] + std::max<std::int16_t>(code[d], -127));
   }
@@ -308,8 +283,8 @@ void PrototypeStore::merge(std::int64_t id, const PrototypeStore& from, Landmark
     const Row to = find_or_create_row(id, from.appearance(row));
     merge(to, from.sum(row), from.count(row));  // after a new row, as sums may have moved
   }
-  const LandmarkIndex own = at(id);
-  if (!has_position(position(own))) set_position(own, from.position(landmark));
+  const LandmarkIndex into = at(id);
+  if (!has_position(position(into))) set_position(into, from.position(landmark));
 }
 
 void PrototypeStore::refresh(Row row) {

@@ -1,13 +1,9 @@
-// What a learning map holds in memory: landmarks, and a row for each prototype.
+// The landmarks of a learning map, with a row for each prototype.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
 #include <functional>
 #include <memory>
 #include <new>
-#include <span>
-#include <vector>
 
 #include "base/fair_shared_mutex.h"
 #include "map/row_table.h"
@@ -16,16 +12,16 @@
 
 namespace protomark {
 
-// What changed in a map since its last commit.
+// The changes of a map since its last commit.
 class Uncommitted {
  public:
   bool empty() const { return !centroids && !metadata && ids_.empty() && !incomplete_; }
-  // Landmarks that came, changed or went, each once, in no order.
+  // Landmarks that were added, changed or removed, each once.
   const LargeVector<std::int64_t>& ids() const { return ids_.ids(); }
   // Whether memory ran out, so that some ids are missing.
   bool incomplete() const { return incomplete_; }
 
-  // Never throws, so that no change is made and not noted.
+  // Never throws, so that every change is noted.
   void insert(std::int64_t id) noexcept try { ids_.insert(id); } catch (const std::bad_alloc&) {
     incomplete_ = true;
   }
@@ -44,7 +40,7 @@ class Uncommitted {
   bool incomplete_ = false;
 };
 
-// Rows stand in blocks by inverted list: all in one without an index, otherwise each in the list of
+// Rows are in blocks by inverted list: all in one without an index, otherwise each in the list of
 // its rounded prototype. Padding fills the last block of a list.
 class PrototypeStore : public RowTable {
  public:
@@ -53,16 +49,15 @@ class PrototypeStore : public RowTable {
 
   std::size_t dim() const { return dim_; }
   std::size_t appearance_bits() const { return appearance_bits_; }
-  // Whether landmarks may have several rows.
   bool several() const { return several_; }
   std::size_t landmark_count() const { return several_ ? ids_.size() : prototype_count_; }
   std::size_t prototype_count() const { return prototype_count_; }
-  // All rows are below, padding included.
+  // The number of rows, padding included.
   std::size_t row_end() const { return lists_.blocks() * kPackedRows; }
-  // Bytes per row, as in a file, so that equal maps have the same.
+  // Bytes per row as in a file, so that equal maps have the same.
   std::size_t row_bytes() const;
 
-  // The appearance that a code is of: bit j is set if code[j] > 0, j < appearance_bits.
+  // Returns the appearance of a code: bit j is set if code[j] > 0, j < appearance_bits.
   std::uint16_t appearance_of(const std::int8_t* code) const {
     unsigned signs = 0;
     for (std::size_t j = 0; j < appearance_bits_; ++j) signs |= (code[j] > 0 ? 1u : 0u) << j;
@@ -70,20 +65,18 @@ class PrototypeStore : public RowTable {
   }
 
   void reserve(std::size_t landmarks, std::size_t rows);
-  // Makes room for so many more landmarks and rows in a change of `changed` rows, so that the
-  // change need not wait for that. Holds `searching` only to swap arrays; others may read
-  // meanwhile.
+  // Makes room for more landmarks and rows in a change of `changed` rows. Others may read
+  // meanwhile, as `searching` is held only to swap arrays.
   void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                  FairSharedMutex& searching);
   void make_room_for_positions(FairSharedMutex& searching);
 
-  // The row of a landmark's appearance, or a new one with a sum and count of zero. If memory runs
-  // out nothing has changed.
+  // Returns the row of a landmark's appearance, if need be a new one with a sum and count of zero.
+  // If memory runs out nothing has changed.
   Row find_or_create_row(std::int64_t id, std::uint16_t appearance);
-  // A new row for an appearance that its landmark does not have; kNoLandmark, for an id that is not
-  // there yet, becomes a new landmark.
+  // Creates a row for an appearance that its landmark lacks; kNoLandmark becomes a new landmark.
   Row create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance);
-  // A landmark goes with its last row.
+  // Removes a row, and with its last row a landmark.
   void erase_row(Row row);
   void erase(std::int64_t id);
 
@@ -93,11 +86,11 @@ class PrototypeStore : public RowTable {
   const std::int16_t* sum(Row row) const { return &sums_[row.value * dim_]; }
   int count(Row row) const { return counts_[row.value]; }
   void set_count(Row row, int count) { counts_[row.value] = static_cast<std::uint8_t>(count); }
-  // The rounded prototypes of one row or several (rows x dim).
+  // Return the rounded prototypes of one row or several (rows x dim).
   void rounded(Row row, std::int8_t* to) const;
   std::vector<std::int8_t> rounded(std::span<const Row> rows) const;
 
-  // Calls take(landmark) for all landmarks, or take(row) for all rows, in no order.
+  // Call take(landmark) for all landmarks, or take(row) for all rows, in no order.
   template <typename Take>
   void each_landmark(const Take& take) const {
     for (LandmarkIndex l{0}; l.value < ids_.size(); ++l.value) {
@@ -110,61 +103,59 @@ class PrototypeStore : public RowTable {
       if (is_row(row)) take(row);
     }
   }
-  // Hand over all landmarks by ascending id, or the rows of a list by id and then appearance, piece
-  // by piece (sorted_pieces.h).
+  // Visit all landmarks by ascending id, or the rows of a list by id and then appearance, piece by
+  // piece (sorted_pieces.h).
   using VisitLandmarks = std::function<void(std::span<const LandmarkIndex>)>;
   using VisitRows = std::function<void(std::span<const Row>)>;
   void visit_sorted_landmarks(const VisitLandmarks& visit) const;
   void visit_sorted_rows(std::uint32_t list, const VisitRows& visit) const;
   std::vector<LandmarkIndex> sorted_landmarks() const;
-  // The rows that are n-th among all rows by id and then appearance.
+  // Returns the rows that are n-th among all by id and then appearance.
   std::vector<Row> sorted_rows_at(std::span<const std::size_t> n) const;
 
-  // The rows of these landmarks' codes, kNoRow for those not there yet.
+  // Finds the rows of these landmarks' codes, kNoRow for those that do not exist.
   void find_rows(std::span<const std::int64_t> ids, Codes codes, std::span<Row> rows) const;
-  // Applies Eq. 2 for one code after the other, with new landmarks and rows where needed; rounded
-  // prototypes follow. `rows` are those that find_rows found.
+  // Applies Eq. 2 for one code after the other, with new landmarks and rows where needed. `rows`
+  // are those that find_rows found.
   void add(std::span<const std::int64_t> ids, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const std::int16_t* sum, int count);
-  // Adds a landmark of a store, which may be this one, to the one with an id, there or not, which
-  // keeps its position if it has one.
+  // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
+  // which keeps its position if it has one.
   void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark);
   // Makes the rounded prototype follow the sum and count.
   void refresh(Row row);
-  // Puts rows that were created or refreshed into their lists; ends every change.
+  // Puts refreshed rows into their lists; ends every change.
   void reassign(int threads);
 
   void set_position(LandmarkIndex landmark, const Position& position);
 
-  // Centroids of the inverted lists; none without an index.
+  // Has no lists without an index.
   const CoarseQuantizer& quantizer() const { return quantizer_; }
   const ListBlocks& lists() const { return lists_; }
-  // Where rows will stand by other centroids.
+  // The rows by other centroids.
   struct Arrangement {
     CoarseQuantizer quantizer;
     ListBlocks lists;
-    std::vector<Row> to;  // of each row; kNoRow for padding
+    std::vector<Row> to;  // new row of each row; kNoRow for padding
   };
-  // By these centroids; none drop the index.
   Arrangement arrange(CoarseQuantizer quantizer, int threads) const;
-  // Arranges this map within its memory, for which make_room_for must have been called; uses up the
-  // arrangement, and takes its centroids.
-  void rearrange(Arrangement& arrangement) noexcept;
+  // Moves rows and takes the arrangement's centroids. After make_room_for it cannot run out of
+  // memory.
+  void rearrange(Arrangement arrangement);
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching);
 
-  // A number that each set of centroids has for itself.
+  // Grows with each new set of centroids.
   std::size_t lists_version() const { return lists_version_; }
-  // A number that grows with each row that came, changed or went while there was an index.
+  // Grows with each row that was added, changed or removed while there was an index.
   std::size_t changes() const { return changes_; }
-  // What to commit; nullptr as long as nobody does. Only whoever commits may take it, while no
-  // change is going on.
+  // What to commit; nullptr without a journal. A commit takes it while no change is going on.
   std::shared_ptr<Uncommitted> uncommitted;
 
   PackedPrototypes view() const;
 
  private:
-  // Names a row by what does not change when others go.
+  // Names a row, whose index changes when others are removed.
   struct Key {
     std::int64_t id;
     std::uint16_t appearance;
@@ -184,16 +175,16 @@ class PrototypeStore : public RowTable {
   void add(Row row, const std::int8_t* code);
   Row take_row(std::uint32_t list);
   void resize(std::size_t rows);
-  // Copies all that stands at a row, but not what leads to it.
+  // Copies all of a row, but not what leads to it.
   void copy_row(Row from, Row to);
   void vacate(Row row);
-  // Moves a row to where padding is, and leaves padding.
+  // Moves a row to a padding row, and leaves padding.
   void relocate(Row from, Row to);
   void close_gap(Row row);
   void permute(std::vector<Row>& to, Row spare);
 
-  // As RowTable::for_each_array, with the arrays of this class, without and with the packed one,
-  // which holds whole blocks of rows.
+  // As RowTable::for_each_array, with the arrays of this class, without and with the packed one, in
+  // which rows are interleaved.
   template <typename Visit>
   void for_each_plain_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
     RowTable::for_each_array(landmarks, rows, visit);

@@ -7,13 +7,12 @@
 namespace protomark {
 namespace {
 
-// Rows whose lists are looked up at a time, and those that are moved at a time.
+// Rows that are assigned to lists at a time, and those that are moved at a time.
 constexpr std::size_t kAssignChunk = 1 << 14, kReassignChunk = 1 << 16;
 
 }  // namespace
 
-// A row is looked up by its key again before it moves, as its index may have changed when another
-// one moved.
+// Finds a row by its key again before moving it, as another move may have changed its index.
 void PrototypeStore::reassign(int threads) {
   const auto find_key = [&](const Key& key) {
     const LandmarkIndex landmark = find(key.id);
@@ -41,7 +40,7 @@ void PrototypeStore::reassign(int threads) {
     }
     for (std::size_t i = 0; i < moving; ++i) {
       const Row row = find_key(keys[i]);
-      if (lists_.list_of(row) == lists[i]) continue;  // its key was there twice
+      if (lists_.list_of(row) == lists[i]) continue;  // its key came twice
       relocate(row, take_row(lists[i]));
       close_gap(row);
     }
@@ -79,16 +78,17 @@ PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, i
 }
 
 void PrototypeStore::make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
-  // And the block in which rows stand while they move.
+  // One more block is for rows while they move.
   const std::size_t blocks = std::max(lists_.blocks(), arrangement.lists.blocks()) + 1;
   for_each_array(0, blocks * kPackedRows, [&](auto& v, std::size_t n, const auto&) {
     if (v.capacity() < n) enlarge(v, n, searching);
   });
 }
 
-void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
+void PrototypeStore::rearrange(Arrangement arrangement) {
   const ListBlocks& lists = arrangement.lists;
   const std::size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
+  for_each_array(0, end + kPackedRows, [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
   relink(arrangement.to);
   resize(end + kPackedRows);
   permute(arrangement.to, row_at(end));
@@ -97,27 +97,27 @@ void PrototypeStore::rearrange(Arrangement& arrangement) noexcept {
     for (Row row{lists.last(list).value + 1}; row.value % kPackedRows != 0; ++row.value)
       vacate(row);
   }
-  std::swap(quantizer_, arrangement.quantizer);
-  std::swap(lists_, arrangement.lists);
+  quantizer_ = std::move(arrangement.quantizer);
+  lists_ = std::move(arrangement.lists);
   resize(row_end());
   ++lists_version_;
   changes_ += prototype_count_;
   if (uncommitted) uncommitted->centroids = true;
 }
 
-// Moves every row to where it goes, and uses up `to`. A row that stands there goes on in its turn,
-// until one comes to padding; meanwhile rows stand at `spare` and the next row. In a large map
-// nearly all of this waits for memory, so that is prefetched.
+// Moves every row to to[row], and uses up `to`. A row that is there moves on in its turn, until one
+// comes to padding; `spare` and the next row hold rows meanwhile. In a large map nearly all of this
+// waits for memory, which is therefore prefetched.
 void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
   constexpr int kAhead = 8;
-  // Where the row that stands here goes; kNoRow if none stands here that has yet to move.
+  // Where the row here goes; kNoRow if none has to leave.
   const auto next = [&](Row row) { return row.value < to.size() ? to[row.value] : kNoRow; };
   Row moving = spare, met{spare.value + 1};
   for (Row first{0}; first.value < to.size(); ++first.value) {
     if (to[first.value] == kNoRow || to[first.value] == first) continue;
     copy_row(first, moving);
     Row row = std::exchange(to[first.value], kNoRow), ahead = row;
-    const auto look_ahead = [&] {
+    const auto prefetch = [&] {
       if (ahead == kNoRow) return;
       prefetch_prototype(ahead);
       RowTable::for_each_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
@@ -125,9 +125,9 @@ void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
       });
       ahead = next(ahead);
     };
-    for (int i = 0; i < kAhead; ++i) look_ahead();
+    for (int i = 0; i < kAhead; ++i) prefetch();
     while (next(row) != kNoRow) {
-      look_ahead();
+      prefetch();
       copy_row(row, met);
       copy_row(moving, row);
       std::swap(moving, met);

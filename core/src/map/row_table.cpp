@@ -1,6 +1,5 @@
 #include "map/row_table.h"
 
-#include <algorithm>
 #include <cmath>
 #include <utility>
 
@@ -47,6 +46,12 @@ std::size_t RowTable::row_bytes() const {
   return sizeof(ids_[0]) + (any_position() ? sizeof(Position) : 0);
 }
 
+void RowTable::make_room_for_landmark() {
+  index_.make_room(ids_, 1);
+  if (!several_) return;
+  for_each_array(1, 0, [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
+}
+
 void RowTable::add_landmark(std::int64_t id, Row row, std::uint16_t appearance) {
   if (!several_) {
     ids_[row.value] = id;
@@ -54,14 +59,8 @@ void RowTable::add_landmark(std::int64_t id, Row row, std::uint16_t appearance) 
     return;
   }
   const LandmarkIndex landmark = landmark_at(ids_.size());
-  for_each_array(1, 0, [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
   ids_.push_back(id);
-  try {
-    index_.insert(ids_, landmark);
-  } catch (...) {
-    ids_.pop_back();
-    throw;
-  }
+  index_.insert(ids_, landmark);
   first_rows_.push_back(kNoRow);
   if (!positions_.empty()) positions_.push_back(kNoPosition);
   add_row(landmark, row, appearance);

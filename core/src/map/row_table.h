@@ -1,13 +1,9 @@
-// Which rows a landmark of a learning map has, and which landmark a row belongs to.
+// The rows of each landmark of a learning map, and the landmark of each row.
 #pragma once
 
 #include <algorithm>
-#include <cstddef>
-#include <cstdint>
 #include <limits>
 #include <mutex>
-#include <span>
-#include <vector>
 
 #include "base/fair_shared_mutex.h"
 #include "base/id_index.h"
@@ -21,22 +17,21 @@ inline constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 inline constexpr Position kNoPosition = {kNaN, kNaN, kNaN};
 bool has_position(const Position& position);
 
-// All that depends on how many rows a landmark has stands here. With one row per landmark, a
-// landmark has the index of its row, and only ids and positions are stored, by row. With one row
-// per appearance, landmarks have indices of their own, without gaps, and the rows of a landmark
-// form a chain.
+// Has two layouts. With one row per landmark, a landmark has the index of its row, and only ids and
+// positions are stored, by row. With one row per appearance, landmarks have indices of their own,
+// without gaps, and the rows of a landmark form a chain.
 //
-// Neither landmarks nor rows are sorted. Rows that no landmark has are padding. Indices hold until
-// a landmark or row goes or moves; others then take its place.
+// Neither landmarks nor rows are sorted. Rows of no landmark are padding. Indices change when a
+// landmark or row is removed, as others then get its index.
 class RowTable {
  public:
   // `several`: a landmark may have several rows.
   explicit RowTable(bool several) : several_(several) {}
 
-  // By landmark index; -1 if no landmark has that index.
+  // By landmark index; -1 for padding.
   const LargeVector<std::int64_t>& ids() const { return ids_; }
   std::int64_t id(LandmarkIndex landmark) const { return ids_[landmark.value]; }
-  // The landmark with an id, or kNoLandmark; `at` throws UnknownLandmark instead.
+  // Return the landmark with an id; if there is none, kNoLandmark, or `at` throws UnknownLandmark.
   LandmarkIndex find(std::int64_t id) const { return index_.find(ids_, id); }
   LandmarkIndex at(std::int64_t id) const;
 
@@ -47,12 +42,12 @@ class RowTable {
     return several_ ? owners_[row.value] != kNoLandmark : ids_[row.value] >= 0;
   }
   std::uint16_t appearance(Row row) const { return several_ ? appearances_[row.value] : 0; }
-  // The rows of a landmark, in no order: one and the next, up to kNoRow.
+  // Run through the rows of a landmark, in no order, up to kNoRow.
   Row first_row(LandmarkIndex landmark) const {
     return several_ ? first_rows_[landmark.value] : Row{landmark.value};
   }
   Row next_row(Row row) const { return several_ ? next_rows_[row.value] : kNoRow; }
-  // The row of a landmark's appearance, or kNoRow.
+  // Returns the row of a landmark's appearance, or kNoRow.
   Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
     Row row = first_row(landmark);
     while (several_ && row != kNoRow && appearances_[row.value] != appearance) row = next_row(row);
@@ -60,37 +55,38 @@ class RowTable {
   }
 
   std::size_t row_count(LandmarkIndex landmark) const;
-  // The rows of one landmark, by ascending appearance; or of several, in their order.
+  // Return the rows of a landmark by ascending appearance, or of several landmarks in their order.
   std::vector<Row> sorted_rows(LandmarkIndex landmark) const;
   std::vector<Row> sorted_rows(std::span<const LandmarkIndex> landmarks) const;
 
   Position position(LandmarkIndex landmark) const {
     return positions_.empty() ? kNoPosition : positions_[landmark.value];
   }
-  // By landmark index; empty as long as no landmark ever had a position.
+  // By landmark index; empty if no landmark ever had a position.
   const std::vector<Position>& positions() const { return positions_; }
   bool any_position() const;
 
-  // Rows that were stepped over to find those that lead to a row which goes or moves.
+  // Counts rows that were stepped over to remove or move others.
   std::size_t steps() const { return steps_; }
 
  protected:
-  // Makes a padding row the only one of a new landmark. If memory runs out nothing has changed but
-  // that row, which must be made padding again.
+  // Makes room for a landmark, without which add_landmark could run out of memory.
+  void make_room_for_landmark();
+  // Makes a padding row the only one of a new landmark.
   void add_landmark(std::int64_t id, Row row, std::uint16_t appearance);
-  // Makes a padding row another one of a landmark.
+  // Makes a padding row one more of a landmark.
   void add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance);
-  // Takes a row away from its landmark, which goes with its last row.
+  // Removes a row from its landmark, and a landmark with its last row.
   void remove_row(Row row);
-  // Makes what leads to one row lead to another, or all that leads to rows lead to to[row].
+  // Make what leads to one row lead to another, or all that leads to rows lead to to[row].
   void relink(Row from, Row to);
   void relink(std::span<const Row> to);
   void set_position(LandmarkIndex landmark, const Position& position);
 
-  // Bytes per row, as in a file: positions count if any landmark has one.
+  // Bytes per row as in a file, so that equal maps have the same.
   std::size_t row_bytes() const;
-  // Calls visit(array, size, padding) for each array, with the size that so many landmarks and rows
-  // take and what it holds for padding.
+  // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
+  // and rows.
   template <typename Visit>
   void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
     if (!several_) landmarks = rows;
@@ -122,7 +118,7 @@ class RowTable {
   std::size_t steps_ = 0;
 };
 
-// How arrays grow: as push_back does, but before a change, so that it cannot fail half-way.
+// Arrays grow as with push_back, but before a change, which therefore cannot fail half-way.
 template <typename Vector>
 std::size_t larger_capacity(const Vector& v, std::size_t more) {
   return std::max(2 * v.capacity(), v.size() + more);

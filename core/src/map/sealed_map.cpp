@@ -5,7 +5,7 @@
 #include <utility>
 
 #include "base/packed_numbers.h"
-#include "base/sq4.h"
+#include "base/quantize.h"
 #include "file/ids.h"
 #include "file/journal.h"
 #include "file/sections.h"
@@ -18,14 +18,8 @@
 #include "search/recall.h"
 
 namespace protomark {
-namespace {
-
-constexpr char kRemedy[] = "call build_index before the map is sealed";
-
-}  // namespace
 
 struct SealedMap::Content {
-  // Bytes of the caller, or of a file that is mapped.
   Content(Bytes bytes, const std::string& name, std::unique_ptr<MappedFile> from = nullptr)
       : mapped(std::move(from)), file(bytes, name) {
     file.expect(FileKind::sealed_map);
@@ -71,7 +65,7 @@ struct SealedMap::Content {
     }
   }
 
-  // Reads the inverted lists, and how many rows they have, padding included.
+  // Reads the inverted lists, which tell how many rows there are, padding included.
   void read_index() {
     centroids = read_centroids(file, shape.dim);
     const std::size_t lists = centroids.size() / shape.dim;
@@ -103,7 +97,7 @@ struct SealedMap::Content {
   }
 
   int code_bits() const { return prototypes.scale == 0 ? 8 : 4; }
-  // With an index. Throws FileError if the owners are broken there.
+  // Only with an index. Throws FileError if the owners are broken.
   LandmarkIndex owner(Row row) const { return landmark_at((*owners)[row.value]); }
 
   std::size_t nlist() const { return list_rows.size(); }
@@ -112,7 +106,7 @@ struct SealedMap::Content {
     return codec ? codec->decode(&positions[landmark.value * codec->size()]) : kNoPosition;
   }
 
-  // The prototypes of a landmark, the first one and the one behind the last, counted by id.
+  // Returns the first prototype of a landmark and the one after its last, counted by id.
   std::pair<std::size_t, std::size_t> prototypes_of(LandmarkIndex landmark) const {
     const std::size_t i = landmark.value;
     if (row_counts.empty()) return {i, i + 1};
@@ -121,8 +115,8 @@ struct SealedMap::Content {
     return {first, first + row_counts[i]};
   }
 
-  // The row of a prototype that is counted by id. With an index rows are looked up once, by the
-  // owners of all.
+  // Returns the row of a prototype that is counted by id. With an index, the owners of all rows are
+  // read once.
   Row row_of(std::size_t prototype) const {
     if (nlist() == 0) return row_at(prototype);
     std::call_once(rows_found, [&] {
@@ -134,7 +128,7 @@ struct SealedMap::Content {
         if (landmark.value >= shape.landmarks) continue;
         const auto [first, last] = prototypes_of(landmark);
         const std::size_t at = first + taken[landmark.value]++;
-        if (at == last) file.fail("it has more prototypes of a landmark than it says");
+        if (at == last) file.fail("it has more prototypes of a landmark than it counts");
         found[at] = row;
         ++total;
       }
@@ -151,9 +145,10 @@ struct SealedMap::Content {
     return sq4_level(packed4_high(d) ? byte >> 4 : byte & 15, prototypes.scale);
   }
 
+  static constexpr char kRemedy[] = "call build_index before the map is sealed";
   static constexpr std::size_t kFirstRowStep = 64;  // landmarks
 
-  std::unique_ptr<MappedFile> mapped;  // nullptr: the bytes are the caller's
+  std::unique_ptr<MappedFile> mapped;  // nullptr if the caller keeps the bytes
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
@@ -162,7 +157,7 @@ struct SealedMap::Content {
   std::span<const std::uint8_t> row_counts;  // empty if each landmark has one row
   std::vector<std::uint32_t> first_rows;     // of every kFirstRowStep-th landmark
   PackedPrototypes prototypes;
-  // The index, if there is one.
+  // With an index.
   std::vector<std::int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
   std::span<const std::uint32_t> list_rows;
@@ -182,13 +177,13 @@ SealedMap::SealedMap(const std::filesystem::path& path) {
   auto mapped = std::make_unique<MappedFile>(path);
   const Bytes bytes = mapped->bytes();
   content_ = std::make_unique<const Content>(bytes, path.string(), std::move(mapped));
-  // A map file that takes the place of one with commits is refused.
+  // Refuses a map file that replaced one with commits.
   const JournaledFile both(path);
   both.journal().commits(both.file().identity());
 }
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
   if (reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment != 0) {
-    invalid("the bytes of a map must stand at a multiple of 64");
+    invalid("the bytes of a map must begin at a multiple of ", kSectionAlignment, " in memory");
   }
   content_ = std::make_unique<const Content>(bytes, name);
 }
@@ -211,7 +206,7 @@ double SealedMap::bytes_per_landmark() const {
 }
 
 std::size_t SealedMap::nprobe(double recall) const {
-  check_recall(recall, nlist(), kRemedy);
+  check_recall(recall, nlist(), Content::kRemedy);
   return nprobe_for(content_->recall_table, recall, nlist());
 }
 
@@ -223,18 +218,18 @@ std::optional<Position> SealedMap::position_error() const {
   return Position{step[0] / 2, step[1] / 2, step[2] / 2};
 }
 
-std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> wanted) const {
+std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmark_ids) const {
   std::vector<std::uint32_t> result;
-  for (const std::int64_t id : wanted) {
+  for (const std::int64_t id : landmark_ids) {
     result.push_back(content_->counts[content_->ids.find(id).value]);
   }
   return result;
 }
 
-Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> wanted) const {
-  Matrix<float> means(wanted.size(), dim());
-  for (std::size_t i = 0; i < wanted.size(); ++i) {
-    const auto [first, end] = content_->prototypes_of(content_->ids.find(wanted[i]));
+Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) const {
+  Matrix<float> means(landmark_ids.size(), dim());
+  for (std::size_t i = 0; i < landmark_ids.size(); ++i) {
+    const auto [first, end] = content_->prototypes_of(content_->ids.find(landmark_ids[i]));
     for (std::size_t d = 0; d < dim(); ++d) {
       int sum = 0;
       for (std::size_t p = first; p < end; ++p) sum += content_->value(content_->row_of(p), d);
@@ -256,9 +251,9 @@ Matrix<float> SealedMap::appearances(std::int64_t id) const {
   return result;
 }
 
-std::vector<Position> SealedMap::positions(std::span<const std::int64_t> wanted) const {
+std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmark_ids) const {
   std::vector<Position> result;
-  for (const std::int64_t id : wanted) {
+  for (const std::int64_t id : landmark_ids) {
     result.push_back(content_->position(content_->ids.find(id)));
   }
   return result;
@@ -278,7 +273,7 @@ Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOption
 
 Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
   const Content& c = *content_;
-  check_lists(options, nlist(), kRemedy);
+  check_lists(options, nlist(), Content::kRemedy);
   const std::size_t lists =
       options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
   const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
@@ -296,7 +291,7 @@ Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOption
   } else {
     matches = search_lists(c.prototypes, inverted, centroids, lists, queries, k, options);
   }
-  // Search gives landmark indices. Ids ascend with them, so that ties went to the smaller id.
+  // Search returns landmark indices, with which ids ascend, so that ties went to the smaller id.
   if (c.ids.are_indices()) return matches;
   for (std::int64_t& id : matches.ids.data) {
     if (id >= 0) id = c.ids[landmark_at(static_cast<std::size_t>(id))];

@@ -2,21 +2,18 @@
 
 #include <algorithm>
 #include <bit>
-#include <cmath>
 #include <functional>
 #include <queue>
-#include <span>
 #include <utility>
 
-#include "base/rounded_mean.h"
+#include "base/quantize.h"
 #include "base/text.h"
-#include "map/merge_cost.h"
 #include "protomark/prototype_map.h"
 
 namespace protomark {
 namespace {
 
-// A sealed map has a byte for the number of a landmark's prototypes.
+// A sealed map stores the number of a landmark's prototypes in a byte.
 constexpr std::size_t kMaxRows = 255;
 
 std::size_t prototype_bytes(std::size_t dim, int bits) {
@@ -35,22 +32,22 @@ struct LandmarkRows {
   std::vector<std::uint8_t> counts;
 };
 
-// The merges of all landmarks, and how many of each one's are made.
+// The merges of all landmarks, and how many of each landmark are made.
 class Merges {
  public:
-  // Makes those of least cost over the whole map first, of equals that of the first landmark, until
-  // there are at most `limit` rows.
+  // Makes those of least cost over the whole map, ties to the first landmark, until there are at
+  // most `limit` rows.
   Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, std::size_t limit)
       : ends_(landmarks.size()), made_(landmarks.size()) {
     std::size_t rows = store.prototype_count();
     using Next = std::pair<double, std::size_t>;  // cost, index in landmarks
     std::vector<Next> first;
     for (std::size_t i = 0; i < landmarks.size(); ++i) {
-      const LandmarkRows own(store, landmarks[i]);
-      const auto merges = appearance_merges(own.sums, own.counts, store.dim());
+      const LandmarkRows of_landmark(store, landmarks[i]);
+      const auto merges = appearance_merges(of_landmark.sums, of_landmark.counts, store.dim());
       merges_.insert(merges_.end(), merges.begin(), merges.end());
       ends_[i] = merges_.size();
-      if (own.counts.size() > kMaxRows) made_[i] = own.counts.size() - kMaxRows;
+      if (merges.size() >= kMaxRows) made_[i] = merges.size() + 1 - kMaxRows;
       rows -= made_[i];
       if (made_[i] < merges.size()) first.emplace_back(of(i)[made_[i]].cost, i);
     }
@@ -97,32 +94,27 @@ SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_
     invalid("bytes_per_landmark must be at least ", smallest,
             " for this map, which one prototype of 4 bits per number takes");
   }
-  // What a product of doubles loses must not cost a prototype.
+  // The rounding of the product must not cost a prototype.
   const double budget = *bytes_per_landmark * static_cast<double>(n) * (1 + 1e-12);
-  const auto fits = [&](std::size_t m, int bits) {
-    return static_cast<double>(sealed_bytes(n, m, dim, bits)) <= budget;
-  };
-  if (fits(rows, 8)) return {8, rows};
-  if (fits(rows, 4)) return {4, rows};
+  for (const int bits : {8, 4}) {
+    if (static_cast<double>(sealed_bytes(n, rows, dim, bits)) <= budget) return {bits, rows};
+  }
   const double limit =
       (budget - 2 * static_cast<double>(n)) / static_cast<double>(prototype_bytes(dim, 4));
   return {4, std::max(n, static_cast<std::size_t>(std::max(limit, 0.0)))};
 }
 
 std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std::size_t limit) {
-  if (!store.several()) return std::nullopt;
-  bool fits = store.prototype_count() <= limit;
-  store.each_landmark([&](LandmarkIndex l) { fits = fits && store.row_count(l) <= kMaxRows; });
-  if (fits) return std::nullopt;
+  if (store.prototype_count() <= limit) return std::nullopt;
   const std::vector<LandmarkIndex> landmarks = store.sorted_landmarks();
   const Merges merges(store, landmarks, limit);
   const std::size_t dim = store.dim();
   PrototypeStore result(dim, store.appearance_bits());
   result.reserve(landmarks.size(), std::min(limit, store.prototype_count()));
   for (std::size_t i = 0; i < landmarks.size(); ++i) {
-    const LandmarkRows own(store, landmarks[i]);
-    std::vector<std::int64_t> sums(own.sums.begin(), own.sums.end());
-    std::vector<std::int64_t> counts(own.counts.begin(), own.counts.end());
+    const LandmarkRows before(store, landmarks[i]);
+    std::vector<std::int64_t> sums(before.sums.begin(), before.sums.end());
+    std::vector<std::int64_t> counts(before.counts.begin(), before.counts.end());
     for (const AppearanceMerge& m : merges.made(i)) {
       for (std::size_t d = 0; d < dim; ++d) sums[m.into * dim + d] += sums[m.source * dim + d];
       counts[m.into] += std::exchange(counts[m.source], 0);
@@ -142,12 +134,7 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std
       result.refresh(row);
     }
   }
-  if (store.quantizer().nlist() != 0) {
-    FairSharedMutex nobody_searches;
-    auto arrangement = result.arrange(store.quantizer(), 1);
-    result.make_room_for(arrangement, nobody_searches);
-    result.rearrange(arrangement);
-  }
+  if (store.quantizer().nlist() != 0) result.rearrange(result.arrange(store.quantizer(), 1));
   return result;
 }
 

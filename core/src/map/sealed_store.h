@@ -1,8 +1,5 @@
-// How a map is sealed: bits per number of a prototype, and how many prototypes.
+// Chooses how a map is sealed: bits per number of a prototype, and which prototypes.
 #pragma once
-
-#include <cstddef>
-#include <optional>
 
 #include "map/prototype_store.h"
 
@@ -13,19 +10,38 @@ struct SealFormat {
   std::size_t row_limit;  // prototypes in all
 };
 
-// Chooses the format for a number of bytes per landmark, as SealOptions says. Throws
-// std::invalid_argument, with the smallest possible number, if that is too small.
+// Chooses the format for a number of bytes per landmark (SealOptions). Throws
+// std::invalid_argument, which names the smallest possible number, if that is too small.
 SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark);
 
-// Bytes that the prototypes, their number and the counts of so many landmarks take.
+// Returns the bytes that prototypes, their number and the counts of landmarks take.
 std::size_t sealed_bytes(std::size_t landmarks, std::size_t rows, std::size_t dim, int bits);
 
-// Bits that the owner of a row takes in a map of so many landmarks; padding has that number.
+// Returns the bits of a row's owner, which is a landmark or, for padding, the number of landmarks.
 int owner_bits(std::size_t landmarks);
 
-// Merges appearances until there are at most `limit` rows, and 255 of any landmark. Returns a store
-// of the prototypes, in lists of the same centroids, or nullopt if nothing has to be merged. Of
-// more than 255 observations it has the rounded prototype, with a count of one.
+// Merges prototype `source` into prototype `into`, which precedes it and keeps its index.
+struct AppearanceMerge {
+  double cost;
+  std::uint16_t into;
+  std::uint16_t source;
+};
+
+// Returns all merges that make one prototype of several, at each step the one of least cost, ties
+// to the first rows. `sums` is (rows x dim), `counts` (rows), at most 65536 rows. Of more than 2048
+// rows, neighbours are merged first, at no cost.
+//
+// The cost of merging the means a and b of n and m observations is what that adds to the sum of
+// squared distances of all observations to their means (Ward 1963), |a - b|^2 n m / (n + m). It is
+// the same double on every machine, as the order of operations on the integer sums is fixed.
+std::vector<AppearanceMerge> appearance_merges(std::span<const std::int16_t> sums,
+                                               std::span<const std::uint8_t> counts,
+                                               std::size_t dim);
+
+// Merges appearances until there are at most `limit` rows (SealFormat), and 255 of any landmark.
+// Returns a store of the prototypes, in lists of the same centroids, or nullopt if nothing has to
+// be merged. A prototype of more than 255 observations has its rounded mean as sum, and a count of
+// one.
 std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std::size_t limit);
 
 }  // namespace protomark

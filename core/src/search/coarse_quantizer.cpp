@@ -6,7 +6,7 @@
 #include <queue>
 #include <utility>
 
-#include "base/rounded_mean.h"
+#include "base/quantize.h"
 #include "search/inverted_lists.h"
 #include "search/recall.h"
 #include "search/scan.h"
@@ -32,7 +32,7 @@ std::vector<std::uint32_t> nearest_ids(Codes codes, const Search& search) {
   return result;
 }
 
-// Gives each centroid without codes one code of the largest lists.
+// Replaces each centroid without codes by a code of the largest lists.
 void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
             const std::vector<std::uint32_t>& counts, std::vector<std::int8_t>& centroids) {
   const std::size_t nlist = counts.size(), dim = codes.columns;
@@ -54,7 +54,7 @@ void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
     if (counts[c] != 0) continue;
     Large from = largest.top();
     largest.pop();
-    // A different code each time, spread over the list.
+    // Another code each time, spread over the list.
     const std::size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
     std::copy_n(codes.row(members[at]), dim, &centroids[c * dim]);
     ++from.parts;
@@ -63,7 +63,7 @@ void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
   }
 }
 
-// `assign(centroids)` gives the list of each code.
+// `assign(centroids)` returns the list of each code.
 template <typename Assign>
 std::vector<std::int8_t> k_means(Codes codes, std::size_t nlist, const Assign& assign) {
   const std::size_t dim = codes.columns;
@@ -126,7 +126,7 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
   std::vector<Row> group_of;
   for (const std::uint32_t group : assign(group_centroids)) group_of.push_back({group});
   const ListOrder order(std::move(group_of), groups);
-  // Leave out groups that are nearest to no centroid, as a broken file may have them.
+  // Leave out groups without centroids, which a broken file may bring about.
   std::vector<std::int8_t> used;
   for (std::size_t g = 0; g < groups; ++g) {
     if (order.sizes[g] == 0) continue;
@@ -158,12 +158,12 @@ std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t d
   const auto n = static_cast<double>(prototypes), k = static_cast<double>(packed_dim(dim));
   constexpr double kBytes = 4;
   // A sealed map stores the landmark of each row, the recall table, and for each list its centroid,
-  // its number of rows and half a block of padding, somewhat rounded up.
+  // its number of rows and half a block of padding, rounded up.
   const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
   const double sealed =
       (n * (kBytes - static_cast<double>(std::bit_width(prototypes)) / 8) - table) / (9.5 * k + 4);
-  // A learning map keeps for each list its centroid three times, some numbers, half a block of rows
-  // and half of the 12 bytes of a block.
+  // A learning map keeps for each list its centroid three times, 16 bytes, and half a block of rows
+  // and of the 12 bytes of a block.
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
   const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
   const double nlist = std::min({4 * std::sqrt(n), sealed, learning});

@@ -1,36 +1,30 @@
 // The centroids of inverted lists, learned from the prototypes of a map.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
-#include <vector>
-
 #include "search/packed.h"
 
 namespace protomark {
 
-// Which list a code belongs to depends on the code and the centroids alone, so that the lists of a
-// map do not depend on its history. Centroids have lists themselves, *groups*: a code's list is
-// that of the nearest centroid in the few nearest groups, ties to the smaller, which is almost
-// always the nearest of all and takes some hundreds of comparisons for thousands of lists.
+// The list of a code depends on the code and the centroids alone, so that the lists of a map do not
+// depend on its history. Centroids have lists themselves, *groups*: a code's list is that of the
+// nearest centroid in the few nearest groups, ties to the smaller, which is almost always the
+// nearest of all and takes some hundred comparisons for thousands of lists.
 class CoarseQuantizer {
  public:
   static constexpr std::size_t kMaxLists = 1 << 16;
 
-  // Without lists.
-  CoarseQuantizer() = default;
-  // Of these centroids, (nlist x dim), at least one.
+  CoarseQuantizer() = default;  // without lists
+  // `centroids` are (nlist x dim), at least one.
   CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim);
   // Learns by Lloyd's k-means, in integers; `nlist` is at most the number of codes.
   static CoarseQuantizer learn(Codes codes, std::size_t nlist, int threads);
-  // Returns a number of lists so small that the index takes at most 4 bytes per prototype, both in
-  // a learning map, where a row takes `row_bytes`, and in a sealed one.
+  // Returns a number of lists with which the index takes at most 4 bytes per prototype, both in a
+  // learning map, where a row takes `row_bytes`, and in a sealed one.
   static std::size_t default_nlist(std::size_t prototypes, std::size_t dim, std::size_t row_bytes);
-  // How many prototypes suffice to learn so many lists.
+  // Returns how many prototypes suffice to learn this many lists.
   static std::size_t sample_size(std::size_t nlist) { return 48 * nlist; }
 
   std::size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }
-  // (nlist x dim)
   const std::vector<std::int8_t>& centroids() const { return centroids_; }
   PackedPrototypes packed() const { return packed_view(packed_, nlist()); }
 
@@ -53,10 +47,10 @@ class CoarseQuantizer {
   std::vector<std::uint32_t> group_blocks_;  // first block of each group, and the end
 };
 
-// Where rows stand if lists follow each other, each from a new block on, rows in the order in which
-// they come. A row of no list, kNoRow, stands nowhere.
+// The new rows of prototypes if lists follow each other, each beginning a new block, with
+// prototypes in their present order.
 struct ListOrder {
-  // Takes the list of each row, as its value.
+  // `lists` has the list of each row as its value, or kNoRow for padding.
   ListOrder(std::vector<Row> lists, std::size_t nlist);
 
   std::vector<std::uint32_t> sizes;         // of each list

@@ -1,30 +1,122 @@
-// What exact, inverted-list and Hamming search share: how they are divided among threads, their
-// loop over the hits of a kernel, and how they write their answer.
+// The driver of exact, inverted-list and Hamming search: keeps the nearest, divides the work among
+// threads, and writes the answer.
 #pragma once
 
 #include <algorithm>
-#include <cstddef>
-#include <cstdint>
 #include <mutex>
-#include <optional>
-#include <span>
 
 #include "base/parallel.h"
 #include "base/text.h"
 #include "kernels/kernels.h"
 #include "protomark/search.h"
 #include "protomark/types.h"
-#include "search/top_k.h"
 
 namespace protomark {
 
-// How many ranges of queries, each with how many ranges of work (rows, or lists), a search has.
+// The k nearest that one query has met so far, sorted, ties to the smaller id, in the caller's
+// arrays. Free entries have id -1, which counts as larger than all others, and the limit as their
+// distance.
+class TopK {
+ public:
+  TopK(std::int64_t* ids, std::int32_t* distances, std::size_t k)
+      : ids_(ids), distances_(distances), k_(k) {}
+
+  // Returns the distance that a candidate must not exceed.
+  std::int32_t limit() const { return distances_[k_ - 1]; }
+
+  // Takes a candidate whose id was not offered before. One or two neighbours, as most searches ask
+  // for, need no loop.
+  void offer(std::int32_t distance, std::int64_t id) {
+    if (k_ > 2) {
+      if (before(distance, id, k_ - 1)) insert(distance, id, k_ - 1);
+    } else if (before(distance, id, 0)) {
+      if (k_ == 2) set(1, distances_[0], ids_[0]);
+      set(0, distance, id);
+    } else if (k_ == 2 && before(distance, id, 1)) {
+      set(1, distance, id);
+    }
+  }
+
+  // Takes a candidate whose id may be among the nearest already, at another distance.
+  void offer_distinct(std::int32_t distance, std::int64_t id) {
+    if (!before(distance, id, k_ - 1)) return;
+    const auto at = static_cast<std::size_t>(std::find(ids_, ids_ + k_, id) - ids_);
+    if (at == k_) {
+      insert(distance, id, k_ - 1);
+    } else if (distance < distances_[at]) {
+      insert(distance, id, at);
+    }
+  }
+
+ private:
+  bool before(std::int32_t distance, std::int64_t id, std::size_t i) const {
+    return distance < distances_[i] ||
+           (distance == distances_[i] &&
+            static_cast<std::uint64_t>(id) < static_cast<std::uint64_t>(ids_[i]));
+  }
+
+  // Overwrites entry i and moves the new one up to where it belongs.
+  void insert(std::int32_t distance, std::int64_t id, std::size_t i) {
+    for (; i > 0 && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
+    set(i, distance, id);
+  }
+
+  void set(std::size_t i, std::int32_t distance, std::int64_t id) {
+    distances_[i] = distance;
+    ids_[i] = id;
+  }
+
+  std::int64_t* ids_;
+  std::int32_t* distances_;
+  std::size_t k_;
+};
+
+// The nearest of several queries.
+class Neighbours {
+ public:
+  // A query takes no neighbour beyond its limit.
+  Neighbours(std::size_t k, std::span<const std::int32_t> limits)
+      : k_(k), ids_(limits.size() * k, -1) {
+    distances_.reserve(ids_.size());
+    for (const std::int32_t limit : limits) distances_.insert(distances_.end(), k, limit);
+  }
+
+  std::size_t queries() const { return ids_.size() / k_; }
+  std::size_t k() const { return k_; }
+  std::int32_t limit(std::size_t query) const { return distances_[query * k_ + k_ - 1]; }
+  TopK operator[](std::size_t query) {
+    return {ids_.data() + query * k_, distances_.data() + query * k_, k_};
+  }
+  const std::int64_t* ids(std::size_t query) const { return ids_.data() + query * k_; }
+  const std::int32_t* distances(std::size_t query) const { return distances_.data() + query * k_; }
+
+  Neighbours part(Range queries) const {
+    Neighbours result(k_, {});
+    result.ids_.assign(ids(queries.begin), ids(queries.end));
+    result.distances_.assign(distances(queries.begin), distances(queries.end));
+    return result;
+  }
+  // Takes the neighbours of `part`, whose queries begin with `first`.
+  void merge(std::size_t first, const Neighbours& part) {
+    for (std::size_t i = 0; i < part.ids_.size(); ++i) {
+      if (part.ids_[i] < 0) continue;
+      (*this)[first + i / k_].offer_distinct(part.distances_[i], part.ids_[i]);
+    }
+  }
+
+ private:
+  std::size_t k_;
+  std::vector<std::int64_t> ids_;
+  std::vector<std::int32_t> distances_;
+};
+
+// Divides a search into ranges of queries times ranges of work (rows, or visits to lists).
 struct Division {
   std::size_t query_ranges = 1;
   std::size_t work_ranges = 1;
 
-  // Divides the queries first, as those of a range share the work on each row that does not depend
-  // on the query. If they are too few for all threads, divides the rows as well.
+  // Divides the queries first, as those of a range share the reading of each row, and the rows as
+  // well if the queries are too few for all threads.
   static Division of_rows(int threads, std::size_t queries, std::size_t rows) {
     constexpr std::size_t kQueries = 64, kRows = 4096;
     if (threads <= 1 || queries == 0) return {};
@@ -33,19 +125,12 @@ struct Division {
     const std::size_t work_ranges = std::min(divide_up(n, query_ranges), divide_up(rows, kRows));
     return {query_ranges, std::max<std::size_t>(work_ranges, 1)};
   }
-  // Divides only the visits to lists, as all queries that visit a list share the reading of it.
+  // Divides only the visits, as all queries that visit a list share the reading of it.
   static Division of_lists(int threads, std::size_t visits) {
     constexpr std::size_t kVisits = 64;
     if (threads <= 1) return {};
     return {1, std::clamp<std::size_t>(divide_up(visits, kVisits), 1,
                                        4 * static_cast<std::size_t>(threads))};
-  }
-
-  static Range range(std::size_t n, std::size_t ranges, std::size_t i) {
-    constexpr std::size_t kGrain = 16;
-    const std::size_t grains = divide_up(n, kGrain);
-    return {std::min(n, grains * i / ranges * kGrain),
-            std::min(n, grains * (i + 1) / ranges * kGrain)};
   }
 
  private:
@@ -60,20 +145,19 @@ void run_search(int threads, const Division& division, std::size_t work, Neighbo
   const std::size_t tasks = division.query_ranges * division.work_ranges;
   run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](std::size_t i) {
     if (tasks == 1) return scan(Range{0, nearest.queries()}, Range{0, work}, nearest);
-    const Range queries =
-        Division::range(nearest.queries(), division.query_ranges, i / division.work_ranges);
+    const std::size_t part_of_queries = i / division.work_ranges;
+    const Range queries = range_of(nearest.queries(), division.query_ranges, part_of_queries, 16);
     std::unique_lock lock(mutex);
     Neighbours part = nearest.part(queries);
     lock.unlock();
-    scan(queries, Division::range(work, division.work_ranges, i % division.work_ranges), part);
+    scan(queries, range_of(work, division.work_ranges, i % division.work_ranges, 16), part);
     lock.lock();
     nearest.merge(queries.begin, part);
   });
 }
 
-// Visits the hits of n queries among the rows of a chunk. kernel(first, n, limits, &block, hits)
-// scans for some queries from a block on. take(query, distance, row) gets the rows within
-// limit_of(query), which it may tighten.
+// Calls take(query, distance, row) for the rows of a chunk within limit_of(query), which `take` may
+// tighten. kernel(first, n, limits, &block, hits) scans for n queries from a block on.
 template <typename Kernel, typename LimitOf, typename Take>
 void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel& kernel,
               const LimitOf& limit_of, const Take& take) {

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cstring>
-#include <vector>
 
 #include "search/driver.h"
 
@@ -11,7 +10,7 @@ namespace {
 
 using kernels::kWordRows;
 
-// Packs some rows as kernels::PackedWords, the last word of each padded with zeros.
+// Packs rows as kernels::PackedWords, the last word of each padded with zeros.
 void pack(Descriptors database, Range rows, std::size_t words, std::uint64_t* packed) {
   const std::size_t rest = database.columns % 8;
   for (std::size_t i = 0; i < rows.size(); ++i) {
@@ -27,7 +26,7 @@ void pack(Descriptors database, Range rows, std::size_t words, std::uint64_t* pa
   }
 }
 
-void check(Descriptors queries, Descriptors database) {
+void check(Descriptors queries, Descriptors database, const HammingOptions& options) {
   if (queries.columns != database.columns) {
     invalid("queries have ", queries.columns, " bytes, the database has ", database.columns);
   }
@@ -35,13 +34,20 @@ void check(Descriptors queries, Descriptors database) {
     invalid("a descriptor has 1 to 4096 bytes, not ", queries.columns);
   }
   if (database.rows > UINT32_MAX) invalid("the database has over 2^32 rows");
+  if (!options.landmarks) return;
+  const std::span<const std::int64_t> landmarks = *options.landmarks;
+  if (landmarks.size() != database.rows) {
+    invalid("the database has ", database.rows, " rows, landmarks has ", landmarks.size());
+  }
+  for (const std::int64_t id : landmarks) {
+    if (id < 0) invalid("landmark ids must not be negative");
+  }
 }
 
-// Compares queries with some rows, and calls offer(neighbours of a query, distance, row).
-template <typename Offer>
-void scan(Descriptors queries, Descriptors database, Range rows, Neighbours& nearest,
-          const Offer& offer) {
-  // So much is packed and then compared with all queries, from the L1 cache.
+// Compares queries with some rows, whose landmarks are nullptr if ids are rows.
+void scan(Descriptors queries, Descriptors database, Range rows, const std::int64_t* landmarks,
+          Neighbours& nearest) {
+  // Bytes that are packed and then compared with all queries, from the L1 cache.
   constexpr std::size_t kChunkBytes = 16384;
   const std::size_t words = (queries.columns + 7) / 8;
   std::vector<std::uint64_t> query_words(queries.rows * words, 0);
@@ -64,52 +70,33 @@ void scan(Descriptors queries, Descriptors database, Range rows, Neighbours& nea
         },
         [&](std::size_t q) { return nearest.limit(q); },
         [&](std::size_t q, std::int32_t distance, std::size_t row) {
-          offer(nearest[q], distance, begin + row);
+          if (landmarks != nullptr) {
+            nearest[q].offer_distinct(distance, landmarks[begin + row]);
+          } else {
+            nearest[q].offer(distance, static_cast<std::int64_t>(begin + row));
+          }
         });
   }
-}
-
-template <typename Offer>
-Matches search(Descriptors queries, Descriptors database, std::size_t k,
-               const HammingOptions& options, const Offer& offer) {
-  check(queries, database);
-  Matches matches = room_for_answer(queries.rows, k, options.max_distance);
-  const auto bits = static_cast<std::int32_t>(8 * queries.columns);
-  const std::vector<std::int32_t> limits(queries.rows,
-                                         std::min(bits, options.max_distance.value_or(bits)));
-  Neighbours nearest(k, limits);
-  run_search(options.threads, Division::of_rows(options.threads, queries.rows, database.rows),
-             database.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
-               scan({queries.row(some.begin), some.size(), queries.columns}, database, rows, part,
-                    offer);
-             });
-  write_answer(nearest, {}, {}, 0, matches);
-  return matches;
 }
 
 }  // namespace
 
 Matches hamming_search(Descriptors queries, Descriptors database, std::size_t k,
                        const HammingOptions& options) {
-  return search(queries, database, k, options,
-                [](TopK best, std::int32_t distance, std::size_t row) {
-                  best.offer(distance, static_cast<std::int64_t>(row));
-                });
-}
-
-Matches hamming_search(Descriptors queries, Descriptors database,
-                       std::span<const std::int64_t> landmarks, std::size_t k,
-                       const HammingOptions& options) {
-  if (landmarks.size() != database.rows) {
-    invalid("the database has ", database.rows, " rows, landmarks has ", landmarks.size());
-  }
-  for (const std::int64_t id : landmarks) {
-    if (id < 0) invalid("landmark ids must not be negative");
-  }
-  return search(queries, database, k, options,
-                [&](TopK best, std::int32_t distance, std::size_t row) {
-                  best.offer_distinct(distance, landmarks[row]);
-                });
+  check(queries, database, options);
+  Matches matches = room_for_answer(queries.rows, k, options.max_distance);
+  const std::int64_t* landmarks = options.landmarks ? options.landmarks->data() : nullptr;
+  const auto bits = static_cast<std::int32_t>(8 * queries.columns);
+  const std::vector<std::int32_t> limits(queries.rows,
+                                         std::min(bits, options.max_distance.value_or(bits)));
+  Neighbours nearest(k, limits);
+  run_search(options.threads, Division::of_rows(options.threads, queries.rows, database.rows),
+             database.rows, nearest, [&](Range range, Range rows, Neighbours& part) {
+               scan({queries.row(range.begin), range.size(), queries.columns}, database, rows,
+                    landmarks, part);
+             });
+  write_answer(nearest, {}, {}, 0, matches);
+  return matches;
 }
 
 }  // namespace protomark

@@ -10,19 +10,20 @@ namespace {
 // Queries that go through the lists together, so that their visits take little memory.
 constexpr std::size_t kQueries = 1 << 14;
 
-// A sample of one block of centroids in kMinStep or more limits the distance of the nearest ones,
-// by that of about its kMaxRank-th nearest at most.
-constexpr std::size_t kMinStep = 16, kMaxRank = 64;
-// Up to so many lists a heap is faster than selection.
+// Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
+// which, or a nearer one, limits the distance.
+constexpr std::size_t kMinStep = 16, kMaxSampled = 64;
+// Up to this many lists a heap is faster than selection.
 constexpr std::size_t kFewProbes = 16;
-// Queries that are compared with the centroids together.
+// Queries that are compared with centroids together.
 constexpr std::size_t kBatch = 256;
 
-// What a query has found: distances above, indices of centroids below, so that the order of these
-// numbers decides ties.
+// The centroids that a query has found: distance in the upper bits, index in the lower ones, so
+// that ties go to the smaller index.
 using Found = std::vector<std::int64_t>;
 
-// The centroids against a batch of queries. For one thread.
+// Selects the lists nearest to a batch of queries, on one thread. (TopK is for a few neighbours;
+// these may be hundreds.)
 class Selection {
  public:
   // `found` has room for each query of the batch.
@@ -35,7 +36,6 @@ class Selection {
     for (Found& of_query : found_) of_query.clear();
   }
 
-  // Writes (queries x nprobe) indices.
   void nearest(std::size_t nprobe, std::uint32_t* to) {
     guess_limits(nprobe);
     const auto limit_of = [&](std::size_t q) { return limits_[q]; };
@@ -60,11 +60,10 @@ class Selection {
   }
 
  private:
-  // Sets limits that are likely to leave some more than `nprobe` centroids.
+  // Sets limits that probably leave a few more than `nprobe` centroids.
   void guess_limits(std::size_t nprobe) {
-    const std::size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxRank);
-    const std::size_t rank = nprobe * 3 / 2 / step + 5;
-    Neighbours sample(rank, limits_);
+    const std::size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
+    Neighbours sample(nprobe * 3 / 2 / step + 5, limits_);
     for (std::size_t row = 0; row < centroids_.rows; row += step * kPackedRows) {
       compare(
           row, std::min(kPackedRows, centroids_.rows - row),
@@ -108,7 +107,7 @@ struct Visit {
   std::uint32_t query;
 };
 
-// Returns those of a range of each query's `nprobe` nearest lists, sorted by list.
+// Returns the visits to a range of each query's `nprobe` nearest lists, sorted by list.
 std::vector<Visit> sorted_visits(const std::vector<std::uint32_t>& nearest, std::size_t nprobe,
                                  Range range, std::size_t nlist) {
   const std::size_t queries = nearest.size() / nprobe;
@@ -127,7 +126,7 @@ std::vector<Visit> sorted_visits(const std::vector<std::uint32_t>& nearest, std:
   return result;
 }
 
-void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, PrototypeScan& scan) {
+void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, PrototypeScan scan) {
   std::vector<std::uint32_t> blocks, queries;
   for (std::size_t i = 0; i < visits.size();) {
     const std::uint32_t list = visits[i].list;
@@ -181,9 +180,9 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
     for (const Range& range : {Range{0, 1}, Range{1, nprobe}}) {
       const std::vector<Visit> visits = sorted_visits(nearest_to, nprobe, range, lists.nlist());
       run_search(options.threads, Division::of_lists(options.threads, visits.size()), visits.size(),
-                 nearest, [&](Range all, Range some, Neighbours& part) {
-                   PrototypeScan scan(prototypes, prepared, all, part);
-                   scan_visits(lists, std::span(visits).subspan(some.begin, some.size()), scan);
+                 nearest, [&](Range all, Range work, Neighbours& part) {
+                   scan_visits(lists, std::span(visits).subspan(work.begin, work.size()),
+                               {prototypes, prepared, all, part});
                  });
     }
     write_answer(nearest, prepared.norms(), options, begin, matches);

@@ -1,21 +1,16 @@
 // Approximate search in the inverted lists whose centroids are nearest to a query.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
-#include <span>
-#include <vector>
-
 #include "search/list_blocks.h"
 #include "search/scan.h"
 
 namespace protomark {
 
-// A view of the blocks of each list: chained in a learning map, one after the other elsewhere.
+// A view of the blocks of each list, chained in a learning map, one after the other elsewhere.
 class InvertedLists {
  public:
   explicit InvertedLists(const ListBlocks& chained) : chained_(&chained) {}
-  // Rows of each list, and the first block of each list and the end.
+  // `rows` counts those of each list; `first_blocks` has the first block of each list, and the end.
   InvertedLists(std::span<const std::uint32_t> rows, std::span<const std::uint32_t> first_blocks)
       : rows_(rows), first_blocks_(first_blocks) {}
 
@@ -23,7 +18,7 @@ class InvertedLists {
   std::size_t rows(std::uint32_t list) const {
     return chained_ != nullptr ? chained_->rows(list) : rows_[list];
   }
-  // Sets `blocks` to those of a list, in order; all are full but the last one.
+  // Replaces `blocks` by those of a list, in order, all full but the last one.
   void read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const;
 
  private:
@@ -32,7 +27,7 @@ class InvertedLists {
   std::span<const std::uint32_t> first_blocks_;
 };
 
-// Returns (queries x nprobe) indices of the centroids that are nearest to each query, ties to the
+// Returns the indices of the centroids nearest to each query (queries x nprobe), ties to the
 // smaller, the nearest first, the others in no order. `nprobe` is 1 to the number of centroids.
 std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
                                          const PreparedCodes& queries, std::size_t nprobe,

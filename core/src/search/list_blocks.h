@@ -1,17 +1,13 @@
-// The inverted lists of a learning map: which rows are in which list.
+// The inverted lists of a learning map.
 #pragma once
 
 #include <algorithm>
-#include <cstddef>
-#include <cstdint>
-#include <vector>
 
 #include "search/packed.h"
 
 namespace protomark {
 
-// A list is a chain of blocks of kPackedRows rows, all full but the last one. So kernels scan it,
-// and it costs 12 bytes per block. No block is empty.
+// A list is a chain of blocks of kPackedRows rows, all full but the last one, which is not empty.
 class ListBlocks {
  public:
   static constexpr std::uint32_t kNone = UINT32_MAX;
@@ -22,7 +18,7 @@ class ListBlocks {
   std::size_t blocks() const { return list_.size(); }
   std::size_t rows(std::uint32_t list) const { return lists_[list].rows; }
   std::uint32_t list_of(Row row) const { return list_[row.value / kPackedRows]; }
-  // The row that came last into a list, which must not be empty.
+  // Returns the last row of a list that is not empty.
   Row last(std::uint32_t list) const {
     const List& l = lists_[list];
     return {static_cast<std::uint32_t>(l.last * kPackedRows + (l.rows - 1) % kPackedRows)};
@@ -47,12 +43,12 @@ class ListBlocks {
   void reserve(std::size_t blocks) {
     for (auto* v : {&list_, &previous_, &next_}) v->reserve(blocks);
   }
-  // Makes sure that the next append does not throw for want of memory.
+  // Makes sure that the next append cannot run out of memory.
   void make_room() {
     if (list_.size() < std::min({list_.capacity(), previous_.capacity(), next_.capacity()})) return;
     reserve(std::max<std::size_t>(16, 2 * list_.size()));
   }
-  // Adds a row to a list, which may be the first one of a new last block.
+  // Adds a row to a list, and returns it.
   Row append(std::uint32_t list) {
     List& l = lists_[list];
     if (l.rows++ % kPackedRows == 0) {
@@ -66,8 +62,8 @@ class ListBlocks {
     }
     return last(list);
   }
-  // Removes the last row of a list. If that empties its block, returns the block, where the caller
-  // must move the rows of the last of all blocks; else kNone.
+  // Removes the last row of a list. If that empties its block, returns that block, to which the
+  // caller must move the rows of the last of all blocks; else kNone.
   std::uint32_t pop(std::uint32_t list) {
     List& l = lists_[list];
     if (--l.rows % kPackedRows != 0) return kNone;
@@ -92,7 +88,7 @@ class ListBlocks {
     std::uint32_t rows = 0;
   };
   std::vector<List> lists_;
-  // Of each block: its list, and the blocks before and after it there.
+  // Of each block: its list, and the blocks before and after it in that.
   std::vector<std::uint32_t> list_, previous_, next_;
 };
 

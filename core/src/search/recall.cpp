@@ -8,8 +8,8 @@
 namespace protomark {
 namespace {
 
-// Moves codes as far as observations are from their prototypes, by 0.4 of the difference of two
-// others: that has 0.32 times the variance of all codes, observations have 0.2 to 0.5 times.
+// Moves codes about as far as observations are from their prototypes, by 0.4 of the difference of
+// two others, which has 0.32 times the variance of all codes; observations have 0.2 to 0.5 times.
 std::vector<std::int8_t> like_observations(Codes codes) {
   std::vector<std::int8_t> result(codes.rows * codes.columns);
   for (std::size_t i = 0; i < codes.rows; ++i) {
@@ -29,12 +29,12 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
                     const SearchTwo& search_two, const ListOf& list_of) {
   const std::size_t n = queries.rows, dim = queries.columns;
   const Matrix<std::int64_t> ids = search_two(queries).ids;
-  // The list of the landmark that a query looks for, and how far away its centroid is.
+  // The list of the landmark that a query searches for, and the distance of its centroid.
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
   std::vector<std::int32_t> limits(n, INT32_MIN);
   for (std::size_t q = 0; q < n; ++q) {
-    // If others are as near, the owner may come second, or not at all.
+    // If others are as near, the owner may be second, or not among the two.
     const std::int64_t nearest = ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0];
     if (nearest < 0) continue;
     lists[q] = list_of(nearest, queries.row(q));
@@ -44,7 +44,7 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
       limits[q] += centroid[d] * (centroid[d] - 2 * queries.row(q)[d]);
     }
   }
-  RecallTable table(n, 0);  // the lists up to that one
+  RecallTable table(n, 0);  // counts the lists up to that one
   const PackedPrototypes centroids = quantizer.packed();
   CodeScan(prepared, {0, n})
       .compare(
@@ -63,8 +63,8 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
 std::vector<std::size_t> test_rows(std::size_t rows) {
   const std::size_t n = std::min(rows, kTestQueries);
   std::vector<std::size_t> result(n);
-  // Multiples of the golden ratio are evenly spread, but in no step with the rows that lists are
-  // learned from.
+  // Multiples of the golden ratio are evenly spread, but not in step with the rows from which lists
+  // are learned.
   for (std::size_t i = 0; i < n; ++i) {
     const std::uint64_t x = (i + 1) * std::uint64_t{0x9e3779b97f4a7c15};
     result[i] = static_cast<std::size_t>((x >> 32) * rows >> 32);
@@ -88,7 +88,7 @@ RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& ow
 
 std::size_t nprobe_for(const RecallTable& table, double recall, std::size_t nlist) {
   if (recall >= 1 || table.empty()) return nlist;
-  // Add two standard errors, as the share that n test queries show is uncertain.
+  // Two standard errors more, as the share that n test queries show is uncertain.
   const auto n = static_cast<double>(table.size());
   const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
   if (enough > n) return nlist;

@@ -1,6 +1,7 @@
 #include "search/scan.h"
 
 #include <algorithm>
+#include <cstring>
 
 namespace protomark {
 namespace {
@@ -12,6 +13,59 @@ std::int32_t squared_norm(const std::uint8_t* code, std::size_t dim) {
 }
 
 }  // namespace
+
+static_assert(kPackedRows == kernels::kCodeRows);
+
+std::vector<CodeVector> pack_codes(Codes codes) {
+  std::vector<CodeVector> result(packed_size(codes.rows, codes.columns) / sizeof(CodeVector));
+  auto* to = reinterpret_cast<std::int8_t*>(result.data());
+  for (std::size_t row = 0; row < codes.rows; ++row) {
+    for (std::size_t d = 0; d < codes.columns; ++d) {
+      to[packed_index(row, d, codes.columns)] = codes.row(row)[d];
+    }
+  }
+  return result;
+}
+
+BlockReader::BlockReader(const PackedPrototypes& prototypes)
+    : data_(static_cast<const std::uint8_t*>(prototypes.data)),
+      dim_(prototypes.dim),
+      scale_(prototypes.scale),
+      block_bytes_(scale_ == 0 ? packed_size(kPackedRows, dim_) : packed4_size(kPackedRows, dim_)),
+      code_bytes_(packed_size(kPackedRows, dim_)) {}
+
+const std::int8_t* BlockReader::read(std::size_t first_block, std::size_t n) {
+  const std::uint8_t* stored = data_ + first_block * block_bytes_;
+  if (scale_ == 0) return reinterpret_cast<const std::int8_t*>(stored);
+  std::int8_t* codes = room(n);
+  copy(first_block, n, codes);
+  return codes;
+}
+
+const std::int8_t* BlockReader::read(std::span<const std::uint32_t> blocks) {
+  bool consecutive = true;
+  for (std::size_t i = 1; i < blocks.size(); ++i) {
+    consecutive = consecutive && blocks[i] == blocks[i - 1] + 1;
+  }
+  if (consecutive) return read(blocks[0], blocks.size());
+  std::int8_t* codes = room(blocks.size());
+  for (std::size_t i = 0; i < blocks.size(); ++i) copy(blocks[i], 1, codes + i * code_bytes_);
+  return codes;
+}
+
+void BlockReader::copy(std::size_t first_block, std::size_t n, std::int8_t* codes) const {
+  const std::uint8_t* stored = data_ + first_block * block_bytes_;
+  if (scale_ == 0) {
+    std::memcpy(codes, stored, n * block_bytes_);
+  } else {
+    kernels::active().code_unpack4(stored, n, dim_, scale_, codes);
+  }
+}
+
+std::int8_t* BlockReader::room(std::size_t blocks) {
+  room_.resize(std::max(room_.size(), blocks * code_bytes_ / sizeof(CodeVector)));
+  return reinterpret_cast<std::int8_t*>(room_.data());
+}
 
 PreparedCodes::PreparedCodes(Codes codes)
     : dim_(packed_dim(codes.columns)), codes_(codes.rows * dim_, 128) {
@@ -26,7 +80,7 @@ PreparedCodes::PreparedCodes(Codes codes)
 
 Neighbours PreparedCodes::neighbours(std::size_t k, const SearchOptions& options) const {
   std::vector<std::int32_t> limits(queries(), CodeScan::kNoLimit);
-  // With the ratio test, the second nearest counts at any distance.
+  // The ratio test needs the second nearest at any distance.
   if (options.max_distance && !options.ratio) {
     for (std::size_t q = 0; q < limits.size(); ++q) {
       limits[q] = std::min(limits[q], *options.max_distance - norms_[q]);
@@ -60,8 +114,8 @@ std::size_t CodeScan::chunk_rows() const {
 }
 
 void CodeScan::choose_prefix(std::size_t met) {
-  // Few queries wait for memory, which is read whole. The more rows were met, the nearer are the
-  // neighbours, and the fewer dimensions tell.
+  // Few queries wait for memory, which is read as a whole. The more rows were met, the nearer are
+  // the neighbours, and the fewer dimensions suffice.
   constexpr std::size_t kManyRows = std::size_t{1} << 18;
   if (n_ <= kernels::kFewQueries) return;
   const std::size_t eighths = met < kManyRows ? 6 : 5;
@@ -88,12 +142,13 @@ void PrototypeScan::scan(Range rows) {
   for (std::size_t row = rows.begin; row < rows.end; row += chunk_rows) {
     const std::size_t n = std::min(chunk_rows, rows.end - row);
     scan_.choose_prefix(row - rows.begin);
-    landmarks_.start_chunk(row, n);
+    chunk_ = {row, row + n};
+    of_chunk_.clear();
     scan_.compare(
         blocks_.read(row / kPackedRows, (n + kPackedRows - 1) / kPackedRows), n,
         [&](std::size_t q) { return nearest_.limit(q); },
         [&](std::size_t q, std::int32_t distance, std::size_t i) {
-          landmarks_.offer(nearest_[q], distance, {static_cast<std::uint32_t>(row + i)});
+          offer(nearest_[q], distance, row_at(row + i));
         });
   }
 }
@@ -109,8 +164,19 @@ void PrototypeScan::scan(std::span<const std::uint32_t> queries,
         blocks_.read(chunk), n, [&](std::size_t i) { return nearest_.limit(queries[i]); },
         [&](std::size_t i, std::int32_t distance, std::size_t at) {
           const std::size_t row = chunk[at / kPackedRows] * kPackedRows + at % kPackedRows;
-          landmarks_.offer(nearest_[queries[i]], distance, {static_cast<std::uint32_t>(row)});
+          offer(nearest_[queries[i]], distance, row_at(row));
         });
+  }
+}
+
+void PrototypeScan::count_chunk() {
+  const std::uint8_t* counts = landmarks_.row_counts;
+  while (counted_ + counts[landmark_.value] <= chunk_.begin) counted_ += counts[landmark_.value++];
+  LandmarkIndex landmark = landmark_;
+  std::size_t end = counted_ + counts[landmark.value];
+  for (std::size_t row = chunk_.begin; row < chunk_.end; ++row) {
+    if (row == end) end += counts[++landmark.value];
+    of_chunk_.push_back(landmark);
   }
 }
 

@@ -1,20 +1,12 @@
-// Queries against packed prototypes.
+// Compares queries with packed prototypes.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
-#include <span>
-#include <vector>
-
-#include "kernels/kernels.h"
-#include "protomark/search.h"
 #include "search/driver.h"
 #include "search/packed.h"
-#include "search/top_k.h"
 
 namespace protomark {
 
-// Queries as kernels take them: unsigned, padded to whole steps of 4 dimensions.
+// Queries as kernels take them: unsigned, padded to a multiple of 4 dimensions.
 class PreparedCodes {
  public:
   explicit PreparedCodes(Codes codes);
@@ -22,7 +14,7 @@ class PreparedCodes {
   std::size_t queries() const { return norms_.size(); }
   std::size_t dim() const { return dim_; }
   const std::uint8_t* operator[](std::size_t query) const { return codes_.data() + query * dim_; }
-  // Squared norms, which the distances of kernels lack.
+  // Squared norms, which the distances that kernels give lack.
   const std::vector<std::int32_t>& norms() const { return norms_; }
 
   // Returns room for the k nearest of each query, for two if the ratio test needs them.
@@ -34,29 +26,27 @@ class PreparedCodes {
   std::vector<std::int32_t> norms_;
 };
 
-// Compares queries with codes. For one thread.
+// Compares queries with codes, on one thread.
 class CodeScan {
  public:
-  // Beyond all distances without norms, whose magnitude is below 2^24.
+  // Above all distances without norms, whose magnitude is below 2^24.
   static constexpr std::int32_t kNoLimit = 1 << 25;
 
-  // Compares the queries of this range, which are counted from 0 from here on.
+  // Compares the queries of this range, whose indices begin with 0 here.
   CodeScan(const PreparedCodes& queries, Range range);
-  // Compares only these from now on.
+  // Compares only these of them from now on.
   void select(std::span<const std::uint32_t> queries);
 
-  // Rows to compare at a time, a multiple of 16. Many queries come back to them from the L2 cache;
-  // for few, rows should come from memory while the last ones are compared.
+  // Returns how many rows to compare at a time, a multiple of 16: many queries find them in the L2
+  // cache; for few, memory should deliver rows while earlier ones are compared.
   std::size_t chunk_rows() const;
 
-  // For scans of many rows, of which `met` were compared before: from now on a row is first
-  // compared over a prefix of the dimensions. Encoders put those first that tell most, so that the
-  // distance over them usually shows that a row is not among the nearest.
+  // Compares later rows first over a prefix of the dimensions, after `met` rows. Encoders put those
+  // that tell most first, so that they usually show that a row is not among the nearest.
   void choose_prefix(std::size_t met);
 
-  // Calls take(i, distance, row) for rows of a packed chunk that are within limit_of(i), for the
-  // i-th of the queries. Distances are squared and lack the query's norm, which does not change
-  // their order.
+  // Calls take(i, distance, row) for the rows of a packed chunk within limit_of(i) of the i-th
+  // query. Distances are squared and lack the query's norm, which does not change their order.
   template <typename LimitOf, typename Take>
   void compare(const std::int8_t* packed, std::size_t rows, const LimitOf& limit_of,
                const Take& take) {
@@ -86,19 +76,48 @@ class CodeScan {
   std::vector<std::int32_t> biases_, prefix_biases_;
 };
 
-// Offers the landmarks of rows to the places of queries. For one thread.
-class LandmarkReader {
+// Reads blocks of prototypes as int8 codes, on one thread.
+class BlockReader {
  public:
-  explicit LandmarkReader(const RowLandmarks& landmarks) : landmarks_(landmarks) {}
+  explicit BlockReader(const PackedPrototypes& prototypes);
 
-  // Announces the rows that come next. With RowLandmarks::row_counts, chunks must ascend.
-  void start_chunk(std::size_t first_row, std::size_t rows) {
-    first_row_ = first_row;
-    rows_ = rows;
-    of_chunk_.clear();
-  }
+  // Returns the codes of these blocks, one after the other, valid until the next call. sq4 numbers
+  // are unpacked into the cache, once for all queries.
+  const std::int8_t* read(std::size_t first_block, std::size_t n);
+  const std::int8_t* read(std::span<const std::uint32_t> blocks);
 
-  // Does nothing if the row is padding or its landmark not searched.
+ private:
+  void copy(std::size_t first_block, std::size_t n, std::int8_t* codes) const;
+  std::int8_t* room(std::size_t blocks);
+
+  const std::uint8_t* data_;
+  std::size_t dim_;
+  int scale_;
+  std::size_t block_bytes_;  // as stored
+  std::size_t code_bytes_;   // of a block as int8 codes
+  std::vector<CodeVector> room_;
+};
+
+// Finds the nearest landmarks of queries, on one thread.
+class PrototypeScan {
+ public:
+  // `nearest` are those of the queries of this range.
+  PrototypeScan(const PackedPrototypes& prototypes, const PreparedCodes& queries, Range range,
+                Neighbours& nearest)
+      : blocks_(prototypes),
+        landmarks_(prototypes.landmarks),
+        scan_(queries, range),
+        nearest_(nearest) {}
+
+  // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16. With
+  // RowLandmarks::row_counts, calls must ascend.
+  void scan(Range rows);
+  // Compares some queries with the `rows` rows of some blocks, all full but the last.
+  void scan(std::span<const std::uint32_t> queries, std::span<const std::uint32_t> blocks,
+            std::size_t rows);
+
+ private:
+  // Offers the landmark of a row to a query, unless the row is padding.
   void offer(TopK best, std::int32_t distance, Row row) {
     const LandmarkIndex landmark = landmark_of(row);
     if (landmark >= landmarks_.end) return;
@@ -112,60 +131,27 @@ class LandmarkReader {
       best.offer(distance, id);
     }
   }
-
- private:
   LandmarkIndex landmark_of(Row row) {
     if (!several_rows_) return {row.value};
     if (landmarks_.of_row != nullptr) return landmarks_.of_row[row.value];
     if (landmarks_.look_up) return landmarks_.look_up(row);
-    // Once neighbours are near, most chunks have no hits and need not be counted.
+    // Most chunks have no hits and need not be counted.
     if (of_chunk_.empty()) count_chunk();
-    return of_chunk_[row.value - first_row_];
+    return of_chunk_[row.value - chunk_.begin];
   }
+  void count_chunk();
 
-  void count_chunk() {
-    const std::uint8_t* counts = landmarks_.row_counts;
-    while (counted_ + counts[landmark_.value] <= first_row_) counted_ += counts[landmark_.value++];
-    LandmarkIndex landmark = landmark_;
-    std::size_t end = counted_ + counts[landmark.value];
-    for (std::size_t row = first_row_; row < first_row_ + rows_; ++row) {
-      if (row == end) end += counts[++landmark.value];
-      of_chunk_.push_back(landmark);
-    }
-  }
-
-  const RowLandmarks& landmarks_;
-  bool several_rows_ =
-      landmarks_.of_row != nullptr || landmarks_.row_counts != nullptr || landmarks_.look_up;
-  std::size_t first_row_ = 0;
-  std::size_t rows_ = 0;
-  std::vector<LandmarkIndex> of_chunk_;
-  LandmarkIndex landmark_;   // no row of the chunk is of an earlier one
-  std::size_t counted_ = 0;  // rows of earlier landmarks
-};
-
-// Keeps the nearest landmarks of queries. For one thread.
-class PrototypeScan {
- public:
-  // Neighbours of the queries of this range.
-  PrototypeScan(const PackedPrototypes& prototypes, const PreparedCodes& queries, Range range,
-                Neighbours& nearest)
-      : blocks_(prototypes),
-        landmarks_(prototypes.landmarks),
-        scan_(queries, range),
-        nearest_(nearest) {}
-
-  // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16.
-  void scan(Range rows);
-  // Compares some queries with the `rows` rows of some blocks, all of them full but the last.
-  void scan(std::span<const std::uint32_t> queries, std::span<const std::uint32_t> blocks,
-            std::size_t rows);
-
- private:
   BlockReader blocks_;
-  LandmarkReader landmarks_;
+  const RowLandmarks& landmarks_;
   CodeScan scan_;
   Neighbours& nearest_;
+  bool several_rows_ =
+      landmarks_.of_row != nullptr || landmarks_.row_counts != nullptr || landmarks_.look_up;
+  // With RowLandmarks::row_counts.
+  Range chunk_{};
+  std::vector<LandmarkIndex> of_chunk_;  // the landmarks of its rows
+  LandmarkIndex landmark_;               // no row of the chunk is of an earlier one
+  std::size_t counted_ = 0;              // rows of earlier landmarks
 };
 
 // Compares all queries with all prototypes.

@@ -1,4 +1,4 @@
-"""The libraries that Protomark is measured beside; each is imported only if it is installed."""
+"""The peers of Protomark; each library is imported only if it is installed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 
-# Module -> distribution.
+# Distributions by module.
 DISTRIBUTIONS = {
     "torch": "torch",
     "onnxruntime": "onnxruntime",
@@ -19,12 +19,12 @@ DISTRIBUTIONS = {
 
 
 def installed(*modules: str) -> bool:
-    """Whether all these modules are there."""
+    """Whether all these modules are installed."""
     return all(find_spec(module) is not None for module in modules)
 
 
 def missing() -> list[str]:
-    """A sentence for each peer that is not there, with what installs it."""
+    """A sentence per peer that is not installed, with the command that installs it."""
     return [
         f"{distribution} is not installed (pip install {distribution})"
         for module, distribution in DISTRIBUTIONS.items()
@@ -34,9 +34,9 @@ def missing() -> list[str]:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """While entered, every peer that has a setting of its own computes on so many threads.
+    """Set the number of threads of every peer with a global setting, inside the context.
 
-    ONNX Runtime, hnswlib and USearch take theirs with each session or call.
+    ONNX Runtime, hnswlib and USearch take theirs per session or call.
     """
     from threadpoolctl import threadpool_limits
 

@@ -1,4 +1,4 @@
-"""FAISS: exact search, graphs, inverted lists."""
+"""FAISS: exact search, graphs and inverted lists."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from protomark_bench.speed.peers.index import (
 _TRAINING_ROWS = 64  # per inverted list
 _GRAPH_LISTS = 65_536
 _GRAPH_TRAINING_ROWS = 39  # per list, as many as FAISS takes without a warning
-_SQ8 = faiss.ScalarQuantizer.QT_8bit_direct_signed  # int8 as it is: nothing is lost
-_M, _EF = 16, 200  # as hnswlib's own; FAISS's are 32 and 40
+_SQ8 = faiss.ScalarQuantizer.QT_8bit_direct_signed  # int8 without loss
+_M, _EF = 16, 200  # hnswlib's defaults; FAISS's are 32 and 40
 
 
 def flat(rows: NDArray[np.int8], queries: NDArray[np.int8]) -> Search:
@@ -62,7 +62,7 @@ def hnsw(rows: NDArray[np.int8], asked: IndexQueries, *, cache: IndexCache) -> T
 
 
 def scalar_quantizer(rows: NDArray[np.int8], asked: IndexQueries) -> TunableIndex:
-    """Inverted lists of the rows as they are, 8 bits a dimension."""
+    """Inverted lists of the int8 rows, 8 bits per dimension."""
     nlist, dim = _nlist(len(rows)), rows.shape[1]
     quantizer = faiss.IndexFlatL2(dim)
     by_residual = False  # residuals are not int8
@@ -77,7 +77,7 @@ def scalar_quantizer(rows: NDArray[np.int8], asked: IndexQueries) -> TunableInde
 
 
 def product_quantizer(rows: NDArray[np.int8], asked: IndexQueries, *, parts: int) -> TunableIndex:
-    """Inverted lists of 4-bit codes of so many parts (fast scan), refined by whole rows."""
+    """Inverted lists of 4-bit codes of these parts (fast scan), refined by whole rows."""
     nlist, dim = _nlist(len(rows)), rows.shape[1]
     base = faiss.IndexIVFPQFastScan(faiss.IndexFlatL2(dim), dim, nlist, parts, 4)
     refine = faiss.IndexScalarQuantizer(dim, _SQ8, faiss.METRIC_L2)
@@ -96,17 +96,16 @@ def product_quantizer(rows: NDArray[np.int8], asked: IndexQueries, *, parts: int
 def lists_by_graph(
     rows: NDArray[np.int8], asked: IndexQueries, *, cache: IndexCache
 ) -> TunableIndex:
-    """65,536 lists, found by a graph, as FAISS's guide has it from a million rows on.
+    """65,536 lists that a graph finds, as FAISS's guide recommends from a million rows on.
 
-    Clustering finds centroids by a graph, too: a k-means that compares all with all takes an hour
-    on two cores.
+    Clustering finds centroids by a graph, too, as an exhaustive k-means takes an hour on two cores.
     """
     dim = rows.shape[1]
 
     def build() -> Any:
         coarse = faiss.IndexHNSWFlat(dim, 32)
         base = faiss.IndexIVFPQFastScan(coarse, dim, _GRAPH_LISTS, dim, 4)
-        base.quantizer_trains_alone = 2  # clusters first, then adds the centroids to the graph
+        base.quantizer_trains_alone = 2  # cluster first, then add the centroids to the graph
         finder = faiss.IndexHNSWFlat(dim, 32)  # FAISS does not keep it alive
         base.clustering_index = finder
         index = faiss.IndexRefine(base, faiss.IndexScalarQuantizer(dim, _SQ8, faiss.METRIC_L2))
@@ -131,7 +130,8 @@ def lists_by_graph(
 def _refined(first: int, last: int) -> list[list[tuple[int, int]]]:
     """Lines of (nprobe, k_factor).
 
-    The most thorough comes first: once it has found enough, others are left where they take longer.
+    The most thorough line comes first: once it reaches the goal, slower settings of the others are
+    skipped.
     """
     return [[(nprobe, factor) for nprobe in doubling(first, last)] for factor in (256, 64, 16, 4)]
 
@@ -170,7 +170,7 @@ def _cached(
 
 
 def _nlist(n: int) -> int:
-    """Four times the root, as FAISS's guide has it for up to a million rows."""
+    """Four times the root, as FAISS's guide recommends up to a million rows."""
     return max(min(int(4 * sqrt(n)), n // _TRAINING_ROWS), 1)
 
 

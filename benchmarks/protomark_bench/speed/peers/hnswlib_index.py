@@ -17,11 +17,11 @@ from protomark_bench.speed.peers.index import (
     doubling,
 )
 
-_M, _EF = 16, 200  # its defaults
+_M, _EF = 16, 200  # the defaults
 
 
 def hnsw(rows: NDArray[np.int8], asked: IndexQueries, *, cache: IndexCache) -> TunableIndex:
-    """The graph, from the cache if it is there."""
+    """The graph, from the cache or new."""
     n, dim = rows.shape
 
     def build() -> hnswlib.Index:

@@ -1,4 +1,4 @@
-"""An approximate index of a peer, as the bench sees it, and a cache of those that take long."""
+"""The interface of peers' approximate indexes, and a cache for those that take long to build."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from protomark.files import write_text
 
 T = TypeVar("T")
 
+# Returns the rows (n,) nearest to the first n queries, -1 for none.
 Search = Callable[[int], NDArray[np.int64]]
-"""Rows nearest to each of the first n queries, (n,), -1 where nothing was found."""
 
-K = 2  # neighbours that every search asks for, as a ratio test needs them
+K = 2  # neighbours in every search, as a ratio test needs two
 
 
 @dataclass(frozen=True)
 class IndexQueries:
-    """What an index is asked, and on how many threads.
+    """Queries, and numbers of threads.
 
     Attributes:
         codes: (q, dim) int8.
-        threads: of a search.
-        build_threads: of building.
+        threads: threads to search on.
+        build_threads: threads to build on.
     """
 
     codes: NDArray[np.int8]
@@ -41,23 +41,23 @@ class IndexQueries:
 
     @cached_property
     def floats(self) -> NDArray[np.float32]:
-        """(q, dim) the same as float32."""
+        """(q, dim) float32, the same queries."""
         return self.codes.astype(np.float32)
 
 
 @dataclass
 class TunableIndex:
-    """Built, and ready to be searched with any of its settings.
+    """An index that is built, and can be searched at any of its settings.
 
     Attributes:
-        prepare: makes the search of a setting.
-        settings: lines of settings, as `approximate.tune` takes them; a number n: one line,
-            1, 2, 3, 4, 6, 8, ... n.
-        bytes: of the whole index, as it would be stored.
-        setting: the name of the setting.
-        note: how it was built.
-        more: bytes per landmark beyond what an exact search needs, where that is known.
-        seconds: that it took to build, if not as long as the call that gave it.
+        prepare: returns the search at a setting.
+        settings: lines of settings for `approximate.tune`; a number n: the line 1, 2, 3, 4, 6, 8,
+            ... n.
+        bytes: bytes of the whole index when stored.
+        setting: name of the setting.
+        note: how the index was built.
+        more: bytes per landmark beyond those of an exact search, None if unknown.
+        seconds: seconds to build it; None: those of the call that returned it.
     """
 
     prepare: Callable[[Any], Search]
@@ -75,7 +75,7 @@ class TunableIndex:
 
 
 def doubling(first: int, last: int) -> list[int]:
-    """first, 2 first, ... up to last, with a step in between each."""
+    """The numbers first, 2 first, ... up to last, and one between each two."""
     values = [first]
     while values[-1] < last:
         values += [max(values[-1] * 3 // 2, values[-1] + 1), values[-1] * 2]
@@ -83,7 +83,7 @@ def doubling(first: int, last: int) -> list[int]:
 
 
 class IndexCache:
-    """A folder of indexes, named by what they are built from; None: every index is built anew."""
+    """A folder of indexes by the digest of their content; None: every index is built anew."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = folder
@@ -97,15 +97,15 @@ class IndexCache:
         write: Callable[[T, Path], None],
         read: Callable[[Path], T],
     ) -> tuple[T, float]:
-        """An index of `rows` (n, d), and the seconds that it took to build, now or once.
+        """An index of `rows` (n, d), and the seconds that it took to build.
 
         Args:
-            label: what distinguishes it from other indexes of the same rows, parameters included.
-            distribution: the package that builds it; another version builds its own.
-            rows: what is in it.
-            build: makes it.
-            write: stores it.
-            read: loads what `write` stored.
+            label: kind and parameters of the index.
+            distribution: the package that builds it, whose version counts, too.
+            rows: the content of the index.
+            build: builds the index.
+            write: writes the index.
+            read: reads an index that `write` wrote.
 
         Raises:
             OSError: the folder cannot be written.
@@ -116,7 +116,7 @@ class IndexCache:
         key = hashlib.sha256(f"{label} {version(distribution)} {rows.shape}".encode())
         key.update(np.ascontiguousarray(rows).data)
         path = self._folder / f"{distribution}-{key.hexdigest()[:16]}"
-        # Written last: an index without it was cut short.
+        # This file is written last, so an index without it is incomplete.
         facts = path.with_suffix(".json")
         if facts.exists():
             return read(path), float(json.loads(facts.read_text())["seconds"])

@@ -1,4 +1,4 @@
-"""An encoder's network in floating point, as its peers compute it."""
+"""An encoder's network in floating point, for peers to compute."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class FloatLayer:
     Attributes:
         weights: (out, in) float32.
         bias: (out,) float32.
-        step, middle: an 8-bit pre-activation q stands for step * q + middle.
-        unit, zero: an 8-bit activation a stands for unit * (a - zero); 1 and 0 after the last one.
+        step, middle: an 8-bit pre-activation q means step * q + middle.
+        unit, zero: an 8-bit activation a means unit * (a - zero); 1 and 0 after the last layer.
     """
 
     weights: NDArray[np.float32]
@@ -32,7 +32,7 @@ class FloatLayer:
 
 
 def float_layers(encoder: pm.Encoder, dim: int) -> list[FloatLayer]:
-    """The layers of an encoder cut to `dim`, in real numbers: bits 0 and 1 in, code units out."""
+    """The layers of an encoder, cut to `dim`, as real numbers from bits 0 and 1 to code units."""
     result = []
     unit, zero = 1.0, 0
     for layer in encoder.layers:
@@ -59,7 +59,7 @@ def float_layers(encoder: pm.Encoder, dim: int) -> list[FloatLayer]:
 
 
 def bits_of(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, B) -> (n, 8 B) of 0 and 1, least significant bit first."""
+    """Bits (n, 8 B) of descriptors (n, B), least significant bit first."""
     return np.unpackbits(descriptors, axis=1, bitorder="little")
 
 
@@ -69,10 +69,10 @@ def selu(x: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _fit(table: NDArray[np.uint8]) -> tuple[float, float, float, int]:
-    """Step, middle, unit and zero of the 8-bit SELU that the table holds.
+    """Step, middle, unit and zero of the 8-bit SELU in a table.
 
-    The table is selu(step * q + middle) for q from -128 to 127, spread over 0 to 255: a search over
-    the two ends of its range, each time finer.
+    The table is selu(step * q + middle) for q from -128 to 127, scaled to 0 to 255. A search that
+    becomes finer with each pass finds both ends of its range.
     """
     q = np.arange(-128, 128)
     low, high, reach = -2.5, 10.0, np.array([2.5, 9.5])

@@ -1,4 +1,4 @@
-"""The network in ONNX Runtime: float32, and int8 in the ways that it offers."""
+"""The network in ONNX Runtime: float32, and int8, static and dynamic."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Model = Any  # onnx.ModelProto, which has no types
 
 
 def float_model(layers: list[FloatLayer]) -> Model:
-    """Gemm and Selu: bits (n, bits) float32 -> codes (n, dim) float32."""
+    """Gemm and Selu, from bits (n, bits) float32 to codes (n, dim) float32."""
     graph = _OnnxGraph()
     x = "input"
     for i, layer in enumerate(layers):
@@ -29,10 +29,10 @@ def float_model(layers: list[FloatLayer]) -> Model:
 
 
 def static_model(layers: list[FloatLayer]) -> Model:
-    """Statically quantised, in QDQ form, which ONNX Runtime fuses to QGemm.
+    """A statically quantised network in QDQ form, which ONNX Runtime fuses to QGemm.
 
-    Bits (n, bits) uint8 -> codes (n, dim) int8, at the very scales of our integer encoder: int8
-    weights with a scale for each output, uint8 activations.
+    It maps bits (n, bits) uint8 to codes (n, dim) int8 with the scales of our integer encoder: int8
+    weights with a scale per output, and uint8 activations.
     """
     graph = _OnnxGraph()
     scale, zero = 1.0, 0
@@ -68,7 +68,7 @@ def static_model(layers: list[FloatLayer]) -> Model:
                 TensorProto.UINT8,
                 TensorProto.INT8,
             )
-        # Between the layers: to 8 bits, SELU in float, to 8 bits.
+        # Between layers values are quantised to 8 bits before and after SELU in float.
         offset = 128 - round(layer.middle / layer.step)
         between = graph.scale(layer.step, min(max(offset, 0), 255), np.uint8)
         x = graph.node("QuantizeLinear", [x, *between])
@@ -82,7 +82,7 @@ def static_model(layers: list[FloatLayer]) -> Model:
 
 
 def dynamic_model(layers: list[FloatLayer]) -> Model:
-    """Quantised as it runs: MatMulInteger, SELU in float; bits uint8 -> codes float32."""
+    """A dynamically quantised network, from bits uint8 to codes float32."""
     graph = _OnnxGraph()
     x, scale, zero = "input", "", ""
     for i, layer in enumerate(layers):

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from protomark_bench.speed.peers.index import IndexQueries, K, Search, TunableIndex, doubling
 
-_PART = (1 << 18) - 1  # rows that BFMatcher takes in one piece
+_PART = (1 << 18) - 1  # BFMatcher's limit on rows per piece
 _KDTREE, _LSH = 1, 6
 
 
 def brute_force(rows: NDArray[np.uint8], queries: NDArray[np.uint8]) -> Search:
-    """BFMatcher with Hamming distance; answers are rows."""
+    """BFMatcher with Hamming distance."""
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
     matcher.add([rows[begin : begin + _PART] for begin in range(0, len(rows), _PART)])
 
@@ -41,7 +41,7 @@ def kd_trees(rows: NDArray[np.int8], asked: IndexQueries) -> TunableIndex:
 def lsh(rows: NDArray[np.uint8], queries: NDArray[np.uint8]) -> TunableIndex:
     """FLANN's locality-sensitive hashing on bits.
 
-    Its setting is how many bits of a key may differ, and belongs to the index.
+    The setting is the number of bits of a key that may differ; each setting has its own index.
     """
     indexes = {
         level: cv2.flann.Index(
@@ -68,7 +68,7 @@ def _search(index: Any, queries: NDArray[Any], checks: int) -> Search:
 
 
 def _bytes(index: Any) -> int:
-    """Size as saved, without the rows that are searched."""
+    """Size of the saved index, without the rows."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "index"
         index.save(str(path))

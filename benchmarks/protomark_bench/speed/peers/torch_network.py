@@ -12,7 +12,7 @@ from protomark_bench.speed.peers.network import FloatLayer
 
 
 def network(layers: list[FloatLayer]) -> torch.nn.Module:
-    """Bits (n, bits) float32 -> codes (n, dim) float32."""
+    """The network from bits (n, bits) float32 to codes (n, dim) float32."""
     modules: list[torch.nn.Module] = []
     for i, layer in enumerate(layers):
         linear = torch.nn.Linear(layer.weights.shape[1], layer.weights.shape[0])

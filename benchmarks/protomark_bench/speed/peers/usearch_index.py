@@ -18,13 +18,13 @@ from protomark_bench.speed.peers.index import (
     doubling,
 )
 
-_CONNECTIVITY, _EXPANSION = 16, 200  # as thorough as the other graphs; its own default is 128
+_CONNECTIVITY, _EXPANSION = 16, 200  # as in the other graphs; the default expansion is 128
 
 
 def hnsw(
     rows: NDArray[np.int8], asked: IndexQueries, *, dtype: str, cache: IndexCache
 ) -> TunableIndex:
-    """The graph over the rows as they are ("i8") or as float32 ("f32")."""
+    """The graph over the rows as int8 ("i8") or float32 ("f32")."""
     queries: NDArray[Any] = asked.codes if dtype == "i8" else asked.floats
 
     def build() -> Graph:
@@ -46,7 +46,7 @@ def hnsw(
     def read(path: Path) -> Graph:
         index = Graph.restore(str(path))
         if index is None:
-            raise OSError(f"{path}: no index of USearch")
+            raise OSError(f"{path}: not an index of USearch, delete it")
         return index
 
     label = f"{dtype}, {_CONNECTIVITY}, {_EXPANSION}"

@@ -1,4 +1,4 @@
-// Scalar quantization to 4 bits: u, 0 to 15, means the level scale * (2 u - 15).
+// Rounds means of codes to int8, and numbers to 4 bits.
 #pragma once
 
 #include <algorithm>
@@ -9,6 +9,26 @@
 
 namespace protomark {
 
+// Returns sum / n rounded to the nearest integer, halves away from zero.
+template <typename Integer>
+std::int8_t rounded_mean(Integer sum, Integer n) {
+  const Integer magnitude = (2 * std::abs(sum) + n) / (2 * n);
+  return static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
+}
+
+// Computes the same for `dim` sums, without divisions; n is 1 to 255 and no sum beyond 127 n. With
+// 1/2 added, no quotient is nearer to an integer than its own error, 2^-23 of itself.
+inline void rounded_means(const std::int16_t* sums, int n, std::size_t dim, std::int8_t* means) {
+  const float reciprocal = 1.0f / static_cast<float>(2 * n);
+  for (std::size_t d = 0; d < dim; ++d) {
+    const int sum = sums[d];
+    const auto twice = static_cast<float>(2 * (sum < 0 ? -sum : sum) + n);
+    const auto magnitude = static_cast<int>((twice + 0.5f) * reciprocal);
+    means[d] = static_cast<std::int8_t>(sum < 0 ? -magnitude : magnitude);
+  }
+}
+
+// Scalar quantization to 4 bits: u, 0 to 15, means the level scale * (2 u - 15).
 inline constexpr int kMaxScale = 8;  // 15 * 8 is the last multiple of 15 that int8 holds
 
 // Returns the u whose level is nearest to `value`, ties away from zero and for zero upwards.
