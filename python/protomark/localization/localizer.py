@@ -74,7 +74,8 @@ class Localizer:
         if not _has_positions(self.scene):
             raise ValueError(
                 f"none of the map's {len(self.scene)} landmarks has a position, so images cannot "
-                "be localized in it: set positions with `set_positions`, or build the map from tracks"
+                "be localized in it: set positions with `set_positions`, or build the map from "
+                "tracks"
             )
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
