@@ -11,7 +11,7 @@ cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 .PHONY: help demo bench test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads \
-  sanitize-python-memory sanitize-python-threads coverage fuzz torture check format clean
+  sanitize-python-memory sanitize-python-threads coverage fuzz torture check docs format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick')"
@@ -21,7 +21,8 @@ help:
 	@echo "make coverage  print the lines of the core that its C++ tests run"
 	@echo "make fuzz      feed mutated files to every reader of the core (FUZZ_SECONDS=60 each)"
 	@echo "make torture   kill savers, fill disks (KILLS=600)"
-	@echo "make check     formatting, lint and types of both languages"
+	@echo "make check     formatting, lint and types of both languages, links of the docs"
+	@echo "make docs      build the site of the docs into build/site"
 	@echo "make format    rewrite sources in the project's format"
 
 demo: .venv/installed
@@ -120,7 +121,12 @@ KILLS ?= 600
 torture: .venv/installed
 	.venv/bin/python tests/torture/run.py --kills $(KILLS)
 
-check: .venv-check/installed
+# Strict: dead links and anchors, pages out of the navigation and absent snippets are errors.
+docs: .venv-check/installed
+	NO_MKDOCS_2_WARNING=1 .venv-check/bin/mkdocs build --strict
+	.venv-check/bin/python -m pytest --quiet tests/test_docs.py -k links
+
+check: .venv-check/installed docs
 	.venv-check/bin/ruff format --check
 	.venv-check/bin/ruff check
 	cp .venv-check/lib/python3*/site-packages/protomark/_*.pyi python/protomark/
@@ -167,5 +173,5 @@ clean:
 .venv-check/installed: $(SOURCES)
 	test -x .venv-check/bin/python || $(PYTHON) -m venv .venv-check
 	.venv-check/bin/pip install --quiet -c constraints.txt cmake ninja ruff mypy clang-format clang-tidy
-	.venv-check/bin/pip install --quiet -c constraints.txt '.[test,train]'
+	.venv-check/bin/pip install --quiet -c constraints.txt '.[test,docs]'
 	touch $@

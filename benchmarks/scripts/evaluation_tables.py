@@ -1,9 +1,10 @@
-"""Writes the tables of docs/evaluation.md and of the encoders' cards from an evaluation's JSON.
+"""Writes the tables of docs/results/evaluation.md and of the encoders' cards.
 
 python benchmarks/scripts/evaluation_tables.py [RESULTS.json ...]
 
 Without arguments: from all benchmarks/results/evaluation.*.json, which `protomark evaluate --json`
 wrote. Methods of one sequence may come from several files; of the same method the last file counts.
+Every figure of every sequence stays in these files.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ from pathlib import Path
 from protomark.evaluation.methods import method_choices
 from protomark.evaluation.results import (
     SequenceResult,
-    evaluation_markdown,
     load_json,
     mean_rows,
     save_precision_plot,
+    summary_markdown,
 )
 from protomark.files import write_text
 from protomark_bench.report import ReportTable, number
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
-DOCUMENT = ROOT / "docs" / "evaluation.md"
+DOCUMENT = ROOT / "docs" / "results" / "evaluation.md"
 MODELS = ROOT / "python" / "protomark" / "models"
 DIMS = (8, 16, 32, 64)
 SPLITS = {
@@ -166,7 +167,7 @@ def main() -> None:
     parts = []
     for descriptor in dict.fromkeys(result.descriptor for result in results):
         same = [result for result in results if result.descriptor == descriptor]
-        parts += [f"### {descriptor.upper()}", precision_table(same, list(COLUMNS)).markdown()]
+        parts += [f"## {descriptor.upper()}", precision_table(same, list(COLUMNS)).markdown()]
         tests = [result for result in same if split_of(result.sequence) == "test"]
         if tests:
             title = f"{descriptor.upper()}: mean of {', '.join(r.sequence for r in tests)}"
@@ -174,18 +175,14 @@ def main() -> None:
                 mean_rows(tests), DOCUMENT.parent / f"precision.{descriptor}.png", title
             )
             parts += [ratio_table(tests), f"![{title}](precision.{descriptor}.png)"]
+            parts += [f"### {title}", summary_markdown(mean_rows(tests)).rstrip()]
             replace_tables(MODELS / f"{descriptor}.md", card_text(tests))
         upright = RESULTS / f"upright.{descriptor}.json"
         if upright.is_file():
             table = upright_table(same, load_json(upright))
-            parts += [f"#### Cameras that do not roll: `{descriptor}-upright`", table]
+            parts += [f"### Cameras that do not roll: `{descriptor}-upright`", table]
             card = MODELS / f"{descriptor}-upright.md"
             replace_tables(card, f"## Beside the plain encoder\n\n{table}")
-    parts.append("### Every figure")
-    for split, members in SPLITS.items():
-        chosen = [result for result in results if result.sequence in members]
-        if chosen:
-            parts.append(f"**Split: {split}**\n\n{evaluation_markdown(chosen).rstrip()}")
     replace_tables(DOCUMENT, "\n\n".join(parts))
 
 

@@ -8,8 +8,9 @@ query counts as found where the nearest landmark of the exact search, or one as 
 
 Rounds: each sequence's observations come in the order of its keyframes, in ten parts. Drift: one
 half of the sequences replaces the other. Inverted lists are learned in the first round and never
-again. Prints the tables of docs/index.md, and how far observations are from their landmark's
-prototype, as a share of the variance of prototypes: the core moves its test queries by as much.
+again. Prints the tables of docs/results/large-maps.md, and how far observations are from their
+landmark's prototype, as a share of the variance of prototypes: the core moves its test queries by
+as much.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Builds the map of every tracks file as `protomark build` does and localizes the 
 *other* sequences in it: whatever pose comes out is wrong. Frames of the same sequence are localized
 in maps of the other nine tenths of their keyframes and of the earlier half: such a pose is right if
 it is off by at most 5 % of the median depth of its landmarks and 5 degrees. Prints the table of
-docs/localization.md.
+docs/results/localization.md.
 
 With --fit, the weights of `protomark.localization.confidence` are fitted to the frames and maps of
 the named sequences and printed. The table always uses the weights in the package.

@@ -181,7 +181,7 @@ def localize_halves(
 
 
 def main() -> None:
-    """Prints the table of docs/localization.md."""
+    """Prints the table of docs/results/localization.md."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tracks", type=Path)
     parser.add_argument("--calibrate", type=Path, nargs="+", required=True)

@@ -6,7 +6,7 @@ Keyframes of the later half of each sequence are localized in a map of the earli
 random tenth in a map of the other nine. The calibration is fitted to the other sequences. Precision
 and recall are those of accepted matches over all keypoints; a pose is found if it is off by at most
 1 % of the median scene depth and 2 degrees. Then the same fit, to maps of 8 bits a number, on maps
-of 4 bits and of several appearances per landmark. Prints the tables of docs/localization.md.
+of 4 bits and of several appearances per landmark. Prints tables of docs/results/localization.md.
 """
 
 from __future__ import annotations
