@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import protomark as pm
+from protomark import _core
 
 # Less likely matches are not accepted. Chosen on the training and validation sequences
 # (docs/localization.md).
@@ -39,6 +40,7 @@ def match(
     min_probability: float = MIN_PROBABILITY,
     threads: int = 1,
     recall: float | None = None,
+    among: ArrayLike | None = None,
 ) -> Matches:
     """The landmarks that the keypoints of a frame see.
 
@@ -47,14 +49,13 @@ def match(
         descriptors: (n, bits / 8) uint8.
         min_probability: of an accepted match.
         threads: threads to encode and search on.
-        recall: see `search`.
+        recall, among: see `search`.
 
     Raises:
-        ValueError: the map's encoder was not calibrated, or the descriptors are not its own.
+        ValueError: the map's encoder was not calibrated, the descriptors are not its own, or
+            `min_probability` is not 0 to 1.
     """
-    calibration = scene.encoder.match_calibration(scene.dim)
-    ids, distances = scene.search(descriptors, k=2, threads=threads, recall=recall)
-    return accept(ids[:, 0], calibration.probability(distances), min_probability)
+    return Matches(*_core.match(scene, descriptors, min_probability, threads, recall, among))
 
 
 def accept(
@@ -69,8 +70,4 @@ def accept(
         probabilities: (n,) float64, that it is the right one.
         min_probability: of an accepted match.
     """
-    order = np.argsort(-probabilities, kind="stable")
-    order = order[(nearest[order] >= 0) & (probabilities[order] >= min_probability)]
-    _, best = np.unique(nearest[order], return_index=True)
-    kept = order[np.sort(best)]
-    return Matches(kept, nearest[kept], probabilities[kept])
+    return Matches(*_core.accept(nearest, probabilities, min_probability))
