@@ -58,8 +58,8 @@ void test_refused() {
   const int three[] = {2, 2, 2};
   for (const cv::Mat& wrong : {cv::Mat(2, 8, CV_32F), cv::Mat(2, 8, CV_8S), cv::Mat(2, 8, CV_8UC3),
                                cv::Mat(3, three, CV_8U)}) {
-    CHECK(
-        check::throws<std::invalid_argument>([&] { MatDescriptors{wrong}; }, "CV_8UC1 with 2 dimensions is needed, not CV_"));
+    CHECK(check::throws<std::invalid_argument>([&] { MatDescriptors{wrong}; },
+                                               "CV_8UC1 with 2 dimensions is needed, not CV_"));
   }
 }
 

@@ -49,7 +49,8 @@ def match(
         descriptors: (n, bits / 8) uint8.
         min_probability: of an accepted match.
         threads: threads to encode and search on.
-        recall, among: see `search`.
+        recall: see `search`.
+        among: landmarks to search, as in `search`.
 
     Raises:
         ValueError: the map's encoder was not calibrated, the descriptors are not its own, or
