@@ -26,20 +26,20 @@ nb::object probability(const MatchCalibration& calibration, nb::handle distances
   return to_numpy(std::move(result));
 }
 
-nb::tuple to_numpy(MatchList matches) {
+nb::tuple arrays_of(MatchList matches) {
   const std::size_t n = matches.size();
   return nb::make_tuple(to_array<std::int64_t>(std::move(matches.keypoints), {n}),
                         to_numpy(std::move(matches.landmarks)),
                         to_numpy(std::move(matches.probabilities)));
 }
 
-constexpr char kMatchSignature[] =
-    "def match(scene: PrototypeMap | SealedMap, descriptors: NDArray[numpy.uint8], "
-    "min_probability: float, threads: int, recall: float | None, among: ArrayLike | None) -> "
-    "tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.float64]]";
-
 template <typename Map>
-void bind_match(nb::module_& m) {
+void bind_match(nb::module_& m, const std::string& type) {
+  const std::string signature =
+      "def match(scene: " + type +
+      ", descriptors: NDArray[numpy.uint8], min_probability: float, threads: int, "
+      "recall: float | None, among: ArrayLike | None) -> "
+      "tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.float64]]";
   m.def(
       "match",
       [](const Map& map, nb::object array, double min_probability, int threads,
@@ -51,10 +51,10 @@ void bind_match(nb::module_& m) {
           searched = ids_or_mask(map, *among);
           options.among = searched;
         }
-        return to_numpy(without_gil([&] { return match(map, view(d), options); }));
+        return arrays_of(without_gil([&] { return match(map, view(d), options); }));
       },
       "scene"_a, "descriptors"_a, "min_probability"_a, "threads"_a, "recall"_a.none(),
-      "among"_a.none(), nb::sig(kMatchSignature),
+      "among"_a.none(), nb::sig(signature.c_str()),
       "See protomark.matching.match: keypoints, landmarks and probabilities.");
 }
 
@@ -107,14 +107,14 @@ keypoint's landmark is in the map at all. Where there is no second landmark, s i
         return std::string("MatchCalibration(") +
                nb::repr(nb::make_tuple(c.weights[0], c.weights[1], c.weights[2])).c_str() + ")";
       });
-  bind_match<PrototypeMap>(m);
-  bind_match<SealedMap>(m);
+  bind_match<PrototypeMap>(m, "PrototypeMap");
+  bind_match<SealedMap>(m, "SealedMap");
   m.def(
       "accept",
       [](nb::object nearest, nb::object probabilities, double min_probability) {
         const auto ids = landmark_ids(nearest);
         const auto p = nb::cast<Array1<double>>(float64(probabilities));
-        return to_numpy(accept(view(ids), view(p), min_probability));
+        return arrays_of(accept(view(ids), view(p), min_probability));
       },
       "nearest"_a, "probabilities"_a, "min_probability"_a,
       nb::sig("def accept(nearest: NDArray[numpy.int64], probabilities: NDArray[numpy.float64], "

@@ -77,7 +77,7 @@ def test_probabilities_are_as_defined() -> None:
 def test_matches_are_as_defined(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     # Steep enough that many probabilities are 1, so that rows decide.
-    calibration = MatchCalibration((-1.0, -1e-4, 5e-3))
+    calibration = MatchCalibration((2.0, -0.05, 2.0))
     encoder = with_calibration(encoder, {12: calibration}, "made up")
     ids = rng.permutation(10_000)[:500]
     bits = rng.integers(0, 256, (500, encoder.bits // 8)).astype(np.uint8)
@@ -123,7 +123,7 @@ def test_bad_input(encoder: pm.Encoder) -> None:
         pm.match(scene, frame, among=[7])
     with pytest.raises(ValueError, match="mask"):
         pm.match(scene, frame, among=np.zeros(3, bool))
-    with pytest.raises(ValueError, match="no index"):
+    with pytest.raises(ValueError, match="recall needs an index"):
         pm.match(scene, frame, recall=0.9)
     with pytest.raises(ValueError, match="1 probabilities do not fit 2 landmarks"):
         accept(np.array([1, 2]), np.array([0.5]))
