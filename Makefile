@@ -10,12 +10,13 @@ JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo bench test test-python test-cpp test-arm sanitize sanitize-memory sanitize-threads \
+.PHONY: help demo bench test test-python test-cpp test-cpp-bridges test-arm sanitize sanitize-memory sanitize-threads \
   sanitize-python-memory sanitize-python-threads coverage fuzz torture check docs format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick')"
 	@echo "make test      run the tests (C++ and Python)"
+	@echo "make test-cpp-bridges  run the C++ tests and examples that need OpenCV and Eigen"
 	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
 	@echo "make sanitize  run the tests of the core under sanitizers (memory, undefined behaviour, threads)"
 	@echo "make coverage  print the lines of the core that its C++ tests run"
@@ -39,15 +40,26 @@ test-python: .venv-test/installed .venv-test/bench
 	.venv-test/bin/python -m pytest
 
 test-cpp: .venv-test/installed
-	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON > /dev/null
+	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \
+	  -DPROTOMARK_TEST_BRIDGES=OFF -DCMAKE_DISABLE_FIND_PACKAGE_OpenCV=ON > /dev/null
 	.venv-test/bin/cmake --build build/core -j$(JOBS)
 	.venv-test/bin/ctest --test-dir build/core --output-on-failure
 	# The installed library, as another project finds it.
 	.venv-test/bin/cmake --install build/core --prefix build/prefix > /dev/null
 	$(call cmake,.venv-test) -S core/examples -B build/consumer \
-	  -DCMAKE_PREFIX_PATH=$(abspath build/prefix) > /dev/null
+	  -DCMAKE_PREFIX_PATH=$(abspath build/prefix) -DCMAKE_DISABLE_FIND_PACKAGE_OpenCV=ON > /dev/null
 	.venv-test/bin/cmake --build build/consumer
-	build/consumer/01_build_and_search python/protomark/models/freak.pme build
+	.venv-test/bin/ctest --test-dir build/consumer --output-on-failure
+
+# protomark/opencv.h and protomark/eigen.h, and the examples with OpenCV's PnP.
+test-cpp-bridges: .venv-test/installed
+	@pkg-config --exists opencv4 eigen3 || { \
+	  echo "make test-cpp-bridges needs: apt-get install libopencv-dev libeigen3-dev"; exit 1; }
+	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \
+	  -DPROTOMARK_TEST_BRIDGES=ON -DCMAKE_DISABLE_FIND_PACKAGE_OpenCV=OFF > /dev/null
+	.venv-test/bin/cmake --build build/core -j$(JOBS) --target test_opencv test_eigen 04_relocalize
+	.venv-test/bin/ctest --test-dir build/core --output-on-failure \
+	  -R '^(opencv|eigen|example_04_relocalize)$$'
 
 # 64-bit ARM, NEON included, by Debian's cross compiler and qemu-user.
 test-arm: .venv-test/installed

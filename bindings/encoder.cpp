@@ -8,6 +8,7 @@
 #include <map>
 
 #include "module.h"
+#include "protomark/matching.h"
 
 namespace protomark::python {
 namespace {
@@ -128,6 +129,16 @@ Raises:
     TypeError: descriptors are not (n, bits / 8) uint8.
     ValueError: they are of another size than the encoder's, dim is none of `dims`, or threads is
         below 1.)")
+      .def(
+          "match_calibration",
+          [](const Encoder& encoder, std::optional<std::size_t> dim) {
+            return MatchCalibration::of(encoder, dim.value_or(0));
+          },
+          "dim"_a = nb::none(),
+          nb::sig("def match_calibration(self, dim: int | None = None) -> MatchCalibration"),
+          "How likely a match is right, by the distances to the two nearest landmarks, for codes "
+          "of `dim` numbers, one of `dims` (None: the full length). Raises ValueError if the "
+          "encoder was not calibrated for codes of this length.")
       .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor.")
       .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
       .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")

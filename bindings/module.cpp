@@ -68,6 +68,7 @@ NB_MODULE(_core, m) {
   bind_encoder(m);
   bind_sealed_map(m);
   bind_prototype_map(m);
+  bind_matching(m);
   bind_hamming(m);
   bind_files(m);
 }

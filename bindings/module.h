@@ -32,6 +32,7 @@ void bind_encoder(nb::module_& m);
 void bind_prototype_map(nb::module_& m);
 void bind_sealed_map(nb::module_& m);
 void bind_hamming(nb::module_& m);
+void bind_matching(nb::module_& m);
 void bind_files(nb::module_& m);
 
 }  // namespace protomark::python

@@ -36,17 +36,22 @@ QUICK = {"build", "info", "localize", "merge", "seal", "split"}
 # Commands of protomark-bench, which need not be installed here.
 BENCH = {"bench", "evaluate-mapping", "reproduce"}
 # What the fragments of C++ may use.
-PREAMBLE = """#include <memory>
+PREAMBLE = """#include <cmath>
+#include <memory>
+#include <optional>
 #include <span>
+#include <vector>
 #include "protomark/protomark.h"
 namespace pm = protomark;
-namespace cv {
-struct Mat {
-  int rows, cols;
-  template <typename T> const T* ptr() const;
-};
-}
+struct Pose {};
+struct Pixel {};
+std::optional<Pose> pnp(const std::vector<pm::Position>&, const std::vector<Pixel>&);
 """
+# What a header needs that not every machine has.
+OPTIONAL = {
+    "protomark/opencv.h": Path("/usr/include/opencv4"),
+    "protomark/eigen.h": Path("/usr/include/eigen3"),
+}
 
 
 def blocks(page: Path, *languages: str) -> list[tuple[str, str]]:
@@ -182,7 +187,11 @@ def test_cpp_compiles(page: Path, tmp_path: Path) -> None:
         whole = "int main" in text
         source = tmp_path / f"block{i}.cpp"
         source.write_text(text if whole else PREAMBLE + text)
-        options = ["-std=c++20", "-Wall", f"-I{ROOT / 'core' / 'include'}", str(source)]
+        needed = [folder for header, folder in OPTIONAL.items() if header in text]
+        if not all(folder.is_dir() for folder in needed):
+            continue
+        include = [f"-I{ROOT / 'core' / 'include'}", *(f"-isystem{folder}" for folder in needed)]
+        options = ["-std=c++20", "-Wall", *include, str(source)]
         if not (whole and library.is_file()):
             subprocess.run([compiler, "-fsyntax-only", *options], check=True)
             continue

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import protomark as pm
@@ -19,11 +17,10 @@ from protomark.match_calibration import (
     SOURCE_KEY,
     MatchCalibration,
     fit_logistic,
-    parse,
     sigmoid,
     with_calibration,
 )
-from protomark.matching import MIN_PROBABILITY, accept
+from protomark.matching import MIN_PROBABILITY
 from protomark.tracks.file import Tracks
 from protomark.training.match_calibration import matches_by_dim, measure_calibration
 
@@ -64,21 +61,6 @@ def test_probability() -> None:
     assert len(calibration.probability(np.zeros((0, 2)))) == 0
 
 
-@given(st.lists(st.tuples(st.integers(-1, 5), st.floats(0, 1)), max_size=30))
-def test_accepted_are_the_likeliest_of_each_landmark(rows: list[tuple[int, float]]) -> None:
-    nearest = np.array([r[0] for r in rows], np.int64)
-    probability = np.array([r[1] for r in rows])
-    found = accept(nearest, probability, 0.3)
-    best = {
-        landmark: max(p for n, p in rows if n == landmark)
-        for landmark, p in rows
-        if landmark >= 0 and p >= 0.3
-    }
-    assert dict(zip(found.landmarks.tolist(), found.probabilities.tolist(), strict=True)) == best
-    assert (np.diff(found.probabilities) <= 0).all()
-    assert (nearest[found.keypoints] == found.landmarks).all()
-
-
 def test_the_note_changes_neither_identity_nor_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
     fitted = {5: MatchCalibration((1.0, -2.5, 3e-7)), 12: MatchCalibration((0.0, 1.0, 12345.6))}
     with_calibration(encoder, fitted, "here, there").save(tmp_path / "x.pme")
@@ -99,9 +81,12 @@ def test_without_a_note_the_error_says_what_to_do(encoder: pm.Encoder) -> None:
 
 
 @pytest.mark.parametrize("note", ["8 1 2", "8 1 2 3 4", "8 1 2 nan", "8 1 2 x", "\n"])
-def test_broken_notes(note: str) -> None:
+def test_broken_notes(note: str, encoder: pm.Encoder) -> None:
+    broken = pm.Encoder(
+        encoder.layers, encoder.dims, "tiny", "test", encoder.scale, notes={KEY: note}
+    )
     with pytest.raises(ValueError, match="note on match_calibration is broken"):
-        parse(note)
+        MatchCalibration.of(broken, 5)
 
 
 @pytest.mark.parametrize("name", models.names())
@@ -119,13 +104,6 @@ def test_what_ships_is_calibrated_and_as_its_card_says(name: str) -> None:
         near, far = encoder.match_calibration(dim).probability([[1, 10_000], [9801, 10_000]])
         assert near > 0.8
         assert near - far > 0.3
-
-
-def test_an_older_map_takes_over_what_the_encoder_that_ships_says() -> None:
-    ships = pm.Encoder.load("orb")
-    old = pm.Encoder(ships.layers, ships.dims, "orb", "orb", ships.scale)
-    assert KEY not in old.notes
-    assert MatchCalibration.of(old, 16) == MatchCalibration.of(ships, 16)
 
 
 def test_probabilities_hold_on_a_sequence_that_they_were_not_fitted_to() -> None:

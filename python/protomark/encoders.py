@@ -1,15 +1,11 @@
-"""Encoder methods beyond the core: loading bundled models, and match calibration."""
+"""Loads bundled encoders by name."""
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
 
 from protomark._core import Encoder as Encoder
 from protomark.models import resolve
-
-if TYPE_CHECKING:
-    from protomark.match_calibration import MatchCalibration
 
 _load_file = Encoder.load
 
@@ -24,21 +20,5 @@ def load(source: str | os.PathLike[str]) -> Encoder:
     return _load_file(resolve(source))
 
 
-def match_calibration(self: Encoder, dim: int | None = None) -> MatchCalibration:
-    """The calibration that turns distances to the two nearest landmarks into a probability.
-
-    Args:
-        self: the encoder.
-        dim: length of a code, one of `dims`; None: the full length.
-
-    Raises:
-        ValueError: the encoder was not calibrated for codes of this length.
-    """
-    from protomark.match_calibration import MatchCalibration
-
-    return MatchCalibration.of(self, dim)
-
-
-# The stub of the core declares both methods (bindings/stub_patterns.txt).
+# The stub of the core declares it (bindings/stub_patterns.txt).
 setattr(Encoder, "load", staticmethod(load))  # noqa: B010
-setattr(Encoder, "match_calibration", match_calibration)  # noqa: B010

@@ -9,66 +9,20 @@ them (`protomark.training.match_calibration`), and the model file stores the fit
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 import protomark as pm
+from protomark._core import MatchCalibration as MatchCalibration
 
 KEY = "match_calibration"
 SOURCE_KEY = "match_calibration_data"
 # The squared distance that search returns where there is no landmark.
 NO_DISTANCE = np.iinfo(np.int32).max
-_WEIGHTS = 3
 # Keeps weights finite if the features separate right from wrong completely.
 _RIDGE = 1e-4
 _STEPS = 50
-
-
-@dataclass(frozen=True)
-class MatchCalibration:
-    """P(right) = 1 / (1 + exp(-(w0 + w1 d^2 + w2 (s^2 - d^2)))).
-
-    d and s are the distances to the nearest and to the second nearest landmark, in code units.
-    Training makes exp(-distance^2 / T) the likelihood of a landmark (Snell et al., Prototypical
-    Networks, NeurIPS 2017), so the margin between two landmarks is a difference of squares, while d
-    alone tells whether the keypoint's landmark is in the map. Without a second landmark s is 2 d.
-
-    Attributes:
-        weights: w0, w1, w2.
-    """
-
-    weights: tuple[float, ...]
-
-    def probability(self, distances: ArrayLike) -> NDArray[np.float64]:
-        """Probabilities (n,) float64 that the nearest landmarks are right, 0 where there is none.
-
-        Args:
-            distances: (n, k) squared distances with k >= 2, as `search` returns them.
-        """
-        nearest, second = np.asarray(distances, np.float64)[:, :2].T
-        present = nearest < NO_DISTANCE
-        x = calibration_features(np.where(present, nearest, 0.0), second)
-        return np.where(present, sigmoid(self.weights[0] + x @ np.array(self.weights[1:])), 0.0)
-
-    @classmethod
-    def of(cls, encoder: pm.Encoder, dim: int | None = None) -> MatchCalibration:
-        """The calibration in an encoder's model file for codes of `dim` numbers (None: all).
-
-        An encoder without a calibration has that of the bundled encoder with the same identity.
-
-        Raises:
-            ValueError: the encoder was never calibrated for codes of this length.
-        """
-        dim = dim or encoder.dim
-        fitted = parse(encoder.notes.get(KEY, "")) or parse(_bundled_note(encoder))
-        if dim not in fitted:
-            raise ValueError(
-                f"encoder '{encoder.name}' has no match calibration for codes of {dim} numbers: "
-                "run `protomark calibrate MODEL TRACKS...` and build the map with that model"
-            )
-        return fitted[dim]
 
 
 def calibration_features(
@@ -76,27 +30,6 @@ def calibration_features(
 ) -> NDArray[np.float64]:
     """Features (n, 2) of squared distances (n,): d^2 and s^2 - d^2."""
     return np.column_stack([nearest, np.where(second < NO_DISTANCE, second, 4 * nearest) - nearest])
-
-
-def parse(note: str) -> dict[int, MatchCalibration]:
-    """Read the note in a model file, whose lines hold a code length and the weights.
-
-    Raises:
-        ValueError: the note is broken.
-    """
-    fitted = {}
-    for line in note.splitlines():
-        try:
-            dim, *weights = line.split()
-            values = tuple(float(w) for w in weights)
-            if len(values) != _WEIGHTS or not np.isfinite(values).all():
-                raise ValueError
-            fitted[int(dim)] = MatchCalibration(values)
-        except ValueError:
-            raise ValueError(
-                f"the model's note on {KEY} is broken, calibrate it anew: {line[:80]!r}"
-            ) from None
-    return fitted
 
 
 def with_calibration(
@@ -122,15 +55,6 @@ def with_calibration(
         encoder.licence,
         {**encoder.notes, KEY: "\n".join(lines), SOURCE_KEY: source},
     )
-
-
-def _bundled_note(encoder: pm.Encoder) -> str:
-    from protomark.models import names
-
-    if encoder.name not in names():
-        return ""
-    bundled = pm.Encoder.load(encoder.name)
-    return bundled.notes.get(KEY, "") if bundled.identity == encoder.identity else ""
 
 
 def fit_logistic(

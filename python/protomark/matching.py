@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import protomark as pm
+from protomark import _core
 
 # Smallest probability of an accepted match, chosen on the training and validation sequences.
 MIN_PROBABILITY = 0.2
@@ -38,6 +39,7 @@ def match(
     min_probability: float = MIN_PROBABILITY,
     threads: int = 1,
     recall: float | None = None,
+    among: ArrayLike | None = None,
 ) -> Matches:
     """Match the keypoints of a frame with the landmarks of a map.
 
@@ -47,16 +49,16 @@ def match(
         min_probability: smallest probability of an accepted match, in [0, 1].
         threads: threads to encode and search on.
         recall: share of nearest landmarks to find by approximate search; None: exact search.
+        among: landmarks to search, as in `search`.
 
     Returns:
         The accepted matches: each landmark has the likeliest of its keypoints only.
 
     Raises:
-        ValueError: the map's encoder was not calibrated, or takes other descriptors.
+        ValueError: the map's encoder was not calibrated or takes other descriptors, or
+            `min_probability` is not 0 to 1.
     """
-    calibration = scene.encoder.match_calibration(scene.dim)
-    ids, distances = scene.search(descriptors, k=2, threads=threads, recall=recall)
-    return accept(ids[:, 0], calibration.probability(distances), min_probability)
+    return Matches(*_core.match(scene, descriptors, min_probability, threads, recall, among))
 
 
 def accept(
@@ -71,8 +73,4 @@ def accept(
         probabilities: (n,) float64, the probability that it is right.
         min_probability: smallest probability of an accepted match.
     """
-    order = np.argsort(-probabilities, kind="stable")
-    order = order[(nearest[order] >= 0) & (probabilities[order] >= min_probability)]
-    _, best = np.unique(nearest[order], return_index=True)
-    rows = order[np.sort(best)]
-    return Matches(rows, nearest[rows], probabilities[rows])
+    return Matches(*_core.accept(nearest, probabilities, min_probability))

@@ -24,7 +24,6 @@ from protomark.localization.prior import PosePrior, visible
 from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
 from protomark.maps.cameras import map_cameras
 from protomark.maps.open import open_map
-from protomark.match_calibration import MatchCalibration
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
@@ -80,7 +79,7 @@ class Localizer:
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
-        self.calibration = MatchCalibration.of(self.scene.encoder, self.scene.dim)
+        self.calibration = self.scene.encoder.match_calibration(self.scene.dim)
         self._extractors = threading.local()
 
     def localize(

@@ -114,7 +114,7 @@ class Prototypes(Memory):
         self.map = pm.PrototypeMap(encoder, dim, appearance_bits)
         self.calibration: MatchCalibration | None = None
         with contextlib.suppress(ValueError):
-            self.calibration = MatchCalibration.of(encoder, dim)
+            self.calibration = encoder.match_calibration(dim)
 
     def encode(self, descriptors: NDArray[np.uint8]) -> NDArray[Any]:
         """See `Memory.encode`."""

@@ -1,0 +1,106 @@
+#include "protomark/matching.h"
+
+#include <algorithm>
+#include <cmath>
+#include <functional>
+#include <locale>
+#include <sstream>
+#include <string>
+#include <unordered_set>
+
+#include "base/text.h"
+
+namespace protomark {
+namespace {
+
+// The note has a line for each length of codes: the length and three weights.
+constexpr char kNote[] = "match_calibration";
+
+std::optional<MatchCalibration> read_note(const std::string& note, std::size_t dim) {
+  std::optional<MatchCalibration> found;
+  std::istringstream lines(note);
+  for (std::string line; std::getline(lines, line);) {
+    std::istringstream in(line);
+    in.imbue(std::locale::classic());
+    std::size_t length = 0;
+    MatchCalibration calibration;
+    in >> length;
+    for (double& weight : calibration.weights) in >> weight;
+    std::string rest;
+    if (in.fail() || in >> rest) {
+      invalid("the model's note on ", kNote, " is broken: '", line.substr(0, 80), "'");
+    }
+    if (length == dim) found = calibration;
+  }
+  return found;
+}
+
+template <typename Map>
+MatchList match_with(const Map& map, Descriptors descriptors, const MatchOptions& options) {
+  if (!(options.min_probability >= 0 && options.min_probability <= 1)) {
+    invalid("min_probability must be 0 to 1, not ", options.min_probability);
+  }
+  const auto calibration = MatchCalibration::of(*map.encoder(), map.dim());
+  SearchOptions search;
+  search.recall = options.recall;
+  search.among = options.among;
+  search.threads = options.threads;
+  const auto [ids, distances] = map.search(descriptors, 2, search);
+  std::vector<std::int64_t> nearest(ids.rows);
+  std::vector<double> probabilities(ids.rows);
+  for (std::size_t i = 0; i < ids.rows; ++i) {
+    nearest[i] = ids.row(i)[0];
+    probabilities[i] = calibration.probability(distances.row(i)[0], distances.row(i)[1]);
+  }
+  return accept(nearest, probabilities, options.min_probability);
+}
+
+}  // namespace
+
+MatchCalibration MatchCalibration::of(const Encoder& encoder, std::size_t dim) {
+  if (dim == 0) dim = encoder.dim();
+  for (const auto& [key, note] : encoder.info().notes) {
+    if (key != kNote) continue;
+    if (const auto found = read_note(note, dim)) return *found;
+  }
+  invalid("encoder '", encoder.info().name, "' has no match calibration for codes of ", dim,
+          " numbers: run `protomark calibrate MODEL TRACKS...` and build the map with that model");
+}
+
+double MatchCalibration::probability(double nearest, double second) const {
+  if (nearest >= INT32_MAX) return 0;
+  const double margin = (second < INT32_MAX ? second : 4 * nearest) - nearest;
+  const double x = weights[0] + weights[1] * nearest + weights[2] * margin;
+  const double e = std::exp(-std::abs(x));  // at most 1, so that nothing overflows
+  return (x >= 0 ? 1 : e) / (1 + e);
+}
+
+MatchList accept(std::span<const std::int64_t> nearest, std::span<const double> probabilities,
+                 double min_probability) {
+  if (nearest.size() != probabilities.size()) {
+    invalid(probabilities.size(), " probabilities do not fit ", nearest.size(), " landmarks");
+  }
+  std::vector<std::size_t> order;
+  for (std::size_t i = 0; i < nearest.size(); ++i) {
+    if (nearest[i] >= 0 && probabilities[i] >= min_probability) order.push_back(i);
+  }
+  std::ranges::stable_sort(order, std::greater(), [&](std::size_t i) { return probabilities[i]; });
+  MatchList result;
+  std::unordered_set<std::int64_t> matched;
+  for (const std::size_t i : order) {
+    if (!matched.insert(nearest[i]).second) continue;
+    result.keypoints.push_back(i);
+    result.landmarks.push_back(nearest[i]);
+    result.probabilities.push_back(probabilities[i]);
+  }
+  return result;
+}
+
+MatchList match(const PrototypeMap& map, Descriptors descriptors, const MatchOptions& options) {
+  return match_with(map, descriptors, options);
+}
+MatchList match(const SealedMap& map, Descriptors descriptors, const MatchOptions& options) {
+  return match_with(map, descriptors, options);
+}
+
+}  // namespace protomark
