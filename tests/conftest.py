@@ -1,4 +1,4 @@
-"""What many tests share: a small encoder with random weights, its codes, and the command."""
+"""Fixtures that tests share: a small encoder with random weights, its codes, and the command."""
 
 from __future__ import annotations
 

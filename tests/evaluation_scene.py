@@ -1,4 +1,4 @@
-"""A made scene with everything known: landmarks with noisy descriptors, cameras all round."""
+"""A synthetic scene: landmarks with noisy descriptors, and cameras around them."""
 
 from __future__ import annotations
 

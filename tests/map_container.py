@@ -1,4 +1,4 @@
-"""Files of docs/format.md taken apart and put together, without Protomark."""
+"""Reads and writes the container of docs/format.md without Protomark."""
 
 from __future__ import annotations
 

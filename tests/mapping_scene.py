@@ -1,4 +1,4 @@
-"""A room of three textured walls at different depths, walked past by a camera."""
+"""A room of three textured walls at different depths, and a camera that walks past them."""
 
 from __future__ import annotations
 

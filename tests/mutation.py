@@ -1,4 +1,4 @@
-"""Broken files on purpose, from seeds, and what a reader may need to refuse them."""
+"""Files broken at random from seeds, and limits on the readers that refuse them."""
 
 from __future__ import annotations
 

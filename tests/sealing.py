@@ -1,4 +1,4 @@
-"""Sealed maps of 4 bits per number: how to ask for them, and their numbers, by docs/format.md."""
+"""Helpers for sealed maps of 4 bits per number, written from docs/format.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several prototypes per landmark: exact under any history, searched exactly, merged by cost."""
+"""Several prototypes per landmark: exact after any change, searched exactly, merged by cost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command as users meet it: help, build, info, and errors in one sentence."""
+"""The command line: help, build, info, and errors in one sentence."""
 
 from __future__ import annotations
 

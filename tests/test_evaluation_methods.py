@@ -1,4 +1,4 @@
-"""Every baseline against a plain rendering of its definition."""
+"""Every baseline, compared with a plain implementation of its definition."""
 
 from __future__ import annotations
 

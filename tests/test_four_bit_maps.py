@@ -1,4 +1,4 @@
-"""Sealed maps of 4 bits per number, against what docs/format.md says, in NumPy."""
+"""Sealed maps of 4 bits per number, compared with docs/format.md in NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Approximate search: all lists give the exact answer, whatever happened to the map."""
+"""Approximate search: all inverted lists together give the exact answer after any change."""
 
 from __future__ import annotations
 

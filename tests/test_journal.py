@@ -1,4 +1,4 @@
-"""Journals: what was committed is there, whatever happens to the process or the file's end."""
+"""Journals: a commit survives a killed process and a truncated file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where images were taken: rendered images in maps made of others, good and bad ones."""
+"""Poses of rendered images in maps of other images, with good and bad queries."""
 
 from __future__ import annotations
 

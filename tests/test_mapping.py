@@ -1,4 +1,4 @@
-"""`protomark map` as a user runs it, on rendered images: results, going on, and bad input."""
+"""`protomark map` on rendered images: results, resuming, and bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Structure, culling, merging and loops on simulated frames, where every answer is known."""
+"""Structure, culling, merging and loops on simulated frames with true poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What maps say of themselves, and which encoder they are of."""
+"""Metadata of maps, and the encoder that a map belongs to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Thousands of broken model and map files: refused by name, or read without harm."""
+"""Thousands of broken model and map files: refused with their name, or read without harm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Invariant 1: prototypes are exact under any history of changes."""
+"""Invariant 1: prototypes are exact after any sequence of changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps that many share: joined from shards, split into parts, asked while they change."""
+"""Maps shared by several threads and processes: merged, split, searched while they change."""
 
 from __future__ import annotations
 

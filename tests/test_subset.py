@@ -1,4 +1,4 @@
-"""A search among some landmarks answers as a map of these alone would."""
+"""Search among a subset of landmarks, compared with a map of only these."""
 
 from __future__ import annotations
 

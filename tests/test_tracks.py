@@ -1,4 +1,4 @@
-"""Tracks of a rendered scene, whose landmarks must lie on the plane that was rendered."""
+"""Tracks of a rendered plane, on which all landmarks must lie."""
 
 from __future__ import annotations
 

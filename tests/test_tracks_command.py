@@ -1,4 +1,4 @@
-"""`protomark tracks` as a user runs it: results, skipping, and what it says of bad input."""
+"""`protomark tracks`: results, skipping of finished work, and errors on bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks from a COLMAP database that holds binary descriptors, and its model."""
+"""Tracks from a COLMAP database with binary descriptors and from its model."""
 
 from __future__ import annotations
 

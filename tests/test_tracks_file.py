@@ -1,4 +1,4 @@
-"""What a tracks file may say: everything else is refused, with the file's name and the field's."""
+"""Tracks files: anything invalid is refused with the names of the file and the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Doubles of a landmark merge into one; neighbours and misfits do not."""
+"""Duplicates of a landmark merge; neighbours and outliers do not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A textured plane under known cameras, rendered through any COLMAP camera model."""
+"""A textured plane and its cameras, rendered through any COLMAP camera model."""
 
 from __future__ import annotations
 

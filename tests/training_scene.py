@@ -1,4 +1,4 @@
-"""Synthetic tracks: landmarks with a look of their own, under a nuisance that all of them share.
+"""Synthetic tracks: each landmark has a descriptor, distorted by a nuisance that all share.
 
 The nuisance moves more bits than the identity does, so a projection that keeps the directions of
 most variance (PCA) keeps the wrong ones, and an encoder that learns from tracks can do better.

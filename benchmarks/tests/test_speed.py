@@ -1,4 +1,4 @@
-"""`protomark bench`: what it measures on, how it chooses and reports; never how fast."""
+"""`protomark bench`: its data, choices and report; no test depends on speed."""
 
 from __future__ import annotations
 

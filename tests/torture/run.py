@@ -1,13 +1,13 @@
-"""Kill savers, limit files and fill disks: what was saved is there, old or new, whole.
+"""Kills saving processes, limits file sizes and fills disks; the map must stay whole.
 
     python tests/torture/run.py --kills 600
 
-A child process saves three states of a file in turn and says when each save has returned. It is
-killed (SIGKILL) at a random moment, and the file must then hold the state that was saved last or
-the one after it, byte for byte. A map with a journal goes from state to state by commits, every
-fourth time by a compaction; what is compared then is the map that opening the file gives. Killing a
-process does not lose what the system has already taken over; that everything is synced in the right
-order is tested in core/tests/test_durability.cpp and test_journal_durability.cpp.
+A child process saves three states of a file in turn and reports when each save has returned. The
+script kills it (SIGKILL) at a random moment; the file must then contain the last saved state or the
+next one, byte for byte. A map with a journal changes its state by commits, every fourth time by a
+compaction; the script then compares the opened map. Killing a process does not lose data that the
+system has accepted; core/tests/test_durability.cpp and test_journal_durability.cpp test that
+everything is synced in the right order.
 """
 
 from __future__ import annotations
