@@ -49,7 +49,7 @@ def read_map(path: Path) -> None:
 
 
 def repaired(data: bytes) -> bytes:
-    """With right checksums of the owners, so that broken owners are read."""
+    """The checksums of the owners are right, so that the reader gets to the broken owners."""
     try:
         parts = dict(sections(data))
         if container([*parts.items()]) != data or "ownercrc" not in parts:

@@ -27,7 +27,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def change(path: Path, made: Callable[[Arrays, dict[str, str]], None]) -> None:
-    """Change a tracks file behind the back of `Tracks.save`."""
+    """Change a tracks file without `Tracks.save` and its checks."""
     with safe_open(path, "numpy") as file:
         header = dict(file.metadata())
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

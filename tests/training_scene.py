@@ -21,7 +21,7 @@ def scene(
     seed: int = 0,
     descriptor: str = "synthetic",
 ) -> Tracks:
-    """One sequence; all seeds share what a bit depends on, as one descriptor's sequences do."""
+    """One sequence; all seeds share the origin of each bit, like sequences of one descriptor."""
     rng = np.random.default_rng(seed)
     bit = np.random.default_rng(1234)
     of_identity = bit.normal(size=(IDENTITY, bits))

@@ -15,7 +15,7 @@ from protomark_bench.paper.objectives import (
 
 
 def views_of(counts):
-    """Views whose first two bytes name the landmark, whose third names the view."""
+    """Views whose first two bytes encode the landmark and whose third encodes the view."""
     landmark = np.repeat(np.arange(len(counts)), counts)
     view = np.concatenate([np.arange(n) for n in counts])
     descriptors = np.stack([landmark // 256, landmark % 256, view], axis=1).astype(np.uint8)
