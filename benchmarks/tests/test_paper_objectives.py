@@ -61,7 +61,7 @@ def test_triplets_are_two_views_of_a_landmark_and_one_of_another():
 
 
 def test_triplets_need_two_landmarks():
-    with pytest.raises(ValueError, match="made: no two landmarks"):
+    with pytest.raises(ValueError, match="made: there are no two landmarks"):
         draw_triplets(views_of([4]), 8, np.random.default_rng(0))
     with pytest.raises(ValueError, match="made: no two landmarks"):
         draw_triplets(views_of([1, 1]), 8, np.random.default_rng(0))
@@ -101,5 +101,5 @@ def test_episodes_have_support_and_queries_of_every_class():
 
 
 def test_episodes_need_two_classes():
-    with pytest.raises(ValueError, match="made: no two landmarks"):
+    with pytest.raises(ValueError, match="made: an episode needs two landmarks"):
         draw_episode(views_of([5, 1]), 8, np.random.default_rng(0))
