@@ -63,7 +63,7 @@ def test_triplets_are_two_views_of_a_landmark_and_one_of_another():
 def test_triplets_need_two_landmarks():
     with pytest.raises(ValueError, match="made: there are no two landmarks"):
         draw_triplets(views_of([4]), 8, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="made: no two landmarks"):
+    with pytest.raises(ValueError, match="made: there are no two landmarks"):
         draw_triplets(views_of([1, 1]), 8, np.random.default_rng(0))
 
 
