@@ -82,7 +82,7 @@ def change(scene: tuple[Path, Tracks], tmp_path: Path, sql: str) -> Path:
 
 
 def test_other_descriptor(scene: tuple[Path, Tracks]) -> None:
-    with pytest.raises(ValueError, match=r"32 bytes, freak has 64.*orb or latch or teblid"):
+    with pytest.raises(ValueError, match=r"32 bytes, but freak has 64.*orb or latch or teblid"):
         tracks_from_database(scene[0] / "database.db", scene[0] / "points", "freak")
 
 
