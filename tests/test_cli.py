@@ -1,4 +1,4 @@
-"""The command as users meet it: help, build, info, and errors in one sentence."""
+"""The command line: help, build, info, and errors in one sentence."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_build_and_info(tracks: Tracks, model: Path, tmp_path: Path) -> None:
 
 
 def row(output: str, name: str) -> str:
-    """The line of the facts that begins with a name."""
+    """The line of the printed facts that starts with `name`."""
     return next(line for line in output.splitlines() if line.startswith(name))
 
 
