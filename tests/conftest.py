@@ -1,4 +1,4 @@
-"""What many tests share: a small encoder with random weights, its codes, and the command."""
+"""Fixtures that tests share: a small encoder with random weights, its codes, and the command."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def random_descriptors(n: int, bits: int = 64, seed: int = 0) -> NDArray[np.uint
 
 
 def rounded(means: Any) -> Any:
-    """To integers, halves away from zero."""
+    """Rounds to integers, halves away from zero."""
     return (np.sign(means) * np.floor(np.abs(means) + 0.5)).astype(np.int64)
 
 
@@ -83,7 +83,7 @@ def layers() -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def encoder(layers: list[dict[str, Any]]) -> pm.Encoder:
-    """64 bits to 12 dimensions, prefix of 5: no length is a multiple of a vector's."""
+    """64 bits to 12 dimensions, prefix of 5: no length is a multiple of a vector register's."""
     return pm.Encoder(layers, [5, 12], name="tiny", descriptor="test", scale=0.02)
 
 
@@ -113,7 +113,7 @@ class _MallocInfo(ctypes.Structure):
 
 
 def allocated_bytes() -> int | None:
-    """Memory that this process has allocated and not freed; None without glibc 2.33 or newer."""
+    """Bytes that this process has allocated and not freed; None without glibc 2.33 or newer."""
     gc.collect()
     try:
         mallinfo = ctypes.CDLL(None).mallinfo2

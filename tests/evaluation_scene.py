@@ -1,4 +1,4 @@
-"""A made scene with everything known: landmarks with noisy descriptors, cameras all round."""
+"""A synthetic scene: landmarks with noisy descriptors, and cameras around them."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def ring_scene(
 
 
 def looking_inwards(angle: float) -> NDArray[np.float64]:
-    """(3, 4) pose of a camera on the ring that looks at the middle, y down."""
+    """(3, 4) pose of a camera on the ring that faces the centre, y down."""
     where = 6 * np.array([np.cos(angle), 0, np.sin(angle)])
     ahead = -where / 6
     down = np.array([0.0, 1.0, 0.0])
@@ -84,7 +84,7 @@ def radial_pixels(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def observations(
     draw: st.DrawFn, max_landmarks: int = 12, max_count: int = 9
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Landmarks in any order, each seen at least twice, and a descriptor of 16 bits of each."""
+    """Landmarks in any order, each with two or more observations and a 16-bit descriptor."""
     counts = draw(st.lists(st.integers(2, max_count), min_size=1, max_size=max_landmarks))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     ids = np.sort(rng.choice(1000, len(counts), replace=False))

@@ -1,4 +1,4 @@
-"""Files of docs/format.md taken apart and put together, without Protomark."""
+"""Reads and writes the container of docs/format.md without Protomark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def sections(data: bytes) -> list[Section]:
 
 
 def container(parts: list[Section], version: int = 1, kind: int = SEALED_MAP) -> bytes:
-    """A file of these sections whose checksums are right."""
+    """A file of these sections with right checksums."""
     table, body = b"", b""
     offset = -(-(64 + 32 * len(parts)) // 64) * 64
     start = offset

@@ -1,4 +1,4 @@
-"""A room of three textured walls at different depths, walked past by a camera."""
+"""A room of three textured walls at different depths, and a camera that walks past them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SIDE = 10.0
 
 @cache
 def _paper(seed: int) -> NDArray[np.uint8]:
-    """Random triangles over each other: corners that look alike nowhere."""
+    """Random triangles over each other, whose corners all differ."""
     rng = np.random.default_rng(seed)
     paper = np.full((2000, 2000), 128, np.uint8)
     for size in (300, 120, 60):
@@ -30,7 +30,7 @@ def _paper(seed: int) -> NDArray[np.uint8]:
 
 
 def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
-    """(count, 3, 4) cam_from_world: sideways, a little up and down, turning a little."""
+    """(count, 3, 4) cam_from_world of a sideways motion with small rotations and heights."""
     out = []
     for i in range(count):
         center = np.array([i * step - 0.5, 0.05 * np.sin(0.9 * i), 0.02 * i])
@@ -40,7 +40,7 @@ def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
 
 
 def show(pose: NDArray[np.float64], camera: Camera = PINHOLE, seed: int = 0) -> NDArray[np.uint8]:
-    """What a camera sees; another seed is another room."""
+    """Renders the image of a camera; every seed gives another room."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     ray = camera.rays(np.column_stack([x.ravel(), y.ravel()]))
     direction = np.column_stack([ray, np.ones(len(ray))]) @ pose[:, :3]
@@ -58,7 +58,7 @@ def show(pose: NDArray[np.float64], camera: Camera = PINHOLE, seed: int = 0) -> 
 
 
 def write_images(folder: Path, poses: NDArray[np.float64], seed: int = 0, first: int = 1) -> Path:
-    """img1.png, img2.png, ... in a folder that may be there already."""
+    """Writes img1.png, img2.png, ... to a new or existing folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, pose in enumerate(poses, first):
         cv2.imwrite(str(folder / f"img{i}.png"), show(pose, seed=seed))

@@ -1,4 +1,4 @@
-"""Broken files on purpose, from seeds, and what a reader may need to refuse them."""
+"""Files broken at random from seeds, and limits on the readers that refuse them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NUMBERS = (0, 1, 2, 4, 127, 128, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """With some bytes changed, removed, repeated or inserted."""
+    """The data with some bytes changed, removed, repeated or inserted."""
     changed = bytearray(data)
     for _ in range(int(rng.integers(1, 4))):
         at, length = (int(rng.integers(0, max(1, len(changed)))) for _ in range(2))
@@ -72,7 +72,7 @@ def mutated_container(data: bytes, rng: np.random.Generator) -> bytes:
 
 @contextmanager
 def bounded(megabytes: int = 256, seconds: float = 300) -> Iterator[None]:
-    """Within it, memory beyond what is there now raises MemoryError, and a hang ends all."""
+    """Limits a reader: too much memory raises MemoryError, a hang ends the process."""
     resource = None
     if not _SANITIZED:  # sanitizers themselves take all addresses
         import resource

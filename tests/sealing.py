@@ -1,4 +1,4 @@
-"""Sealed maps of 4 bits per number: how to ask for them, and their numbers, by docs/format.md."""
+"""Helpers for sealed maps of 4 bits per number, written from docs/format.md."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import protomark as pm
 
 
 def four_bits(scene: pm.PrototypeMap, prototypes: float | None = None) -> float:
-    """`bytes_per_landmark` for so many prototypes per landmark; None: all there are."""
+    """`bytes_per_landmark` for this number of prototypes per landmark; None: all."""
     existing = scene.prototype_count / max(len(scene), 1) if len(scene) else 1.0
     wanted = existing if prototypes is None else prototypes
     several = wanted > 1 and existing > 1
@@ -24,7 +24,7 @@ def levels(scale: int) -> NDArray[np.int64]:
 
 @cache
 def nearest_levels(scale: int) -> NDArray[np.int64]:
-    """For each value from -128: of two levels the one away from zero, for zero the one above."""
+    """The 4-bit level of each value from -128; ties go away from zero, zero goes up."""
     return np.array(
         [
             min(levels(scale).tolist(), key=lambda level: (abs(level - v), -abs(level), -level))

@@ -1,4 +1,4 @@
-"""Tracks of two keyframes that need no image and no COLMAP."""
+"""Tracks of two keyframes, without images or COLMAP."""
 
 from __future__ import annotations
 

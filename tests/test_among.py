@@ -1,4 +1,4 @@
-"""A search among some landmarks answers as a map of these alone would."""
+"""Search among a subset of landmarks, compared with a map of only these."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def observed(appearance_bits: int) -> pm.PrototypeMap:
 def filtered(
     scene: pm.PrototypeMap | pm.SealedMap, ids: NDArray[np.int64], codes: NDArray[np.int8], k: int
 ) -> tuple[list[list[int]], list[list[int]]]:
-    """The first k that are among `ids` of all landmarks by distance."""
+    """The k nearest of all landmarks that are in `ids`."""
     every, distances = scene.search_codes(codes, k=len(scene))
     found, away = [], []
     for row, distance in zip(every, distances, strict=True):

@@ -1,4 +1,4 @@
-"""Several prototypes per landmark: exact under any history, searched exactly, merged by cost."""
+"""Several prototypes per landmark: exact after any change, searched exactly, merged by cost."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_any_order_and_any_batches_give_the_same_bytes(
 def test_any_history_of_changes(
     bits: int, steps: list[tuple[str, list[tuple[int, int]]]], encoder: pm.Encoder, folder: Path
 ) -> None:
-    """Rows and landmarks come and go; in the end the map is as if built from what is left."""
+    """After additions and removals the map equals one built from the remaining observations."""
     pool = random_descriptors(31)
     codes = encoder.encode(pool)
     scene, reference = pm.PrototypeMap(encoder, appearance_bits=bits), Reference(bits)
@@ -222,7 +222,7 @@ def expected_answers(
     max_distance: int | None,
     ratio: float | None,
 ) -> list[tuple[int, int]]:
-    """The definition: a landmark is as far away as its nearest prototype."""
+    """The definition: a landmark's distance is that of its nearest prototype."""
     every = sorted((int(((p - query) ** 2).sum(1).min()), i) for i, p in landmarks.items())
     clear = len(every) < 2 or ratio is None or every[0][0] < ratio * ratio * every[1][0]
     every = every if clear else []
@@ -289,7 +289,7 @@ def test_search_equals_sorting(
 
 
 def test_search_across_chunks(encoder: pm.Encoder, folder: Path) -> None:
-    """A map larger than the chunks that the search works in, landmarks across their borders."""
+    """A map larger than the search's chunks, with landmarks across their borders."""
     rng = np.random.default_rng(0)
     scene = pm.PrototypeMap(encoder, appearance_bits=6)
     codes = rng.integers(-127, 128, (6000, 12)).astype(np.int8)
@@ -610,7 +610,7 @@ def test_every_flipped_byte_is_noticed(encoder: pm.Encoder, tmp_path: Path) -> N
 
 
 def test_plain_code_gives_the_same_file_and_answers(encoder: pm.Encoder, tmp_path: Path) -> None:
-    """The instruction set is chosen when a process starts: another process, with the plain one."""
+    """Each process chooses its instruction set at the start, so another one runs the plain code."""
     scene = pm.PrototypeMap(encoder, appearance_bits=7)
     descriptors = random_descriptors(5000)
     scene.add(np.arange(5000) % 600, descriptors)

@@ -1,4 +1,4 @@
-"""The command as users meet it: help, build, info, and errors in one sentence."""
+"""The command line: help, build, info, and errors in one sentence."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_megabytes_keep_the_landmarks_that_cover_the_images(tmp_path: Path) -> N
 
 
 def row(output: str, name: str) -> str:
-    """The line of the facts that begins with a name."""
+    """The line of the printed facts that starts with `name`."""
     return next(line for line in output.splitlines() if line.startswith(name))
 
 

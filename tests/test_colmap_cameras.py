@@ -1,4 +1,4 @@
-"""Cameras on their way to pycolmap, which reads as many parameters as their model has."""
+"""Cameras given to pycolmap, whose number of parameters must fit their model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`protomark demo`: on the sample that ships, and what it does with what is in its way."""
+"""`protomark demo` on the shipped sample, and its handling of existing outputs."""
 
 from __future__ import annotations
 

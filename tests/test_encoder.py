@@ -52,7 +52,7 @@ def test_codes_at_the_extremes(extreme: str) -> None:
 
 
 def test_every_instruction_set_gives_the_same_bytes(tmp_path: Path) -> None:
-    """PROTOMARK_ISA is read once a process, so each set gets a process of its own."""
+    """Each process reads PROTOMARK_ISA once, so every instruction set needs its process."""
     encoder = pm.Encoder(
         random_layers([512, 96, 48]), [16, 48], name="x", descriptor="x", scale=1.0
     )

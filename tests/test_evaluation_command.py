@@ -1,4 +1,4 @@
-"""`protomark evaluate` as users meet it."""
+"""`protomark evaluate` on synthetic tracks."""
 
 from __future__ import annotations
 

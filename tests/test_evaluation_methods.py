@@ -1,4 +1,4 @@
-"""Every baseline against a plain rendering of its definition."""
+"""Every baseline, compared with a plain implementation of its definition."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def groups(data: Observations) -> dict[int, NDArray[np.uint8]]:
 
 
 def as_dict(built: HammingMap) -> dict[int, list[int]]:
-    """Landmark -> its one descriptor."""
+    """Landmark -> its only descriptor."""
     assert len(set(built.landmarks.tolist())) == len(built.landmarks)
     return dict(zip(built.landmarks.tolist(), built.descriptors.tolist(), strict=True))
 
@@ -101,7 +101,7 @@ def test_medoid_is_that_of_orb_slam(data: Observations) -> None:
 
 
 def test_medoid_of_many_observations() -> None:
-    """More than one batch of groups, and groups of hundreds."""
+    """Several batches of groups, and groups of hundreds of descriptors."""
     rng = np.random.default_rng(0)
     counts = np.concatenate([np.full(3000, 2), [300, 300]])
     landmarks = np.repeat(np.arange(len(counts)), counts)
@@ -255,7 +255,7 @@ def test_projected_means(learned: object) -> None:
 def assert_same_matches(
     built: Any, scene: pm.PrototypeMap | pm.SealedMap, queries: NDArray[np.uint8]
 ) -> None:
-    """Methods give root distances, the core gives squared ones."""
+    """Methods return distances, the core returns squared distances."""
     ids, distances = built.match(queries)
     expected_ids, squared = scene.search(queries)
     assert np.array_equal(ids, expected_ids)

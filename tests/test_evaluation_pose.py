@@ -1,4 +1,4 @@
-"""Poses from matches, and what counts as right and found."""
+"""Poses from matches, right matches and found poses."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from protomark.tracks.file import Tracks
 
 @st.composite
 def any_tracks(draw: st.DrawFn) -> Tracks:
-    """Keyframes with random keypoints, of which random ones see random landmarks."""
+    """Keyframes with random keypoints, some of which observe random landmarks."""
     keyframes = draw(st.integers(2, 30))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     per_frame = rng.integers(0, 15, keyframes)
@@ -70,7 +70,7 @@ def test_the_same_seed_gives_the_same_split_and_another_one_another() -> None:
 
 
 def test_the_split_is_the_one_that_published_figures_stand_on() -> None:
-    """Pinned, since figures in docs/ hold for these keyframes on every platform."""
+    """The split must not change: figures in docs/ are of these keyframes on every platform."""
     assert split(ring_scene(), 0).query_keyframes.tolist() == [1, 15]
     assert split(ring_scene(), 1).query_keyframes.tolist() == [6, 19]
 

@@ -1,4 +1,4 @@
-"""The reader that docs/format.md alone is enough for, against the core."""
+"""The example reader, written from docs/format.md alone, compared with the core."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keypoints of one image that are not too close to each other."""
+"""Selection of keypoints that are not too close to each other."""
 
 from __future__ import annotations
 

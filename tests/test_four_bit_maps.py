@@ -1,4 +1,4 @@
-"""Sealed maps of 4 bits per number, against what docs/format.md says, in NumPy."""
+"""Sealed maps of 4 bits per number, compared with docs/format.md in NumPy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def coder() -> pm.Encoder:
-    """Dims around the 8 dimensions that are packed together, and beyond."""
+    """Code lengths around the 8 dimensions that are packed together, and larger ones."""
     dims = [1, 3, 4, 5, 7, 8, 9, 12, 16, 21]
     return pm.Encoder(random_layers([64, 40, 21]), dims, name="t", descriptor="test", scale=0.02)
 
@@ -49,7 +49,7 @@ def filled(coder: pm.Encoder, dim: int, n: int, limit: int, seed: int) -> pm.Pro
 
 
 def read_levels(path: Path, n: int, k: int) -> NDArray[np.int64]:
-    """Prototypes of a file, by docs/format.md."""
+    """Reads the prototypes of a file by docs/format.md."""
     found = dict(sections(path.read_bytes()))
     scale = int.from_bytes(found["sq4scale"], "little")
     k8, n16 = -(-k // 8) * 8, -(-n // 16) * 16
@@ -112,7 +112,7 @@ def test_levels_and_search_equal_the_definition(
 
 
 def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
-    """A map larger than the chunks that the search works in; it opens as it was sealed."""
+    """A map larger than the search's chunks opens as it was sealed."""
     scene = pm.PrototypeMap(coder, dim=21)
     rng = np.random.default_rng(0)
     scene.add_codes(np.arange(3000), rng.integers(-127, 128, (3000, 21)).astype(np.int8))
@@ -193,7 +193,7 @@ def test_hostile_sections_are_refused(
 
 
 def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
-    """Of 16 dimensions 7 are padding, of 32 rows 12: they are never read."""
+    """The search never reads the padding, 7 of 16 dimensions and 12 of 32 rows."""
     path = tmp_path / "s.pmk"
     sealed = filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=9)
     queries = np.random.default_rng(1).integers(-127, 128, (20, 9)).astype(np.int8)
@@ -218,7 +218,7 @@ def test_later_formats_are_refused(coder: pm.Encoder, tmp_path: Path) -> None:
 
 
 def test_plain_code_gives_the_same_file_and_answers(coder: pm.Encoder, tmp_path: Path) -> None:
-    """The instruction set is chosen when a process starts: another process, with the plain one."""
+    """Each process chooses its instruction set at the start, so another one runs the plain code."""
     open_path, path = tmp_path / "o.pmk", tmp_path / "s.pmk"
     scene = filled(coder, 21, 900, 60, 3)
     scene.save(open_path)

@@ -1,4 +1,4 @@
-"""What a rough pose makes visible: never less than what some allowed pose sees."""
+"""Landmarks visible from an uncertain pose, a superset of those visible from any pose in it."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from conftest import NO_DISTANCE, random_descriptors
 def reference(
     queries: Any, database: Any, k: int, landmarks: Any, limit: int
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Sorts everything by distance and id."""
+    """Reference search: sorts all rows by distance and id."""
     ids = np.full((len(queries), k), -1, np.int64)
     distances = np.full((len(queries), k), NO_DISTANCE, np.int32)
     for q, query in enumerate(queries):
@@ -54,7 +54,7 @@ def test_equals_sorting(
 
 
 def test_large_database_on_threads() -> None:
-    """Crosses the chunks that the search works in."""
+    """The rows cross the borders of the search's chunks."""
     queries, database = random_descriptors(200, 256, 1), random_descriptors(5000, 256, 2)
     expected = np.bitwise_count(queries[:, None] ^ database[None]).sum(-1, dtype=np.int64)
     order = np.argsort(expected, axis=1, kind="stable")[:, :2]

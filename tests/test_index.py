@@ -1,4 +1,4 @@
-"""Approximate search: all lists give the exact answer, whatever happened to the map."""
+"""Approximate search: all inverted lists together give the exact answer after any change."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def coder() -> pm.Encoder:
 
 
 def random_codes(n: int, seed: int) -> NDArray[np.int8]:
-    """In clumps, as real ones are."""
+    """Codes in clusters, as real ones are."""
     rng = np.random.default_rng(seed)
     clumps = np.random.default_rng(0).integers(-90, 91, (20, DIM))
     return (clumps[rng.integers(0, 20, n)] + rng.integers(-37, 38, (n, DIM))).astype(np.int8)
@@ -175,7 +175,7 @@ def test_an_index_takes_at_most_4_bytes_per_prototype(
 
 
 def test_equal_maps_get_as_many_lists(coder: pm.Encoder, tmp_path: Path) -> None:
-    """A regression: a position that was taken away again left room for itself."""
+    """A regression: a removed position still used memory."""
     a, b = (filled(coder, 20_000) for _ in range(2))
     some = a.ids[:1]
     a.set_positions(some, [[1.0, 2.0, 3.0]])
@@ -281,7 +281,7 @@ def test_errors(coder: pm.Encoder, tmp_path: Path) -> None:
 
 
 def replaced(parts: list[Section], name: str, content: bytes | None) -> list[Section]:
-    """With another content of a section, or without it."""
+    """The file with another content of a section, or without the section."""
     return [(n, c if n != name else content) for n, c in parts if n != name or content is not None]
 
 

@@ -1,4 +1,4 @@
-"""Journals: what was committed is there, whatever happens to the process or the file's end."""
+"""Journals: a commit survives a killed process and a truncated file."""
 
 from __future__ import annotations
 
@@ -333,7 +333,7 @@ def containers(journal: bytes) -> list[bytes]:
 
 
 def chained(parts: list[bytes]) -> bytes:
-    """The journal of these containers, each with the number and checksum that it should have."""
+    """Joins containers to a journal with the right numbers and checksums."""
     result = [parts[0]]
     for number, part in enumerate(parts[1:], 1):
         chain = number.to_bytes(8, "little") + result[-1][28:32].ljust(8, b"\0")
@@ -396,7 +396,7 @@ def test_broken_journals_are_refused_or_read(appearance_bits: int, tmp_path: Pat
 
 
 def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any]:
-    """Of a map or a commit: appearances, counts, sums and position of each landmark."""
+    """Appearances, counts, sums and position of each landmark in a map or a commit."""
     n, dim = (int(v) for v in np.frombuffer(parts["shape"], "<u8", 2))
     ids = np.frombuffer(parts["ids"], "<i8").tolist()
     rows = np.frombuffer(parts["rows"], "<u4") if appearance_bits else np.ones(n, int)
@@ -416,7 +416,7 @@ def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any
 
 
 def replayed(base: bytes, journal: bytes, appearance_bits: int) -> dict[int, Any]:
-    """The landmarks of a map and its journal, from docs/format.md alone."""
+    """Reads the landmarks of a map and its journal by docs/format.md."""
     size = 64 + 32 * int.from_bytes(base[24:28], "little")
     identity = hashlib.sha256(base[:size]).hexdigest().encode()
     landmarks = landmarks_in(dict(sections(base)), appearance_bits)

@@ -1,4 +1,4 @@
-"""What docs/limits.md states, as Python meets it; core/tests/test_limits.cpp has the rest."""
+"""Limits that docs/limits.md states, in Python; core/tests/test_limits.cpp has the others."""
 
 from __future__ import annotations
 

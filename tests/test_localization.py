@@ -1,4 +1,4 @@
-"""Where images were taken: rendered images in maps made of others, good and bad ones."""
+"""Poses of rendered images in maps of other images, with good and bad queries."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def test_real_frames_of_the_sample() -> None:
 
 @pytest.fixture
 def query(folder: Path, scene: pm.PrototypeMap, images: list[Any], tmp_path: Path) -> Path:
-    """A map, three images with true poses, a black one and one that is none."""
+    """A map, three images with true poses, a black image and a file that is no image."""
     scene.save(tmp_path / "scene.pmk")
     (tmp_path / "images").mkdir()
     for i, image in enumerate(images):

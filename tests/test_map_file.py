@@ -88,7 +88,7 @@ def test_empty_and_single_maps(encoder: pm.Encoder, tmp_path: Path) -> None:
 
 
 def test_checksums_are_those_of_zlib(scene: pm.PrototypeMap, tmp_path: Path) -> None:
-    """What docs/format.md says, read without Protomark."""
+    """Reads a file by docs/format.md, without Protomark."""
     scene.save(tmp_path / "scene.pmk")
     data = (tmp_path / "scene.pmk").read_bytes()
     sections = int.from_bytes(data[24:28], "little")

@@ -1,4 +1,4 @@
-"""`protomark map` as a user runs it, on rendered images: results, going on, and bad input."""
+"""`protomark map` on rendered images: results, resuming, and bad input."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def pictures(poses, seed: int = 0) -> list[InputImage]:  # type: ignore[no-untyp
 
 
 def error_of(scene: Path, poses) -> float:  # type: ignore[no-untyped-def]
-    """Trajectory error in units in which the camera moves 0.08 a frame."""
+    """Trajectory error in units in which the camera moves 0.08 per frame."""
     found = pycolmap.Reconstruction(str(scene / "sparse"))
     images = sorted(found.images.values(), key=lambda i: int(i.name[3:-4]))
     true = np.array([poses[int(i.name[3:-4]) - 1] for i in images])
@@ -95,7 +95,7 @@ def test_what_is_written_agrees(finished: Path) -> None:
 
 
 def test_prototypes_are_what_building_at_once_gives() -> None:
-    """Added, taken back and merged as the map grew, they are sums of the codes that are left."""
+    """After all additions, subtractions and merges, they are sums of the remaining codes."""
     mapper = Mapper(SETTINGS, PINHOLE)
     # A window that never moves on: every observation that is left keeps its code.
     mapper.options = MappingOptions(descriptor="orb", max_keypoints=500, window=100)
@@ -225,7 +225,7 @@ def test_an_unknown_camera_is_calibrated_along_the_way(images: Path, tmp_path: P
 def test_resumed_with_an_unknown_camera(
     beginning: int, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether it is stopped before the map begins again or after."""
+    """Ctrl-C comes before or after the map starts again."""
     add = Mapper.add
     begun = 0
 

@@ -1,4 +1,4 @@
-"""Structure, culling, merging and loops on simulated frames, where every answer is known."""
+"""Structure, culling, merging and loops on simulated frames with true poses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ POINTS = 60
 
 
 def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Prototypes]:
-    """Eight frames that see the same points, each with descriptors of its own."""
+    """Eight frames that see the same points; every frame has other descriptors."""
     rng = np.random.default_rng(seed)
     points = np.column_stack(
         [rng.uniform(-0.6, 0.5, POINTS), rng.uniform(-0.5, 0.5, POINTS), rng.uniform(2, 3, POINTS)]
@@ -58,7 +58,7 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Prototypes]:
 
 
 def check_memory(structure: Structure, memory: Prototypes) -> None:
-    """The memory holds exactly the observations of the frames."""
+    """The memory contains exactly the observations of the frames."""
     expected = pm.PrototypeMap(ENCODER, 12)
     for frame in structure.frames:
         expected.add_codes(frame.seen, frame.codes[frame.observed])

@@ -1,4 +1,4 @@
-"""Which matches are accepted: the fit, what the model file says, and that it holds."""
+"""Match calibration: the fit, its record in the model file, and its accuracy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What maps say of themselves, and which encoder they are of."""
+"""Metadata of maps, and the encoder that a map belongs to."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_it_goes_along(scene: pm.PrototypeMap, encoder: pm.Encoder, tmp_path: Pa
 
 
 def test_its_section_is_as_documented(scene: pm.PrototypeMap, tmp_path: Path) -> None:
-    """And a reader that does not know it, as all were before it, reads all the rest."""
+    """An older reader, without this section, reads all other sections."""
     path = tmp_path / "scene.pmk"
     scene.save(path)
     without = path.read_bytes()

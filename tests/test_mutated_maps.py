@@ -1,4 +1,4 @@
-"""Thousands of broken model and map files: refused by name, or read without harm."""
+"""Thousands of broken model and map files: refused with their name, or read without harm."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def read_map(path: Path) -> None:
 
 
 def repaired(data: bytes) -> bytes:
-    """With right checksums of the owners, so that broken owners are read."""
+    """The checksums of the owners are right, so that the reader gets to the broken owners."""
     try:
         parts = dict(sections(data))
         if container([*parts.items()]) != data or "ownercrc" not in parts:

@@ -23,7 +23,7 @@ _JUNK: list[Any] = [
 
 
 def mutated_json(value: Any, rng: np.random.Generator) -> Any:
-    """A JSON value with one place in it changed."""
+    """A JSON value with one change."""
     if isinstance(value, dict) and value and rng.integers(0, 4):
         key = list(value)[int(rng.integers(0, len(value)))]
         rest = {k: v for k, v in value.items() if k != key}

@@ -1,4 +1,4 @@
-"""Invariant 1: prototypes are exact under any history of changes."""
+"""Invariant 1: prototypes are exact after any sequence of changes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from conftest import NO_DISTANCE, random_descriptors, rounded
 
 
 class Reference:
-    """Eq. 1 and Eq. 2 in plain NumPy: a sum and a count a landmark, halved at 255."""
+    """Eq. 1 and Eq. 2 in plain NumPy: a sum and a count per landmark, halved at 255."""
 
     def __init__(self) -> None:
         self.sums: dict[int, Any] = {}
@@ -211,7 +211,7 @@ def test_search_equals_sorting(
 
 
 def test_a_neighbour_at_just_the_limit_is_reported(encoder: pm.Encoder) -> None:
-    """A regression: half of them were lost where distances were rounded roots."""
+    """A regression: rounded root distances lost half of the matches."""
     rng = np.random.default_rng(3)
     scene = pm.PrototypeMap(encoder)
     scene.add_codes(np.arange(500), rng.integers(-127, 128, (500, 12)).astype(np.int8))
@@ -238,7 +238,7 @@ def test_ties_go_to_the_smaller_id(encoder: pm.Encoder) -> None:
 
 
 def test_search_across_chunks(encoder: pm.Encoder) -> None:
-    """A map larger than the chunks that the search works in."""
+    """A map larger than the search's chunks."""
     rng = np.random.default_rng(0)
     scene = pm.PrototypeMap(encoder)
     codes = rng.integers(-127, 128, (3000, 12)).astype(np.int8)
@@ -320,7 +320,7 @@ def test_maps_of_different_encoders_do_not_merge(
 
 
 def test_ids_of_all_sizes(encoder: pm.Encoder) -> None:
-    """Many insertions and removals keep the index whole."""
+    """The index stays whole after many insertions and removals."""
     rng = np.random.default_rng(1)
     scene = pm.PrototypeMap(encoder)
     there: set[int] = set()

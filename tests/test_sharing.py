@@ -1,4 +1,4 @@
-"""Maps that many share: joined from shards, split into parts, asked while they change."""
+"""Maps shared by several threads and processes: merged, split, searched while they change."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_ids_of_merge_map_are_checked_before_anything_changes(
 
 
 def shard(folder: Path, part: int, parts: int, appearance_bits: int) -> None:
-    """Builds and saves the map of every `parts`-th observation; run in a process of its own."""
+    """Builds and saves the map of every `parts`-th observation, in a separate process."""
     scene = pm.PrototypeMap(pm.Encoder.load(folder / "tiny.pme"), appearance_bits=appearance_bits)
     data = np.load(folder / "observations.npz")
     some = slice(part, None, parts)
@@ -130,7 +130,7 @@ def shard(folder: Path, part: int, parts: int, appearance_bits: int) -> None:
 def test_shards_of_several_processes_join_to_the_same_bytes(
     appearance_bits: int, balanced: pm.Encoder, tmp_path: Path
 ) -> None:
-    """Landmark 3 gets 255 observations, as many as a prototype holds."""
+    """Landmark 3 gets 255 observations, the limit of a prototype."""
     balanced.save(tmp_path / "tiny.pme")
     rng = np.random.default_rng(5)
     ids = rng.permutation(np.concatenate([rng.integers(100, 400, 3000), np.full(255, 3)]))
@@ -162,7 +162,7 @@ def test_shards_of_several_processes_join_to_the_same_bytes(
 def test_beyond_255_two_maps_join_to_the_same_bytes_in_either_order(
     encoder: pm.Encoder, tmp_path: Path
 ) -> None:
-    """Halving rounds, so that more than two shards may differ by their order; two do not."""
+    """Halving rounds, so the order of more than two shards may change the result."""
     codes = np.random.default_rng(0).integers(-127, 128, (400, 12)).astype(np.int8)
 
     def half(part: int) -> pm.PrototypeMap:
@@ -271,7 +271,7 @@ def seconds_of(work: Callable[[], object]) -> float:
 
 
 def test_who_waits_for_the_map_does_not_hold_the_interpreter(encoder: pm.Encoder) -> None:
-    """A long search, a change that waits for it, a question that waits for that: Python goes on."""
+    """Python threads continue while a change waits for a search and a reader for the change."""
     rng = np.random.default_rng(3)
     scene = pm.PrototypeMap(encoder)
     ids = np.arange(20_000)
@@ -325,7 +325,7 @@ def mapped_bytes(path: Path) -> dict[str, int]:
 
 
 def search_and_measure(path: Path, barrier: Barrier, results: Any) -> None:
-    """Touches the whole map and says what of it is in memory while the others have it open."""
+    """Reads the whole map and reports its bytes in memory while other processes have it open."""
     scene = pm.open(path)
     scene.search_codes(np.ones((1, scene.dim), np.int8))
     barrier.wait()

@@ -1,4 +1,4 @@
-"""Tracks of a rendered scene, whose landmarks must lie on the plane that was rendered."""
+"""Tracks of a rendered plane, on which all landmarks must lie."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def spread_on_plane(tracks: Tracks) -> np.ndarray:
 
 
 def check_labels(tracks: Tracks) -> None:
-    """What holds for every tracks file."""
+    """Checks that hold for every tracks file."""
     assert tracks.landmark_ids.tolist() == list(range(len(tracks.landmark_ids)))
     rows = tracks.observations
     pairs = np.column_stack([tracks.landmark_of_keypoint[rows], tracks.keyframe_of_keypoint[rows]])

@@ -1,4 +1,4 @@
-"""`protomark tracks` as a user runs it: results, skipping, and what it says of bad input."""
+"""`protomark tracks`: results, skipping of finished work, and errors on bad input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FAST = ["--max-keypoints", "300", "--threads", "1"]
 
 
 def run(*arguments: object, command: str = "tracks") -> subprocess.CompletedProcess[str]:
-    """The command in this process, which saves its start."""
+    """Runs the command in this process, which saves the time of a new one."""
     words = ["protomark", command, *map(str, arguments)]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
@@ -44,7 +44,7 @@ def copy(sequence: Path, tmp_path: Path) -> Path:
 
 
 def fails(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    """One sentence on stderr that holds the words, exit code 1, no traceback."""
+    """Expects one sentence on stderr with these words, exit code 1 and no traceback."""
     assert done.returncode == 1, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     message = done.stderr[done.stderr.index("error:") :].strip()

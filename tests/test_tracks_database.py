@@ -1,4 +1,4 @@
-"""Tracks from a COLMAP database that holds binary descriptors, and its model."""
+"""Tracks from a COLMAP database with binary descriptors and from its model."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def change(scene: tuple[Path, Tracks], tmp_path: Path, sql: str) -> Path:
 
 
 def test_other_descriptor(scene: tuple[Path, Tracks]) -> None:
-    with pytest.raises(ValueError, match=r"32 bytes, freak has 64.*orb or latch or teblid"):
+    with pytest.raises(ValueError, match=r"32 bytes, but freak has 64.*orb or latch or teblid"):
         tracks_from_database(scene[0] / "database.db", scene[0] / "points", "freak")
 
 

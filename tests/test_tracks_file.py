@@ -1,4 +1,4 @@
-"""What a tracks file may say: everything else is refused, with the file's name and the field's."""
+"""Tracks files: anything invalid is refused with the names of the file and the field."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def change(path: Path, made: Callable[[Arrays, dict[str, str]], None]) -> None:
-    """Change a tracks file behind the back of `Tracks.save`."""
+    """Change a tracks file without `Tracks.save` and its checks."""
     with safe_open(path, "numpy") as file:
         header = dict(file.metadata())
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

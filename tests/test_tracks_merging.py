@@ -1,4 +1,4 @@
-"""Doubles of a landmark merge into one; neighbours and misfits do not."""
+"""Duplicates of a landmark merge; neighbours and outliers do not."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PIXEL = 2 / 300  # at the plane, 2 in front of cameras with a focal length of 30
 
 
 def scene(*landmarks: tuple[NDArray[np.float64], list[int]]) -> Scene:
-    """Landmarks at places, each seen exactly by the keyframes listed."""
+    """Landmarks at these positions, each seen exactly by the listed keyframes."""
     world = poses(8)
     rows = sorted((k, label) for label, (_, seen) in enumerate(landmarks) for k in seen)
     keyframe = np.array([k for k, _ in rows])

@@ -99,7 +99,7 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
         (["a"], ["other"], "one descriptor at a time"),
         (["a", "b"], ["b"], "not trained on"),
         (["tiny"], ["unseen"], "give more or longer tracks"),
-        (["a", "short"], ["unseen"], "short.*3 or more views"),
+        (["a", "short"], ["unseen"], "short.*the 3 views that training needs"),
         (["a"], ["short"], "short.*support observations|too short"),
         (["narrow"], ["unseen"], "64 to 1024 bits"),
         ([], ["unseen"], "no training tracks"),
@@ -177,7 +177,7 @@ def test_without_options_the_last_file_picks_and_the_descriptor_names_the_model(
     before = (tmp_path / "synthetic.pme").read_bytes()
     again = run(*words)
     assert isinstance(again.exception, FileExistsError)
-    assert "synthetic.pme exists and is kept" in str(again.exception)
+    assert "synthetic.pme exists already" in str(again.exception)
     assert (tmp_path / "synthetic.pme").read_bytes() == before
     (tmp_path / "synthetic.pme").unlink()
     assert "synthetic.md exists and is kept" in str(run(*words).exception)

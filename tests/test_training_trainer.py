@@ -44,7 +44,7 @@ def nothing(step, loss, progress):
 
 
 def pca_precision(trial: Trial, dims) -> dict[int, float]:
-    """Float means of principal components fitted on the support: no rounding to hold it back."""
+    """PCA fitted on the support, with means in float: the baseline without rounding."""
     bits = np.unpackbits(trial.support, axis=1).astype(np.float32)
     mean = bits.mean(0)
     _, axes = np.linalg.eigh(np.cov((bits - mean).T))
@@ -53,7 +53,7 @@ def pca_precision(trial: Trial, dims) -> dict[int, float]:
 
 
 def raw_precision(trial: Trial) -> float:
-    """Nearest raw descriptor."""
+    """Precision of the nearest raw descriptor."""
     signs = [
         2.0 * np.unpackbits(d, axis=1).astype(np.float32) - 1
         for d in (trial.support, trial.queries)

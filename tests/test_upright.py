@@ -15,7 +15,7 @@ from protomark.maps.build import build_map
 
 
 def added(angle: float, size: float) -> tuple[list[int], list[int]]:
-    """Which of the 32 angle and of the 32 size bits are set."""
+    """The set bits of the 32 angle bits and of the 32 size bits."""
     longer = upright_descriptors(np.zeros((1, 4), np.uint8), [angle], [size])
     bits = np.unpackbits(longer[0, 4:], bitorder="little")
     return np.flatnonzero(bits[:32]).tolist(), np.flatnonzero(bits[32:]).tolist()

@@ -1,4 +1,4 @@
-"""A textured plane under known cameras, rendered through any COLMAP camera model."""
+"""A textured plane and its cameras, rendered through any COLMAP camera model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DISTORTED = Camera(
 
 
 def texture(size: int = 900, seed: int = 3) -> NDArray[np.uint8]:
-    """Blocks of random grey on four scales, rich in corners."""
+    """Blocks of random grey on four scales, with many corners."""
     rng = np.random.default_rng(seed)
     image = np.zeros((size, size), np.float32)
     for cells, weight in ((12, 0.3), (30, 0.3), (75, 0.3), (180, 0.1)):
@@ -31,7 +31,7 @@ def texture(size: int = 900, seed: int = 3) -> NDArray[np.uint8]:
 
 
 def poses(count: int) -> NDArray[np.float64]:
-    """(count, 3, 4) cam_from_world on an arc, all looking at the plane z = 0 from z = -2."""
+    """(count, 3, 4) cam_from_world on an arc at z = -2, all facing the plane z = 0."""
     out = []
     for t in np.linspace(-0.45, 0.45, count):
         center = np.array([2 * np.sin(t), 0.15 * np.cos(7 * t), -2 * np.cos(t)])
@@ -48,7 +48,7 @@ def poses(count: int) -> NDArray[np.float64]:
 def render(
     pose: NDArray[np.float64], camera: Camera, image: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """What the camera sees of the plane z = 0, on which the texture covers [-1.5, 1.5]²."""
+    """Renders the plane z = 0, on which the texture covers [-1.5, 1.5]²."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     ray = camera.rays(np.column_stack([x.ravel(), y.ravel()]))
     direction = np.column_stack([ray, np.ones(len(ray))]) @ pose[:, :3]
@@ -69,7 +69,7 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 def write_model(
     folder: Path, camera: Camera, names: list[str], cam_from_world: NDArray[np.float64]
 ) -> None:
-    """Write a COLMAP text model without points, as data sets with known poses come."""
+    """Write a COLMAP text model without points, as in data sets with true poses."""
     folder.mkdir(parents=True)
     params = " ".join(map(str, camera.params))
     (folder / "cameras.txt").write_text(

@@ -1,4 +1,4 @@
-"""Synthetic tracks: landmarks with a look of their own, under a nuisance that all of them share.
+"""Synthetic tracks: each landmark has a descriptor, distorted by a nuisance that all share.
 
 The nuisance moves more bits than the identity does, so a projection that keeps the directions of
 most variance (PCA) keeps the wrong ones, and an encoder that learns from tracks can do better.
@@ -21,7 +21,7 @@ def scene(
     seed: int = 0,
     descriptor: str = "synthetic",
 ) -> Tracks:
-    """One sequence; all seeds share what a bit depends on, as one descriptor's sequences do."""
+    """One sequence; all seeds share the origin of each bit, like sequences of one descriptor."""
     rng = np.random.default_rng(seed)
     bit = np.random.default_rng(1234)
     of_identity = bit.normal(size=(IDENTITY, bits))

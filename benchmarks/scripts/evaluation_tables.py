@@ -2,9 +2,9 @@
 
 python benchmarks/scripts/evaluation_tables.py [RESULTS.json ...]
 
-Without arguments: from all benchmarks/results/evaluation.*.json, which `protomark evaluate --json`
-wrote. Methods of one sequence may come from several files; of the same method the last file counts.
-Every figure of every sequence stays in these files.
+Without arguments, the script reads all benchmarks/results/evaluation.*.json, which `protomark
+evaluate --json` wrote. Methods of one sequence may come from several files; the last file that
+contains a method counts.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ COLUMNS = {
     **{f"protomark-{dim}x4": f"**{dim} x 4 bits**" for dim in (16, 32, 64)},
     **{f"appearances-{size}": f"**appearances, {size} B**" for size in (17, 33, 65)},
 }
-# Bytes per landmark -> what is kept in them: int8, 4 bits, 4 bits and several appearances.
+# Bytes per landmark -> methods of that size: int8, 4 bits, 4 bits and several appearances.
 BUDGETS = {
     9: ("protomark-8", "protomark-16x4", None),
     17: ("protomark-16", "protomark-32x4", "appearances-17"),
@@ -65,7 +65,7 @@ def replace_tables(document: Path, tables: str) -> None:
 
 
 def split_of(sequence: str) -> str:
-    """Whether a sequence trained, validated or tests what ships."""
+    """Whether the shipped encoders use a sequence for training, validation or test."""
     return next(name for name, members in SPLITS.items() if sequence in members)
 
 
@@ -122,7 +122,7 @@ def ratio_table(results: Sequence[SequenceResult]) -> str:
 
 
 def card_text(results: Sequence[SequenceResult]) -> str:
-    """What a card says of the test sequences; all results are of its descriptor."""
+    """The card's section on the test sequences; all results are of its descriptor."""
     names = ["unaggregated", "medoid", "majority", *(f"protomark-{dim}" for dim in DIMS)]
     missing = [name for name in SPLITS["test"] if name not in {r.sequence for r in results}]
     parts = [

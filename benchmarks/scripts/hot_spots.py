@@ -1,14 +1,14 @@
-"""Samples which functions of the core take the time of encoding, adding and searching.
+"""Samples the functions of the core in which encoding, adding and searching spend their time.
 
 python benchmarks/scripts/hot_spots.py [--landmarks 1000000] [--work encode,add,...]
 
-Linux `perf` samples one thread, a thousand times per second, while one kind of work is repeated on
-synthetic landmarks. Functions have names where the package was installed with them:
+Linux `perf` samples one thread, a thousand times per second, while it repeats one kind of work on
+synthetic landmarks. Functions have names if the package is installed with them:
 
     pip install . -C cmake.build-type=RelWithDebInfo \
       -C cmake.define.CMAKE_CXX_FLAGS_RELWITHDEBINFO="-O3 -g -DNDEBUG"
 
-What the compiler inlined counts for the function that calls it.
+An inlined function counts for its caller.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WORK = ("encode", "add", "exact", "one query", "approximate")
 
 
 def work(name: str, workload: Workload, landmarks: int) -> Callable[[], object]:
-    """Something to repeat."""
+    """The function that does this kind of work."""
     encoder, dim = workload.encoder, workload.dim
     descriptors = workload.queries(landmarks, 20_000)
     if name == "encode":
@@ -86,13 +86,13 @@ def main() -> None:
     """Prints a table for each kind of work."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--landmarks", type=int, default=1_000_000)
-    parser.add_argument("--work", default=",".join(WORK))
+    parser.add_argument("--work", default=",".join(WORK), help="default: all kinds")
     parser.add_argument("--seconds", type=float, default=5.0)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     real = RealLandmarks.load([])
     workload = Workload(real, pm.Encoder.load(real.descriptor), build_threads=2)
-    for name in asked.work.split(","):
-        found = sampled(work(name, workload, asked.landmarks), asked.seconds)
+    for name in args.work.split(","):
+        found = sampled(work(name, workload, args.landmarks), args.seconds)
         rows = [[symbol, f"{100 * share:.0f} %"] for share, symbol in found if share >= SHOWN]
         print(ReportTable((name, "share"), rows).markdown(), end="\n\n")
 

@@ -1,16 +1,16 @@
-"""Measures the recall of approximate search: stated and true, and through ten rounds of updates.
+"""Measures the recall of approximate search: stated and true, and over ten rounds of updates.
 
 python benchmarks/scripts/index_recall.py TRACKS... --plot FILE.svg [--dim 32]
 
-Each tracks file is split as `protomark evaluate` does: a random 90 % of the keyframes build the
-map, what the others saw asks. The last map is that of all files together, each with its own ids. A
-query counts as found where the nearest landmark of the exact search, or one as near, comes first.
+The script splits each tracks file as `protomark evaluate` does: a random 90 % of the keyframes
+build the map, and the observations of the others are the queries. The last map contains the
+landmarks of all files. A query counts as found if the first result is as near as the nearest
+landmark of the exact search.
 
-Rounds: each sequence's observations come in the order of its keyframes, in ten parts. Drift: one
-half of the sequences replaces the other. Inverted lists are learned in the first round and never
-again. Prints the tables of docs/results/large-maps.md, and how far observations are from their
-landmark's prototype, as a share of the variance of prototypes: the core moves its test queries by
-as much.
+Rounds: each sequence adds its observations in the order of its keyframes, in ten parts. Drift: one
+half of the sequences replaces the other. The index learns its inverted lists only in the first
+round. Prints the tables of docs/results/large-maps.md, and the distance of observations from their landmark's
+prototype as a share of the variance of prototypes: the core moves its test queries by as much.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ MAX_QUERIES = 2000
 
 @dataclass
 class CodedSequence:
-    """Codes of what builds a map and of what asks it.
+    """Codes that build a map, and codes that query it.
 
     Attributes:
-        landmarks, codes: observations of the support, in the order of keyframes; (n,), (n, dim).
+        landmarks, codes: observations that build the map, by keyframe; (n,), (n, dim).
         seen: codes of held-out keypoints whose landmark is in the map, (q, dim).
-        frames: codes of held-out keypoints of all kinds, as whole frames bring them, (q, dim).
+        frames: codes of all held-out keypoints, with or without a landmark in the map, (q, dim).
     """
 
     landmarks: NDArray[np.int64]
@@ -51,7 +51,10 @@ class CodedSequence:
 
     @property
     def spread(self) -> float:
-        """Mean squared distance of an observation to the mean of its landmark's others."""
+        """Mean squared distance of an observation to the mean of its landmark's other observations.
+
+        It is a share of the variance of the landmarks' means.
+        """
         order = np.argsort(self.landmarks, kind="stable")
         codes = self.codes[order].astype(np.float64)
         ids, starts, counts = np.unique(
@@ -59,15 +62,15 @@ class CodedSequence:
         )
         sums = np.add.reduceat(codes, starts, axis=0)
         landmark = np.repeat(np.arange(len(ids)), counts)
-        enough = counts[landmark] >= 3
-        own, code = landmark[enough], codes[enough]
-        others = (sums[own] - code) / (counts[own] - 1)[:, None]
+        chosen = counts[landmark] >= 3
+        landmark, code = landmark[chosen], codes[chosen]
+        others = (sums[landmark] - code) / (counts[landmark] - 1)[:, None]
         variance = (sums / counts[:, None]).var(axis=0).sum()
         return float(np.square(code - others).sum(axis=1).mean() / variance)
 
 
 def read(tracks: Tracks, encoder: pm.Encoder, dim: int, first_id: int) -> CodedSequence:
-    """The split of one file; landmark ids count from `first_id`."""
+    """Splits and encodes one file; its landmark ids start at `first_id`."""
     part = split(tracks, 0)
     rng = np.random.default_rng(0)
 
@@ -86,8 +89,8 @@ def read(tracks: Tracks, encoder: pm.Encoder, dim: int, first_id: int) -> CodedS
     )
 
 
-def together(sequences: list[CodedSequence]) -> CodedSequence:
-    """All of them in one map."""
+def concatenated(sequences: list[CodedSequence]) -> CodedSequence:
+    """The sequences as one."""
     return CodedSequence(
         np.concatenate([s.landmarks for s in sequences]),
         np.concatenate([s.codes for s in sequences]),
@@ -99,14 +102,14 @@ def together(sequences: list[CodedSequence]) -> CodedSequence:
 def recall(
     scene: pm.PrototypeMap, queries: NDArray[np.int8], stated: float | None, nprobe: int | None
 ) -> float:
-    """Share of queries whose nearest landmark is found."""
+    """Share of the queries whose nearest landmark the search finds."""
     exact = scene.search_codes(queries, k=1)[1]
     found = scene.search_codes(queries, k=1, recall=stated, nprobe=nprobe)[1]
     return float(np.mean(found <= exact))
 
 
 def least_nprobe(scene: pm.PrototypeMap, queries: NDArray[np.int8], wanted: float) -> int:
-    """The fewest inverted lists that truly bring a recall."""
+    """The smallest number of inverted lists that reaches a true recall."""
     low, high = 1, scene.nlist
     while low < high:
         middle = (low + high) // 2
@@ -122,7 +125,7 @@ def rounds(
 ) -> list[tuple[int, float]]:
     """Landmarks and recall after each tenth of every sequence."""
     scene = pm.PrototypeMap(encoder, dim)
-    frames = together(sequences).frames
+    frames = concatenated(sequences).frames
     result = []
     for i in range(ROUNDS):
         for s in sequences:
@@ -138,9 +141,9 @@ def drift(encoder: pm.Encoder, dim: int, sequences: list[CodedSequence]) -> list
     """Landmarks and recall while half the sequences are replaced by the other half.
 
     Each round subtracts a ninth of the landmarks of one half and adds a ninth of those of the
-    other; queries change in the same measure.
+    other; the queries change in the same proportion.
     """
-    old, new = together(sequences[0::2]), together(sequences[1::2])
+    old, new = concatenated(sequences[0::2]), concatenated(sequences[1::2])
     scene = pm.PrototypeMap(encoder, dim)
     scene.add_codes(old.landmarks, old.codes)
     scene.build_index()
@@ -166,20 +169,20 @@ def drift(encoder: pm.Encoder, dim: int, sequences: list[CodedSequence]) -> list
 
 
 def main() -> None:
-    """Measures, prints and draws."""
+    """Measures, prints the tables and draws the plot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tracks", type=Path, nargs="+")
-    parser.add_argument("--dim", type=int, default=32)
-    parser.add_argument("--plot", type=Path)
-    asked = parser.parse_args()
-    encoder = pm.Encoder.load(Tracks.load(asked.tracks[0]).descriptor)
+    parser.add_argument("--dim", type=int, default=32, help="code length; default: 32")
+    parser.add_argument("--plot", type=Path, help="SVG file to write")
+    args = parser.parse_args()
+    encoder = pm.Encoder.load(Tracks.load(args.tracks[0]).descriptor)
     parts = {
-        file.name.split(".")[0]: read(Tracks.load(file), encoder, asked.dim, i << 32)
-        for i, file in enumerate(asked.tracks)
+        file.name.split(".")[0]: read(Tracks.load(file), encoder, args.dim, i << 32)
+        for i, file in enumerate(args.tracks)
     }
     rows, curves = [], []
-    for name, s in {**parts, "all": together(list(parts.values()))}.items():
-        scene = pm.PrototypeMap(encoder, asked.dim)
+    for name, s in {**parts, "all": concatenated(list(parts.values()))}.items():
+        scene = pm.PrototypeMap(encoder, args.dim)
         scene.add_codes(s.landmarks, s.codes)
         scene.build_index()
         trues = [recall(scene, s.frames, stated, None) for stated in RECALLS]
@@ -196,8 +199,8 @@ def main() -> None:
     print(ReportTable((*heads, "least nprobe (frames)"), rows).markdown())
     sequences = list(parts.values())
     steps = {
-        "ten parts of the tracks": rounds(encoder, asked.dim, sequences),
-        "other sequences take over": drift(encoder, asked.dim, sequences),
+        "ten parts of the tracks": rounds(encoder, args.dim, sequences),
+        "other sequences take over": drift(encoder, args.dim, sequences),
     }
     rows = [
         [name, *(f"{true:.3f} ({landmarks:,})" for landmarks, true in found)]
@@ -205,7 +208,7 @@ def main() -> None:
     ]
     numbers = [str(i + 1) for i in range(ROUNDS)]
     print(ReportTable(["recall (landmarks) after round", *numbers], rows).markdown())
-    if asked.plot:
+    if args.plot:
         curves.append(plot.Series("", (0.8, 1), (0.8, 1), plot.INK, ":", 0.8))
         lines = [
             plot.Series(name, range(1, ROUNDS + 1), [true for _, true in found], color)
@@ -226,7 +229,7 @@ def main() -> None:
                 ),
             ]
         )
-        plot.save_svg(figure, asked.plot, "benchmarks/scripts/index_recall.py")
+        plot.save_svg(figure, args.plot, "benchmarks/scripts/index_recall.py")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Measures what a commit costs, in bytes and time, and what a journal costs `add`.
+"""Measures the bytes and time of a commit, and the time that a journal adds to `add`.
 
 python benchmarks/scripts/journal_commit.py [--landmarks 1000000] [--observations 1000]
 
-A map with positions gets observations of landmarks drawn at random, a tenth of them new ones, and
-commits, again and again. Beside each commit as many bytes are written to another file and synced:
-the least that the disk takes, whoever writes. Then `add` and `add_codes`, where a journal weighs
-most, are timed on this map and on one without a journal, in turn.
+The script adds observations of random landmarks, a tenth of them new, to a map with positions and
+commits, --rounds times. After each commit it writes as many bytes to another file and syncs it: a
+lower bound for this disk. It then times `add` and `add_codes`, where a journal costs most, in turn
+on this map and on one without a journal.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from protomark_bench.report import ReportTable
 
 
 def milliseconds(work: Callable[[], object]) -> float:
-    """How long it takes."""
+    """How long `work` takes."""
     begin = time.perf_counter()
     work()
     return 1e3 * (time.perf_counter() - begin)
@@ -42,7 +42,7 @@ def random_map(landmarks: int, dim: int, rng: np.random.Generator) -> pm.Prototy
 
 
 def append_and_sync(path: Path, data: bytes) -> None:
-    """The least that a commit can do."""
+    """Appends bytes to a file and syncs it, the lower bound for a commit."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     try:
         os.write(handle, data)
@@ -51,11 +51,11 @@ def append_and_sync(path: Path, data: bytes) -> None:
         os.close(handle)
 
 
-def measure(asked: argparse.Namespace, folder: Path) -> dict[str, list[float]]:
-    """Name -> values, with the files in this folder."""
+def measure(args: argparse.Namespace, folder: Path) -> dict[str, list[float]]:
+    """Name -> measured values; the files are in `folder`."""
     rng = np.random.default_rng(0)
     path = folder / "scene.pmk"
-    n, count, dim = asked.landmarks, asked.observations, asked.dim
+    n, count, dim = args.landmarks, args.observations, args.dim
     found: dict[str, list[float]] = {}
 
     def note(name: str, value: float) -> None:
@@ -67,9 +67,9 @@ def measure(asked: argparse.Namespace, folder: Path) -> dict[str, list[float]]:
     scene = pm.open(path, journal=True)
     assert isinstance(scene, pm.PrototypeMap)
     width = scene.encoder.bits // 8
-    for _ in range(asked.rounds):
+    for _ in range(args.rounds):
         ids = rng.integers(0, n, count)
-        ids[::10] += n  # a tenth of them are new
+        ids[::10] += n  # a tenth of the landmarks are new
         scene.add(ids, rng.integers(0, 256, (count, width), dtype=np.uint8))
         begin = time.perf_counter()
         size = scene.commit()
@@ -80,8 +80,8 @@ def measure(asked: argparse.Namespace, folder: Path) -> dict[str, list[float]]:
             "write and sync as many bytes, ms",
             milliseconds(partial(append_and_sync, folder / "beside", data)),
         )
-    note(f"open after {asked.rounds} commits, ms", milliseconds(lambda: pm.open(path)))
-    for i in range(asked.rounds):
+    note(f"open after {args.rounds} commits, ms", milliseconds(lambda: pm.open(path)))
+    for i in range(args.rounds):
         ids = rng.integers(0, n, count)
         descriptors = rng.integers(0, 256, (count, width), dtype=np.uint8)
         codes = rng.integers(-127, 128, (count, dim), dtype=np.int8)
@@ -94,16 +94,20 @@ def measure(asked: argparse.Namespace, folder: Path) -> dict[str, list[float]]:
 
 
 def main() -> None:
-    """Prints median and the tenths at both ends."""
+    """Prints the median and the 10 % and 90 % quantiles."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--landmarks", type=int, default=1_000_000)
     parser.add_argument("--observations", type=int, default=1_000)
     parser.add_argument("--dim", type=int, default=32)
     parser.add_argument("--rounds", type=int, default=100)
-    parser.add_argument("--folder", type=Path, help="on the disk to measure; default: the system's")
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="protomark_journal_", dir=asked.folder) as name:
-        found = measure(asked, Path(name))
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="folder on the disk to measure; default: the system's temporary folder",
+    )
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="protomark_journal_", dir=args.folder) as name:
+        found = measure(args, Path(name))
     rows = [
         [name, *(f"{value:,.6g}" for value in np.percentile(values, [50, 10, 90]))]
         for name, values in found.items()

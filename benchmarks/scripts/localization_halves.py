@@ -2,11 +2,11 @@
 
 python benchmarks/scripts/localization_halves.py TRACKS --calibrate TRACKS...
 
-All descriptors of each landmark searched by Hamming distance, one medoid descriptor per landmark,
-and prototypes go through the same code. Which matches each accepts is fitted to the sequences of
---calibrate. The map holds landmarks with two observations in the first half; no later observation
-is in a prototype. Positions are those of the tracks, triangulated from all keyframes, for all kinds
-of map alike.
+The kinds are all descriptors of each landmark, one medoid descriptor per landmark (both searched by
+Hamming distance), and prototypes. The same code localizes in all of them, and the calibration of
+each kind's matches is fitted to the sequences of --calibrate. The map contains the landmarks with
+at least two observations in the first half, and prototypes average only those. All kinds of map use
+the positions in the tracks file, which were triangulated from all keyframes.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from protomark.training.match_calibration import (
 from protomark_bench.report import ReportTable
 
 MIN_OBSERVATIONS = 2
-# Makes a search for the `CANDIDATES` nearest landmarks of observations, and says how many bytes per
-# landmark it keeps, positions left out.
+# Returns a search for the `CANDIDATES` nearest landmarks, and its bytes per landmark without
+# positions.
 Builder = Callable[[Support], tuple[Search, float]]
 
 
 def kinds_of_map(encoder: pm.Encoder, dims: Sequence[int]) -> dict[str, Builder]:
-    """Name -> kind of map: all descriptors, medoids, and prototypes of each length."""
+    """Name -> kind of map: all descriptors, medoids, and prototypes of each code length."""
 
     def all_descriptors(support: Support) -> tuple[Search, float]:
         size = len(support.descriptors) / len(support.ids) * support.descriptors.shape[1] + 1
@@ -98,14 +98,14 @@ class HalvesResult:
     """One kind of map on one sequence.
 
     Attributes:
-        bytes_per_landmark: all that matching needs, the position left out.
-        landmarks: of the map.
-        frames: asked for.
+        bytes_per_landmark: all that matching needs, without the position.
+        landmarks: number of landmarks in the map.
+        frames: number of frames to localize.
         recall: share of the frames whose pose is within each of `THRESHOLDS`.
-        median_error: of all frames; distance in world units and degrees, infinite without a pose.
-        median_inliers: of all frames.
-        search_ms, pose_ms: median time per frame on one thread; the search of prototypes includes
-            encoding.
+        median_error: over all frames, in world units and degrees; infinite without a pose.
+        median_inliers: over all frames.
+        search_ms, pose_ms: median time per frame on one thread; a search among prototypes
+            includes encoding.
     """
 
     bytes_per_landmark: float
@@ -125,14 +125,14 @@ def localize_halves(
     share: float = 0.5,
     stride: int = 1,
 ) -> HalvesResult:
-    """Localizes the frames after the first `share` of a sequence in a map of those before.
+    """Localizes the later frames of a sequence in a map of its first ones.
 
     Args:
         tracks: a sequence, its keyframes in order of time.
         build: the kind of map.
-        calibration: of its matches.
-        share: of the keyframes that build the map.
-        stride: every so many of the others is asked for.
+        calibration: calibration of this kind's matches.
+        share: share of the keyframes that build the map.
+        stride: localize every `stride`-th of the other keyframes.
 
     Raises:
         ValueError: there are too few keyframes or too short tracks.
@@ -184,20 +184,22 @@ def main() -> None:
     """Prints the table of docs/results/localization.md."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tracks", type=Path)
-    parser.add_argument("--calibrate", type=Path, nargs="+", required=True)
-    parser.add_argument("--encoder", help="by default the one of the tracks' descriptor")
-    parser.add_argument("--dims", default="16,32,64")
-    parser.add_argument("--stride", type=int, default=1, help="every so many frames")
-    asked = parser.parse_args()
-    tracks = Tracks.load(asked.tracks)
-    others = [Tracks.load(path) for path in asked.calibrate]
-    encoder = pm.Encoder.load(asked.encoder or tracks.descriptor)
-    kinds = kinds_of_map(encoder, [int(dim) for dim in asked.dims.split(",")])
+    parser.add_argument("--calibrate", type=Path, nargs="+", required=True, help="tracks files")
+    parser.add_argument("--encoder", help="default: the encoder of the tracks' descriptor")
+    parser.add_argument("--dims", default="16,32,64", help="code lengths; default: 16,32,64")
+    parser.add_argument(
+        "--stride", type=int, default=1, help="localize every n-th frame; default: 1"
+    )
+    args = parser.parse_args()
+    tracks = Tracks.load(args.tracks)
+    others = [Tracks.load(path) for path in args.calibrate]
+    encoder = pm.Encoder.load(args.encoder or tracks.descriptor)
+    kinds = kinds_of_map(encoder, [int(dim) for dim in args.dims.split(",")])
     rows, found = [], {}
     with progress_bar() as progress:
         for name, build in tracked(kinds.items(), progress, "localize", len(kinds)):
             fitted = calibrated(build, others)
-            found[name] = localize_halves(tracks, build, fitted, stride=asked.stride)
+            found[name] = localize_halves(tracks, build, fitted, stride=args.stride)
     for name, r in found.items():
         rows.append(
             [

@@ -1,12 +1,13 @@
-"""Compares which matches to accept: calibrated probabilities beside fixed ratios, on real frames.
+"""Compares two rules that accept matches, calibrated probabilities and fixed ratios, on frames.
 
 python benchmarks/scripts/match_calibration.py TRACKS... [--dim 32]
 
-Keyframes of the later half of each sequence are localized in a map of the earlier half, and a
-random tenth in a map of the other nine. The calibration is fitted to the other sequences. Precision
-and recall are those of accepted matches over all keypoints; a pose is found if it is off by at most
-1 % of the median scene depth and 2 degrees. Then the same fit, to maps of 8 bits a number, on maps
-of 4 bits and of several appearances per landmark. Prints tables of docs/results/localization.md.
+The script localizes keyframes of the later half of each sequence in a map of the earlier half, and
+a random tenth of the keyframes in a map of the other nine tenths. It fits the calibration to the
+other sequences. Precision and recall are those of accepted matches over all keypoints; a pose is
+found if its errors are at most 1 % of the median scene depth and 2 degrees. It then applies the
+same calibration, fitted to maps of 8 bits per number, to maps of 4 bits per number and of several
+appearances per landmark. Prints the tables of docs/results/localization.md.
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ RATIOS = (0.7, 0.8, 0.9, 0.95)
 PARTS = ("tenth", "half")
 KINDS = ("8 bits", "4 bits", "appearances")
 FRAMES = 40
-# A rule: squared distances (n, 2) -> a score of each match, and the least one that is accepted.
+# A rule: squared distances (n, 2) -> the score of each match, and the lowest accepted score.
 Rule = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], float]]
 
 
 def clearness(distances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) from 0, the two nearest are as far away, to 1."""
+    """One minus the ratio of the two smallest distances, (n,), from their squares, (n, 2)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(distances[:, 1] > 0, 1 - np.sqrt(distances[:, 0] / distances[:, 1]), 0.0)
 
 
 def rules(calibration: MatchCalibration) -> dict[str, Rule]:
-    """All that are compared, by name."""
+    """Name -> rule."""
 
     def by_probability(least: float) -> Rule:
         return lambda distances: (calibration.probability(distances), least)
@@ -89,27 +90,27 @@ def measure(
     }
     result = np.zeros((len(PARTS), len(compared), 4))
     for i, name in enumerate(PARTS):
-        support, asked = cuts[name]
+        support, queries = cuts[name]
         used = np.zeros(len(tracks.keypoints), bool)
         used[support] = True
         scene = build_map(tracks.where(used), encoder, dim)
         sums = np.zeros((len(compared), 5))
-        for keyframe in asked[:: max(1, len(asked) // FRAMES)]:
+        for keyframe in queries[:: max(1, len(queries) // FRAMES)]:
             frame = QueryFrame.of(tracks, int(keyframe))
             ids, distances = scene.search(frame.descriptors, k=CANDIDATES)
             positions = tracks.landmark_positions[np.searchsorted(tracks.landmark_ids, ids)]
-            every = FrameMatches(np.arange(len(ids)), ids[:, 0])
-            right = right_matches(frame, every, positions[:, 0])
+            nearest = FrameMatches(np.arange(len(ids)), ids[:, 0])
+            right = right_matches(frame, nearest, positions[:, 0])
             for j, score in enumerate(compared.values()):
                 values, least = score(distances.astype(np.float64))
-                taken = accept(ids[:, 0], values, least)
+                matches = accept(ids[:, 0], values, least)
                 candidates = Candidates(frame.keypoints, ids, positions, values)
                 found = solve_pose(candidates, frame.camera, least, "known")
                 good = False
                 if found.cam_from_world is not None:
                     off, angle = pose_error(found.cam_from_world, frame.cam_from_world)
                     good = off <= 0.01 * depth and angle <= 2
-                sums[j] += (len(taken), right[taken.keypoints].sum(), right.sum(), good, 1)
+                sums[j] += (len(matches), right[matches.keypoints].sum(), right.sum(), good, 1)
         accepted, true, all_right, good_poses, frames = sums.T
         precision, recall = true / np.maximum(accepted, 1), true / np.maximum(all_right, 1)
         result[i] = np.stack([accepted / frames, precision, recall, good_poses / frames], axis=1)
@@ -135,22 +136,22 @@ def kinds(
 
 
 def main() -> None:
-    """Measures and prints means over the sequences."""
+    """Measures all sequences and prints the means."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tracks", type=Path, nargs="+")
-    parser.add_argument("--encoder", help="by default the one of the tracks' descriptor")
-    parser.add_argument("--dim", type=int, default=32)
-    asked = parser.parse_args()
-    loaded = {sequence_name(path): Tracks.load(path) for path in asked.tracks}
-    encoder = pm.Encoder.load(asked.encoder or next(iter(loaded.values())).descriptor)
+    parser.add_argument("--encoder", help="default: the encoder of the tracks' descriptor")
+    parser.add_argument("--dim", type=int, default=32, help="code length; default: 32")
+    args = parser.parse_args()
+    loaded = {sequence_name(path): Tracks.load(path) for path in args.tracks}
+    encoder = pm.Encoder.load(args.encoder or next(iter(loaded.values())).descriptor)
     by_rule, by_kind, given = [], [], {}
     with progress_bar() as progress:
         for name, tracks in tracked(loaded.items(), progress, "query maps"):
-            given[name] = matches_by_dim(encoder, tracks)[asked.dim]
+            given[name] = matches_by_dim(encoder, tracks)[args.dim]
         for name, tracks in tracked(loaded.items(), progress, "localize"):
             fitted = fit_calibration([m for other, m in given.items() if other != name])
-            by_rule.append(measure(tracks, encoder, asked.dim, rules(fitted)))
-            by_kind.append(kinds(tracks, encoder, asked.dim, fitted))
+            by_rule.append(measure(tracks, encoder, args.dim, rules(fitted)))
+            by_kind.append(kinds(tracks, encoder, args.dim, fitted))
     names = list(rules(MatchCalibration((0.0, 0.0, 0.0))))
     means = np.mean(by_rule, axis=0)
     rows = [

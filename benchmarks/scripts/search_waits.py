@@ -2,11 +2,11 @@
 
 python benchmarks/scripts/search_waits.py [--landmarks 1000000] [--searchers 1] [--seconds 3]
 
-Some threads of one process search all the time, one query per call; another one does one thing
-after the other, each again and again for some seconds. What a search took beyond the median search
-of the idle map is its *wait*, whatever it waited for: a lock, the interpreter (GIL), or a core.
-Only searches that ran while the other thread was inside a call count. The map is random: prototypes
-of two codes each. It is searched exactly, then by an index with --nprobe inverted lists.
+Threads of one process search all the time, one query per call; another thread repeats each
+operation for --seconds. The time that a search takes beyond the median search of the idle map is
+its *wait*, whether it waits for a lock, the interpreter (GIL) or a core. Only searches that run
+while the other thread is inside a call count. The map is random: each prototype is the mean of two
+codes. The threads search exactly, then by an index with --nprobe inverted lists.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BATCHES = (1_000, 10_000, 100_000)
 
 @dataclass
 class Searcher:
-    """Searches until it is stopped, and records when each search began and ended."""
+    """Searches until it is stopped, and records the start and end of each search."""
 
     scene: pm.PrototypeMap
     queries: NDArray[np.int8]
@@ -78,14 +78,14 @@ def searches_while(
 
 
 def random_codes(n: int, dim: int, rng: np.random.Generator) -> NDArray[np.int8]:
-    """Codes, (n, dim), spread as those of encoders are."""
+    """Codes, (n, dim), with about the spread of an encoder's."""
     return np.clip(rng.normal(0, 40, (n, dim)), -127, 127).astype(np.int8)
 
 
 def works(
     scene: pm.PrototypeMap, folder: Path, rng: np.random.Generator, indexed: bool
 ) -> dict[str, Callable[[], object]]:
-    """What the other thread does, by name; the map stays about as large."""
+    """Name -> operation of the other thread. All leave the map about as large as before."""
     encoder, dim, landmarks, largest = scene.encoder, scene.dim, len(scene), BATCHES[-1]
     descriptors = rng.integers(0, 256, (largest, encoder.bits // 8), dtype=np.uint8)
     existing = rng.integers(0, landmarks, largest)
@@ -108,7 +108,7 @@ def works(
         scene.remove(new[: largest // 2])
 
     def measure_recall() -> None:
-        # So much of the map changes that its recall table is measured anew.
+        # The map measures its recall table again once this share of it has changed.
         scene.add_codes(np.arange(landmarks // 8), random_codes(landmarks // 8, dim, rng))
         scene.nprobe(0.95)
 
@@ -129,7 +129,7 @@ def works(
     if indexed:
         found["add_codes of an eighth of the map, nprobe"] = measure_recall
         found["build_index"] = scene.build_index
-        # Another nlist than before: else no row moves.
+        # With the same nlist no row would move.
         rebuild = lambda: scene.build_index(scene.nlist - 1, in_place=True)  # noqa: E731
         found["build_index(in_place=True)"] = rebuild
     return found
@@ -138,17 +138,17 @@ def works(
 def measure(
     scene: pm.PrototypeMap, searchers: int, seconds: float, nprobe: int | None
 ) -> ReportTable:
-    """A row for each thing that the other thread does."""
+    """A row per operation of the other thread."""
     rng = np.random.default_rng(1)
     queries = random_codes(4096, scene.dim, rng)
     group = [Searcher(scene, queries, nprobe) for _ in range(searchers)]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        usual = 0.0
+        idle = 0.0
         for name, work in works(scene, Path(folder), rng, nprobe is not None).items():
             took, runs = searches_while(group, work, seconds)
-            usual = usual or float(np.median(took))
-            waits = 1e3 * np.quantile(np.maximum(took - usual, 0), [0.5, 0.99, 1])
+            idle = idle or float(np.median(took))
+            waits = 1e3 * np.quantile(np.maximum(took - idle, 0), [0.5, 0.99, 1])
             cells = [f"{1e3 * np.median(runs):.4g}", f"{len(took):,}"]
             rows.append([name, *cells, *(f"{wait:.2f}" for wait in waits)])
     heads = ("the other thread, again and again", "a run of it, ms", "searches")
@@ -158,23 +158,27 @@ def measure(
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--landmarks", type=int, default=1_000_000)
-    parser.add_argument("--dim", type=int, default=32)
-    parser.add_argument("--searchers", type=int, default=1, help="threads that search")
-    parser.add_argument("--seconds", type=float, default=3, help="of each thing")
-    parser.add_argument("--nprobe", type=int, default=8, help="inverted lists that are searched")
-    asked = parser.parse_args()
+    parser.add_argument("--landmarks", type=int, default=1_000_000, help="default: 1000000")
+    parser.add_argument("--dim", type=int, default=32, help="code length; default: 32")
+    parser.add_argument("--searchers", type=int, default=1, help="threads that search; default: 1")
+    parser.add_argument(
+        "--seconds", type=float, default=3, help="seconds per operation; default: 3"
+    )
+    parser.add_argument(
+        "--nprobe", type=int, default=8, help="inverted lists to search; default: 8"
+    )
+    args = parser.parse_args()
     rng = np.random.default_rng(0)
-    scene = pm.PrototypeMap(pm.Encoder.load("freak"), asked.dim)
-    for begin in range(0, asked.landmarks, 1 << 18):
-        ids = np.arange(begin, min(asked.landmarks, begin + (1 << 18)))
+    scene = pm.PrototypeMap(pm.Encoder.load("freak"), args.dim)
+    for begin in range(0, args.landmarks, 1 << 18):
+        ids = np.arange(begin, min(args.landmarks, begin + (1 << 18)))
         for _ in range(2):
-            scene.add_codes(ids, random_codes(len(ids), asked.dim, rng))
-    print(f"{asked.landmarks:,} landmarks, {asked.dim} dimensions, searched exactly\n")
-    print(measure(scene, asked.searchers, asked.seconds, None).markdown())
+            scene.add_codes(ids, random_codes(len(ids), args.dim, rng))
+    print(f"{args.landmarks:,} landmarks, {args.dim} dimensions, searched exactly\n")
+    print(measure(scene, args.searchers, args.seconds, None).markdown())
     scene.build_index()
-    print(f"\nby {asked.nprobe} of {scene.nlist:,} inverted lists\n")
-    print(measure(scene, asked.searchers, asked.seconds, asked.nprobe).markdown())
+    print(f"\nby {args.nprobe} of {scene.nlist:,} inverted lists\n")
+    print(measure(scene, args.searchers, args.seconds, args.nprobe).markdown())
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Measures what each part of the training recipe brings: data, objective, capacity, length.
+"""Measures the effect of each part of the training recipe: data, objective, capacity, length.
 
 python benchmarks/scripts/training_ablation.py TRACKS... -o FOLDER [--steps 300] [--only NAME]
 
 TRACKS are the FREAK (or other) tracks of hololens, caliterra, and, plain and augmented, of
-desk_rpy, viking, conch and seneca. Trained on the latter four, measured on hololens and caliterra,
-which are no test sequences. FOLDER caches finished trainings. Writes docs/results/training.md and
-its plot.
+desk_rpy, viking, conch and seneca. The script trains on the latter four and measures on hololens
+and caliterra, which are no test sequences. FOLDER caches finished trainings. Writes
+docs/results/training.md and its plot.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ QUERIES = 5000
 
 @dataclass(frozen=True)
 class RecipeChange:
-    """One change of the recipe: options that differ, and what is learned from.
+    """One change of the recipe: options and training data that differ.
 
     Attributes:
-        name: for the table.
-        options: of `TrainingOptions`; "steps" is a factor.
-        group: "capacity" and "data" are drawn.
-        sequences: that it is trained on.
-        augmented: whether their augmented tracks are used.
+        name: row of the table.
+        options: fields of `TrainingOptions` that differ; "steps" is a factor.
+        group: "capacity" or "data" if the plot shows it.
+        sequences: training sequences.
+        augmented: whether to train on their augmented tracks.
         upright: whether angle and size are further inputs.
     """
 
@@ -89,7 +89,7 @@ CHANGES = (
 
 
 def precision_of_all_codes(trial: Trial, codes: NDArray[np.float32]) -> float:
-    """Precision with all codes of the support, none averaged; the queries' codes come last."""
+    """Precision with all codes of the support instead of means; the queries' codes come last."""
     support, queries = codes[: len(trial.support)], codes[len(trial.support) :]
     norms = (support**2).sum(1)
     right = 0
@@ -186,28 +186,28 @@ def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Trains what is missing, then writes the page."""
+    """Trains the changes that the cache lacks, then writes the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tracks", nargs="+", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=300, help="default: 300")
     parser.add_argument("--only", action="append", help="train only this change; may be repeated")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     keep_freed_memory()
     torch.set_num_threads(1)
     tracks = {}
-    for path in asked.tracks:
+    for path in args.tracks:
         loaded = Tracks.load(path)
         tracks[sequence_name(path) + ".augmented" * bool(loaded.info.get("augmentations"))] = loaded
-    cache = ResultCache(asked.output)
+    cache = ResultCache(args.output)
     results: dict[str, dict[str, Any]] = {}
     with progress_bar() as progress:
         for done, change in enumerate(CHANGES):
             progress(f"train, {change.name}", done, len(CHANGES))
-            key = key_of(name=change.name, steps=asked.steps, tracks=sorted(tracks))
+            key = key_of(name=change.name, steps=args.steps, tracks=sorted(tracks))
             found = cache.load(key)
-            if found is None and (not asked.only or change.name in asked.only):
-                found = train(change, asked.steps, tracks)
+            if found is None and (not args.only or change.name in args.only):
+                found = train(change, args.steps, tracks)
                 cache.save(key, found)
             if found is not None:
                 results[change.name] = found
@@ -215,7 +215,7 @@ def main() -> None:
     text = (
         "# What each part of the training recipe brings\n\n"
         "Written by `benchmarks/scripts/training_ablation.py`; [training](../training.md) says "
-        f"what to read from it. {tracks[MEASURED[0]].descriptor.upper()}, one seed, {asked.steps} "
+        f"what to read from it. {tracks[MEASURED[0]].descriptor.upper()}, one seed, {args.steps} "
         "steps where nothing else is said. The last column of a sequence keeps every code of the "
         "support at the greatest length, so that only the encoder loses, not the mean. Raw "
         f"descriptors, all kept: {', '.join(f'{s} {p:.3f}' for s, p in raw.items())}.\n\n"

@@ -1,7 +1,7 @@
-"""Holds maps against true poses: python benchmarks/scripts/trajectory_error.py SCENE MODEL ...
+"""Compares maps with true poses: python benchmarks/scripts/trajectory_error.py SCENE MODEL ...
 
-SCENE is what `protomark map` wrote, MODEL the COLMAP model with the true poses of its images; there
-may be several pairs. Prints the errors of each.
+SCENE is a folder that `protomark map` wrote, MODEL the COLMAP model with the true poses of its
+images. Several pairs give several rows. Prints the errors of each.
 """
 
 from __future__ import annotations

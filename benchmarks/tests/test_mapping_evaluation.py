@@ -1,4 +1,4 @@
-"""`protomark evaluate-mapping` on a tiny room, and what its report is made of."""
+"""`protomark evaluate-mapping` on a tiny room, and the parts of its report."""
 
 from __future__ import annotations
 

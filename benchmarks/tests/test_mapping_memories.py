@@ -1,4 +1,4 @@
-"""The memories that mapping is compared with, and prototypes: one contract."""
+"""The descriptor memories that mapping is compared with: one contract for all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`protomark reproduce` as users meet it, on synthetic tracks and with very short trainings."""
+"""`protomark reproduce` on synthetic tracks with very short trainings."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from protomark_bench.paper.objectives import (
 
 
 def views_of(counts):
-    """Views whose first two bytes name the landmark, whose third names the view."""
+    """Views whose first two bytes encode the landmark and whose third encodes the view."""
     landmark = np.repeat(np.arange(len(counts)), counts)
     view = np.concatenate([np.arange(n) for n in counts])
     descriptors = np.stack([landmark // 256, landmark % 256, view], axis=1).astype(np.uint8)
@@ -61,9 +61,9 @@ def test_triplets_are_two_views_of_a_landmark_and_one_of_another():
 
 
 def test_triplets_need_two_landmarks():
-    with pytest.raises(ValueError, match="made: no two landmarks"):
+    with pytest.raises(ValueError, match="made: there are no two landmarks"):
         draw_triplets(views_of([4]), 8, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="made: no two landmarks"):
+    with pytest.raises(ValueError, match="made: there are no two landmarks"):
         draw_triplets(views_of([1, 1]), 8, np.random.default_rng(0))
 
 
@@ -101,5 +101,5 @@ def test_episodes_have_support_and_queries_of_every_class():
 
 
 def test_episodes_need_two_classes():
-    with pytest.raises(ValueError, match="made: no two landmarks"):
+    with pytest.raises(ValueError, match="made: an episode needs two landmarks"):
         draw_episode(views_of([5, 1]), 8, np.random.default_rng(0))

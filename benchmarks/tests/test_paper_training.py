@@ -66,7 +66,7 @@ def test_a_limited_training_slows_down_and_ends():
 
 def test_scales():
     assert [find_scale(name).name for name in SCALES] == ["small", "medium", "full"]
-    with pytest.raises(ValueError, match="'tiny' is not known: give small, medium, full"):
+    with pytest.raises(ValueError, match="--scale 'tiny' is unknown: give small, medium, full"):
         find_scale("tiny")
 
 

@@ -1,4 +1,4 @@
-"""Scripts whose figures stand in docs/, on small data."""
+"""Scripts that compute figures of docs/, on small data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`protomark bench`: what it measures on, how it chooses and reports; never how fast."""
+"""`protomark bench`: its data, choices and report; no test depends on speed."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_synthetic_prototypes_are_the_means_of_synthetic_descriptors(
 def test_bytes_of_a_synthetic_landmark_are_of_two_parents(
     synthetic: SyntheticLandmarks, real: RealLandmarks
 ) -> None:
-    """Each byte, in all its observations, is one that its two parents have there."""
+    """In all observations each byte comes from one of the two parents."""
     parents, _ = synthetic._parents(0)
     rows = synthetic.descriptors(20).reshape(20, -1, 64)
     for i in range(20):
@@ -236,7 +236,7 @@ def test_peers_compute_the_same_network(encoder: pm.Encoder) -> None:
 
 @pytest.fixture
 def fixed() -> BenchResults:
-    """Made up: ours takes 1 unit of time, peers 3, 2 and 4."""
+    """Synthetic timings: ours takes 1 unit of time, the peers 3, 2 and 4."""
 
     def contest(section: str, names: list[str], **more: object) -> Contest:
         timings = [Timing("Protomark", True, [1e-6, 1e-6, 1e-6], 100)]

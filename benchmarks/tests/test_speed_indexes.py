@@ -1,4 +1,4 @@
-"""Cached indexes of peers: built once for the same rows, and the same when they are read."""
+"""Cached indexes of peers: built once for the same rows, and unchanged when read again."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-// Mutates what is in a file of docs/format.md and makes its checksums right again, so that the
-// fuzzer gets behind them. A part of its inputs stays as broken as it is.
+// Mutates the content of a file (docs/format.md) and usually corrects its checksums, so that the
+// fuzzer gets past them.
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
@@ -42,14 +42,14 @@ struct File {
   }
 };
 
-// Whatever libFuzzer does to bytes that know nothing of a format.
+// Mutates bytes as libFuzzer does without knowing a format.
 void mutate(Content& bytes, std::size_t most) {
   const std::size_t size = bytes.size();
   bytes.resize(std::max(size, std::min(2 * size + 16, most)));
   bytes.resize(LLVMFuzzerMutate(reinterpret_cast<std::uint8_t*>(bytes.data()), size, bytes.size()));
 }
 
-// Of the header and table, whose checksum is made right.
+// Mutates header and table, and corrects their checksum.
 Content mutate_table(Bytes file) {
   Content bytes(file.begin(), file.end());
   std::uint32_t sections;
@@ -64,7 +64,7 @@ Content mutate_table(Bytes file) {
   return bytes;
 }
 
-// Makes the checksums of the owners of rows right again.
+// Corrects the checksums of the owners of rows.
 void repair_owners(File& file) {
   const auto find = [&](const char* name) {
     const auto found =
@@ -110,7 +110,7 @@ Content mutate_file(Bytes bytes, Random& random, std::size_t most) {
   return file.serialize();
 }
 
-// The containers that a journal consists of, and what follows the last whole one.
+// The containers of a journal, and the bytes after the last whole one.
 std::vector<Content> split(Bytes bytes) {
   std::vector<Content> result;
   while (!bytes.empty()) {
@@ -124,7 +124,7 @@ std::vector<Content> split(Bytes bytes) {
   return result;
 }
 
-// Names in a record the one before it.
+// Links a record to the one before it.
 void chain(Content& record, std::uint64_t number, const Content& previous) {
   File file(record);
   for (auto& [name, content] : file.sections) {

@@ -38,7 +38,7 @@ void write(const fs::path& path, std::span<const std::byte> bytes) {
              static_cast<std::streamsize>(bytes.size()));
 }
 
-// What was read from memory is there in files, too, and one can go on with it.
+// Files with the same bytes give the same map, which can be changed and committed.
 void go_on(const PrototypeMap& map, std::span<const std::byte> base,
            std::span<const std::byte> journal) noexcept {
   const fs::path path = scratch(".map");

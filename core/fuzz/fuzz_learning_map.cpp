@@ -28,7 +28,7 @@ std::vector<char> saved(const PrototypeMap& map) {
   return {std::istreambuf_iterator<char>(file), {}};
 }
 
-// What was added can be subtracted, and nothing is left of it.
+// Added observations can be subtracted, after which the map is as before.
 void change(PrototypeMap& map) {
   test::Random random(4);
   const std::size_t n = 20, dim = map.dim();

@@ -47,7 +47,7 @@ void fill(PrototypeMap& map, std::size_t landmarks, std::int64_t step, bool posi
   }
 }
 
-// Journals of one commit, of several, and with a map file in between.
+// Journals of one commit, of several, and with a fold between.
 void write_journals(const fs::path& folder) {
   const fs::path path = folder.parent_path() / "journal.pmk";
   int number = 0;

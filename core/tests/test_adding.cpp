@@ -1,5 +1,5 @@
-// Adding in chunks and pieces, by several threads, and out of memory: the same as one observation
-// after the other.
+// Adding in chunks and pieces, by several threads and out of memory, gives the map of one
+// observation after the other.
 #include <unistd.h>
 
 #include <algorithm>
@@ -18,7 +18,7 @@ namespace fs = std::filesystem;
 
 namespace {
 
-// More than two chunks that are encoded (8192) and one piece that searches wait for (2048).
+// More than two chunks of encoding (8192) and one piece of a change (2048).
 constexpr std::size_t kMany = 2 * 8192 + 2048 + 77, kBytes = 8;
 const fs::path path =
     fs::temp_directory_path() / ("protomark_adding_" + std::to_string(::getpid()) + ".pmk");
@@ -33,7 +33,7 @@ struct Observations {
   std::vector<std::int64_t> ids;
   std::vector<std::uint8_t> descriptors;
 
-  // Of landmarks first to last; runs of one landmark are long enough to be halved.
+  // Of landmarks `first` to `last`; runs of one landmark are long enough to halve its count.
   Observations(std::uint32_t seed, std::size_t n, std::int64_t first, std::int64_t last)
       : descriptors(test::Random(seed).integers<std::uint8_t>(n * kBytes, 0, 255)) {
     test::Random random(seed);
@@ -51,14 +51,14 @@ struct Observations {
   }
 };
 
-// Known, new and repeated landmarks in one batch.
-void test_threads(std::size_t appearance_bits, std::size_t dim, std::size_t cells) {
+// Existing, new and repeated landmarks in one batch.
+void test_threads(std::size_t appearance_bits, std::size_t dim, std::size_t nlist) {
   const auto encoder = test::random_encoder(64, dim);
   const Observations first(1, 3000, 0, 999), more(2, kMany, 500, 2499);
   const auto begun = [&] {
     PrototypeMap map(encoder, dim, appearance_bits);
     first.add_to(map, 0, first.ids.size(), 1);
-    if (cells != 0) map.build_index({.nlist = cells});
+    if (nlist != 0) map.build_index({.nlist = nlist});
     return map;
   };
   PrototypeMap single = begun();
@@ -78,9 +78,9 @@ auto distances(const PrototypeMap& map, Codes queries) {
   return map.search_codes(queries, 1).distances;
 }
 
-// Whichever allocation fails, the map is whole: each observation is in it or not, and its rounded
-// prototypes, which search reads, are those of its sums, which a file has.
-void test_failures(std::size_t appearance_bits, std::size_t cells, int threads) {
+// Whichever allocation fails, the map holds each observation or not, and its rounded prototypes,
+// which search reads, follow from its sums, which a file has.
+void test_failures(std::size_t appearance_bits, std::size_t nlist, int threads) {
   const auto encoder = test::random_encoder();
   const Observations first(3, 500, 0, 99), more(4, kMany, 50, 2499);
   const std::vector<std::int8_t> codes = first.codes(*encoder);
@@ -90,7 +90,7 @@ void test_failures(std::size_t appearance_bits, std::size_t cells, int threads) 
   for (long allowed = 0; !done; allowed += 1 + allowed / 8) {
     PrototypeMap map(encoder, 0, appearance_bits);
     first.add_to(map, 0, first.ids.size(), 1);
-    if (cells != 0) map.build_index({.nlist = cells});
+    if (nlist != 0) map.build_index({.nlist = nlist});
     test::left = allowed;
     try {
       more.add_to(map, 0, kMany, threads);
@@ -111,8 +111,8 @@ void test_failures(std::size_t appearance_bits, std::size_t cells, int threads) 
   CHECK(failed > 10);
 }
 
-// A caller that writes over ids and codes meanwhile gets an error or other landmarks, and a map
-// that is whole.
+// A caller that writes over ids and codes meanwhile gets an error or other landmarks, but a valid
+// map.
 void test_races(std::size_t appearance_bits) {
   const auto encoder = test::random_encoder();
   const std::size_t dim = encoder->dim();
@@ -144,9 +144,9 @@ void test_races(std::size_t appearance_bits) {
 
 int main() {
   for (const std::size_t appearance_bits : {0, 3}) {
-    for (const std::size_t cells : {0, 7}) {
-      for (const std::size_t dim : {12, 32, 34}) test_threads(appearance_bits, dim, cells);
-      for (const int threads : {1, 2}) test_failures(appearance_bits, cells, threads);
+    for (const std::size_t nlist : {0, 7}) {
+      for (const std::size_t dim : {12, 32, 34}) test_threads(appearance_bits, dim, nlist);
+      for (const int threads : {1, 2}) test_failures(appearance_bits, nlist, threads);
     }
 #ifndef __SANITIZE_THREAD__  // which is right to complain
     test_races(appearance_bits);

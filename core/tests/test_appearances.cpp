@@ -74,7 +74,7 @@ int main() {
   const auto codes = random.integers<std::int8_t>(n * kDim, -127, 127);
   const Codes all{codes.data(), n, kDim}, queries{codes.data(), 60, kDim};
 
-  // Signs say which appearance a code is of; each one has the mean of its codes.
+  // The signs of a code tell its appearance, which has the mean of its codes.
   PrototypeMap map(encoder, 0, 4);
   map.add_codes(ids, all);
   std::map<std::int64_t, std::map<int, std::array<int, kDim + 1>>> expected;
@@ -104,7 +104,7 @@ int main() {
   CHECK(map.size() == expected.size() && map.prototype_count() == prototypes);
   check_search(map, means, queries);
 
-  // From several threads, and taken back.
+  // Added from several threads, and subtracted again.
   PrototypeMap shared(encoder, 0, 4);
   {
     std::vector<std::jthread> threads;

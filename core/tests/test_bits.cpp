@@ -1,4 +1,4 @@
-// Packed numbers, whatever their width.
+// Packed numbers of every width.
 #include "base/packed_numbers.h"
 
 #include "base/checksums.h"
@@ -17,7 +17,7 @@ int main() {
     for (std::size_t i = 0; i < values.size(); ++i) {
       packer.add(values[i], bits);
       if (i % 100 != 0) continue;
-      // What is full may be taken at any time.
+      // Full words may be taken at any time.
       words.insert(words.end(), packer.words().begin(), packer.words().end());
       packer.words().clear();
     }
@@ -32,7 +32,7 @@ int main() {
     CHECK(equal);
   }
 
-  // A broken block answers none of its numbers, and no other block suffers.
+  // Reading any number of a broken block throws; those of other blocks are right.
   auto words = random.integers<std::uint64_t>(3 * CheckedNumbers::kBlock + 7, 0, 1000);
   std::vector<std::uint32_t> checksums;
   for (std::size_t at = 0; at < words.size(); at += CheckedNumbers::kBlock) {

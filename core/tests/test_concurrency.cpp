@@ -77,7 +77,7 @@ class Cycle {
   std::vector<std::int64_t> into_, source_;
 };
 
-// What there is to see of a map that goes through the cycle, from one thread alone.
+// All states of a map that goes through the cycle, observed from one thread.
 struct States {
   States(const Cycle& cycle, Codes queries, PrototypeMap map) {
     cycle.start(map);
@@ -106,7 +106,7 @@ void test_searches_while_a_writer_changes(std::size_t appearance_bits, const fs:
 
   const States states(cycle, queries, PrototypeMap(encoder, kDim, appearance_bits));
 
-  // A path of its own: where the last commits are not folded in, nothing else may be saved there.
+  // Another path, as no map may be saved over commits.
   const fs::path journaled = folder / ("journaled" + std::to_string(appearance_bits) + ".pmk");
   {
     PrototypeMap first(encoder, kDim, appearance_bits);
@@ -203,8 +203,8 @@ void test_merges_while_both_are_searched() {
   CHECK(left.size() == 200 + right.size());
 }
 
-// A change of more than a piece (MapChange::kPiece) shows piece by piece to searches, and
-// whole to files.
+// Searches see a change of more than a piece (MapChange::kPiece) piece by piece, files see it
+// whole.
 void test_large_changes_show_in_pieces(const fs::path& folder) {
   constexpr std::size_t kPiece = 2048, kAll = 9 * kPiece + 1000;
   const auto encoder = test::random_encoder();
@@ -246,8 +246,8 @@ void test_large_changes_show_in_pieces(const fs::path& folder) {
   CHECK(wrong == 0);
 }
 
-// Exact answers do not depend on an index that comes and goes, and approximate ones are given with
-// ranks of its own cells.
+// Building and dropping an index does not change exact answers, and approximate ones use the recall
+// table of the present lists.
 void test_searches_while_an_index_is_built() {
   const auto encoder = test::random_encoder();
   test::Random random(12);

@@ -1,4 +1,4 @@
-// What a save does to the disk, in which order, and what is there when a step of it fails.
+// The steps of a save, their order, and the files after a step that fails.
 #include <sys/resource.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -40,7 +40,7 @@ PrototypeMap map_of(std::size_t landmarks) {
   return map;
 }
 
-// Sections that come into being while they are written.
+// Sections that are produced while they are written.
 void pieces(const fs::path& path) {
   const auto values = test::Random(4).integers<std::int32_t>(300'000, -1000, 1000);
   ContainerWriter whole(FileKind::encoder), pieced(FileKind::encoder);
@@ -58,7 +58,7 @@ void pieces(const fs::path& path) {
       std::copy_n(&values[3 * i], 3, to);
     });
   });
-  // Side by side, in any turn.
+  // Produced side by side, in any order.
   pieced.add_together(
       {{"first", 100}, {"second", bytes.size()}, {"last", ContainerWriter::kUnknownSize}},
       [&](std::span<const ContainerWriter::Sink> sinks) {
@@ -73,7 +73,7 @@ void pieces(const fs::path& path) {
   const auto old_bytes = read(path);
   CHECK(std::ranges::equal(std::as_bytes(std::span(old_bytes)), whole.serialize()));
 
-  // Whatever goes wrong in one, the old file stays.
+  // If a producer throws, the old file stays.
   pieced.add("broken", 1,
              [](const ContainerWriter::Sink&) { throw std::invalid_argument("no such value"); });
   CHECK(check::throws<std::invalid_argument>([&] { pieced.write(path); }, "no such value"));
@@ -87,7 +87,8 @@ void pieces(const fs::path& path) {
   fs::remove(path);
 }
 
-// What a target may be: a link, which stays and leads to the new file; a long name; no device.
+// A target may be a link, which stays and leads to the new file, or have a long name, but is no
+// device.
 void targets(const PrototypeMap& old_map, const PrototypeMap& new_map, const fs::path& folder) {
   const fs::path real = folder / "real.pmk", link = folder / "link.pmk", far = folder / "far.pmk";
   fs::create_symlink("real.pmk", link);
@@ -115,7 +116,7 @@ void targets(const PrototypeMap& old_map, const PrototypeMap& new_map, const fs:
   CHECK(fs::is_fifo(pipe) && fs::is_character_file("/dev/null"));
 }
 
-// A limit on file sizes is an error like any other, though the system would end the program.
+// A limit on file sizes gives an error, though the system would end the program.
 void size_limit(const PrototypeMap& map, const fs::path& folder) {
   const std::size_t before = files(folder);
   rlimit limit;
@@ -170,7 +171,7 @@ int main() {
   CHECK(check::throws<FileError>([&] { new_map.save(folder / "none" / "map.pmk"); },
                                  "No such file or directory"));
 
-  // Here the new map is there, and the caller knows that it may not stay.
+  // Here the new map exists, and the caller learns that a power cut may undo it.
   fails(&Disk::fsync_folder, EIO, "its folder cannot be synced: Input/output error");
   CHECK(read(path) == new_bytes);
 

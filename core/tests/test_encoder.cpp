@@ -38,13 +38,13 @@ std::vector<std::int8_t> reference(const Encoder& encoder, const std::uint8_t* d
   return {x.begin(), x.end()};
 }
 
-// A network of one random layer after the other, in which results neither vanish nor all saturate.
+// A network of random layers whose results neither vanish nor all saturate.
 Encoder network(std::uint32_t seed, const std::vector<std::size_t>& widths, int shift) {
   test::Random random(seed);
   std::vector<Layer> layers;
   for (std::size_t l = 1; l < widths.size(); ++l) {
     Layer layer = test::random_layer(random, widths[l - 1], widths[l]);
-    // The multipliers of random_layer go with a shift of 22.
+    // The multipliers of random_layer belong to a shift of 22.
     layer.shift = shift;
     for (std::int32_t& m : layer.multipliers) {
       const std::int64_t scaled = shift < 22 ? m >> (22 - shift) : std::int64_t{m} << (shift - 22);
@@ -67,7 +67,7 @@ void compare(const Encoder& encoder, std::size_t n, int threads, test::Random& r
   }
   std::vector<std::int8_t> codes(n * dim, 99);
   encoder.encode({descriptors.data(), n, bytes}, {codes.data(), n, dim}, threads);
-  // The reference is slow: the ends, and some between.
+  // The first, the last and a few between, as the reference is slow.
   for (std::size_t i = 0; i < n; i += i < 20 || i + 20 > n ? 1 : 13) {
     const auto expected = reference(encoder, &descriptors[i * bytes]);
     CHECK(std::equal(expected.begin(), expected.end(), &codes[i * dim]));
@@ -93,8 +93,8 @@ int main() {
     CHECK(std::equal(&prefix[i * 10], &prefix[i * 10] + 10, &codes[i * 20]));
   }
 
-  // Sizes around those at which the way of computing changes; every instruction set is tested in
-  // its own run (PROTOMARK_ISA).
+  // Sizes around those at which the method changes. Each instruction set has its own run
+  // (PROTOMARK_ISA).
   const Encoder wide = network(3, {512, 80, 40}, 32);
   for (const std::size_t size :
        {0, 1, 15, 16, 17, 63, 64, 65, 127, 128, 129, 511, 512, 513, 1000}) {

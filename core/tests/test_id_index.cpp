@@ -10,7 +10,7 @@ using protomark::IdIndex, protomark::kNoLandmark, protomark::LandmarkIndex;
 
 namespace {
 
-// x where x ^ (x >> shift) is y.
+// Returns the x for which x ^ (x >> shift) is y.
 std::uint64_t undo_shift(std::uint64_t y, int shift) {
   std::uint64_t x = y;
   for (int i = 0; i < 64 / shift; ++i) x = y ^ (x >> shift);
@@ -24,8 +24,8 @@ std::uint64_t inverse(std::uint64_t odd) {
   return x;
 }
 
-// Ids that SplitMix64, as it is published, sends to one slot of any table of up to 2^28. Slots are
-// counted, not time.
+// Ids that SplitMix64 without a seed maps to one slot of any table of up to 2^28. The test counts
+// slots, not time.
 void chosen_ids() {
   protomark::LargeVector<std::int64_t> ids;
   for (std::uint64_t k = 0; ids.size() < 10000; ++k) {

@@ -1,4 +1,4 @@
-// What an index takes beside the map while it is built, and a map whose index runs out of memory.
+// Memory beside the map while an index is built, and maps that run out of memory meanwhile.
 #include <unistd.h>
 
 #include <cmath>
@@ -45,10 +45,10 @@ constexpr std::size_t kLandmarks = 20'000, kTries = 40;
 #else
 constexpr std::size_t kLandmarks = 500'000, kTries = 400;
 #endif
-// Of any map: codes that cells are learned from, and buffers.
+// For any map: the codes from which lists are learned, and buffers.
 constexpr double kBuffers = 4 << 20;
 
-// Bytes a landmark.
+// Bytes per landmark.
 template <typename Work>
 double bytes(const std::string& what, const Work& work) {
   const auto more = static_cast<double>(test::memory_of(work));
@@ -61,15 +61,15 @@ void test_memory(std::size_t appearance_bits, bool placed) {
   PrototypeMap map = map_of(kLandmarks, appearance_bits, placed);
   const double own = static_cast<double>(test::held - before) / kLandmarks;
   const std::string what =
-      "look bits " + std::to_string(appearance_bits) + (placed ? ", placed" : "");
+      "appearance bits " + std::to_string(appearance_bits) + (placed ? ", placed" : "");
   std::printf("%-50s %4.1f bytes a landmark\n", what.c_str(), own);
   const double few = 5.5 + kBuffers / kLandmarks, sums = 2 * kDim;
-  // Arrays that grew have room; positions were made at once, and with looks rows do without them.
+  // Arrays that grew have room; positions did not grow, and are not by row with appearances.
   const double grown = placed && appearance_bits == 0 ? sizeof(Position) : 0;
   CHECK(bytes(what + ": in place", [&] { map.build_index({30, true}); }) < few + grown);
   CHECK(bytes(what + ": in place again", [&] { map.build_index({20, true}); }) < few);
   CHECK(bytes(what + ": beside", [&] { map.build_index({20}); }) > 0.7 * own);
-  // Now they have none for the half-filled blocks of more cells, and grow one after the other.
+  // Now they have none for the half-filled blocks of more lists, and grow one after the other.
   CHECK(bytes(what + ": in place, no room", [&] { map.build_index({60, true}); }) < few + sums);
 }
 
@@ -100,29 +100,29 @@ State state_of(const PrototypeMap& map, Codes queries) {
   return s;
 }
 
-// Whichever allocation fails, the map is what it was and does what it did.
+// Whichever allocation fails, the map is as before.
 void test_failures(std::size_t appearance_bits, bool placed, bool in_place) {
   PrototypeMap map = map_of(200, appearance_bits, placed);
   test::Random random(7);
   const auto codes = random.integers<std::int8_t>(20 * kDim, -127, 127);
   const Codes queries{codes.data(), 20, kDim};
-  for (const std::size_t cells : {5, 9, 2}) {
+  for (const std::size_t nlist : {5, 9, 2}) {
     const State before = state_of(map, queries);
-    // Learning takes most allocations; how many there are is seen on an equal map.
+    // Counts the allocations on an equal map.
     PrototypeMap same = map_of(200, appearance_bits, placed);
     const long all = 1L << 40;
     test::left = all;
-    same.build_index({cells, in_place});
+    same.build_index({nlist, in_place});
     const long needed = all - test::left;
     test::left = -1;
     int failed = 0;
     bool kept = true, done = false;
     for (long allowed = 0; !done; ++allowed) {
-      // All of those at the end, where rows change places.
+      // All of those at the end, where rows move.
       if (allowed + 60 < needed) allowed += needed / static_cast<long>(kTries);
       test::left = allowed;
       try {
-        map.build_index({cells, in_place});
+        map.build_index({nlist, in_place});
         done = true;
       } catch (const std::bad_alloc&) {
         ++failed;
@@ -132,7 +132,7 @@ void test_failures(std::size_t appearance_bits, bool placed, bool in_place) {
     }
     CHECK(failed > 30);
     CHECK(kept);
-    CHECK(map.nlist() == cells);
+    CHECK(map.nlist() == nlist);
     const State after = state_of(map, queries);
     CHECK(after.ids == before.ids && after.counts == before.counts);
     CHECK(after.prototypes == before.prototypes);

@@ -1,4 +1,4 @@
-// Inverted lists: all of them are the exact answer, whatever happened to the map.
+// Inverted lists: a search of all of them is exact after any history.
 #include <unistd.h>
 
 #include <algorithm>
@@ -44,7 +44,7 @@ SearchOptions with_recall(double recall) {
   return options;
 }
 
-// Codes in clumps, as real ones are.
+// Codes in clumps, like real ones.
 std::vector<std::int8_t> clumped(test::Random& random, std::size_t n, std::size_t dim = kDim) {
   std::vector<std::int8_t> result;
   for (std::size_t i = 0; i < n; ++i) {
@@ -56,7 +56,7 @@ std::vector<std::int8_t> clumped(test::Random& random, std::size_t n, std::size_
   return result;
 }
 
-// What a map answers in all ways that are exact.
+// The answers of a map by all exact searches.
 template <typename Map>
 void check_exact(const Map& map, const Matches& expected, Codes queries) {
   CHECK(search(map, queries, 3) == expected);
@@ -69,13 +69,13 @@ void check_exact(const Map& map, const Matches& expected, Codes queries) {
 void list_blocks() {
   test::Random random(3);
   ListBlocks blocks(5);
-  // Of each list its rows in order, and what stands in each row.
+  // The expected rows of each list in order, and the value of each row.
   std::map<std::uint32_t, std::vector<int>> expected;
   std::vector<int> stands;
   int next = 0;
   for (int step = 0; step < 4000; ++step) {
     const auto list = static_cast<std::uint32_t>(random.integer(0, 4));
-    // Rises, then falls to nothing.
+    // Grows, then shrinks to nothing.
     if (random.integer(0, 99) < (step < 2000 ? 65 : 25)) {
       const Row row = blocks.append(list);
       stands.resize(blocks.blocks() * kPackedRows, -1);
@@ -137,7 +137,7 @@ void learning() {
   CHECK(CoarseQuantizer::learn(view, 40, 3).centroids() == quantizer.centroids());
   const auto own = quantizer.assign(view, 1);
   CHECK(quantizer.assign(view, 4) == own);
-  // One code alone is where it is among others.
+  // A code alone has the list that it has among others.
   for (const std::size_t i : {0, 17, 2999})
     CHECK(quantizer.assign({view.row(i), 1, kDim}, 1)[0] == own[i]);
   // All lists are used, and nearly all codes are in that of the nearest centroid.
@@ -155,7 +155,7 @@ void learning() {
         std::vector<std::uint32_t>(n, 0));
 }
 
-// Which lists are searched, against the definition; few, many and all of them.
+// The nearest lists against their definition: a few, many and all of them.
 void nearest() {
   test::Random random(14);
   for (const std::size_t nlist : {1, 15, 300, 2000}) {
@@ -193,7 +193,7 @@ std::vector<std::byte> content(const fs::path& path) {
   return {file.bytes().begin(), file.bytes().end()};
 }
 
-// Whatever happens to a map with an index, it answers as one without.
+// After any history a map with an index answers as one without.
 void histories(std::size_t appearance_bits) {
   const auto encoder = test::random_encoder();
   test::Random random(6);
@@ -222,12 +222,12 @@ void histories(std::size_t appearance_bits) {
   CHECK(with.nlist() == 16);
   for (int round = 0; round < 12; ++round) {
     add(400, 300 + 100 * round);
-    // Some observations are taken back, all of some landmarks among them.
+    // Subtracts observations, all those of a few landmarks among them.
     std::vector<std::int64_t> landmarks;
     std::vector<std::int8_t> taken;
-    const std::int64_t gone = random.integer(0, 300);
+    const std::int64_t removed = random.integer(0, 300);
     std::erase_if(added, [&](const Observation& o) {
-      if (o.id % 40 != gone % 40 && random.integer(0, 9) != 0) return false;
+      if (o.id % 40 != removed % 40 && random.integer(0, 9) != 0) return false;
       landmarks.push_back(o.id);
       taken.insert(taken.end(), o.code.begin(), o.code.end());
       return true;
@@ -263,7 +263,7 @@ void histories(std::size_t appearance_bits) {
     CHECK(with.counts(with.ids()) == without.counts(without.ids()));
     check_exact(with, search(without, queries, 3), queries);
 
-    // Lists do not depend on how the map came about: built anew from its file it answers alike.
+    // Lists do not depend on the history: a map read from the file gives the same answers.
     const fs::path path =
         fs::temp_directory_path() / ("test_inverted_lists_" + std::to_string(::getpid()) + ".pmk");
     with.save(path);
@@ -288,7 +288,7 @@ void histories(std::size_t appearance_bits) {
   check_exact(with, search(without, queries, 3), queries);
 }
 
-// Rows that change places within the map end where they would beside it.
+// Rows that move within the map get the indices that they get in a copy.
 void ways(std::size_t appearance_bits, bool placed) {
   const auto encoder = test::random_encoder();
   const fs::path path =
@@ -338,10 +338,10 @@ void ways(std::size_t appearance_bits, bool placed) {
     beside.build_index({nlist});
     within.build_index({nlist, true});
     check_equal();
-    // Of lists in which rows are gone, and others have come.
+    // With rows removed and others added.
     const auto ids = beside.ids();
-    const std::vector<std::int64_t> gone(ids.begin() + 40, ids.begin() + 200);
-    both([&](PrototypeMap& map) { map.remove(gone); });
+    const std::vector<std::int64_t> removed(ids.begin() + 40, ids.begin() + 200);
+    both([&](PrototypeMap& map) { map.remove(removed); });
     check_equal();
     add(300, static_cast<std::int64_t>(nlist) * 10);
     check_equal();

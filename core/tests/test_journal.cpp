@@ -1,4 +1,4 @@
-// Journals: what is committed is there when the map is opened, whatever others do meanwhile.
+// Journals: an opened map has all commits, whatever others do meanwhile.
 #include <fcntl.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
@@ -19,7 +19,7 @@ using namespace protomark;
 using namespace protomark::test;
 
 namespace {
-// What happens before a file is opened.
+// Runs before a file is opened.
 std::function<void(const std::string&)> before_open;
 }  // namespace
 
@@ -89,7 +89,7 @@ void any_history(std::size_t appearance_bits, std::uint32_t seed) {
         map->compact();
         committed = bytes_of(*map);
         break;
-      case 1:  // what was not committed is gone
+      case 1:  // uncommitted changes are lost
         map.reset();
         map.emplace(PrototypeMap::load(path, true));
         CHECK(bytes_of(*map) == committed);
@@ -112,7 +112,7 @@ void any_history(std::size_t appearance_bits, std::uint32_t seed) {
   verify_file(path);
 }
 
-// Who may not read the map may not read its journal, nor the map once it is compacted.
+// The journal, and the map after compacting, are only as readable as the map file was.
 void permissions_of_the_map() {
   for (const auto mode : {fs::perms(0600), fs::perms(0664)}) {
     begin(0);
@@ -133,7 +133,7 @@ void other_map_files() {
   other.save(folder / "other.pmk");
   const auto other_bytes = read(folder / "other.pmk");
   const std::string stale = "map.pmk.journal: holds 3 commits to another map file";
-  // Somebody puts another file there.
+  // Another file replaces the map file.
   write(path, other_bytes);
   CHECK(check::throws<FileError>([] { PrototypeMap::load(path); }, stale));
   CHECK(check::throws<FileError>([] { PrototypeMap::load(path, true); }, stale));
@@ -141,11 +141,11 @@ void other_map_files() {
   other.seal(folder / "sealed.pmk");
   fs::copy_file(folder / "sealed.pmk", path, fs::copy_options::overwrite_existing);
   CHECK(check::throws<FileError>([] { SealedMap{path}; }, stale));
-  // And brings the right one back.
+  // The right one is back.
   write(path, c.base);
   CHECK(bytes_of(PrototypeMap::load(path)) == c.states[3]);
 
-  // Nobody saves over commits.
+  // No map is saved over commits.
   const std::string lost = "map.pmk: cannot be written: its journal holds 3 commits";
   CHECK(check::throws<FileError>([&] { other.save(path); }, lost));
   CHECK(check::throws<FileError>([&] { other.seal(path); }, lost));
@@ -154,7 +154,7 @@ void other_map_files() {
   CHECK(check::throws<FileError>([&] { other.save(folder / "other_link.pmk"); },
                                  "other_link.pmk: cannot be written: its journal holds 3 commits"));
   CHECK(read(path) == c.base && read(journal) == c.whole);
-  // Nor while somebody may commit.
+  // Nor while a map may commit.
   PrototypeMap map = PrototypeMap::load(path, true);
   const std::string held = "its journal is held by another map of this process";
   CHECK(check::throws<FileError>([&] { other.save(path); }, held));
@@ -167,7 +167,7 @@ void other_map_files() {
   CHECK(bytes_of(PrototypeMap::load(path)) == other_bytes);
   CHECK(bytes_of(PrototypeMap::load(path, true)) == other_bytes);
 
-  // A map file that goes while it is open is noticed.
+  // A commit notices that the map file was removed.
   PrototypeMap next = PrototypeMap::load(path, true);
   add(next, 1);
   write(path, c.base);
@@ -195,7 +195,7 @@ void one_writer() {
   CHECK(PrototypeMap::load(path).size() == map->size());
   CHECK(PrototypeMap::load(folder / "link.pmk").size() == map->size());
 
-  // Another process is told which one has it; a copy of this one may not commit.
+  // The error tells another process which one holds the journal; a fork of this one may not commit.
   add(*map, 2);
   const pid_t child = ::fork();
   if (child == 0) {
@@ -223,8 +223,8 @@ void one_writer() {
   PrototypeMap::load(path, true);
 }
 
-// A map file that is compacted twice while it is read, to an equal one in the end: its journal was
-// that of the one in between.
+// A map file that is compacted twice while it is read, in the end to an equal one, whose journal is
+// not that of the one in between.
 void compacted_twice_meanwhile() {
   begin(0);
   PrototypeMap map = PrototypeMap::load(path, true);
@@ -269,7 +269,7 @@ void nothing_is_left_behind() {
   write(path, broken);
   CHECK(check::throws<FileError>([] { PrototypeMap::load(path, true); }, "checksum"));
   CHECK(!fs::exists(journal));
-  // One that was there stays.
+  // An existing one stays.
   begin(0);
   PrototypeMap::load(path, true).close();
   const Content head = read(journal);
@@ -278,14 +278,14 @@ void nothing_is_left_behind() {
   CHECK(read(journal) == head);
 }
 
-// Files that are made to be slow to read: landmarks with thousands of looks, and others that come
-// and go beside them. Rows are counted, not time.
+// Files made to be slow to read: landmarks with thousands of appearances, and others added and
+// removed beside them. The test counts rows, not time.
 void thousands_of_appearances() {
   begin(12);
   PrototypeMap map = PrototypeMap::load(path, true);
   std::vector<std::int8_t> codes;
-  for (int look = 0; look < 1 << 12; ++look) {
-    for (int d = 0; d < 12; ++d) codes.push_back((look >> d & 1) != 0 ? 5 : -5);
+  for (int appearance = 0; appearance < 1 << 12; ++appearance) {
+    for (int d = 0; d < 12; ++d) codes.push_back((appearance >> d & 1) != 0 ? 5 : -5);
   }
   const auto grow = [&](std::int64_t id) {
     map.add_codes(std::vector<std::int64_t>(codes.size() / 12, id),
@@ -316,7 +316,7 @@ void thousands_of_appearances() {
   CHECK(bytes_of(PrototypeMap::load(path)) == expected);
 }
 
-// Its cost follows what changed.
+// The cost of a commit grows with the change.
 void cost() {
   begin(0);
   PrototypeMap map = PrototypeMap::load(path, true);

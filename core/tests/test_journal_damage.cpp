@@ -1,4 +1,4 @@
-// Journals that are cut off, broken or none: a broken tail is left out, anything else refused.
+// Damaged journals: a torn last record is left out, anything else refused.
 #include <algorithm>
 #include <cstdlib>
 #include <cstring>
@@ -12,7 +12,7 @@
 using namespace protomark;
 using namespace protomark::test;
 
-// A machine without memory for what no test needs. Inlined, they look mismatched to g++.
+// Fails for sizes that no test needs. Inlined, new and delete look mismatched to g++.
 [[gnu::noinline]] void* operator new(std::size_t size) {
   void* memory = size > std::size_t{1} << 30 ? nullptr : std::malloc(size);
   return memory != nullptr ? memory : throw std::bad_alloc();
@@ -61,7 +61,7 @@ void torn_tails(std::size_t appearance_bits) {
     }
   }
   CHECK(refused > c.lengths[2] / 2);
-  // Opened to go on with, the tail is cut off.
+  // Opening with the journal cuts the torn record off.
   Content torn = c.whole;
   torn.resize(torn.size() - 70);
   write(journal, torn);
@@ -120,7 +120,7 @@ void refused() {
   fails(joined({c.base}), "it holds a learning map, not a journal");
   fails(Content(1000, 'x'), "not a Protomark file");
 
-  // A later Protomark may write what this one does not know; that is no torn tail.
+  // A record of a later version is not a torn one.
   for (const std::size_t field : {std::size_t{8}, std::size_t{12}}) {
     Content newer(record(2).begin(), record(2).end());
     newer[field] = 77;
@@ -150,7 +150,7 @@ void refused() {
   fails(joined({head, record(0), impossible}), "has an impossible prototype");
 }
 
-// Whatever stands within a commit that was interrupted, it is not what stands behind it.
+// The content of an interrupted commit does not count as a record behind it.
 void containers_within_a_torn_record() {
   const Commits c(0);
   const auto all = std::span<const char>(c.whole);
@@ -179,7 +179,7 @@ void containers_within_a_torn_record() {
         [&] { c.opened(joined({all, broken, later})); },
         "another one follows at byte " + std::to_string(all.size() + record.size())));
   }
-  // Where its header did not reach the disk, no record of before stands behind it.
+  // If its header did not reach the disk, no earlier record follows.
   Content broken = commit(4, earlier);
   std::fill_n(broken.begin(), 64, 0);
   CHECK(c.opened(joined({all, broken})) == c.states[3]);
@@ -187,7 +187,7 @@ void containers_within_a_torn_record() {
                                  "at byte " + std::to_string(all.size() + broken.size())));
 }
 
-// Files that are large because nothing was ever written to most of them.
+// Sparse files that claim to be large.
 void holes() {
   begin(0);
   PrototypeMap::load(path, true).close();
@@ -206,7 +206,7 @@ void holes() {
   fs::remove(journal);
 }
 
-// How many commits stand in the way, where a fold may have taken place or not.
+// The error states how many commits may be in the map file already.
 void commits_to_other_map_files() {
   const Commits c(0);
   const auto all = std::span<const char>(c.whole);

@@ -1,5 +1,5 @@
-// What a commit and a compaction do to the disk: the order of steps, each step that fails, and each
-// moment at which a process is killed or the power goes.
+// The steps of a commit and a compaction: their order, each one failing, and a killed process or
+// power cut at each moment.
 #include <cerrno>
 #include <chrono>
 #include <cstring>
@@ -34,21 +34,21 @@ Content read(const fs::path& file) {
   return {std::istreambuf_iterator<char>(in), {}};
 }
 
-// The map file and journal that a disk may have after a power cut at some moment: what was synced,
-// and of the rest any part. A process that is killed leaves the present names and contents.
+// The map files and journals that a disk may have after a power cut: all that was synced, and any
+// part of the rest. A killed process leaves the present names and contents.
 class PowerCuts {
  public:
   using World = std::map<std::string, Content>;
 
-  // What is there now is synced.
+  // The present content is synced.
   PowerCuts() {
-    look();
+    observe();
     synced_names_ = names_;
     synced_ = current_;
     worlds_.clear();
-    disk.before_step = [this] { look(); };
+    disk.before_step = [this] { observe(); };
     disk.after_sync = [this](int descriptor, bool of_folder) {
-      look();
+      observe();
       struct stat status;
       ::fstat(descriptor, &status);
       if (of_folder) synced_names_ = names_;
@@ -59,16 +59,16 @@ class PowerCuts {
   PowerCuts(const PowerCuts&) = delete;
   PowerCuts& operator=(const PowerCuts&) = delete;
 
-  // Those that there may have been since the last time.
+  // Those that are possible since the last call.
   std::set<World> take() {
-    look();
+    observe();
     return std::exchange(worlds_, {});
   }
 
  private:
   using Names = std::map<std::string, ino_t>;
 
-  void look() {
+  void observe() {
     names_.clear();
     for (const auto& entry : fs::directory_iterator(path.parent_path())) {
       struct stat status;
@@ -95,7 +95,7 @@ class PowerCuts {
 
   std::set<Content> contents(ino_t inode) {
     const Content &now = current_[inode], &synced = synced_[inode];
-    // The size is there, and what was to stand there is not.
+    // The size reached the disk, the content did not.
     Content zeros = now;
     for (std::size_t i = synced.size(); i < zeros.size(); ++i) zeros[i] = 0;
     return {now, synced, zeros};
@@ -118,7 +118,7 @@ Content bytes_of(const PrototypeMap& map) {
   return read(folder / "scratch.pmk");
 }
 
-// A map file, commits behind it, and changes that are not committed.
+// A map file, commits to it, and uncommitted changes.
 struct Session {
   Session() {
     fs::remove_all(path.parent_path());
@@ -147,7 +147,7 @@ using Action = void (*)(PrototypeMap&);
 void commit(PrototypeMap& map) { map.commit(); }
 void compact(PrototypeMap& map) { map.compact(); }
 
-// A map that is opened there is one of these, and one can go on with it.
+// An opened map is one of these and can be changed and committed.
 void check_world(const PowerCuts::World& world, const std::set<Content>& states) {
   const fs::path there = folder / "world";
   fs::remove_all(there);
@@ -189,7 +189,7 @@ void power_cuts(Action action) {
   CHECK(during.size() > 3);
 }
 
-// Where the journal could not be emptied, the map file counts, and so do commits after that.
+// If the journal could not be emptied, the map file and later commits count.
 void power_cuts_after_a_failure() {
   for (long step = 4; step > 0; --step) {
     long all = 0;
@@ -221,8 +221,8 @@ void power_cuts_after_a_failure() {
   }
 }
 
-// Somebody opens the map with a journal after `save` onto its file has begun: their commits are not
-// saved over, be the journal open or closed by then.
+// Another map opens the journal after `save` onto its file has begun: its commits are not lost, be
+// the journal open or closed by then.
 void journal_begun_while_saving() {
   for (const bool sealed : {false, true}) {
     for (const bool closed : {false, true}) {
@@ -320,7 +320,7 @@ void failing_steps(Action action, long quiet) {
           CHECK(session.map->commit() == 0);
         }
         CHECK(bytes_of(*session.map) == session.changed);
-        // What failed may be tried again, in any way.
+        // The failed step may be tried again, in any way.
         if (broken) compact(*session.map);
         session.map->commit();
         CHECK(bytes_of(PrototypeMap::load(path)) == session.changed);
@@ -336,7 +336,7 @@ void failing_steps(Action action, long quiet) {
   std::printf("%ld steps that fail\n", steps - 1);
 }
 
-// A map is saved to another file while it is being compacted, which may take long.
+// A map is saved to another file while it is being compacted.
 void saved_while_compacting() {
   Session session;
   std::future<void> saved;
@@ -372,7 +372,7 @@ void order_of_steps() {
   PrototypeMap::load(path);
   CHECK(disk.steps == 0);
   PrototypeMap::load(path, true);
-  // The new name lasts before the commits that the old file lacks are forgotten.
+  // The new name is durable before the commits that the old file lacks are dropped.
   CHECK(disk.calls == Calls{"sync folder", "cut", "sync file", "sync file"});
 }
 

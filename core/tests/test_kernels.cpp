@@ -1,5 +1,5 @@
-// Every instruction set that runs here gives the bytes of plain C++, and scans what the definition
-// says, also on extreme values.
+// Every instruction set that runs here gives the bytes of plain C++ and the hits of the definition,
+// also for extreme values.
 #include "kernels/kernels.h"
 
 #include <algorithm>
@@ -44,7 +44,7 @@ std::vector<T> values(test::Random& random, std::size_t n, int style, std::int64
 
 constexpr std::size_t kOutputs = kernels::kOutputs;
 
-// Weights so large that sums just stay within 16 bits: 256 of them are set at most.
+// Weights with which sums of up to 256 bits just stay within 16 bits.
 void compare_bits(const Kernels& set, test::Random& random, std::size_t count, std::size_t n,
                   int style) {
   const std::int64_t most = count <= 4 ? 128 : 32;
@@ -63,7 +63,7 @@ void compare_bits(const Kernels& set, test::Random& random, std::size_t count, s
       }
     }
   }
-  // What is there before does not count; nothing is written behind the end.
+  // Earlier content does not count, and nothing is written behind the end.
   std::vector<std::int16_t> sums(n * kOutputs + 1, 99);
   set.bit_sums(weights.data(), words.data(), count, n, sums.data());
   CHECK(std::equal(expected.begin(), expected.end(), sums.begin()));
@@ -151,7 +151,7 @@ std::vector<kernels::Hit> all_hits(std::size_t blocks, const Scan& scan) {
   return all;
 }
 
-// Limits of all kinds: what all and nothing is within, and just what some row has.
+// Limits that include all rows, none, and just the distance of a row.
 std::vector<std::int32_t> some_limits(test::Random& random,
                                       const std::vector<std::vector<std::int32_t>>& distances) {
   std::vector<std::int32_t> limits;
@@ -198,7 +198,7 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
   set.code_biases(packed.data(), blocks, dim, prefix, biases.data(), prefix_biases.data());
   std::size_t steps_in_full = 0;
   for (int repeat = 0; repeat < 6; ++repeat) {
-    // Few queries do without biases.
+    // A few queries need no biases.
     const bool biased = n > kernels::kFewQueries || repeat % 2 == 0;
     const auto limits = some_limits(random, distances);
     const auto found = all_hits(blocks, [&](std::size_t* block, kernels::Hit* hits) {
@@ -211,7 +211,7 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
   }
 }
 
-// Not a multiple of a vector's length, and garbage where the padding is.
+// Lengths that are not multiples of a vector, with garbage as padding.
 void compare_unpack4(const Kernels& set, test::Random& random, std::size_t dim,
                      std::size_t blocks) {
   const std::size_t stride = (dim + 3) / 4 * 4;

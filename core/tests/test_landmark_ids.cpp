@@ -57,15 +57,15 @@ void test_round_trip(const Ids& ids) {
   for (std::size_t i = 0; i < ids.size(); ++i) same = same && read[index(i)] == ids[i];
   for (std::size_t i = 0; i < ids.size(); ++i) same = same && read.find(ids[i]) == index(i);
   CHECK(same);
-  const std::set<std::int64_t> known(ids.begin(), ids.end());
+  const std::set<std::int64_t> existing(ids.begin(), ids.end());
   for (const std::int64_t id : ids) {
     for (const std::int64_t near : {id - 1, id == kMostId ? 0 : id + 1}) {
-      CHECK(known.count(near) != 0 || unknown(read, near));
+      CHECK(existing.count(near) != 0 || unknown(read, near));
     }
   }
   CHECK(unknown(read, -1));
   CHECK(unknown(read, std::numeric_limits<std::int64_t>::min()));
-  CHECK(known.count(kMostId) != 0 || unknown(read, kMostId));
+  CHECK(existing.count(kMostId) != 0 || unknown(read, kMostId));
 }
 
 Ids run(std::int64_t first, std::size_t n, std::int64_t step = 1) {
@@ -128,7 +128,7 @@ void test_broken_files() {
   CHECK(broken(129, {{5, 0}, {132, 0}}, {}, "its landmark ids do not ascend"));
   CHECK(broken(129, {{5, 0}, {4, 0}}, {}, "its landmark ids do not ascend"));
   CHECK(broken(2, {{kMostId, 0}}, {}, "its landmark ids do not ascend"));
-  // Only gaps say so.
+  // Only the gaps are wrong.
   CHECK(broken(2, {{5, 2}}, {0b0011}, "its landmark ids do not ascend"));
   CHECK(broken(2, {{kMostId - 1, 1}}, {0b10}, "its landmark ids do not ascend"));
   CHECK(broken(2, {{kMostId - 1, 63}}, {~std::uint64_t{0}, ~std::uint64_t{0}},

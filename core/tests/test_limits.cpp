@@ -257,7 +257,7 @@ void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::pat
   CHECK(SealedMap(path).position_bits() == 0 && !SealedMap(path).position_error());
 }
 
-// Whatever can be done with a map can be done with one of no landmarks, and with one of one.
+// All functions work for maps without landmarks and with one.
 void test_small_maps(const std::shared_ptr<const Encoder>& encoder, const fs::path& folder) {
   const auto queries = codes_of(2, 7);
   for (const std::size_t appearance_bits : {0, 3}) {
@@ -310,7 +310,7 @@ void test_merge_map(const std::shared_ptr<const Encoder>& encoder) {
   CHECK(refused([&] { map.merge_map(PrototypeMap(encoder, 12, 1)); }, "0 and 1 appearance bits"));
 }
 
-// Sections of a file as a stranger may write them.
+// Sections of a file as a malicious writer may make them.
 class File {
  public:
   explicit File(const fs::path& path) {
@@ -354,7 +354,7 @@ class File {
     std::memcpy(start, bytes.data(), bytes.size());
     f(Bytes(static_cast<const std::byte*>(start), bytes.size()));
   }
-  // What opening says of it, or nothing.
+  // Returns the error of opening, or nothing.
   std::string error() const {
     try {
       with_bytes([&](Bytes bytes) {
@@ -446,7 +446,7 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
       CHECK(std::isnan(read[0]) && std::isnan(read[1]) && std::isnan(read[2]));
     });
   }
-  // A section that nobody knows is skipped.
+  // An unknown section is skipped.
   CHECK(File(learning).resize("later", 100).error().empty());
   CHECK(File(sealed).resize("later", 100).error().empty());
 

@@ -18,8 +18,8 @@ namespace fs = std::filesystem;
 
 namespace {
 
-// A map of 4 bits answers as one of the numbers that it gives back, and those are the levels
-// nearest to the rounded means.
+// A map of 4 bits answers by the numbers that it returns, which are the levels nearest to the
+// rounded means.
 void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path) {
   map.seal(path, test::four_bits(map));
   verify_file(path);
@@ -50,7 +50,7 @@ void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path
   }
 }
 
-// Lossless unless a number of bytes is named, then as many as fit.
+// Sealing keeps everything unless bytes are limited, and then as much as fits.
 void test_bytes_per_landmark(const fs::path& path) {
   const auto encoder = test::random_encoder();
   test::Random random(16);

@@ -1,4 +1,4 @@
-// Maps joined under other ids, and parts of maps: always as if all had been one.
+// Maps merged under other ids, and parts of maps, equal one map of all observations.
 #include <unistd.h>
 
 #include <algorithm>
@@ -46,7 +46,7 @@ void place(PrototypeMap& map, std::int64_t id, double where) {
   map.set_positions(std::span(&id, 1), std::span(&position, 1));
 }
 
-// More landmarks than a piece of a change has, so that rooms are made and pieces cut.
+// More landmarks than a piece of a change has.
 void test_merge_under_other_ids(std::size_t appearance_bits, bool indexed) {
   test::Random random(11);
   const Observations own = observations(random, 9000, 3000);

@@ -55,8 +55,8 @@ std::vector<AppearanceMerge> plain_merges(const std::vector<std::int16_t>& sums,
   return merges;
 }
 
-// Merges the pair of least cost over the whole map, of equals that of the first rows of the
-// smallest id, until there are at most `limit` rows.
+// Merges the pair of least cost over the whole map, ties to the first rows of the smallest id,
+// until there are at most `limit` rows.
 std::map<std::int64_t, std::vector<Cluster>> plain_store(const PrototypeStore& store,
                                                          std::size_t limit) {
   std::map<std::int64_t, std::vector<Cluster>> landmarks;
@@ -159,7 +159,7 @@ int main() {
   CHECK(merges.back().cost == 2.0 * 254 * 254 * (300 * 255 / 2));
   CHECK(appearance_merges({}, {}, 3).empty());
 
-  // As many rows as there can be, which took minutes before neighbours were joined first.
+  // As many rows as possible, which took minutes before neighbours were merged first.
   const std::size_t most = 65536;
   std::vector<std::int16_t> many(most);
   for (std::size_t i = 0; i < most; ++i) many[i] = static_cast<std::int16_t>(i % 251);
@@ -167,9 +167,9 @@ int main() {
   CHECK(all.size() == most - 1);
   CHECK(all[0].into == 0 && all[0].source == 1 && all[0].cost == 0);
   std::vector<bool> removed(most, false);
-  for (const auto& join : all) {
-    CHECK(join.into < join.source && !removed[join.into] && !removed[join.source]);
-    removed[join.source] = true;
+  for (const auto& merge : all) {
+    CHECK(merge.into < merge.source && !removed[merge.into] && !removed[merge.source]);
+    removed[merge.source] = true;
   }
   return check::result();
 }

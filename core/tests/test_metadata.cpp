@@ -77,7 +77,7 @@ void test_limits() {
   }
 }
 
-// Files say what the map says, and nothing more where it says nothing.
+// Files have the metadata of the map, and no section without any.
 void test_files(const fs::path& path) {
   PrototypeMap map(encoder());
   const std::int64_t id = 3;

@@ -42,7 +42,7 @@ void write_bytes(const std::vector<std::byte>& bytes) {
   file.replace_target();
 }
 
-// The file with some sections other, or gone where `change` is false; checksums are right.
+// The file with other sections, or without those for which `change` is false; checksums are right.
 template <typename Change>
 std::vector<std::byte> changed(const std::vector<std::byte>& bytes, const Change& change) {
   const ContainerReader file(bytes, "f");
@@ -56,9 +56,9 @@ std::vector<std::byte> changed(const std::vector<std::byte>& bytes, const Change
 }
 
 template <typename Map>
-Matches search(const Map& map, Codes queries, std::optional<std::size_t> probes, int threads = 1) {
+Matches search(const Map& map, Codes queries, std::optional<std::size_t> nprobe, int threads = 1) {
   SearchOptions options;
-  options.nprobe = probes;
+  options.nprobe = nprobe;
   options.threads = threads;
   return map.search_codes(queries, 2, options);
 }
@@ -86,7 +86,7 @@ int main() {
     CHECK(search(sealed, queries, 3, 4) == approximate);
   }
 
-  // Where owners stand, and their checksums.
+  // The offsets of the owners and of their checksums.
   const ContainerReader file(whole, "f");
   const Bytes owners = file.map(section::kOwners);
   const auto at = static_cast<std::size_t>(owners.data() - whole.data());
@@ -106,11 +106,11 @@ int main() {
                             "byte " +
                             std::to_string(block * block_bytes);
     const SealedMap sealed(path);  // none of it is read
-    for (const auto& [probes, right] :
+    for (const auto& [nprobe, right] :
          {std::pair(std::optional<std::size_t>(3), approximate), {std::nullopt, exact}}) {
       for (const int threads : {1, 3}) {
         try {
-          CHECK(search(sealed, queries, probes, threads) == right);
+          CHECK(search(sealed, queries, nprobe, threads) == right);
           ++answered;
         } catch (const FileError& error) {
           CHECK(std::string(error.what()).starts_with(why));

@@ -27,7 +27,7 @@ bool covers(int threads, std::size_t n, std::size_t grain) {
   return whole;
 }
 
-// Returns only once `n` threads are in it.
+// Returns once `n` threads have called it.
 void meet(std::atomic<int>& arrived, int n) {
   ++arrived;
   while (arrived < n) std::this_thread::yield();
@@ -50,7 +50,7 @@ int main() {
     CHECK(arrived == threads);
   }
 
-  // A loop within a task runs where it is.
+  // A loop within a task runs on the thread of the task.
   std::atomic<int> strangers = 0;
   std::atomic<std::size_t> inner = 0;
   run_tasks(4, 50, [&](std::size_t) {
@@ -63,7 +63,7 @@ int main() {
   CHECK(inner == 50 * 30);
   CHECK(strangers == 0);
 
-  // Several callers at once, each with errors of its own.
+  // Several callers at once, each of which gets its own errors.
   {
     std::atomic<int> wrong = 0;
     std::vector<std::jthread> callers;
@@ -86,7 +86,7 @@ int main() {
   CHECK(covers(4, 100, 1));
 
 #ifndef PROTOMARK_NO_FORK
-  // A child process starts afresh, and leaves though its threads sleep.
+  // A child process starts its own threads, and exits while they sleep.
   const pid_t child = ::fork();
   if (child == 0) {
     std::atomic<int> arrived = 0;

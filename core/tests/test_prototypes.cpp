@@ -39,7 +39,7 @@ int main() {
     }
   }
 
-  // Changes and searches from several threads; sums do not depend on who came first.
+  // Changes and searches from several threads; sums do not depend on their order.
   PrototypeMap shared(encoder);
   {
     std::vector<std::jthread> threads;

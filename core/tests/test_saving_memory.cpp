@@ -1,5 +1,4 @@
-// What saving and sealing take beside the map, and what an opened map takes, counted by
-// allocations.
+// Memory that saving and sealing take beside the map, and that an opened map takes.
 #include <algorithm>
 #include <cstdlib>
 #include <filesystem>
@@ -49,9 +48,9 @@ PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t appear
   return map;
 }
 
-// Landmarks by default, and memory beside the share.
+// The default number of landmarks, and memory that does not depend on it.
 #if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-// Each step takes many times as long; of small maps, what does not grow with them is most.
+// Slower by far, so with smaller maps, for which constant memory matters more.
 constexpr std::size_t kLandmarks = 20'000, kBuffers = 5 << 18;
 #else
 constexpr std::size_t kLandmarks = 200'000, kBuffers = 1 << 19;
@@ -92,10 +91,10 @@ int main(int argc, char** argv) {
     if (c.indexed) map.build_index({16});
     const std::size_t own = test::held - before;
     const std::string what = "dim " + std::to_string(c.dim) + ", ids " +
-                             std::to_string(static_cast<int>(c.ids)) + ", look bits " +
+                             std::to_string(static_cast<int>(c.ids)) + ", appearance bits " +
                              std::to_string(c.appearance_bits) + (c.indexed ? ", index" : "");
     check_save(what + ": save", own, [&] { map.save(path); });
-    // A regression: with the last landmark all arrays grew to twice their size.
+    // Once all arrays grew to twice their size with the last landmark.
     const std::size_t closed = test::held;
     const PrototypeMap opened = PrototypeMap::load(path);
     CHECK(test::held - closed < own + own / 4 + kBuffers);

@@ -126,8 +126,8 @@ void check_codes(test::Random& random, std::size_t rows, std::size_t dim, std::s
   }
 }
 
-// Rows for which a prefix of the dimensions is compared first. It tells much, nothing, or as much
-// as all.
+// Rows that are compared over a prefix of the dimensions first, which distinguishes much, nothing,
+// or as much as all.
 template <std::size_t kRows, std::size_t kQueries>
 void check_prefixes(test::Random& random) {
   constexpr std::size_t kDim = 32;

@@ -25,7 +25,7 @@ int main() {
       for (std::uint8_t other = 0; other < 16; ++other) {
         const int level = sq4_level(other, scale);
         CHECK(error <= std::abs(value - level));
-        // Halves go away from zero.
+        // Halves round away from zero.
         if (error == std::abs(value - level) && value != 0) {
           CHECK(std::abs(level) <= std::abs(sq4_level(u, scale)));
         }

@@ -1,13 +1,13 @@
-"""Kill savers, limit files and fill disks: what was saved is there, old or new, whole.
+"""Kills saving processes, limits file sizes and fills disks; the map must stay whole.
 
     python tests/torture/run.py --kills 600
 
-A child process saves three states of a file in turn and says when each save has returned. It is
-killed (SIGKILL) at a random moment, and the file must then hold the state that was saved last or
-the one after it, byte for byte. A map with a journal goes from state to state by commits, every
-fourth time by a compaction; what is compared then is the map that opening the file gives. Killing a
-process does not lose what the system has already taken over; that everything is synced in the right
-order is tested in core/tests/test_durability.cpp and test_journal_durability.cpp.
+A child process saves three states of a file in turn and reports when each save has returned. The
+script kills it (SIGKILL) at a random moment; the file must then contain the last saved state or the
+next one, byte for byte. A map with a journal changes its state by commits, every fourth time by a
+compaction; the script then compares the opened map. Killing a process does not lose data that the
+system has accepted; core/tests/test_durability.cpp and test_journal_durability.cpp test that
+everything is synced in the right order.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Case:
         return path.read_bytes() == self.contents[state]
 
     def prepare(self, folder: Path) -> None:
-        """Learn what each state is and how long saving takes."""
+        """Record each state and the time that saving takes."""
         begin = time.monotonic()
         for save in self.saves:
             save(folder / "target")
@@ -71,7 +71,7 @@ class Case:
         assert len(set(self.contents)) == len(self.contents)
 
     def start(self, path: Path) -> None:
-        """What is there before the saver is."""
+        """Write the file that the saver replaces."""
 
     def run(self, path: Path, report: Report) -> None:
         """Save one state after the other, and report each."""
@@ -80,12 +80,12 @@ class Case:
             report()
 
     def state_after(self, saves: int) -> int | None:
-        """The state that is there then; None: no file."""
+        """The state in the file afterwards; None: no file."""
         return (saves - 1) % len(self.saves) if saves else None
 
 
 class Journal(Case):
-    """A map that goes from state to state by commits and compactions, and back to the first."""
+    """A map whose commits and compactions go through all states and back to the first."""
 
     def __init__(self, name: str, first: pm.PrototypeMap, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -218,7 +218,7 @@ def cases(large: int, seed: int) -> list[Case]:
 
 
 def left_behind(folder: Path) -> list[Path]:
-    """Files beside the target; only those that a killed save may leave."""
+    """Files beside the target; fails if a killed save may not leave them."""
     found = [p for p in folder.iterdir() if p.name not in ("target", "target.journal")]
     for path in found:
         assert LEFT_BEHIND.fullmatch(path.name), f"{path} was left behind"
@@ -226,7 +226,7 @@ def left_behind(folder: Path) -> list[Path]:
 
 
 def kill_once(case: Case, folder: Path, delay: float) -> str:
-    """Kill a saver after `delay` seconds; whether the old or the new state is there."""
+    """Kill a saver after `delay` seconds; the result says which state the file contains."""
     target = folder / "target"
     case.start(target)
     reading, writing = os.pipe()
@@ -275,7 +275,7 @@ def kills(case: Case, folder: Path, n: int, rng: random.Random) -> Counter[str]:
 
 
 def refused(case: Case, folder: Path, prepare: Callable[[], object], cause: str) -> bool:
-    """Save over state 0 under a limit; True where the limit was met and all was as it must be.
+    """Save over state 0 under a limit; True if the save reached the limit and passed all checks.
 
     The child has the limit, so that this process keeps its own.
     """
@@ -318,7 +318,7 @@ def file_limits(case: Case, folder: Path, n: int, rng: random.Random) -> Counter
 
 @contextmanager
 def small_disk(size: int) -> Iterator[Path | None]:
-    """A disk in memory of `size` bytes, or None where this process may not make one."""
+    """A disk in memory of `size` bytes, or None if this process may not mount one."""
     folder = Path(tempfile.mkdtemp(prefix="protomark_disk_"))
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
     mounted = subprocess.run(mount, capture_output=True).returncode == 0

@@ -19,6 +19,8 @@
 
 namespace protomark {
 
+constexpr char kRemedy[] = "call build_index before the map is sealed";
+
 struct SealedMap::Content {
   Content(Bytes bytes, const std::string& name, std::unique_ptr<MappedFile> from = nullptr)
       : mapped(std::move(from)), file(bytes, name) {
@@ -145,7 +147,6 @@ struct SealedMap::Content {
     return sq4_level(packed4_high(d) ? byte >> 4 : byte & 15, prototypes.scale);
   }
 
-  static constexpr char kRemedy[] = "call build_index before the map is sealed";
   static constexpr std::size_t kFirstRowStep = 64;  // landmarks
 
   std::unique_ptr<MappedFile> mapped;  // nullptr if the caller keeps the bytes
@@ -206,7 +207,7 @@ double SealedMap::bytes_per_landmark() const {
 }
 
 std::size_t SealedMap::nprobe(double recall) const {
-  check_recall(recall, nlist(), Content::kRemedy);
+  check_recall(recall, nlist(), kRemedy);
   return nprobe_for(content_->recall_table, recall, nlist());
 }
 
@@ -273,7 +274,7 @@ Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOption
 
 Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
   const Content& c = *content_;
-  check_lists(options, nlist(), Content::kRemedy);
+  check_lists(options, nlist(), kRemedy);
   const std::size_t lists =
       options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
   const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
