@@ -9,8 +9,9 @@ landmark of the exact search.
 
 Rounds: each sequence adds its observations in the order of its keyframes, in ten parts. Drift: one
 half of the sequences replaces the other. The index learns its inverted lists only in the first
-round. Prints the tables of docs/results/large-maps.md, and the distance of observations from their landmark's
-prototype as a share of the variance of prototypes: the core moves its test queries by as much.
+round. Prints the tables of docs/results/large-maps.md, and the distance of observations from their
+landmark's prototype as a share of the variance of prototypes: the core moves its test queries by as
+much.
 """
 
 from __future__ import annotations
