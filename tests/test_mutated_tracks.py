@@ -217,7 +217,7 @@ def test_rows_may_not_share_their_bytes(database: Path) -> None:
     data = data[: (pages[1] - 1) * page_size]
     data[28:32] = (len(data) // page_size).to_bytes(4, "big")
     database.write_bytes(data)
-    with pytest.raises(ValueError, match="keypoints has more in it than the file can hold"):
+    with pytest.raises(ValueError, match="the rows of keypoints exceed the size of the file"):
         read_database(database)
 
 
@@ -236,7 +236,7 @@ def test_a_small_database_does_not_take_long(tmp_path: Path) -> None:
     connection.commit()
     connection.close()
     # Joined, it has 125 million rows.
-    with bounded(seconds=60), pytest.raises(ValueError, match="image_id '1' is there twice"):
+    with bounded(seconds=60), pytest.raises(ValueError, match="image_id '1' occurs twice"):
         read_database(path)
 
 

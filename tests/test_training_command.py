@@ -180,7 +180,7 @@ def test_without_options_the_last_file_picks_and_the_descriptor_names_the_model(
     assert "synthetic.pme exists already" in str(again.exception)
     assert (tmp_path / "synthetic.pme").read_bytes() == before
     (tmp_path / "synthetic.pme").unlink()
-    assert "synthetic.md exists and is kept" in str(run(*words).exception)
+    assert "synthetic.md exists already" in str(run(*words).exception)
 
 
 def test_one_file_cannot_do_both(files):
