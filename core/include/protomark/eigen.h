@@ -2,10 +2,7 @@
 #pragma once
 
 #include <Eigen/Core>
-#include <cstddef>
-#include <span>
 #include <type_traits>
-#include <vector>
 
 #include "protomark/types.h"
 

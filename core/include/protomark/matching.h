@@ -1,13 +1,6 @@
 // Matches of a frame with a map, each with the probability that it is right.
 #pragma once
 
-#include <array>
-#include <cstddef>
-#include <cstdint>
-#include <optional>
-#include <span>
-#include <vector>
-
 #include "protomark/encoder.h"
 #include "protomark/prototype_map.h"
 #include "protomark/sealed_map.h"

@@ -2,10 +2,6 @@
 #pragma once
 
 #include <opencv2/core.hpp>
-#include <span>
-#include <stdexcept>
-#include <string>
-#include <vector>
 
 #include "protomark/types.h"
 

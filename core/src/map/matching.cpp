@@ -5,7 +5,6 @@
 #include <functional>
 #include <locale>
 #include <sstream>
-#include <string>
 #include <unordered_set>
 
 #include "base/text.h"
