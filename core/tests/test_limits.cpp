@@ -241,7 +241,7 @@ void test_positions(const std::shared_ptr<const Encoder>& encoder, const fs::pat
   for (const int bits : {32, 16}) {
     CHECK(refused([&] { map.seal(path, {.position_bits = bits}); }, "too far apart"));
   }
-  CHECK(refused([&] { map.seal(path, {.position_bits = 24}); }, "must be 32 or 16, not 24"));
+  CHECK(refused([&] { map.seal(path, {.position_bits = 24}); }, "must be 32, 16 or 0, not 24"));
   map.set_positions(Ids{2}, std::span(&none, 1));
   for (const int bits : {32, 16}) {
     map.seal(path, {.position_bits = bits});
