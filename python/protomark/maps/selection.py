@@ -89,7 +89,7 @@ class Views:
         """
         ids = scene.ids
         positions = scene.positions(ids)
-        placed = np.isfinite(positions).all(axis=1)
+        placed: NDArray[np.bool_] = np.asarray(np.isfinite(positions).all(axis=1))
         # A few landmarks far away must not make the cells large.
         low, high = np.nanpercentile(positions, (1, 99), axis=0) if placed.any() else (0.0, 1.0)
         size = max(float(np.max(high - low)), np.finfo(np.float64).tiny)
