@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <numeric>
 #include <optional>
 #include <string>
 #include <utility>
@@ -9,24 +10,43 @@
 #include "file/sections.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
+#include "map/packed_sums.h"
 
 namespace protomark {
 namespace {
+
+void put_sums(const ContainerWriter::Sink& sink, const PrototypeStore& store,
+              std::span<const Row> rows) {
+  constexpr std::size_t kPiece = 1 << 16;  // bytes, and those of one row
+  std::vector<std::byte> packed;
+  for (const Row& row : rows) {
+    const std::size_t begin = packed.size();
+    packed.resize(begin + packed_sum_size(store.count(row), store.dim()));
+    pack_sum(store.sum(row), store.count(row), store.dim(), &packed[begin]);
+    if (packed.size() < kPiece && &row != &rows.back()) continue;
+    sink(packed);
+    packed.clear();
+  }
+}
 
 // Adds the sections of all landmarks of a store, or of some by ascending id. The store must not
 // change until the file is written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& some = {}) {
-  std::size_t n = store.landmark_count(), m = store.prototype_count();
+  std::size_t n = 0, m = 0, sum_bytes = 0;
   // A map whose positions were all taken away equals one that never had any.
-  bool positions = !some && store.any_position();
-  if (some) {
-    n = some->size();
-    m = 0;
-    for (const LandmarkIndex landmark : *some) {
-      m += store.row_count(landmark);
-      positions = positions || has_position(store.position(landmark));
+  bool positions = false;
+  const auto count = [&](LandmarkIndex landmark) {
+    ++n;
+    for (Row row = store.first_row(landmark); row != kNoRow; row = store.next_row(row), ++m) {
+      sum_bytes += packed_sum_size(store.count(row), store.dim());
     }
+    positions = positions || has_position(store.position(landmark));
+  };
+  if (some) {
+    std::ranges::for_each(*some, count);
+  } else {
+    store.each_landmark(count);
   }
   add_value(file, section::kShape, MapShape{n, store.dim(), {}});
   std::vector<ContainerWriter::Part> parts{{section::kIds, n * sizeof(std::int64_t)}};
@@ -36,7 +56,7 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
     parts.push_back({section::kAppearances, m * sizeof(std::uint16_t)});
   }
   parts.push_back({section::kCounts, m});
-  parts.push_back({section::kSums, m * store.dim() * sizeof(std::int16_t)});
+  parts.push_back({section::kSums, sum_bytes});
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
 
   const auto put_piece = [&store, positions](std::span<const ContainerWriter::Sink> sinks,
@@ -53,9 +73,7 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
     }
     put_each<std::uint8_t>(*sink++, rows,
                            [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
-    put_values<std::int16_t>(*sink++, rows.size(), store.dim(), [&](std::size_t i, auto* to) {
-      std::copy_n(store.sum(rows[i]), store.dim(), to);
-    });
+    put_sums(*sink++, store, rows);
     if (!positions) return;
     put_each<Position>(*sink, landmarks, [&](LandmarkIndex l) { return store.position(l); });
   };
@@ -144,7 +162,12 @@ class Reading {
       appearances = read_section<std::uint16_t>(file, section::kAppearances, m);
     }
     const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
-    const auto sums = read_section<std::int16_t>(file, section::kSums, m * dim);
+    if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
+    Bytes sums = file.read(section::kSums);
+    const std::size_t sum_bytes = std::accumulate(
+        counts.begin(), counts.end(), std::size_t{0},
+        [&](std::size_t size, int count) { return size + packed_sum_size(count, dim); });
+    if (sums.size() != sum_bytes) file.fail_size(section::kSums);
     std::vector<Position> positions;
     if (file.has(section::kPositions)) {
       positions = read_section<Position>(file, section::kPositions, n);
@@ -161,8 +184,13 @@ class Reading {
       LandmarkIndex landmark = kNoLandmark;
       const std::size_t end = row + (several ? row_counts[i] : 1);
       for (const std::size_t first = row; row < end; ++row) {
-        const std::int16_t* sum = &sums[row * dim];
-        check_prototype(file, ids[i], sum, counts[row]);
+        const std::size_t size = packed_sum_size(counts[row], dim);
+        const Sum sum = unpack_sum(sums.first(size), counts[row], dim);
+        sums = sums.subspan(size);
+        if (std::any_of(sum.begin(), sum.begin() + dim,
+                        [&](int s) { return std::abs(s) > 127 * counts[row]; })) {
+          file.fail("landmark ", ids[i], " has an impossible prototype");
+        }
         const std::uint16_t appearance = several ? appearances[row] : 0;
         if (appearance >> store_.appearance_bits() != 0 ||
             (row > first && appearance <= appearances[row - 1])) {
@@ -170,7 +198,7 @@ class Reading {
         }
         if (!wanted) continue;
         const Row to = store_.create_row(ids[i], landmark, appearance);
-        std::copy_n(sum, dim, store_.sum(to));
+        std::copy_n(sum.begin(), dim, store_.sum(to));
         store_.set_count(to, counts[row]);
         store_.refresh(to);
       }
@@ -185,14 +213,6 @@ class Reading {
     // After the landmarks, so that room for positions is made once.
     for (std::size_t i = 0; i < positions.size(); ++i) {
       if (landmarks[i] != kNoLandmark) store_.set_position(landmarks[i], positions[i]);
-    }
-  }
-
-  void check_prototype(const ContainerReader& file, std::int64_t id, const std::int16_t* sum,
-                       int count) const {
-    if (count == 0 ||
-        std::any_of(sum, sum + store_.dim(), [&](int s) { return std::abs(s) > 127 * count; })) {
-      file.fail("landmark ", id, " has an impossible prototype");
     }
   }
 
