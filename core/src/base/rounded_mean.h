@@ -1,11 +1,15 @@
-// Rounded means of codes.
+// Sums of codes and their rounded means.
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
 
 namespace protomark {
+
+// The sum of codes of at most 256 numbers. Zeros follow the last one up to a multiple of 8.
+using Sum = std::array<std::int16_t, 256>;
 
 // Returns sum / n rounded to the nearest integer, halves away from zero.
 template <typename Integer>

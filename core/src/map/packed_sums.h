@@ -8,12 +8,10 @@
 #include <cstdint>
 #include <cstring>
 
+#include "base/rounded_mean.h"
 #include "file/disk.h"
 
 namespace protomark {
-
-// Of a row: its first numbers, as codes have at most 256.
-using Sum = std::array<std::int16_t, 256>;
 
 // Bits per number; no sum of n codes is beyond 127 n. n is 1 to 255.
 constexpr unsigned sum_bits(int n) {
@@ -24,23 +22,33 @@ constexpr std::size_t packed_sum_size(int n, std::size_t dim) {
   return (dim * sum_bits(n) + 7) / 8;
 }
 
-inline void pack_sum(const std::int16_t* sum, int n, std::size_t dim, std::byte* to) {
+// Room for a row, and for what is read or written beyond it.
+using PackedSum = std::array<std::byte, sizeof(Sum) + sizeof(std::uint64_t)>;
+
+inline PackedSum pack_sum(const Sum& sum, int n, std::size_t dim) {
   const unsigned bits = sum_bits(n);
   const std::uint64_t mask = (std::uint64_t{1} << bits) - 1;
+  PackedSum packed;
+  std::byte* to = packed.data();
   std::uint64_t word = 0;
-  unsigned filled = 0;
+  unsigned filled = 0;  // bits of word
   for (std::size_t d = 0; d < dim; ++d) {
     word |= (static_cast<std::uint64_t>(sum[d]) & mask) << filled;
-    for (filled += bits; filled >= 8; filled -= 8, word >>= 8) *to++ = static_cast<std::byte>(word);
+    filled += bits;
+    if (filled < 48 && d + 1 < dim) continue;
+    std::memcpy(to, &word, sizeof(word));
+    to += filled / 8;
+    word >>= filled / 8 * 8;
+    filled %= 8;
   }
-  if (filled > 0) *to = static_cast<std::byte>(word);
+  return packed;
 }
 
 inline Sum unpack_sum(Bytes packed, int n, std::size_t dim) {
   const unsigned bits = sum_bits(n);
-  std::array<std::byte, sizeof(Sum) + sizeof(std::uint32_t)> padded;
+  PackedSum padded;
   std::memcpy(padded.data(), packed.data(), packed.size());
-  Sum sum;
+  Sum sum{};
   for (std::size_t d = 0; d < dim; ++d) {
     std::uint32_t word;
     std::memcpy(&word, &padded[d * bits / 8], sizeof(word));

@@ -17,13 +17,16 @@ namespace {
 
 void put_sums(const ContainerWriter::Sink& sink, const PrototypeStore& store,
               std::span<const Row> rows) {
+  constexpr std::size_t kAhead = 16;
   constexpr std::size_t kPiece = 1 << 16;  // bytes, and those of one row
   std::vector<std::byte> packed;
-  for (const Row& row : rows) {
-    const std::size_t begin = packed.size();
-    packed.resize(begin + packed_sum_size(store.count(row), store.dim()));
-    pack_sum(store.sum(row), store.count(row), store.dim(), &packed[begin]);
-    if (packed.size() < kPiece && &row != &rows.back()) continue;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    const Row row = rows[i];
+    if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
+    const auto sum = pack_sum(store.sum(row), store.count(row), store.dim());
+    packed.insert(packed.end(), sum.begin(),
+                  sum.begin() + packed_sum_size(store.count(row), store.dim()));
+    if (packed.size() < kPiece && i + 1 < rows.size()) continue;
     sink(packed);
     packed.clear();
   }
@@ -198,9 +201,7 @@ class Reading {
         }
         if (!wanted) continue;
         const Row to = store_.create_row(ids[i], landmark, appearance);
-        std::copy_n(sum.begin(), dim, store_.sum(to));
-        store_.set_count(to, counts[row]);
-        store_.refresh(to);
+        store_.set(to, sum, counts[row]);
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);

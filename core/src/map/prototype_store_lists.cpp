@@ -119,7 +119,7 @@ void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
     Row row = std::exchange(to[first.value], kNoRow), ahead = row;
     const auto look_ahead = [&] {
       if (ahead == kNoRow) return;
-      prefetch_prototype(ahead);
+      prefetch(ahead);
       RowTable::for_each_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
         __builtin_prefetch(v.data() + ahead.value * width, 1);
       });
