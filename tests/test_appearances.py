@@ -502,17 +502,17 @@ def words(*values: int) -> bytes:
         ("rows", words(1, 2), "the appearances of landmark 8 do not ascend"),
         (
             "appear",
-            np.array([1, 1, 2], "<u2").tobytes(),
+            bytes([1, 1, 2]),
             "the appearances of landmark 4 do not ascend",
         ),
         (
             "appear",
-            np.array([7, 1, 2], "<u2").tobytes(),
+            bytes([7, 1, 2]),
             "the appearances of landmark 4 do not ascend",
         ),
         (
             "appear",
-            np.array([1, 8, 2], "<u2").tobytes(),
+            bytes([1, 8, 2]),
             "the appearances of landmark 4 do not ascend",
         ),
         ("appear", b"", "section 'appear' is shorter"),

@@ -403,7 +403,7 @@ def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any
     ends = np.cumsum(rows)[:-1]
     counts = np.frombuffer(parts["counts"], np.uint8)
     several = appearance_bits > 0
-    appearances = np.frombuffer(parts["appear"], "<u2") if several else np.zeros(len(counts))
+    appearances = np.frombuffer(parts["appear"], "u1") if several else np.zeros(len(counts))
     sums = READER["learning_sums"](parts["sums"], counts, dim)
     positions = np.full((n, 3), np.nan)
     if "position" in parts:

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <cstring>
 #include <numeric>
 #include <optional>
 #include <string>
@@ -15,6 +16,12 @@
 namespace protomark {
 namespace {
 
+// Bytes of an appearance in a file.
+std::size_t appearance_size(const PrototypeStore& store) {
+  return store.appearance_bits() <= 8 ? 1 : 2;
+}
+
+// Hands the packed sums of rows to a sink.
 void put_sums(const ContainerWriter::Sink& sink, const PrototypeStore& store,
               std::span<const Row> rows) {
   constexpr std::size_t kAhead = 16;
@@ -56,7 +63,7 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   if (store.several()) {
     add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(store.appearance_bits()));
     parts.push_back({section::kRows, n * sizeof(std::uint32_t)});
-    parts.push_back({section::kAppearances, m * sizeof(std::uint16_t)});
+    parts.push_back({section::kAppearances, m * appearance_size(store)});
   }
   parts.push_back({section::kCounts, m});
   parts.push_back({section::kSums, sum_bytes});
@@ -72,7 +79,11 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
       put_each<std::uint32_t>(*sink++, landmarks, [&](LandmarkIndex l) {
         return static_cast<std::uint32_t>(store.row_count(l));
       });
-      put_each<std::uint16_t>(*sink++, rows, [&](Row row) { return store.appearance(row); });
+      const std::size_t size = appearance_size(store);
+      put_values<std::uint8_t>(*sink++, rows.size(), size, [&](std::size_t i, std::uint8_t* to) {
+        const std::uint16_t appearance = store.appearance(rows[i]);
+        std::memcpy(to, &appearance, size);
+      });
     }
     put_each<std::uint8_t>(*sink++, rows,
                            [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
@@ -162,7 +173,10 @@ class Reading {
     if (several) {
       row_counts = read_section<std::uint32_t>(file, section::kRows, n);
       m = sum_rows(file, std::span<const std::uint32_t>(row_counts));
-      appearances = read_section<std::uint16_t>(file, section::kAppearances, m);
+      const std::size_t size = appearance_size(store_);
+      const auto bytes = read_section<std::uint8_t>(file, section::kAppearances, m * size);
+      appearances.resize(m);
+      for (std::size_t i = 0; i < m; ++i) std::memcpy(&appearances[i], &bytes[i * size], size);
     }
     const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
     if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
