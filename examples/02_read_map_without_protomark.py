@@ -43,6 +43,21 @@ def bit_numbers(content: Any, count: int, width: int) -> Any:
     return (bits.astype(np.int64) << np.arange(width)).sum(1)
 
 
+def learning_sums(content: bytes, counts: Any, k: int) -> Any:
+    """Unpack the sums of rows of k numbers, (m, k): 8 + ceil(log2(count)) bits each."""
+    data, widths = np.frombuffer(content, np.uint8), 8 + np.ceil(np.log2(counts)).astype(int)
+    sizes = (k * widths + 7) // 8
+    starts, sums = np.cumsum(sizes) - sizes, np.empty((len(counts), k), np.int64)
+    for width in np.unique(widths):  # all rows of this width together
+        rows = np.flatnonzero(widths == width)
+        packed = data[starts[rows, None] + np.arange(sizes[rows[0]])]
+        bits = np.unpackbits(packed, axis=1, count=k * width, bitorder="little")
+        values = 1 << np.arange(width)
+        values[-1] *= -1  # two's complement
+        sums[rows] = bits.reshape(-1, k, width) @ values
+    return sums
+
+
 def sealed_ids(parts: dict[str, bytes], n: int) -> Any:
     """Return the ids of a sealed map's n landmarks: in blocks of 128, or 0 ... n - 1."""
     if "idblocks" not in parts:
@@ -113,7 +128,7 @@ class Map:
         self.landmarks = np.repeat(self.ids, rows)
         self.counts = np.frombuffer(parts["counts"], "u1")
         if learning:
-            sums = np.frombuffer(parts["sums"], "<i2").reshape(-1, k).astype(np.int64)
+            sums = learning_sums(parts["sums"], self.counts, k)
             count = self.counts[:, None].astype(np.int64)
             self.prototypes = np.sign(sums) * ((2 * abs(sums) + count) // (2 * count))
         else:

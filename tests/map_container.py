@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import runpy
 import zlib
+from pathlib import Path
+from typing import Any
+
+# The reader that the documentation gives.
+READER: dict[str, Any] = runpy.run_path(
+    str(Path(__file__).parents[1] / "examples" / "02_read_map_without_protomark.py")
+)
 
 Section = tuple[str, bytes]
 

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import runpy
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import protomark as pm
 from conftest import random_descriptors, rounded
+from map_container import READER
 from sealing import four_bits
-
-READER: dict[str, Any] = runpy.run_path(
-    str(Path(__file__).parents[1] / "examples" / "02_read_map_without_protomark.py")
-)
 
 
 def scene(encoder: pm.Encoder, dim: int, appearance_bits: int, step: int) -> pm.PrototypeMap:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 import protomark as pm
 from conftest import balanced_encoder, random_descriptors
-from map_container import container, sections
+from map_container import READER, container, sections
 from mutation import FILES, SEED, bounded, mutated, mutated_container
 
 Change = Callable[[pm.PrototypeMap], object]
@@ -403,8 +403,8 @@ def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any
     ends = np.cumsum(rows)[:-1]
     counts = np.frombuffer(parts["counts"], np.uint8)
     several = appearance_bits > 0
-    appearances = np.frombuffer(parts["appear"], "<u2") if several else np.zeros(len(counts))
-    sums = np.frombuffer(parts["sums"], "<i2").reshape(len(counts), dim)
+    appearances = np.frombuffer(parts["appear"], "u1") if several else np.zeros(len(counts))
+    sums = READER["learning_sums"](parts["sums"], counts, dim)
     positions = np.full((n, 3), np.nan)
     if "position" in parts:
         positions = np.frombuffer(parts["position"], "<f8").reshape(n, 3)

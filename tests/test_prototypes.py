@@ -47,7 +47,11 @@ def assert_equals(scene: pm.PrototypeMap, reference: Reference) -> None:
         np.testing.assert_array_equal(scene.prototypes(ids), reference.means().astype(np.float32))
 
 
-observations = st.lists(st.tuples(st.integers(0, 12), st.integers(0, 30)), max_size=80)
+one = st.tuples(st.integers(0, 12), st.integers(0, 30))
+# Of two, none sees a landmark more than 255 times, from where on it forgets.
+observations = st.lists(one, max_size=80) | st.lists(
+    st.tuples(one, st.sampled_from([1, 3, 14, 17])), max_size=7
+).map(lambda runs: [seen for seen, times in runs for _ in range(times)])
 
 
 @settings(max_examples=60, deadline=None)
@@ -140,6 +144,24 @@ def test_halving_at_255(encoder: pm.Encoder) -> None:
         counts.append(int(scene.counts([3])[0]))
     assert max(counts) <= 255
     assert counts[7] == 127 + 280 - 255
+
+
+def test_every_count_up_and_down(encoder: pm.Encoder) -> None:
+    descriptors = random_descriptors(255)
+    codes = encoder.encode(descriptors).astype(np.int64)
+    scene = pm.PrototypeMap(encoder)
+
+    def assert_first(n: int) -> None:
+        assert scene.counts([3])[0] == n
+        expected = (codes[:n].sum(0) / n).astype(np.float32)
+        np.testing.assert_array_equal(scene.prototypes([3])[0], expected)
+
+    for n in range(255):
+        scene.add([3], descriptors[n : n + 1])
+        assert_first(n + 1)
+    for n in range(254, 0, -1):
+        scene.subtract([3], descriptors[n : n + 1])
+        assert_first(n)
 
 
 def test_merging_above_255_halves_once(encoder: pm.Encoder) -> None:

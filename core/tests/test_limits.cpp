@@ -417,9 +417,10 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(File(learning).set("appbits", 0, std::uint32_t{0}), "0 bits"));
   CHECK(says(File(learning).set("rows", 0, std::uint32_t{0}), "landmark without prototypes"));
   CHECK(says(File(learning).set("rows", 0, UINT32_MAX), "more prototypes than a map can hold"));
-  CHECK(says(File(learning).set("appear", 0, std::uint16_t{4}), "do not ascend"));
+  CHECK(says(File(learning).set("appear", 0, std::uint8_t{4}), "do not ascend"));
   CHECK(says(File(learning).set("counts", 0, std::uint8_t{0}), "impossible prototype"));
-  CHECK(says(File(learning).set("sums", 0, std::int16_t{32767}), "impossible prototype"));
+  CHECK(says(File(learning).set("sums", 0, std::int16_t{0x80}), "impossible prototype"));
+  CHECK(says(File(learning).resize("sums", 100), "'sums' has the wrong size"));
   CHECK(says(File(learning).set("position", 0, kNaN), "no finite position"));
   CHECK(says(File(learning).set("position", 8, kInfinity), "no finite position"));
   CHECK(says(File(sealed).set("rows", 0, std::uint8_t{0}), "landmark without prototypes"));

@@ -62,8 +62,9 @@ std::map<std::int64_t, std::vector<Cluster>> plain_store(const PrototypeStore& s
   std::map<std::int64_t, std::vector<Cluster>> landmarks;
   for (const LandmarkIndex landmark : store.sorted_landmarks()) {
     for (const Row row : store.sorted_rows(landmark)) {
+      const Sum sum = store.sum(row);
       landmarks[store.id(landmark)].push_back(
-          {{store.sum(row), store.sum(row) + store.dim()}, store.count(row)});
+          {{sum.begin(), sum.begin() + store.dim()}, store.count(row)});
     }
   }
   for (std::size_t rows = store.prototype_count(); rows > limit; --rows) {
@@ -98,9 +99,11 @@ void merged_stores_equal_plain_ones() {
     for (int i = 0; i < 60; ++i) {
       const auto appearance = static_cast<std::uint16_t>(random.integer(0, 15));
       const int n = static_cast<int>(random.integer(1, 3));
-      std::vector<std::int16_t> sum(dim);
-      for (auto& value : sum) value = static_cast<std::int16_t>(n * random.integer(-limit, limit));
-      store.merge(store.find_or_create_row(random.integer(0, 9) * 7, appearance), sum.data(), n);
+      Sum sum{};
+      for (std::size_t d = 0; d < dim; ++d) {
+        sum[d] = static_cast<std::int16_t>(n * random.integer(-limit, limit));
+      }
+      store.merge(store.find_or_create_row(random.integer(0, 9) * 7, appearance), sum, n);
     }
     for (const std::size_t wanted : {0, 10, 20, 35, 50}) {
       const auto merged = merge_appearances(store, wanted);
@@ -114,7 +117,8 @@ void merged_stores_equal_plain_ones() {
         equal = equal && rows.size() == clusters.size();
         for (std::size_t i = 0; equal && i < rows.size(); ++i) {
           equal = merged->count(rows[i]) == clusters[i].n &&
-                  std::equal(clusters[i].sum.begin(), clusters[i].sum.end(), merged->sum(rows[i]));
+                  std::equal(clusters[i].sum.begin(), clusters[i].sum.end(),
+                             merged->sum(rows[i]).begin());
         }
       }
       CHECK(equal);

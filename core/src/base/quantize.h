@@ -1,4 +1,4 @@
-// Rounds means of codes to int8, and numbers to 4 bits.
+// Sums of codes; their means rounded to int8, and numbers to 4 bits.
 #pragma once
 
 #include <algorithm>
@@ -8,6 +8,9 @@
 #include <cstdlib>
 
 namespace protomark {
+
+// The sum of codes of at most 256 numbers. Zeros follow the last one up to a multiple of 8.
+using Sum = std::array<std::int16_t, 256>;
 
 // Returns sum / n rounded to the nearest integer, halves away from zero.
 template <typename Integer>

@@ -109,7 +109,8 @@ Matrix<float> PrototypeMap::prototypes(std::span<const std::int64_t> ids) const 
     std::ranges::fill(sum, 0);
     std::int64_t n = 0;
     for (Row row = store.first_row(store.at(ids[i])); row != kNoRow; row = store.next_row(row)) {
-      for (std::size_t d = 0; d < dim(); ++d) sum[d] += store.sum(row)[d];
+      const Sum own = store.sum(row);
+      for (std::size_t d = 0; d < dim(); ++d) sum[d] += own[d];
       n += store.count(row);
     }
     for (std::size_t d = 0; d < dim(); ++d) means.row(i)[d] = mean(sum[d], n);
@@ -123,9 +124,8 @@ Matrix<float> PrototypeMap::appearances(std::int64_t id) const {
   const std::vector<Row> rows = store.sorted_rows(store.at(id));
   Matrix<float> means(rows.size(), dim());
   for (std::size_t i = 0; i < rows.size(); ++i) {
-    for (std::size_t d = 0; d < dim(); ++d) {
-      means.row(i)[d] = mean(store.sum(rows[i])[d], store.count(rows[i]));
-    }
+    const Sum sum = store.sum(rows[i]);
+    for (std::size_t d = 0; d < dim(); ++d) means.row(i)[d] = mean(sum[d], store.count(rows[i]));
   }
   return means;
 }

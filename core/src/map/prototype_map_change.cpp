@@ -161,20 +161,20 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
               store.several() ? " of one appearance" : "", ", ", difference.count,
               " cannot be subtracted");
     }
+    const Sum sum = store.sum(row);
     for (std::size_t d = 0; d < dim; ++d) {
-      if (std::abs(store.sum(row)[d] - difference.sum[d]) > 127 * left) never_added(difference.id);
+      if (std::abs(sum[d] - difference.sum[d]) > 127 * left) never_added(difference.id);
     }
   }
   change.in_pieces(differences.size(), [&](std::size_t i) {
     const Difference& difference = differences[i];
     const Row row = store.find_row(store.at(difference.id), difference.appearance);
     if (store.count(row) == difference.count) return store.erase_row(row);
-    std::int16_t* sum = store.sum(row);
+    Sum sum = store.sum(row);
     for (std::size_t d = 0; d < dim; ++d) {
       sum[d] = static_cast<std::int16_t>(sum[d] - difference.sum[d]);
     }
-    store.set_count(row, store.count(row) - difference.count);
-    store.refresh(row);
+    store.set(row, sum, store.count(row) - difference.count);
   });
 }
 

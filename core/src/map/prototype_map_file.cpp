@@ -2,39 +2,68 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <cstring>
 #include <utility>
 
 #include "file/sections.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
+#include "map/packed_sums.h"
 
 namespace protomark {
 namespace {
+
+// Bytes of an appearance in a file.
+std::size_t appearance_size(const PrototypeStore& store) {
+  return store.appearance_bits() <= 8 ? 1 : 2;
+}
+
+// Hands the packed sums of rows to a sink.
+void put_sums(const ContainerWriter::Sink& sink, const PrototypeStore& store,
+              std::span<const Row> rows) {
+  constexpr std::size_t kAhead = 16;
+  constexpr std::size_t kPiece = 1 << 16;  // bytes, and those of one row
+  std::vector<std::byte> packed;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    const Row row = rows[i];
+    if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
+    const auto sum = pack_sum(store.sum(row), store.count(row), store.dim());
+    packed.insert(packed.end(), sum.begin(),
+                  sum.begin() + packed_sum_size(store.count(row), store.dim()));
+    if (packed.size() < kPiece && i + 1 < rows.size()) continue;
+    sink(packed);
+    packed.clear();
+  }
+}
 
 // Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
 // must not change until the file is written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
-  std::size_t n = store.landmark_count(), m = store.prototype_count();
+  std::size_t n = 0, m = 0, sum_bytes = 0;
   // A map whose positions were all removed equals one that never had any.
-  bool positions = !changed && store.any_position();
-  if (changed) {
-    n = changed->size();
-    m = 0;
-    for (const LandmarkIndex landmark : *changed) {
-      m += store.row_count(landmark);
-      positions = positions || has_position(store.position(landmark));
+  bool positions = false;
+  const auto count = [&](LandmarkIndex landmark) {
+    ++n;
+    for (Row row = store.first_row(landmark); row != kNoRow; row = store.next_row(row), ++m) {
+      sum_bytes += packed_sum_size(store.count(row), store.dim());
     }
+    positions = positions || has_position(store.position(landmark));
+  };
+  if (changed) {
+    std::ranges::for_each(*changed, count);
+  } else {
+    store.each_landmark(count);
   }
   add_value(file, section::kShape, MapShape{n, store.dim(), {}});
   std::vector<ContainerWriter::Part> parts{{section::kIds, n * sizeof(std::int64_t)}};
   if (store.several()) {
     add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(store.appearance_bits()));
     parts.push_back({section::kRows, n * sizeof(std::uint32_t)});
-    parts.push_back({section::kAppearances, m * sizeof(std::uint16_t)});
+    parts.push_back({section::kAppearances, m * appearance_size(store)});
   }
   parts.push_back({section::kCounts, m});
-  parts.push_back({section::kSums, m * store.dim() * sizeof(std::int16_t)});
+  parts.push_back({section::kSums, sum_bytes});
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
 
   const auto put_piece = [&store, positions](std::span<const ContainerWriter::Sink> sinks,
@@ -47,13 +76,15 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
       put_each<std::uint32_t>(*sink++, landmarks, [&](LandmarkIndex l) {
         return static_cast<std::uint32_t>(store.row_count(l));
       });
-      put_each<std::uint16_t>(*sink++, rows, [&](Row row) { return store.appearance(row); });
+      const std::size_t size = appearance_size(store);
+      put_values<std::uint8_t>(*sink++, rows.size(), size, [&](std::size_t i, std::uint8_t* to) {
+        const std::uint16_t appearance = store.appearance(rows[i]);
+        std::memcpy(to, &appearance, size);
+      });
     }
     put_each<std::uint8_t>(*sink++, rows,
                            [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
-    put_values<std::int16_t>(*sink++, rows.size(), store.dim(), [&](std::size_t i, auto* to) {
-      std::copy_n(store.sum(rows[i]), store.dim(), to);
-    });
+    put_sums(*sink++, store, rows);
     if (!positions) return;
     put_each<Position>(*sink, landmarks, [&](LandmarkIndex l) { return store.position(l); });
   };
@@ -139,10 +170,18 @@ class Reading {
     if (several) {
       row_counts = read_section<std::uint32_t>(file, section::kRows, n);
       m = sum_rows(file, std::span<const std::uint32_t>(row_counts));
-      appearances = read_section<std::uint16_t>(file, section::kAppearances, m);
+      const std::size_t size = appearance_size(store_);
+      const auto bytes = read_section<std::uint8_t>(file, section::kAppearances, m * size);
+      appearances.resize(m);
+      for (std::size_t i = 0; i < m; ++i) std::memcpy(&appearances[i], &bytes[i * size], size);
     }
     const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
-    const auto sums = read_section<std::int16_t>(file, section::kSums, m * dim);
+    if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
+    Bytes sums = file.read(section::kSums);
+    const std::size_t sum_bytes = std::accumulate(
+        counts.begin(), counts.end(), std::size_t{0},
+        [&](std::size_t size, int count) { return size + packed_sum_size(count, dim); });
+    if (sums.size() != sum_bytes) file.fail_size(section::kSums);
     std::vector<Position> positions;
     if (file.has(section::kPositions)) {
       positions = read_section<Position>(file, section::kPositions, n);
@@ -159,8 +198,13 @@ class Reading {
       LandmarkIndex landmark = kNoLandmark;
       const std::size_t end = row + (several ? row_counts[i] : 1);
       for (const std::size_t first = row; row < end; ++row) {
-        const std::int16_t* sum = &sums[row * dim];
-        check_prototype(file, ids[i], sum, counts[row]);
+        const std::size_t size = packed_sum_size(counts[row], dim);
+        const Sum sum = unpack_sum(sums.first(size), counts[row], dim);
+        sums = sums.subspan(size);
+        if (std::any_of(sum.begin(), sum.begin() + dim,
+                        [&](int s) { return std::abs(s) > 127 * counts[row]; })) {
+          file.fail("landmark ", ids[i], " has an impossible prototype");
+        }
         const std::uint16_t appearance = several ? appearances[row] : 0;
         if (appearance >> store_.appearance_bits() != 0 ||
             (row > first && appearance <= appearances[row - 1])) {
@@ -168,9 +212,7 @@ class Reading {
         }
         if (!is_newest) continue;
         const Row to = store_.create_row(ids[i], landmark, appearance);
-        std::copy_n(sum, dim, store_.sum(to));
-        store_.set_count(to, counts[row]);
-        store_.refresh(to);
+        store_.set(to, sum, counts[row]);
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);
@@ -183,14 +225,6 @@ class Reading {
     // After the landmarks, so that room for positions is made once.
     for (std::size_t i = 0; i < positions.size(); ++i) {
       if (landmarks[i] != kNoLandmark) store_.set_position(landmarks[i], positions[i]);
-    }
-  }
-
-  void check_prototype(const ContainerReader& file, std::int64_t id, const std::int16_t* sum,
-                       int count) const {
-    if (count == 0 ||
-        std::any_of(sum, sum + store_.dim(), [&](int s) { return std::abs(s) > 127 * count; })) {
-      file.fail("landmark ", id, " has an impossible prototype");
     }
   }
 

@@ -1,12 +1,14 @@
 #include "map/prototype_store.h"
 
 #include <algorithm>
+#include <bit>
 #include <cstring>
 #include <mutex>
 #include <numeric>
 
 #include "base/quantize.h"
 #include "base/sorted_pieces.h"
+#include "kernels/vectors.h"
 #include "map/positions.h"
 #include "protomark/prototype_map.h"
 
@@ -15,6 +17,14 @@ namespace {
 
 // Adding to a large map mostly waits for memory: prefetches it this many observations ahead.
 constexpr std::size_t kAhead = 16;
+
+// Eight numbers, and from a byte each.
+using kernels::load, kernels::store;
+using Eight = kernels::Vector<std::int16_t, 16>;
+using EightBytes = kernels::Vector<std::int8_t, 8>;
+Eight eight(std::uint64_t bytes) {
+  return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
+}
 
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
 // odd count is rounded down.
@@ -25,7 +35,7 @@ std::int16_t half(int sum, int count) {
 }  // namespace
 
 std::size_t PrototypeStore::row_bytes() const {
-  return dim_ * sizeof(sums_[0]) + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
+  return rest_bytes_ + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
 }
 
 void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
@@ -82,14 +92,13 @@ Row PrototypeStore::take_row(std::uint32_t list) {
     throw std::length_error("a map holds under 2^32 prototypes");
   }
   lists_.make_room();
+  slots_.make_room();
   for_each_array(0, kPackedRows,
                  [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
   const Row row = lists_.append(list);
   if (row_end() != counts_.size()) resize(row_end());
   ++prototype_count_;
-  std::fill_n(sum(row), dim_, std::int16_t{0});
-  counts_[row.value] = 0;
-  // No prototype has this number, so refresh sees a difference.
+  // No prototype has this number, so the first one differs.
   packed()[packed_index(row.value, 0, dim_)] = -128;
   return row;
 }
@@ -141,6 +150,7 @@ void PrototypeStore::close_gap(Row row) {
 
 void PrototypeStore::erase_row(Row row) {
   if (uncommitted) uncommitted->insert(id(owner(row)));
+  if (has_slot(row)) slots_.give_back(slot(row));
   remove_row(row);
   close_gap(row);
 }
@@ -231,66 +241,107 @@ void PrototypeStore::add(std::span<const std::int64_t> ids, Codes codes,
                          std::span<const Row> rows) {
   const std::size_t n = rows.size();
   if (quantizer_.nlist() != 0) to_reassign_.reserve(to_reassign_.size() + n);
-  for (std::size_t i = 0; i < n + kAhead; ++i) {
-    if (i < n && rows[i] != kNoRow) prefetch_prototype(rows[i]);
-    if (i < kAhead) continue;
-    const std::size_t at = i - kAhead;
-    const Row row = rows[at];
-    if (row == kNoRow) continue;
-    add(row, codes.row(at));
-    if (at + 1 == n || rows[at + 1] != row) refresh(row);
+  // Neighbours of the same row are added at once.
+  for (std::size_t i = 0, end = 0; i < n + kAhead; ++i) {
+    if (i < n && rows[i] != kNoRow) prefetch(rows[i]);
+    const std::size_t nearer = i - kAhead / 2;
+    if (nearer < n && rows[nearer] != kNoRow) prefetch_slot(rows[nearer]);
+    if (i < end + kAhead) continue;
+    const std::size_t at = end++;
+    if (rows[at] == kNoRow) continue;
+    while (end < n && rows[end] == rows[at]) ++end;
+    add(rows[at], codes.row(at), end - at);
   }
-  // If memory runs out, the observations added so far stay and answer.
-  for (std::size_t i = 0; i < n; ++i) {
+  // If memory runs out, what was added so far stays, and answers.
+  for (std::size_t i = 0, end = 0; i < n; i = end) {
+    end = i + 1;
     if (rows[i] != kNoRow) continue;
     const std::uint16_t appearance = appearance_of(codes.row(i));
-    const Row row = find_or_create_row(ids[i], appearance);
-    add(row, codes.row(i));
-    const bool again =
-        i + 1 < n && ids[i + 1] == ids[i] && appearance_of(codes.row(i + 1)) == appearance;
-    if (!again) refresh(row);
+    while (end < n && ids[end] == ids[i] && appearance_of(codes.row(end)) == appearance) ++end;
+    add(find_or_create_row(ids[i], appearance), codes.row(i), end - i);
   }
 }
 
-void PrototypeStore::add(Row row, const std::int8_t* code) {
-  std::int16_t* s = sum(row);
-  std::uint8_t& n = counts_[row.value];
-  if (n == PrototypeMap::kMaxCount) {
-    n /= 2;
-    for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], n);
+// Adds n codes.
+void PrototypeStore::add(Row row, const std::int8_t* codes, std::size_t n) {
+  Sum s = sum(row);
+  int count = counts_[row.value];
+  for (const std::int8_t* code = codes; code != codes + n * dim_; code += dim_) {
+    if (count == PrototypeMap::kMaxCount) {
+      count /= 2;
+      for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], count);
+    }
+    // A caller may write over codes that were checked: even then no sum is impossible.
+    for (std::size_t d = 0; d < dim_; ++d) {
+      s[d] = static_cast<std::int16_t>(s[d] + std::max<std::int16_t>(code[d], -127));
+    }
+    ++count;
   }
-  // A caller may write over codes after they were checked; even then no sum is impossible.
-  for (std::size_t d = 0; d < dim_; ++d) {
-    s[d] = static_cast<std::int16_t>(s[d] + std::max<std::int16_t>(code[d], -127));
-  }
-  ++n;
+  set(row, s, count);
 }
 
-void PrototypeStore::merge(Row row, const std::int16_t* other, int other_count) {
-  const int n = count(row) + other_count;
-  const bool halved = n > PrototypeMap::kMaxCount;  // once is enough for 255 + 255
-  set_count(row, halved ? n / 2 : n);
-  std::int16_t* s = sum(row);
+void PrototypeStore::merge(Row row, const Sum& other, int other_count) {
+  const int total = count(row) + other_count;
+  const bool halved = total > PrototypeMap::kMaxCount;  // once is enough for 255 + 255
+  const int n = halved ? total / 2 : total;
+  Sum s = sum(row);
   for (std::size_t d = 0; d < dim_; ++d) {
-    const int total = s[d] + other[d];
-    s[d] = halved ? half(total, count(row)) : static_cast<std::int16_t>(total);
+    const int both = s[d] + other[d];
+    s[d] = halved ? half(both, n) : static_cast<std::int16_t>(both);
   }
-  refresh(row);
+  set(row, s, n);
 }
 
 void PrototypeStore::merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
   for (Row row = from.first_row(landmark); row != kNoRow; row = from.next_row(row)) {
-    const Row to = find_or_create_row(id, from.appearance(row));
-    merge(to, from.sum(row), from.count(row));  // after a new row, as sums may have moved
+    merge(find_or_create_row(id, from.appearance(row)), from.sum(row), from.count(row));
   }
   const LandmarkIndex into = at(id);
   if (!has_position(position(into))) set_position(into, from.position(landmark));
 }
 
-void PrototypeStore::refresh(Row row) {
+Sum PrototypeStore::sum(Row row) const {
+  const auto n = static_cast<std::int16_t>(counts_[row.value]);
+  const std::int8_t* in_slot = has_slot(row) ? slots_[slot(row)] : nullptr;
+  Sum sum;
+  for (std::size_t d = 0; d < dim_; d += 8) {
+    const std::int8_t* means = packed() + packed_index(row.value, d, dim_);
+    std::uint64_t mean = load<std::uint32_t>(means);
+    if (d + 4 < dim_) mean |= std::uint64_t{load<std::uint32_t>(means + 4 * kPackedRows)} << 32;
+    Eight left;
+    if (in_slot != nullptr) {
+      left = eight(load<std::uint64_t>(in_slot + d));
+    } else {
+      const std::uint64_t halves = load<std::uint32_t>(rest(row) + d / 2);
+      left = (eight((halves | halves << 28) & 0x0f0f0f0f0f0f0f0f) ^ 8) - 8;
+    }
+    store(&sum[d], n * eight(mean) + left);
+  }
+  return sum;
+}
+
+void PrototypeStore::set(Row row, const Sum& sum, int count) {
+  const bool had_slot = has_slot(row), needs_slot = count > kMaxSmallCount;
+  if (needs_slot && !had_slot) {
+    store(rest(row), slots_.take());
+  } else if (had_slot && !needs_slot) {
+    slots_.give_back(slot(row));
+  }
+  std::int8_t* in_slot = needs_slot ? slots_[slot(row)] : nullptr;
+  counts_[row.value] = static_cast<std::uint8_t>(count);
   std::array<std::int8_t, 256> means;
-  rounded_means(sum(row), count(row), dim_, means.data());
-  std::fill(means.begin() + dim_, means.begin() + packed_dim(dim_), std::int8_t{0});
+  rounded_means(sum.data(), count, (dim_ + 7) / 8 * 8, means.data());
+  for (std::size_t d = 0; d < dim_; d += 8) {
+    const auto n = static_cast<std::int16_t>(count);
+    const Eight left = load<Eight>(&sum[d]) - n * eight(load<std::uint64_t>(&means[d]));
+    if (in_slot != nullptr) {
+      store(in_slot + d, __builtin_convertvector(left, EightBytes));
+    } else {
+      const auto [low, high] = std::bit_cast<std::array<std::uint64_t, 2>>(left & 15);
+      const std::uint64_t pairs = low | high << 4, bytes = (pairs | pairs >> 8) & 0xffff0000ffff;
+      store(rest(row) + d / 2, static_cast<std::uint32_t>(bytes | bytes >> 16));
+    }
+  }
   std::uint32_t differences = 0;
   for (std::size_t d = 0; d < dim_; d += 4) {
     std::int8_t* at = packed() + packed_index(row.value, d, dim_);

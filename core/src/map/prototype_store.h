@@ -1,11 +1,14 @@
 // The landmarks of a learning map, with a row for each prototype.
 #pragma once
 
+#include <cstring>
 #include <functional>
 #include <memory>
 #include <new>
 
 #include "base/fair_shared_mutex.h"
+#include "base/quantize.h"
+#include "base/slots.h"
 #include "map/row_table.h"
 #include "search/coarse_quantizer.h"
 #include "search/list_blocks.h"
@@ -42,10 +45,18 @@ class Uncommitted {
 
 // Rows are in blocks by inverted list: all in one without an index, otherwise each in the list of
 // its rounded prototype. Padding fills the last block of a list.
+//
+// A row keeps its rounded prototype p, which search reads, its count n, and what is left of its
+// sum, sum - n * p: numbers of -n / 2 to n / 2, which take 4 bits up to n = 15, and 8 bits above
+// that.
 class PrototypeStore : public RowTable {
  public:
   PrototypeStore(std::size_t dim, std::size_t appearance_bits)
-      : RowTable(appearance_bits != 0), dim_(dim), appearance_bits_(appearance_bits) {}
+      : RowTable(appearance_bits != 0),
+        dim_(dim),
+        appearance_bits_(appearance_bits),
+        rest_bytes_((dim + 7) / 8 * 4),
+        slots_(2 * rest_bytes_) {}
 
   std::size_t dim() const { return dim_; }
   std::size_t appearance_bits() const { return appearance_bits_; }
@@ -54,7 +65,8 @@ class PrototypeStore : public RowTable {
   std::size_t prototype_count() const { return prototype_count_; }
   // The number of rows, padding included.
   std::size_t row_end() const { return lists_.blocks() * kPackedRows; }
-  // Bytes per row as in a file, so that equal maps have the same.
+  // Bytes per row of few observations, without what arrays have room for, so that equal maps have
+  // the same.
   std::size_t row_bytes() const;
 
   // Returns the appearance of a code: bit j is set if code[j] > 0, j < appearance_bits.
@@ -82,10 +94,21 @@ class PrototypeStore : public RowTable {
 
   std::uint32_t observations(LandmarkIndex landmark) const;
   MapSummary summary() const;
-  std::int16_t* sum(Row row) { return &sums_[row.value * dim_]; }
-  const std::int16_t* sum(Row row) const { return &sums_[row.value * dim_]; }
   int count(Row row) const { return counts_[row.value]; }
-  void set_count(Row row, int count) { counts_[row.value] = static_cast<std::uint8_t>(count); }
+  Sum sum(Row row) const;
+  // Asks for what `sum` reads and `set` writes ahead. Inlined, as GCC drops calls of a function
+  // that does nothing but this.
+  [[gnu::always_inline]] void prefetch(Row row) const {
+    __builtin_prefetch(rest(row), 1);
+    __builtin_prefetch(rest(row) + rest_bytes_ - 1, 1);
+    __builtin_prefetch(&counts_[row.value], 1);
+    for (std::size_t d = 0; d < dim_; d += 4) {
+      __builtin_prefetch(packed() + packed_index(row.value, d, dim_), 1);
+    }
+  }
+  // Replaces the sum and count of a row; its rounded prototype follows. If memory runs out nothing
+  // has changed, and for a new row it does not.
+  void set(Row row, const Sum& sum, int count);
   // Return the rounded prototypes of one row or several (rows x dim).
   void rounded(Row row, std::int8_t* to) const;
   std::vector<std::int8_t> rounded(std::span<const Row> rows) const;
@@ -119,13 +142,11 @@ class PrototypeStore : public RowTable {
   // are those that find_rows found.
   void add(std::span<const std::int64_t> ids, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
-  void merge(Row row, const std::int16_t* sum, int count);
+  void merge(Row row, const Sum& sum, int count);
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
   // which keeps its position if it has one.
   void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark);
-  // Makes the rounded prototype follow the sum and count.
-  void refresh(Row row);
-  // Puts refreshed rows into their lists; ends every change.
+  // Puts rows that were created or set into their lists; ends every change.
   void reassign(int threads);
 
   void set_position(LandmarkIndex landmark, const Position& position);
@@ -163,16 +184,22 @@ class PrototypeStore : public RowTable {
 
   const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
   std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
-  // Inlined, as GCC drops calls of a function that does nothing but this.
-  [[gnu::always_inline]] void prefetch_prototype(Row row) const {
-    __builtin_prefetch(sum(row), 1);
-    __builtin_prefetch(sum(row) + dim_ - 1, 1);
-    __builtin_prefetch(&counts_[row.value], 1);
-    for (std::size_t d = 0; d < dim_; d += 4) {
-      __builtin_prefetch(packed() + packed_index(row.value, d, dim_), 1);
-    }
+  // The 4-bit numbers of a row: the low and high bits of byte d % 4 of each 4 bytes are numbers d
+  // and d + 4 of each 8. Or the slot of its 8-bit ones.
+  const std::uint8_t* rest(Row row) const { return &rests_[row.value * rest_bytes_]; }
+  std::uint8_t* rest(Row row) { return &rests_[row.value * rest_bytes_]; }
+  bool has_slot(Row row) const { return counts_[row.value] > kMaxSmallCount; }
+  std::uint32_t slot(Row row) const {
+    std::uint32_t slot;
+    std::memcpy(&slot, rest(row), sizeof(slot));
+    return slot;
   }
-  void add(Row row, const std::int8_t* code);
+  [[gnu::always_inline]] void prefetch_slot(Row row) const {
+    if (!has_slot(row)) return;
+    __builtin_prefetch(slots_[slot(row)], 1);
+    __builtin_prefetch(slots_[slot(row)] + 2 * rest_bytes_ - 1, 1);
+  }
+  void add(Row row, const std::int8_t* codes, std::size_t n);
   Row take_row(std::uint32_t list);
   void resize(std::size_t rows);
   // Copies all of a row, but not what leads to it.
@@ -188,7 +215,7 @@ class PrototypeStore : public RowTable {
   template <typename Visit>
   void for_each_plain_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
     RowTable::for_each_array(landmarks, rows, visit);
-    visit(sums_, rows * dim_, std::int16_t{0});
+    visit(rests_, rows * rest_bytes_, std::uint8_t{0});
     visit(counts_, rows, std::uint8_t{0});
   }
   template <typename Visit>
@@ -197,15 +224,19 @@ class PrototypeStore : public RowTable {
     visit(packed_, packed_size(rows, dim_) / sizeof(CodeVector), CodeVector{});
   }
 
+  static constexpr int kMaxSmallCount = 15;
+
   std::size_t dim_;
   std::size_t appearance_bits_;
+  std::size_t rest_bytes_;
   std::size_t prototype_count_ = 0;
 
   // By row.
-  LargeVector<std::int16_t> sums_;  // rows x dim
+  LargeVector<std::uint8_t> rests_;  // rows x rest_bytes_
   std::vector<std::uint8_t> counts_;
   LargeVector<CodeVector> packed_;  // rounded prototypes, as PackedPrototypes has them
 
+  Slots slots_;
   ListBlocks lists_;
   CoarseQuantizer quantizer_;
   std::size_t lists_version_ = 0;

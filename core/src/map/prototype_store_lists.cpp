@@ -117,17 +117,17 @@ void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
     if (to[first.value] == kNoRow || to[first.value] == first) continue;
     copy_row(first, moving);
     Row row = std::exchange(to[first.value], kNoRow), ahead = row;
-    const auto prefetch = [&] {
+    const auto prefetch_next = [&] {
       if (ahead == kNoRow) return;
-      prefetch_prototype(ahead);
+      prefetch(ahead);
       RowTable::for_each_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
         __builtin_prefetch(v.data() + ahead.value * width, 1);
       });
       ahead = next(ahead);
     };
-    for (int i = 0; i < kAhead; ++i) prefetch();
+    for (int i = 0; i < kAhead; ++i) prefetch_next();
     while (next(row) != kNoRow) {
-      prefetch();
+      prefetch_next();
       copy_row(row, met);
       copy_row(moving, row);
       std::swap(moving, met);

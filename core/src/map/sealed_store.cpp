@@ -24,7 +24,8 @@ std::size_t prototype_bytes(std::size_t dim, int bits) {
 struct LandmarkRows {
   LandmarkRows(const PrototypeStore& store, LandmarkIndex landmark) {
     for (const Row row : store.sorted_rows(landmark)) {
-      sums.insert(sums.end(), store.sum(row), store.sum(row) + store.dim());
+      const Sum sum = store.sum(row);
+      sums.insert(sums.end(), sum.begin(), sum.begin() + store.dim());
       counts.push_back(static_cast<std::uint8_t>(store.count(row)));
     }
   }
@@ -125,13 +126,12 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std
       const auto appearance = static_cast<std::uint16_t>(from);
       const Row row = result.create_row(store.id(landmarks[i]), landmark, appearance);
       const bool fits_row = counts[from] <= PrototypeMap::kMaxCount;
+      Sum own_sum{};
       for (std::size_t d = 0; d < dim; ++d) {
         const std::int64_t sum = sums[from * dim + d];
-        result.sum(row)[d] = fits_row ? static_cast<std::int16_t>(sum)
-                                      : std::int16_t{rounded_mean(sum, counts[from])};
+        own_sum[d] = fits_row ? static_cast<std::int16_t>(sum) : rounded_mean(sum, counts[from]);
       }
-      result.set_count(row, fits_row ? static_cast<int>(counts[from]) : 1);
-      result.refresh(row);
+      result.set(row, own_sum, fits_row ? static_cast<int>(counts[from]) : 1);
     }
   }
   if (store.quantizer().nlist() != 0) result.rearrange(result.arrange(store.quantizer(), 1));
