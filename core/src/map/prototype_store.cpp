@@ -10,7 +10,6 @@
 
 #include "base/rounded_mean.h"
 #include "base/sorted_pieces.h"
-#include "kernels/vectors.h"
 #include "map/positions.h"
 #include "protomark/prototype_map.h"
 
@@ -21,11 +20,21 @@ namespace {
 constexpr std::size_t kAhead = 16;
 
 // Eight numbers, and from a byte each.
-using kernels::load, kernels::store;
-using Eight = kernels::Vector<std::int16_t, 16>;
-using EightBytes = kernels::Vector<std::int8_t, 8>;
+typedef std::int16_t Eight __attribute__((vector_size(16)));
+typedef std::int8_t EightBytes __attribute__((vector_size(8)));
 Eight eight(std::uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
+}
+
+template <typename T>
+T load(const void* from) {
+  T value;
+  std::memcpy(&value, from, sizeof(value));
+  return value;
+}
+template <typename T>
+void store(void* to, const T& value) {
+  std::memcpy(to, &value, sizeof(value));
 }
 
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
