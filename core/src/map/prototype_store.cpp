@@ -8,7 +8,6 @@
 
 #include "base/quantize.h"
 #include "base/sorted_pieces.h"
-#include "kernels/vectors.h"
 #include "map/positions.h"
 #include "protomark/prototype_map.h"
 
@@ -19,11 +18,21 @@ namespace {
 constexpr std::size_t kAhead = 16;
 
 // Eight numbers, and from a byte each.
-using kernels::load, kernels::store;
-using Eight = kernels::Vector<std::int16_t, 16>;
-using EightBytes = kernels::Vector<std::int8_t, 8>;
+typedef std::int16_t Eight __attribute__((vector_size(16)));
+typedef std::int8_t EightBytes __attribute__((vector_size(8)));
 Eight eight(std::uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
+}
+
+template <typename T>
+T load(const void* from) {
+  T value;
+  std::memcpy(&value, from, sizeof(value));
+  return value;
+}
+template <typename T>
+void store(void* to, const T& value) {
+  std::memcpy(to, &value, sizeof(value));
 }
 
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
@@ -301,18 +310,21 @@ void PrototypeStore::merge(std::int64_t id, const PrototypeStore& from, Landmark
 }
 
 Sum PrototypeStore::sum(Row row) const {
+  // Copies of members, which the compiler cannot know to stay.
+  const std::size_t dim = dim_;
+  const std::int8_t* means = packed() + packed_index(row.value, 0, dim);
+  const std::uint8_t* in_row = rest(row);
   const auto n = static_cast<std::int16_t>(counts_[row.value]);
   const std::int8_t* in_slot = has_slot(row) ? slots_[slot(row)] : nullptr;
   Sum sum;
-  for (std::size_t d = 0; d < dim_; d += 8) {
-    const std::int8_t* means = packed() + packed_index(row.value, d, dim_);
+  for (std::size_t d = 0; d < dim; d += 8, means += 8 * kPackedRows) {
     std::uint64_t mean = load<std::uint32_t>(means);
-    if (d + 4 < dim_) mean |= std::uint64_t{load<std::uint32_t>(means + 4 * kPackedRows)} << 32;
+    if (d + 4 < dim) mean |= std::uint64_t{load<std::uint32_t>(means + 4 * kPackedRows)} << 32;
     Eight left;
     if (in_slot != nullptr) {
       left = eight(load<std::uint64_t>(in_slot + d));
     } else {
-      const std::uint64_t halves = load<std::uint32_t>(rest(row) + d / 2);
+      const std::uint64_t halves = load<std::uint32_t>(in_row + d / 2);
       left = (eight((halves | halves << 28) & 0x0f0f0f0f0f0f0f0f) ^ 8) - 8;
     }
     store(&sum[d], n * eight(mean) + left);
@@ -328,23 +340,25 @@ void PrototypeStore::set(Row row, const Sum& sum, int count) {
     slots_.give_back(slot(row));
   }
   std::int8_t* in_slot = needs_slot ? slots_[slot(row)] : nullptr;
+  std::uint8_t* in_row = rest(row);
   counts_[row.value] = static_cast<std::uint8_t>(count);
+  const auto n = static_cast<std::int16_t>(count);
+  const std::size_t dim = dim_;
   std::array<std::int8_t, 256> means;
-  rounded_means(sum.data(), count, (dim_ + 7) / 8 * 8, means.data());
-  for (std::size_t d = 0; d < dim_; d += 8) {
-    const auto n = static_cast<std::int16_t>(count);
+  rounded_means(sum.data(), count, (dim + 7) / 8 * 8, means.data());
+  for (std::size_t d = 0; d < dim; d += 8) {
     const Eight left = load<Eight>(&sum[d]) - n * eight(load<std::uint64_t>(&means[d]));
     if (in_slot != nullptr) {
       store(in_slot + d, __builtin_convertvector(left, EightBytes));
     } else {
       const auto [low, high] = std::bit_cast<std::array<std::uint64_t, 2>>(left & 15);
       const std::uint64_t pairs = low | high << 4, bytes = (pairs | pairs >> 8) & 0xffff0000ffff;
-      store(rest(row) + d / 2, static_cast<std::uint32_t>(bytes | bytes >> 16));
+      store(in_row + d / 2, static_cast<std::uint32_t>(bytes | bytes >> 16));
     }
   }
   std::uint32_t differences = 0;
-  for (std::size_t d = 0; d < dim_; d += 4) {
-    std::int8_t* at = packed() + packed_index(row.value, d, dim_);
+  std::int8_t* at = packed() + packed_index(row.value, 0, dim);
+  for (std::size_t d = 0; d < dim; d += 4, at += 4 * kPackedRows) {
     std::uint32_t before, after;
     std::memcpy(&before, at, 4);
     std::memcpy(&after, &means[d], 4);
