@@ -158,7 +158,7 @@ clean:
 
 .venv/installed: $(SOURCES)
 	test -x .venv/bin/python || $(PYTHON) -m venv .venv
-	.venv/bin/pip install --quiet .
+	.venv/bin/pip install --quiet -c constraints.txt '.[map]'
 	touch $@
 
 .venv-bench/installed: $(SOURCES) $(BENCH)
