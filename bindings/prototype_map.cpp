@@ -390,7 +390,8 @@ Raises:
       .def("nprobe", &PrototypeMap::nprobe, "recall"_a, "threads"_a = 1, ReleaseGil(),
            "Number of inverted lists that a search with this recall, in (0, 1], visits, as "
            "measured on the map: prototypes are searched for among those of other landmarks, and "
-           "codes as far from them as observations are among all (docs/index.md). Measured once, "
+           "codes as far from them as observations are among all (docs/large-maps.md). Measured "
+           "once, "
            "and again when a tenth of the map has changed. Raises ValueError for another recall, "
            "and without an index.");
   bind_changes(map);

@@ -268,9 +268,9 @@ def test_command(query: Path) -> None:
     assert {name for name, row in rows.items() if row["accepted"] == "1"} == {
         f"{i}.png" for i in (1, 2, 3)
     }
-    assert "truncated" in rows["torn.png"]["note"]
-    assert "0 keypoints" in rows["black.png"]["note"]
-    assert "32 x 24 pixels" in rows["small.png"]["note"]
+    assert "truncated" in rows["torn.png"]["reason"]
+    assert "0 keypoints" in rows["black.png"]["reason"]
+    assert "32 x 24 pixels" in rows["small.png"]["reason"]
     position = [float(rows["2.png"][axis]) for axis in "xyz"]
     assert position == pytest.approx(camera_centers(NEW_POSES[1]), abs=0.02)
 

@@ -140,8 +140,8 @@ class PROTOMARK_API PrototypeMap {
   // Number of inverted lists; 0 means no index.
   std::size_t nlist() const;
   // Returns how many lists a search with this recall, above 0 and at most 1, visits, as measured on
-  // the map (docs/index.md), and again when a tenth of it has changed. Throws std::invalid_argument
-  // for another recall, and without an index.
+  // the map (docs/large-maps.md), and again when a tenth of it has changed. Throws
+  // std::invalid_argument for another recall, and without an index.
   std::size_t nprobe(double recall, int threads = 1) const;
 
   // Returns the squared distance of each code to one landmark, as a search measures it: what guided

@@ -103,7 +103,7 @@ class ImageResult:
             "position_error": self.true_error[0] if self.true_error else None,
             "angle_error": self.true_error[1] if self.true_error else None,
             "seconds": {k: round(v, 6) for k, v in found.seconds.items()} if found else {},
-            "note": self.error or (found.reason if found else ""),
+            "reason": self.error or (found.reason if found else ""),
         }
 
 
@@ -199,7 +199,7 @@ class LocalizationBatch:
         header = ["image", "accepted", "confidence", "inliers", "matches", "x", "y", "z"]
         header += [f"r{i}{j}" for i in range(3) for j in range(3)]
         header += ["focal_length", "position_error", "angle_error"]
-        writer.writerow([*header, *(f"seconds_{stage}" for stage in STAGES), "note"])
+        writer.writerow([*header, *(f"seconds_{stage}" for stage in STAGES), "reason"])
         for image in self.images:
             row = image.as_dict()
             pose = image.found.cam_from_world if image.found else None
@@ -213,7 +213,7 @@ class LocalizationBatch:
                     *numbers,
                     *(row[key] for key in ("focal_length", "position_error", "angle_error")),
                     *(row["seconds"].get(stage, "") for stage in STAGES),
-                    row["note"],
+                    row["reason"],
                 ]
             )
         return out.getvalue()
