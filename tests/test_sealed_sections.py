@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protomark as pm
-from conftest import protomark, random_descriptors
+from conftest import balanced_encoder, protomark, random_descriptors
 from map_container import container, sections
 from sealing import four_bits
 
@@ -163,3 +164,47 @@ def test_info_of_a_sealed_map(encoder: pm.Encoder, tmp_path: Path) -> None:
     assert "\x1b" not in done.stdout
     assert r"\x07\x1b[31m" in done.stdout
     assert "(0, 0, 0) to (65,534, 10, 0)" in done.stdout
+
+
+@pytest.mark.parametrize("how", ["cp", "append", "truncate"])
+def test_a_map_that_was_written_into_while_open_answers_no_more(how: str, tmp_path: Path) -> None:
+    learning = pm.PrototypeMap(balanced_encoder())
+    learning.add(np.arange(0, 3000, 3), random_descriptors(1000))
+    path, other = tmp_path / "scene.sealed.pmk", tmp_path / "other.sealed.pmk"
+    sealed = learning.seal(path)
+    learning.add(np.arange(5000), random_descriptors(5000, seed=2))
+    learning.seal(other)
+    codes = np.zeros((1, learning.dim), np.int8)
+    sealed.search_codes(codes)
+    if how == "cp":
+        path.write_bytes(other.read_bytes())
+    elif how == "append":
+        with path.open("ab") as file:
+            file.write(b"more")
+    else:
+        os.truncate(path, 100)
+    for call in (
+        lambda: sealed.search_codes(codes),
+        lambda: sealed.positions([0]),
+        lambda: sealed.counts([0]),
+        lambda: sealed.prototypes([0]),
+        lambda: sealed.appearances(0),
+        lambda: sealed.ids,
+        sealed.summary,
+    ):
+        with pytest.raises(pm.FileError, match=r"written to while it was open.*by renaming"):
+            call()
+
+
+def test_a_map_that_was_replaced_by_renaming_goes_on(tmp_path: Path) -> None:
+    learning = pm.PrototypeMap(balanced_encoder())
+    learning.add(np.arange(100), random_descriptors(100))
+    sealed = learning.seal(tmp_path / "scene.sealed.pmk")
+    codes = learning.encoder.encode(random_descriptors(5, seed=3))
+    before = sealed.search_codes(codes)
+    learning.add(np.arange(200), random_descriptors(200, seed=2))
+    again = learning.seal(tmp_path / "scene.sealed.pmk")
+    np.testing.assert_array_equal(sealed.search_codes(codes)[1], before[1])
+    assert (len(sealed), len(again)) == (100, 200)
+    (tmp_path / "scene.sealed.pmk").unlink()
+    np.testing.assert_array_equal(sealed.search_codes(codes)[1], before[1])

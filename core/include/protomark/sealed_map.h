@@ -65,6 +65,8 @@ class PROTOMARK_API SealedMap {
 
  private:
   struct Content;
+  const Content& unchanged() const;
+
   std::unique_ptr<const Content> content_;
 };
 

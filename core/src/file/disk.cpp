@@ -160,10 +160,27 @@ MappedFile::MappedFile(const FileDescriptor& file, const std::filesystem::path& 
   if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail_file(path, "not a file");
   const auto size = static_cast<std::size_t>(status.st_size);
   if (size == 0) return;
+  // The mapping and this descriptor are of one file, whatever becomes of its name.
+  file_ = FileDescriptor(::fcntl(file.get(), F_DUPFD_CLOEXEC, 0));
+  if (!file_) fail_file(path, "cannot be read: ", system_error());
+  stamp_ = stamp_of(file_);
   void* data = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.get(), 0);
   if (data == MAP_FAILED) fail_file(path, "cannot be read: ", system_error());
   bytes_ = {static_cast<const std::byte*>(data), size};
 }
+
+std::optional<MappedFile::Stamp> MappedFile::stamp_of(const FileDescriptor& file) {
+  struct stat status;
+  if (::fstat(file.get(), &status) != 0) return std::nullopt;
+#ifdef __APPLE__
+  const timespec& changed = status.st_mtimespec;
+#else
+  const timespec& changed = status.st_mtim;
+#endif
+  return Stamp{status.st_size, changed.tv_sec, changed.tv_nsec};
+}
+
+bool MappedFile::unchanged() const { return bytes_.empty() || stamp_of(file_) == stamp_; }
 
 MappedFile::~MappedFile() {
   if (!bytes_.empty()) ::munmap(const_cast<std::byte*>(bytes_.data()), bytes_.size());

@@ -96,8 +96,20 @@ class MappedFile {
   MappedFile& operator=(const MappedFile&) = delete;
 
   Bytes bytes() const { return bytes_; }
+  // Whether nobody has written to the file since it was mapped: its size and the time of its last
+  // change are the same. A file of another inode that takes its name changes nothing.
+  bool unchanged() const;
 
  private:
+  struct Stamp {
+    off_t size = 0;
+    std::int64_t seconds = 0, nanoseconds = 0;
+    bool operator==(const Stamp&) const = default;
+  };
+  static std::optional<Stamp> stamp_of(const FileDescriptor& file);
+
+  FileDescriptor file_;
+  std::optional<Stamp> stamp_;
   Bytes bytes_;
 };
 

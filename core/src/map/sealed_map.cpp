@@ -191,6 +191,16 @@ SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) 
 SealedMap::SealedMap(SealedMap&&) noexcept = default;
 SealedMap::~SealedMap() = default;
 
+// What was checked when the map was opened need not hold for other bytes.
+const SealedMap::Content& SealedMap::unchanged() const {
+  if (content_->mapped && !content_->mapped->unchanged()) {
+    content_->file.fail(
+        "it was written to while it was open: open it again, and replace map files "
+        "by renaming, not by cp, scp or rsync --inplace");
+  }
+  return *content_;
+}
+
 const std::shared_ptr<const Encoder>& SealedMap::encoder() const { return content_->encoder; }
 const Metadata& SealedMap::metadata() const { return content_->metadata; }
 std::size_t SealedMap::dim() const { return content_->shape.dim; }
@@ -198,7 +208,7 @@ std::size_t SealedMap::size() const { return content_->shape.landmarks; }
 std::size_t SealedMap::prototype_count() const { return content_->prototype_count; }
 int SealedMap::code_bits() const { return content_->code_bits(); }
 std::size_t SealedMap::nlist() const { return content_->nlist(); }
-std::vector<std::int64_t> SealedMap::ids() const { return content_->ids.all(); }
+std::vector<std::int64_t> SealedMap::ids() const { return unchanged().ids.all(); }
 
 double SealedMap::bytes_per_landmark() const {
   if (size() == 0) return 0;
@@ -220,20 +230,22 @@ std::optional<Position> SealedMap::position_error() const {
 }
 
 std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmark_ids) const {
+  const Content& c = unchanged();
   std::vector<std::uint32_t> result;
   for (const std::int64_t id : landmark_ids) {
-    result.push_back(content_->counts[content_->ids.find(id).value]);
+    result.push_back(c.counts[c.ids.find(id).value]);
   }
   return result;
 }
 
 Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) const {
+  const Content& c = unchanged();
   Matrix<float> means(landmark_ids.size(), dim());
   for (std::size_t i = 0; i < landmark_ids.size(); ++i) {
-    const auto [first, end] = content_->prototypes_of(content_->ids.find(landmark_ids[i]));
+    const auto [first, end] = c.prototypes_of(c.ids.find(landmark_ids[i]));
     for (std::size_t d = 0; d < dim(); ++d) {
       int sum = 0;
-      for (std::size_t p = first; p < end; ++p) sum += content_->value(content_->row_of(p), d);
+      for (std::size_t p = first; p < end; ++p) sum += c.value(c.row_of(p), d);
       means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(end - first);
     }
   }
@@ -241,29 +253,32 @@ Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) 
 }
 
 Matrix<float> SealedMap::appearances(std::int64_t id) const {
-  const auto [first, end] = content_->prototypes_of(content_->ids.find(id));
+  const Content& c = unchanged();
+  const auto [first, end] = c.prototypes_of(c.ids.find(id));
   Matrix<float> result(end - first, dim());
   for (std::size_t i = 0; i < result.rows; ++i) {
-    const Row row = content_->row_of(first + i);
+    const Row row = c.row_of(first + i);
     for (std::size_t d = 0; d < dim(); ++d) {
-      result.row(i)[d] = static_cast<float>(content_->value(row, d));
+      result.row(i)[d] = static_cast<float>(c.value(row, d));
     }
   }
   return result;
 }
 
 std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmark_ids) const {
+  const Content& c = unchanged();
   std::vector<Position> result;
   for (const std::int64_t id : landmark_ids) {
-    result.push_back(content_->position(content_->ids.find(id)));
+    result.push_back(c.position(c.ids.find(id)));
   }
   return result;
 }
 
 MapSummary SealedMap::summary() const {
+  const Content& c = unchanged();
   MapSummary result;
   for (std::size_t i = 0; i < size(); ++i) {
-    add_to_summary(result, content_->counts[i], content_->position(landmark_at(i)));
+    add_to_summary(result, c.counts[i], c.position(landmark_at(i)));
   }
   return result;
 }
@@ -273,7 +288,7 @@ Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOption
 }
 
 Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
-  const Content& c = *content_;
+  const Content& c = unchanged();
   check_lists(options, nlist(), kRemedy);
   const std::size_t lists =
       options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
