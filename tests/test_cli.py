@@ -186,6 +186,42 @@ def test_megabytes_keep_the_landmarks_that_cover_the_images(tmp_path: Path) -> N
     assert fewest[0] > 2 * fewest[1]
 
 
+def test_no_command_writes_over_its_input(tracks: Tracks, model: Path, tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "images"):
+        folder.mkdir(exist_ok=True)
+    t, m, link = tmp_path / "t.safetensors", tmp_path / "m.pmk", tmp_path / "link"
+    tracks.save(t)
+    assert protomark("build", t, "-o", m, "--encoder", model).returncode == 0
+    link.symlink_to(t)
+    before = {path: path.read_bytes() for path in (t, m, model)}
+    for arguments in (
+        ("build", t, "-o", t, "--encoder", model),
+        ("build", t, "-o", f"{tmp_path}/./t.safetensors", "--encoder", model),
+        ("build", link, "-o", t, "--encoder", model),
+        ("build", t, "-o", model, "--encoder", model),
+        ("info", m, "--json", m),
+        ("info", t, "--json", t),
+        ("evaluate", t, "--json", t),
+        ("evaluate", t, "--encoder", model, "--markdown", model),
+        ("calibrate", model, t, "-o", t),
+        ("localize", m, tmp_path / "images", "--json", m),
+        ("seal", m, "-o", m),
+        ("merge", m, t, "-o", tmp_path / "o.pmk", "--json", m),
+        ("split", m, "-o", tmp_path / "parts", "--parts", 2, "--json", m),
+        ("train", t, "-o", t),
+    ):
+        done = protomark(*arguments)
+        assert (done.returncode, "is an input of this command" in done.stderr) == (1, True), (
+            arguments,
+            done.stderr,
+        )
+    done = protomark("build", t, "-o", m, "--encoder", model, "--json", m)
+    assert "would be written twice" in done.stderr
+    done = protomark("info", t, "--json", "/dev/null")
+    assert "/dev/null is not a regular file" in done.stderr
+    assert {path: path.read_bytes() for path in before} == before
+
+
 def row(output: str, name: str) -> str:
     """The line of the printed facts that starts with `name`."""
     return next(line for line in output.splitlines() if line.startswith(name))
@@ -328,7 +364,7 @@ def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path
     calls = [
         (["merge", one, "-o", output], "name at least two maps"),
         (["merge", one, tmp_path / "." / "one.pmk", "-o", output], "is named twice"),
-        (["merge", one, tmp_path / "two.pmk", "-o", one], "is one of the maps to merge"),
+        (["merge", one, tmp_path / "two.pmk", "-o", one], "is an input of this command"),
         (["merge", one, short, "-o", output], f"{short}: maps of different encoders or dimensions"),
         (["merge", one, sealed, "-o", output], "is a sealed map, which keeps no sums"),
         (["merge", one, tmp_path / "none.pmk", "-o", output], "No such file"),

@@ -16,6 +16,18 @@ def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
+def test_links_are_written_through_and_devices_stay(tmp_path: Path) -> None:
+    (tmp_path / "v1.txt").write_text("old", encoding="utf-8")
+    (tmp_path / "current.txt").symlink_to("v1.txt")
+    write_text(tmp_path / "current.txt", "new")
+    assert (tmp_path / "current.txt").is_symlink()
+    assert (tmp_path / "v1.txt").read_text(encoding="utf-8") == "new"
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="not a regular file"):
+        write_text(tmp_path / "pipe", "x")
+    assert (tmp_path / "pipe").is_fifo()
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_an_error_leaves_what_was_there(tmp_path: Path, error: type[BaseException]) -> None:
     path = tmp_path / "a.bin"

@@ -139,7 +139,7 @@ def test_a_missing_file_is_named(files, tmp_path):
         (["--resume"], "without --resume"),
         (["--data-licence", "MIT"], "NAME=LICENCE"),
         (["--data-licence", "z=MIT"], "not one of the sequences"),
-        (["-o", "no/such/folder/x.pme"], "does not exist"),
+        (["-o", "no/such/folder/x.pme"], "no such folder to write"),
         (["--report", "nowhere.safetensors"], "nowhere"),
         (["--report", "{longer}"], "report on tracks of the same descriptor"),
         (["--report", "{short}"], "short"),

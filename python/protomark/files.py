@@ -22,7 +22,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     new file survives a power cut and has the permission bits of the old one. A killed process may
     leave `.<name>.<random>`, which nothing reads.
     """
-    target = Path(path).absolute()
+    # Links are written through: whoever made one wants the file that it leads to.
+    target = Path(path).resolve()
+    if target.exists() and not target.is_file():
+        raise OSError(errno.EINVAL, "not a regular file, so it cannot be replaced", str(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     # Not tempfile: only the owner may read its files.
     mode = _permissions(target)

@@ -65,7 +65,7 @@ def build(
     from protomark.tracks.file import Tracks
 
     sealed = None if no_seal else sealed_path(output)
-    check_outputs(output, json_file, sealed)
+    check_outputs(output, json_file, sealed, inputs=[tracks, encoder])
     texts = command_metadata(frame, metadata or [])
     threads = threads or available_threads()
     with progress_bar() as progress:

@@ -50,7 +50,7 @@ def calibrate(
     from protomark.threads import available_threads
     from protomark.training.match_calibration import calibrate as fit
 
-    check_outputs(output or model, json_file)
+    check_outputs(output or model, json_file, inputs=tracks)
     with progress_bar() as progress:
         encoder, quality = fit(
             Encoder.load(model), tracks, threads or available_threads(), progress

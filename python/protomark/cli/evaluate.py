@@ -90,7 +90,8 @@ def evaluate(
     from protomark.plot import check_suffix
     from protomark.threads import available_threads
 
-    check_outputs(json_file, markdown_file, plot_file)
+    inputs = [*tracks, *(encoder or []), *(discriminant_from or [])]
+    check_outputs(json_file, markdown_file, plot_file, inputs=inputs)
     if plot_file:
         check_suffix(plot_file)
     options = EvaluationOptions(

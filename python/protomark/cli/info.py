@@ -33,7 +33,7 @@ def info(
     from protomark.cli.terminal import check_outputs, error_console, write_json
     from protomark.maps.info import describe, is_tracks
 
-    check_outputs(json_file)
+    check_outputs(json_file, inputs=[file])
     with error_console.status(f"Reading {file.name}"):
         facts = describe(file)
         if verify and is_tracks(file):

@@ -94,7 +94,7 @@ def localize(
     from protomark.localization.batch import LocalizationRequest, localize_files
     from protomark.threads import available_threads
 
-    check_outputs(json_file)
+    check_outputs(json_file, inputs=[scene, *images, camera, poses, priors])
     request = LocalizationRequest(
         scene,
         images,

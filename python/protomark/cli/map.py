@@ -94,7 +94,7 @@ def map_(
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
-    check_outputs(json_file)
+    check_outputs(json_file, inputs=[images, camera, poses, encoder])
     if view:
         optional("rerun")
     request = MapRequest(

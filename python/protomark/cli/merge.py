@@ -40,7 +40,7 @@ def merge(
     from protomark.cli.terminal import check_outputs, print_facts, progress_bar, write_json
     from protomark.maps.merge import merge_files
 
-    check_outputs(output, json_file)
+    check_outputs(output, json_file, inputs=maps)
     with progress_bar() as progress:
         facts = merge_files(maps, output, renumber, progress)
     write_json(json_file, facts)

@@ -74,11 +74,12 @@ def seal(
     from protomark.cli.info import show
     from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
     from protomark.maps.info import describe
+    from protomark.maps.open import SCENE_MAP
     from protomark.maps.seal import SealOptions
     from protomark.maps.seal import seal as seal_source
     from protomark.threads import available_threads
 
-    check_outputs(output, json_file)
+    check_outputs(output, json_file, inputs=[source, source / SCENE_MAP])
     options = SealOptions(
         bytes_per_landmark=bytes_per_landmark or None,
         megabytes=megabytes,

@@ -123,7 +123,7 @@ def tracks(
     ]
     sources = [TracksInput(folder, images, model, database) for folder in folders]
     _check(sources, output, augmentations)
-    check_outputs(json_file)
+    check_outputs(json_file, inputs=[database])
     threads = threads or available_threads()
     facts = []
     for source in sources:

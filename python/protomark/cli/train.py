@@ -84,7 +84,8 @@ def train(
     )
     from protomark.extras import optional
 
-    check_outputs(json_file)
+    inputs = [*tracks, *(validation or []), *(report or [])]
+    check_outputs(output, json_file, inputs=inputs)
     optional("torch")
     from protomark.training.data import hold_out
     from protomark.training.encoder import TrainingRequest, default_output, train_encoder
