@@ -6,6 +6,7 @@ of the sample (`workspace`, `names`). Commands that take long are only parsed.
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -33,6 +34,8 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`protomark ([^`]+)`")
 # Quick on the sample; all other commands are only parsed.
 QUICK = {"build", "info", "localize", "merge", "seal", "split"}
+# Whose map is small enough to be made, of rendered images.
+MAPPED = "small-map.md"
 # Commands of protomark-bench, which need not be installed here.
 BENCH = {"bench", "evaluate-mapping", "reproduce"}
 # What the fragments of C++ may use.
@@ -148,16 +151,29 @@ def test_blocks_run(
     folder = tmp_path / "work"
     shutil.copytree(workspace, folder)
     monkeypatch.chdir(folder)
+    quick = QUICK
+    if page.name == MAPPED:
+        pytest.importorskip("pycolmap")
+        from mapping_scene import walk, write_images
+
+        quick = QUICK | {"map"}
+        shutil.rmtree("new")
+        poses = walk(16)
+        write_images(Path("photos"), poses[::2])
+        write_images(Path("new"), poses[1::4])
     for language, text in blocks(page, "python", "bash"):
         if language == "python":
             exec(compile(text, f"{page.name}: {text.splitlines()[0]}", "exec"), names)
             continue
         for arguments in commands(text):
-            if arguments[0] in QUICK:
+            if arguments[0] in quick:
                 if arguments[0] == "localize":
                     pytest.importorskip("poselib")
                     pytest.importorskip("pycolmap")
                 app(arguments, standalone_mode=False)
+    if page.name == MAPPED:
+        found = json.loads(Path("found.json").read_text())
+        assert found["localized"] == found["images"] == 4
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
