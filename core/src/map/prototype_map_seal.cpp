@@ -24,8 +24,8 @@ class BlockPacker {
  public:
   // Numbers have 4 bits, or 8 if `scale` is 0.
   BlockPacker(const PrototypeStore& store, int scale) : store_(&store), scale_(scale) {
-    for (int v = -128; v < 128 && scale_ != 0; ++v) {
-      quantized_[static_cast<std::size_t>(v + 128)] = sq4_quantize(v, scale_);
+    for (std::size_t i = 0; i < quantized_.size() && scale_ != 0; ++i) {
+      quantized_[i] = sq4_quantize(static_cast<int>(i) - 128, scale_);
     }
   }
 
