@@ -70,8 +70,7 @@ class PackedPiece {
 
 void sort_unique(std::vector<LandmarkIndex>& landmarks) {
   if (!std::ranges::is_sorted(landmarks)) std::ranges::sort(landmarks);
-  const auto repeated = std::ranges::unique(landmarks);
-  landmarks.erase(repeated.begin(), repeated.end());
+  landmarks.erase(std::unique(landmarks.begin(), landmarks.end()), landmarks.end());
 }
 
 Matches search_among(const Selection& selection, PackedPrototypes prototypes,
