@@ -26,7 +26,7 @@ Index = Literal["auto", "yes", "no"]
 BYTES_PER_LANDMARK = 33.0
 # An exact search of fewer prototypes is as fast (docs/large-maps.md).
 INDEX_FROM = 100_000
-# A map of so few landmarks localizes nothing.
+# The smallest map that is tried: a pose needs four landmarks.
 MIN_LANDMARKS = 4
 MODEL = "sparse"
 _SIZE_STEPS = 8

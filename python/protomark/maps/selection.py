@@ -131,9 +131,9 @@ def select_landmarks(
     Returns:
         (count,) int64.
     """
-    place = np.searchsorted(ids, views.ids)
-    known = (place < len(ids)) & (ids[np.minimum(place, len(ids) - 1)] == views.ids)
-    landmark, bins = place[known], views.bins[known]
+    index = np.searchsorted(ids, views.ids)
+    present = np.isin(views.ids, ids)
+    landmark, bins = index[present], views.bins[present]
     by_landmark = np.argsort(landmark, kind="stable")
     landmark, bins = landmark[by_landmark], bins[by_landmark]
     chosen_in = np.zeros(bins.max(initial=-1) + 1, np.int64)
