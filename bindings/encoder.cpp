@@ -17,13 +17,14 @@ Layer to_layer(nb::dict d, bool last) {
   const auto weights =
       array_of<Array2<std::int8_t>>(d["weights"], "int8", 2, "weights: a (out, in) int8");
   const auto bias = array_of<Array1<std::int32_t>>(d["bias"], "int32", 1, "bias: a (out,) int32");
-  const auto mult = array_of<Array1<std::int32_t>>(d["mult"], "int32", 1, "mult: a (out,) int32");
+  const auto multipliers =
+      array_of<Array1<std::int32_t>>(d["multipliers"], "int32", 1, "multipliers: a (out,) int32");
   Layer layer;
   layer.outputs = weights.shape(0);
   layer.inputs = weights.shape(1);
   layer.weights.assign(weights.data(), weights.data() + weights.size());
   layer.bias.assign(bias.data(), bias.data() + bias.size());
-  layer.multipliers.assign(mult.data(), mult.data() + mult.size());
+  layer.multipliers.assign(multipliers.data(), multipliers.data() + multipliers.size());
   layer.shift = nb::cast<int>(nb::module_::import_("operator").attr("index")(d["shift"]));
   const nb::object table = d["table"];
   if (table.is_none()) {
@@ -44,7 +45,7 @@ nb::dict from_layer(const Layer& layer, bool last) {
   nb::dict d;
   d["weights"] = to_numpy(std::move(weights));
   d["bias"] = to_numpy(layer.bias);
-  d["mult"] = to_numpy(layer.multipliers);
+  d["multipliers"] = to_numpy(layer.multipliers);
   d["shift"] = layer.shift;
   d["table"] = last ? nb::none()
                     : to_numpy(std::vector<std::uint8_t>(layer.table.begin(), layer.table.end()));
@@ -89,8 +90,8 @@ void bind_encoder(nb::module_& m) {
           R"(Build an encoder from integer layers.
 
 Args:
-    layers: each a dict of weights (out, in) int8, bias (out,) int32, mult (out,) int32, shift, and
-        table (256,) uint8, None in the last layer; docs/format.md says what is computed.
+    layers: each a dict of weights (out, in) int8, bias (out,) int32, multipliers (out,) int32,
+        shift, and table (256,) uint8, None in the last layer; docs/format.md says what is computed.
     dims: lengths at which a code may be cut, ascending, the last one its full length.
     name, descriptor, data, licence, notes: what the model says of itself. No note may have the key
         name, descriptor, data or licence.

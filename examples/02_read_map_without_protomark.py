@@ -45,21 +45,30 @@ def bit_numbers(content: Any, count: int, width: int) -> Any:
 
 def learning_sums(content: bytes, counts: Any, k: int) -> Any:
     """Unpack the sums of rows of k numbers, (m, k): 8 + ceil(log2(count)) bits each."""
-    data, widths = np.frombuffer(content, np.uint8), 8 + np.ceil(np.log2(counts)).astype(int)
-    sizes = (k * widths + 7) // 8
-    starts, sums = np.cumsum(sizes) - sizes, np.empty((len(counts), k), np.int64)
+    bits = np.unpackbits(np.frombuffer(content, np.uint8), bitorder="little")
+    widths = 8 + np.ceil(np.log2(counts)).astype(int)
+    starts, sums = k * (np.cumsum(widths) - widths), np.empty((len(counts), k), np.int64)
     for width in np.unique(widths):  # all rows of this width together
         rows = np.flatnonzero(widths == width)
-        packed = data[starts[rows, None] + np.arange(sizes[rows[0]])]
-        bits = np.unpackbits(packed, axis=1, count=k * width, bitorder="little")
         values = 1 << np.arange(width)
         values[-1] *= -1  # two's complement
-        sums[rows] = bits.reshape(-1, k, width) @ values
+        packed = bits[starts[rows, None] + np.arange(k * width)]
+        sums[rows] = packed.reshape(-1, k, width) @ values
     return sums
 
 
-def sealed_ids(parts: dict[str, bytes], n: int) -> Any:
-    """Return the ids of a sealed map's n landmarks: in blocks of 128, or 0 ... n - 1."""
+def learning_rows(parts: dict[str, bytes], n: int) -> tuple[Any, Any]:
+    """Return the number of rows of each of n landmarks, and the appearance of each row."""
+    if "appbits" not in parts:
+        return np.ones(n, int), np.zeros(n, int)
+    bits = int.from_bytes(parts["appbits"], "little")
+    marked = bit_numbers(np.frombuffer(parts["appear"], "u1"), len(parts["counts"]), bits + 1)
+    last_rows = np.flatnonzero(marked >> bits)
+    return np.diff(last_rows, prepend=-1), marked % (1 << bits)
+
+
+def landmark_ids(parts: dict[str, bytes], n: int) -> Any:
+    """Return the ids of a map's n landmarks: in blocks of 128, or 0 ... n - 1."""
     if "idblocks" not in parts:
         return np.arange(n)
     gaps, ids = np.frombuffer(parts["idgaps"], np.uint8), np.arange(n) % 128
@@ -123,8 +132,9 @@ class Map:
         pairs = texts(parts.get("metadata", b""))
         self.metadata = dict(zip(pairs, pairs, strict=True))
         learning = "sums" in parts
-        self.ids = np.frombuffer(parts["ids"], "<i8") if learning else sealed_ids(parts, n)
-        rows = np.frombuffer(parts["rows"], "<u4" if learning else "u1") if "rows" in parts else 1
+        self.ids = landmark_ids(parts, n)
+        sealed_rows = np.frombuffer(parts.get("rows", bytes([1]) * n), "u1")
+        rows = learning_rows(parts, n)[0] if learning else sealed_rows
         self.landmarks = np.repeat(self.ids, rows)
         self.counts = np.frombuffer(parts["counts"], "u1")
         if learning:

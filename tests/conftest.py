@@ -47,7 +47,8 @@ def random_layers(
                     np.int8
                 ),
                 "bias": rng.integers(-1000, 1000, outputs).astype(np.int32),
-                "mult": (rng.uniform(40, 120, outputs) / spread * 2**30).astype(np.int32) + 1,
+                "multipliers": (rng.uniform(40, 120, outputs) / spread * 2**30).astype(np.int32)
+                + 1,
                 "shift": 30,
                 "table": None if last else np.sort(rng.integers(0, 256, 256)).astype(np.uint8),
             }
@@ -60,7 +61,7 @@ def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8
     x = np.unpackbits(descriptors, axis=1, bitorder="little").astype(np.int64)
     for layer in layers:
         sums = x @ layer["weights"].T.astype(np.int64) + layer["bias"]
-        t = (sums * layer["mult"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
+        t = (sums * layer["multipliers"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
         if layer["table"] is None:
             return np.clip(t, -127, 127).astype(np.int8)
         x = layer["table"][np.clip(t, -128, 127) + 128].astype(np.int64)

@@ -415,7 +415,7 @@ def test_maps_without_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene.add(ids, descriptors)
     data = file_bytes(scene, tmp_path)
     assert data[8:12] == (1).to_bytes(4, "little")
-    assert {name for name, _ in sections(data)} == {"encoder", "shape", "ids", "counts", "sums"}
+    assert {name for name, _ in sections(data)} == {"encoder", "shape", "counts", "sums"}
     assert scene.counts([0]).dtype == np.uint32
     assert scene.prototype_count == len(scene) == 40
     assert scene.appearance_bits == 0

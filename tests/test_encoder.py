@@ -155,7 +155,7 @@ def test_model_file_round_trip(
     np.testing.assert_array_equal(read.encode(descriptors), encoder.encode(descriptors))
     for a, b in zip(read.layers, layers, strict=True):
         assert a["shift"] == b["shift"]
-        for name in ("weights", "bias", "mult", "table"):
+        for name in ("weights", "bias", "multipliers", "table"):
             np.testing.assert_array_equal(a[name], b[name])
 
 
@@ -163,7 +163,10 @@ def test_model_file_round_trip(
     ("change", "message"),
     [
         (lambda ls: ls[1].update(shift=0), "layer 1: shift must be 1 to 62"),
-        (lambda ls: ls[0]["mult"].__setitem__(3, 0), "layer 0: multipliers must be positive"),
+        (
+            lambda ls: ls[0]["multipliers"].__setitem__(3, 0),
+            "layer 0: multipliers must be positive",
+        ),
         (lambda ls: ls.pop(1), "layer 1 has 24 inputs, 40 are needed"),
         (lambda ls: ls[0]["bias"].__setitem__(0, 2**31 - 1), "could leave 32 bits"),
         (lambda ls: ls[2].update(bias=ls[2]["bias"][:3]), "do not match its size"),

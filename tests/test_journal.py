@@ -398,12 +398,11 @@ def test_broken_journals_are_refused_or_read(appearance_bits: int, tmp_path: Pat
 def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any]:
     """Appearances, counts, sums and position of each landmark in a map or a commit."""
     n, dim = (int(v) for v in np.frombuffer(parts["shape"], "<u8", 2))
-    ids = np.frombuffer(parts["ids"], "<i8").tolist()
-    rows = np.frombuffer(parts["rows"], "<u4") if appearance_bits else np.ones(n, int)
+    assert int.from_bytes(parts.get("appbits", b""), "little") == appearance_bits
+    ids = READER["landmark_ids"](parts, n).tolist()
+    rows, appearances = READER["learning_rows"](parts, n)
     ends = np.cumsum(rows)[:-1]
     counts = np.frombuffer(parts["counts"], np.uint8)
-    several = appearance_bits > 0
-    appearances = np.frombuffer(parts["appear"], "u1") if several else np.zeros(len(counts))
     sums = READER["learning_sums"](parts["sums"], counts, dim)
     positions = np.full((n, 3), np.nan)
     if "position" in parts:

@@ -95,8 +95,14 @@ def test_integer_arithmetic_by_hand():
     hidden = np.zeros((1, 8), np.int8)
     hidden[0, [0, 7]] = 10, 100
     layers = [
-        Layer(weights=hidden, bias=np.int32([-6]), mult=np.int32([3]), shift=2, table=table),
-        Layer(weights=np.int8([[-1]]), bias=np.int32([5]), mult=np.int32([1]), shift=1, table=None),
+        Layer(weights=hidden, bias=np.int32([-6]), multipliers=np.int32([3]), shift=2, table=table),
+        Layer(
+            weights=np.int8([[-1]]),
+            bias=np.int32([5]),
+            multipliers=np.int32([1]),
+            shift=1,
+            table=None,
+        ),
     ]
     # bit 0: (10-6)*3=12 -> (12+2)>>2=3 -> 6 -> 5-6=-1 -> (-1+1)>>1=0
     # bit 7: 94*3=282 -> 284>>2=71 -> 142 -> -137 -> -136>>1=-68
@@ -118,7 +124,7 @@ def test_a_dead_unit_does_not_break_the_export():
     with torch.no_grad():
         model.network.layers[0].weight[3] = 0
     for layer in model.export():
-        assert (layer["mult"] > 0).all()
+        assert (layer["multipliers"] > 0).all()
         assert 1 <= layer["shift"] <= 62
     integer_forward(model.export(), random_descriptors(10, 64))
 

@@ -49,8 +49,7 @@ bool step() {
 
 }  // namespace
 
-extern "C" ssize_t write(int descriptor, const void* data, std::size_t size) {
-  if (descriptor <= 2) return syscall(SYS_write, descriptor, data, size);
+extern "C" ssize_t pwrite(int descriptor, const void* data, std::size_t size, off_t offset) {
   if (disk.write_at_most >= 0) {
     disk.interrupted = !disk.interrupted;
     if (disk.interrupted) return failed(EINTR);
@@ -63,11 +62,13 @@ extern "C" ssize_t write(int descriptor, const void* data, std::size_t size) {
   }
   if (!step()) {
     // What fails may have gone half-way.
-    if (syscall(SYS_write, descriptor, data, size / 2) < 0) return -1;
+    if (syscall(SYS_pwrite64, descriptor, data, size / 2, offset) < 0) return -1;
     return failed(disk.error);
   }
-  if (!disk.before_step || size < 2) return syscall(SYS_write, descriptor, data, size);
-  const ssize_t half = syscall(SYS_write, descriptor, data, size / 2);
+  if (!disk.before_step || size < 2) {
+    return syscall(SYS_pwrite64, descriptor, data, size, offset);
+  }
+  const ssize_t half = syscall(SYS_pwrite64, descriptor, data, size / 2, offset);
   disk.before_step();
   return half;
 }

@@ -265,7 +265,9 @@ void nothing_is_left_behind() {
     map.save(path);
   }
   Content broken = read(path);
-  broken[broken.size() - 100] = static_cast<char>(broken[broken.size() - 100] ^ 1);
+  const Bytes bytes = std::as_bytes(std::span(broken));
+  const auto sums = ContainerReader(bytes, "map").map("sums").data() - bytes.data();
+  broken[static_cast<std::size_t>(sums)] ^= 1;
   write(path, broken);
   CHECK(check::throws<FileError>([] { PrototypeMap::load(path, true); }, "checksum"));
   CHECK(!fs::exists(journal));

@@ -140,7 +140,7 @@ void refused() {
     fails(joined({head, record(0), changed}), why);
   };
   broken_second("removed", second + ": its section 'removed' is longer");
-  broken_second("ids", "its section 'ids'");
+  broken_second("idblocks", "its section 'idblocks'");
   broken_second("sums", "its section 'sums'");
   broken_second("chain", "its section 'chain' is shorter");
   const auto impossible =

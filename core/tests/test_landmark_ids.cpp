@@ -21,15 +21,14 @@ using Ids = std::vector<std::int64_t>;
 
 std::vector<std::byte> file_of(const Ids& ids) {
   ContainerWriter file(FileKind::sealed_map);
-  const bool indices = ids.empty() || ids.back() + 1 == static_cast<std::int64_t>(ids.size());
-  if (indices) return file.serialize();
-  file.add_together({{section::kIdBlocks, IdBlockWriter::blocks_size(ids.size())},
-                     {section::kIdGaps, ContainerWriter::kUnknownSize}},
-                    [&](std::span<const ContainerWriter::Sink> sinks) {
-                      IdBlockWriter to(sinks[0], sinks[1]);
-                      for (const std::int64_t id : ids) to.add(id);
-                      to.finish();
-                    });
+  if (!IdBlockWriter::needed(ids.size(), ids.empty() ? -1 : ids.back())) return file.serialize();
+  std::vector<ContainerWriter::Part> parts;
+  IdBlockWriter::add_to(parts, ids.size());
+  file.add_together(std::move(parts), [&](std::span<const ContainerWriter::Sink> sinks) {
+    IdBlockWriter to(sinks[0], sinks[1]);
+    for (const std::int64_t id : ids) to.add(id);
+    to.finish();
+  });
   return file.serialize();
 }
 

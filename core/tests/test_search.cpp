@@ -159,7 +159,7 @@ void check_prefixes(test::Random& random) {
 void check_sq4(test::Random& random, std::size_t rows, std::size_t dim, std::size_t n) {
   Map map = random_map(random, rows, dim, true, 127);
   const int scale = static_cast<int>(random.integer(1, kMaxScale));
-  std::vector<std::uint8_t> packed(packed4_size(rows, dim), 0);
+  std::vector<std::uint8_t> packed(packed_size(rows, dim, 1), 0);
   for (std::size_t i = 0; i < rows * dim; ++i) {
     const std::uint8_t u = sq4_quantize(map.codes[i], scale);
     map.codes[i] = static_cast<std::int8_t>(sq4_level(u, scale));

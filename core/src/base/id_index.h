@@ -1,9 +1,6 @@
 // A hash table from landmark ids to indices, of 4 bytes per slot: the caller keeps the ids.
 #pragma once
 
-#include <algorithm>
-#include <cstddef>
-#include <cstdint>
 #include <random>
 #include <span>
 

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cstring>
 #include <memory>
 #include <utility>
 
@@ -16,18 +17,31 @@ namespace protomark {
 constexpr std::size_t packed_words(std::size_t n, int bits) {
   return (n * static_cast<std::size_t>(bits) + 63) / 64;
 }
+constexpr std::size_t packed_bytes(std::size_t n, int bits) {
+  return packed_words(n, bits) * sizeof(std::uint64_t);
+}
 
-inline std::uint64_t packed_number(const std::uint64_t* words, int bits, std::size_t i) {
+// Returns the number whose lowest bit is bit `first` of words, which may begin anywhere in memory.
+inline std::uint64_t packed_number_at(const void* words, int bits, std::size_t first) {
   if (bits == 0) return 0;
-  const auto width = static_cast<std::size_t>(bits);
-  const std::size_t first = i * width, shift = first % 64;
-  std::uint64_t value = words[first / 64] >> shift;
-  if (shift + width > 64) value |= words[first / 64 + 1] << (64 - shift);
+  const auto width = static_cast<std::size_t>(bits), shift = first % 64;
+  std::uint64_t word[2];
+  const char* from = static_cast<const char*>(words) + first / 64 * sizeof(word[0]);
+  std::memcpy(word, from, sizeof(word[0]));
+  std::uint64_t value = word[0] >> shift;
+  if (shift + width > 64) {
+    std::memcpy(word + 1, from + sizeof(word[0]), sizeof(word[1]));
+    value |= word[1] << (64 - shift);
+  }
   return value & ((std::uint64_t{1} << width) - 1);
+}
+inline std::uint64_t packed_number(const void* words, int bits, std::size_t i) {
+  return packed_number_at(words, bits, i * static_cast<std::size_t>(bits));
 }
 
 class BitPacker {
  public:
+  // A number of 64 bits begins at a whole word.
   void add(std::uint64_t value, int bits) {
     const auto width = static_cast<unsigned>(bits);
     word_ |= value << filled_;

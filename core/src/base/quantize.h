@@ -12,6 +12,12 @@ namespace protomark {
 // The sum of codes of at most 256 numbers. Zeros follow the last one up to a multiple of 8.
 using Sum = std::array<std::int16_t, 256>;
 
+inline std::int32_t squared_distance(const std::int8_t* a, const std::int8_t* b, std::size_t dim) {
+  std::int32_t sum = 0;
+  for (std::size_t d = 0; d < dim; ++d) sum += (a[d] - b[d]) * (a[d] - b[d]);
+  return sum;
+}
+
 // Returns sum / n rounded to the nearest integer, halves away from zero.
 template <typename Integer>
 std::int8_t rounded_mean(Integer sum, Integer n) {

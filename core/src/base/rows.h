@@ -1,9 +1,11 @@
 // Row and LandmarkIndex: two kinds of 32-bit index that the compiler keeps apart.
 #pragma once
 
+#include <algorithm>
 #include <compare>
 #include <cstddef>
 #include <cstdint>
+#include <vector>
 
 namespace protomark {
 
@@ -24,5 +26,12 @@ constexpr LandmarkIndex landmark_at(std::size_t i) { return {static_cast<std::ui
 
 inline constexpr Row kNoRow{UINT32_MAX};
 inline constexpr LandmarkIndex kNoLandmark{UINT32_MAX};
+
+// Sorts values and drops those that occur again.
+template <typename T>
+void sort_unique(std::vector<T>& values) {
+  if (!std::is_sorted(values.begin(), values.end())) std::sort(values.begin(), values.end());
+  values.erase(std::unique(values.begin(), values.end()), values.end());
+}
 
 }  // namespace protomark

@@ -1,18 +1,11 @@
 #include "protomark/encoder.h"
 
-#include <algorithm>
 #include <cmath>
-#include <cstring>
-#include <functional>
-#include <string_view>
 
-#include "base/checksums.h"
 #include "base/parallel.h"
-#include "base/text.h"
 #include "encoder/layers.h"
 #include "file/journal.h"
 #include "file/sections.h"
-#include "kernels/kernels.h"
 
 namespace protomark {
 namespace {

@@ -1,9 +1,6 @@
 #include "file/container.h"
 
-#include <algorithm>
 #include <bit>
-
-#include "base/checksums.h"
 
 namespace protomark {
 namespace {
@@ -36,39 +33,8 @@ bool has_magic(Bytes bytes) {
   return std::ranges::equal(bytes.first(n), magic.first(n));
 }
 
-std::optional<ContainerHead> ContainerHead::parse(Bytes bytes) {
-  ContainerHead head;
-  if (bytes.size() < sizeof(head.header) || !has_magic(bytes)) return std::nullopt;
-  std::memcpy(&head.header, bytes.data(), sizeof(head.header));
-  const std::size_t size =
-      sizeof(head.header) + std::size_t{head.header.sections} * sizeof(SectionEntry);
-  if (head.header.sections > kMaxSections || size > bytes.size()) return std::nullopt;
-  head.bytes = bytes.first(size);
-  return head;
-}
-
 bool ContainerHead::has_right_checksum() const {
   return head_checksum(header, bytes.subspan(sizeof(header))) == header.crc;
-}
-
-std::string ContainerHead::identity() const { return sha256(bytes); }
-
-void ContainerWriter::add(std::string name, Bytes bytes) {
-  add(std::move(name), bytes.size(), [bytes](const Sink& sink) { sink(bytes); });
-}
-
-void ContainerWriter::add(std::string name, std::vector<std::byte> bytes) {
-  const std::size_t size = bytes.size();
-  add(std::move(name), size, [owned = std::move(bytes)](const Sink& sink) { sink(owned); });
-}
-
-void ContainerWriter::add(std::string name, std::size_t size, Produce produce) {
-  add_together({{std::move(name), size}},
-               [produce = std::move(produce)](std::span<const Sink> sinks) { produce(sinks[0]); });
-}
-
-void ContainerWriter::add_together(std::vector<Part> parts, ProduceAll produce) {
-  groups_.push_back({std::move(parts), std::move(produce)});
 }
 
 std::size_t ContainerWriter::head_size() const {
@@ -125,26 +91,6 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
   return head;
 }
 
-std::vector<std::byte> ContainerWriter::serialize() const {
-  std::vector<std::byte> result(head_size());
-  const auto head = emit([&](std::size_t offset, Bytes bytes) {
-    result.resize(std::max(result.size(), offset + bytes.size()));
-    std::copy(bytes.begin(), bytes.end(), result.begin() + static_cast<std::ptrdiff_t>(offset));
-  });
-  std::copy(head.begin(), head.end(), result.begin());
-  return result;
-}
-
-void ContainerWriter::write(const std::filesystem::path& path,
-                            const std::function<void(const std::string&)>& before) const {
-  TemporaryFile file(path);
-  const auto head = emit([&](std::size_t offset, Bytes bytes) { file.write(offset, bytes); });
-  file.write(0, head);
-  file.sync();
-  if (before) before(ContainerHead::parse(head)->identity());
-  file.replace_target();
-}
-
 ContainerReader::ContainerReader(Bytes file, std::string name)
     : file_(file), name_(std::move(name)) {
   ContainerHeader header;
@@ -184,37 +130,12 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   }
 }
 
-void ContainerReader::expect(FileKind kind) const {
-  if (kind_ != kind) fail("it holds ", describe(kind_), ", not ", describe(kind));
-}
-
-const SectionEntry* ContainerReader::find(std::string_view name) const {
-  const auto found = std::ranges::find(sections_, name, &SectionEntry::name);
-  return found == sections_.end() ? nullptr : &*found;
-}
-
 Bytes ContainerReader::read(std::string_view section) const {
   const Bytes bytes = map(section);
   if (crc32(bytes) != find(section)->crc) {
     fail("its section '", section, "' does not match its checksum");
   }
   return bytes;
-}
-
-Bytes ContainerReader::map(std::string_view section) const {
-  const SectionEntry* found = find(section);
-  if (found == nullptr) fail("it lacks the section '", section, "'");
-  return file_.subspan(found->offset, found->size);
-}
-
-std::vector<std::pair<std::string, std::size_t>> ContainerReader::sections() const {
-  std::vector<std::pair<std::string, std::size_t>> result;
-  for (const SectionEntry& entry : sections_) result.emplace_back(entry.name(), entry.size);
-  return result;
-}
-
-void ContainerReader::verify() const {
-  for (const SectionEntry& entry : sections_) read(entry.name());
 }
 
 }  // namespace protomark

@@ -2,15 +2,12 @@
 // little-endian. docs/format.md says what each kind of file holds.
 #pragma once
 
+#include <algorithm>
 #include <cstring>
-#include <filesystem>
 #include <functional>
-#include <string_view>
-#include <utility>
 
-#include "base/text.h"
+#include "base/checksums.h"
 #include "file/disk.h"
-#include "protomark/types.h"
 
 namespace protomark {
 
@@ -62,14 +59,23 @@ bool has_magic(Bytes bytes);
 // The header and section table that bytes begin with.
 struct ContainerHead {
   // Returns nullopt unless both are complete; their checksum may be wrong.
-  static std::optional<ContainerHead> parse(Bytes bytes);
+  static std::optional<ContainerHead> parse(Bytes bytes) {
+    ContainerHead head;
+    if (bytes.size() < sizeof(head.header) || !has_magic(bytes)) return std::nullopt;
+    std::memcpy(&head.header, bytes.data(), sizeof(head.header));
+    const std::size_t size =
+        sizeof(head.header) + std::size_t{head.header.sections} * sizeof(SectionEntry);
+    if (head.header.sections > kMaxSections || size > bytes.size()) return std::nullopt;
+    head.bytes = bytes.first(size);
+    return head;
+  }
 
   ContainerHeader header;
   Bytes bytes;  // header and table
 
   bool has_right_checksum() const;
   // Returns the SHA-256 of header and table, which have the checksum of everything in the file.
-  std::string identity() const;
+  std::string identity() const { return sha256(bytes); }
 };
 
 // Collects the sections of a file, some of them in memory, others to be produced piece by piece
@@ -82,10 +88,19 @@ class ContainerWriter {
   explicit ContainerWriter(FileKind kind) : kind_(kind) {}
 
   // `bytes` must stay alive until the file is written.
-  void add(std::string name, Bytes bytes);
-  void add(std::string name, std::vector<std::byte> bytes);
+  void add(std::string name, Bytes bytes) {
+    add(std::move(name), bytes.size(), [bytes](const Sink& sink) { sink(bytes); });
+  }
+  void add(std::string name, std::vector<std::byte> bytes) {
+    const std::size_t size = bytes.size();
+    add(std::move(name), size, [owned = std::move(bytes)](const Sink& sink) { sink(owned); });
+  }
   // `produce` hands `size` bytes to the sink in order, each time that the file is written.
-  void add(std::string name, std::size_t size, Produce produce);
+  void add(std::string name, std::size_t size, Produce produce) {
+    add_together(
+        {{std::move(name), size}},
+        [produce = std::move(produce)](std::span<const Sink> sinks) { produce(sinks[0]); });
+  }
 
   struct Part {
     std::string name;
@@ -95,16 +110,33 @@ class ContainerWriter {
   using ProduceAll = std::function<void(std::span<const Sink>)>;
   // Sections that are produced side by side: `produce` gets a sink for each. Only the size of the
   // last one may be unknown.
-  void add_together(std::vector<Part> parts, ProduceAll produce);
+  void add_together(std::vector<Part> parts, ProduceAll produce) {
+    groups_.push_back({std::move(parts), std::move(produce)});
+  }
 
-  std::vector<std::byte> serialize() const;
+  std::vector<std::byte> serialize() const {
+    std::vector<std::byte> result(head_size());
+    const auto head = emit([&](std::size_t offset, Bytes bytes) {
+      result.resize(std::max(result.size(), offset + bytes.size()));
+      std::copy(bytes.begin(), bytes.end(), result.begin() + static_cast<std::ptrdiff_t>(offset));
+    });
+    std::copy(head.begin(), head.end(), result.begin());
+    return result;
+  }
   // Writes the file beside `path`, syncs it, renames it to `path` and syncs the folder. If that or
   // a producer fails, the old file stays; only if the folder cannot be synced is the new one there,
   // and a power cut may undo that. A process that is killed leaves `path`.<number> behind, which
   // nobody reads. Calls `before` with the identity of the synced file before renaming it. Throws
   // FileError.
   void write(const std::filesystem::path& path,
-             const std::function<void(const std::string&)>& before = {}) const;
+             const std::function<void(const std::string&)>& before = {}) const {
+    TemporaryFile file(path);
+    const auto head = emit([&](std::size_t offset, Bytes bytes) { file.write(offset, bytes); });
+    file.write(0, head);
+    file.sync();
+    if (before) before(ContainerHead::parse(head)->identity());
+    file.replace_target();
+  }
 
  private:
   struct Group {
@@ -133,13 +165,19 @@ class ContainerReader {
   std::string identity() const { return head_.identity(); }
   std::size_t size() const { return file_.size(); }
   // Throws if the file is of another kind.
-  void expect(FileKind kind) const;
+  void expect(FileKind kind) const {
+    if (kind_ != kind) fail("it holds ", describe(kind_), ", not ", describe(kind));
+  }
 
   bool has(std::string_view section) const { return find(section) != nullptr; }
   // Returns a section after checking its checksum.
   Bytes read(std::string_view section) const;
   // Returns a section without reading it, for those that are large and mapped.
-  Bytes map(std::string_view section) const;
+  Bytes map(std::string_view section) const {
+    const SectionEntry* found = find(section);
+    if (found == nullptr) fail("it lacks the section '", section, "'");
+    return file_.subspan(found->offset, found->size);
+  }
   // The same as n values of a type, for which the file's bytes must be aligned.
   template <typename T>
   std::span<const T> read(std::string_view section, std::size_t n) const {
@@ -150,8 +188,14 @@ class ContainerReader {
     return as<T>(section, map(section), n);
   }
   // In bytes, in file order.
-  std::vector<std::pair<std::string, std::size_t>> sections() const;
-  void verify() const;
+  std::vector<std::pair<std::string, std::size_t>> sections() const {
+    std::vector<std::pair<std::string, std::size_t>> result;
+    for (const SectionEntry& entry : sections_) result.emplace_back(entry.name(), entry.size);
+    return result;
+  }
+  void verify() const {
+    for (const SectionEntry& entry : sections_) read(entry.name());
+  }
   // Throw FileError about this file.
   template <typename... Parts>
   [[noreturn]] void fail(const Parts&... what) const {
@@ -167,7 +211,10 @@ class ContainerReader {
     if (bytes.size() % sizeof(T) != 0 || bytes.size() / sizeof(T) != n) fail_size(section);
     return {reinterpret_cast<const T*>(bytes.data()), n};
   }
-  const SectionEntry* find(std::string_view name) const;
+  const SectionEntry* find(std::string_view name) const {
+    const auto found = std::ranges::find(sections_, name, &SectionEntry::name);
+    return found == sections_.end() ? nullptr : &*found;
+  }
 
   Bytes file_;
   std::string name_;

@@ -51,7 +51,7 @@ std::optional<std::span<std::byte>> FileDescriptor::read(std::span<std::byte> to
   return to.first(done);
 }
 
-bool FileDescriptor::write(Bytes bytes) const {
+bool FileDescriptor::write(std::size_t offset, Bytes bytes) const {
   // At a limit on file sizes SIGXFSZ would end the program; while it is blocked, the write fails.
   sigset_t size_signal, before;
   ::sigemptyset(&size_signal);
@@ -59,10 +59,11 @@ bool FileDescriptor::write(Bytes bytes) const {
   ::pthread_sigmask(SIG_BLOCK, &size_signal, &before);
   ssize_t written = 0;
   while (!bytes.empty()) {
-    written = ::write(descriptor_, bytes.data(), bytes.size());
+    written = ::pwrite(descriptor_, bytes.data(), bytes.size(), static_cast<off_t>(offset));
     if (written < 0 && errno == EINTR) continue;
     if (written < 0) break;
     bytes = bytes.subspan(static_cast<std::size_t>(written));
+    offset += static_cast<std::size_t>(written);
   }
   const int error = errno;
   const timespec now{};
@@ -131,10 +132,7 @@ TemporaryFile::~TemporaryFile() {
 }
 
 void TemporaryFile::write(std::size_t offset, Bytes bytes) {
-  if (bytes.empty()) return;
-  if (offset != offset_ && ::lseek(file_.get(), static_cast<off_t>(offset), SEEK_SET) < 0) fail();
-  if (!file_.write(bytes)) fail();
-  offset_ = offset + bytes.size();
+  if (!file_.write(offset, bytes)) fail();
 }
 
 void TemporaryFile::sync() {

@@ -40,9 +40,9 @@ class FileDescriptor {
 
   // Reads from the beginning up to to.size() bytes. Returns nullopt, with errno set, on failure.
   std::optional<std::span<std::byte>> read(std::span<std::byte> to) const;
-  // Writes all bytes at the current offset. Returns false, with errno set, on failure, also at a
-  // limit on file sizes, which raises no signal.
-  bool write(Bytes bytes) const;
+  // Writes all bytes from an offset on. Returns false, with errno set, on failure, also at a limit
+  // on file sizes, which raises no signal.
+  bool write(std::size_t offset, Bytes bytes) const;
   // Whether the file still has this name.
   bool is_at(const std::filesystem::path& path) const;
 
@@ -82,7 +82,6 @@ class TemporaryFile {
   std::filesystem::path name_, target_;  // as errors call the target, and where it leads
   std::filesystem::path path_;
   FileDescriptor file_;
-  std::size_t offset_ = 0;  // of the descriptor
 };
 
 // A file mapped read-only.

@@ -1,11 +1,10 @@
-// The ascending ids of a sealed map's landmarks, in little space and with random access.
+// The ascending ids of a map's landmarks, in little space and with random access.
 #pragma once
 
-#include <utility>
+#include <bit>
 
-#include "base/packed_numbers.h"
 #include "base/rows.h"
-#include "file/container.h"
+#include "file/sections.h"
 
 namespace protomark {
 
@@ -14,6 +13,9 @@ namespace protomark {
 struct IdBlock {
   std::int64_t first_id;
   std::uint64_t gaps;  // 64 * their first word + bits per gap, 0 to 63
+
+  int bits() const { return static_cast<int>(gaps % 64); }
+  std::size_t first_word() const { return gaps / 64; }
 };
 inline constexpr std::size_t kIdBlock = 128;  // landmarks; the last block may have fewer
 
@@ -21,52 +23,130 @@ inline constexpr std::size_t kIdBlock = 128;  // landmarks; the last block may h
 class IdBlockWriter {
  public:
   IdBlockWriter(ContainerWriter::Sink blocks, ContainerWriter::Sink gaps)
-      : block_sink_(std::move(blocks)), gap_sink_(std::move(gaps)) {}
+      : blocks_(std::move(blocks)), gaps_(std::move(gaps)) {}
 
-  void add(std::int64_t id);
-  void finish();
+  void add(std::int64_t id) {
+    ids_.push_back(id);
+    if (ids_.size() == kIdBlock) end_block();
+  }
+  void finish() {
+    if (!ids_.empty()) end_block();
+    blocks_.finish();
+    gaps_.finish();
+  }
 
-  // Returns the size of the section `idblocks` in bytes.
-  static constexpr std::size_t blocks_size(std::size_t landmarks) {
-    return (landmarks + kIdBlock - 1) / kIdBlock * sizeof(IdBlock);
+  // Whether ids have to be stored: 0 to n - 1 have not.
+  static bool needed(std::size_t n, std::int64_t largest) {
+    return largest + 1 != static_cast<std::int64_t>(n);
+  }
+  // Adds the two sections as the last of several that are produced side by side.
+  static void add_to(std::vector<ContainerWriter::Part>& parts, std::size_t n) {
+    parts.push_back({section::kIdBlocks, (n + kIdBlock - 1) / kIdBlock * sizeof(IdBlock)});
+    parts.push_back({section::kIdGaps, ContainerWriter::kUnknownSize});
   }
 
  private:
-  void end_block();
-  void flush();
+  void end_block() {
+    const auto gap = [&](std::size_t j) {
+      return static_cast<std::uint64_t>(ids_[j] - ids_.front()) - j;
+    };
+    const auto bits = static_cast<int>(std::bit_width(gap(ids_.size() - 1)));
+    blocks_.add(static_cast<std::uint64_t>(ids_.front()), 64);
+    blocks_.add(words_ * 64 + static_cast<std::uint64_t>(bits), 64);
+    for (std::size_t j = 0; j < ids_.size(); ++j) gaps_.add(gap(j), bits);
+    gaps_.align();
+    words_ += packed_words(ids_.size(), bits);
+    ids_.clear();
+  }
 
-  ContainerWriter::Sink block_sink_, gap_sink_;
+  PackedWriter blocks_, gaps_;
   std::vector<std::int64_t> ids_;  // of the block
-  std::vector<IdBlock> blocks_;
-  BitPacker gaps_;
-  std::size_t words_ = 0;  // of all gaps
+  std::size_t words_ = 0;          // of all gaps
 };
 
 class LandmarkIds {
  public:
   LandmarkIds() = default;
-  // Checks everything but the gaps, which are checked as they are read. `file` must outlive this.
-  // Throws FileError.
-  LandmarkIds(const ContainerReader& file, std::size_t n);
+  // Checks everything but the gaps, which are mapped, and checked as they are read. `file` must
+  // outlive this. Throws FileError.
+  LandmarkIds(const ContainerReader& file, std::size_t n) : file_(&file), n_(n) {
+    if (!file.has(section::kIdBlocks)) return;
+    const std::size_t blocks = (n + kIdBlock - 1) / kIdBlock;
+    if (file.map(section::kIdBlocks).size() != blocks * sizeof(IdBlock)) {
+      file.fail_size(section::kIdBlocks);
+    }
+    blocks_ = read_section<IdBlock>(file, section::kIdBlocks, blocks);
+    gaps_ = file.map(section::kIdGaps);
+    check_blocks();
+  }
 
   // Whether each landmark's id is its index.
   bool are_indices() const { return blocks_.empty(); }
   // Throws FileError if the id is not below those of the next block.
-  std::int64_t operator[](LandmarkIndex landmark) const;
+  std::int64_t operator[](LandmarkIndex landmark) const {
+    if (are_indices()) return landmark.value;
+    const std::size_t b = landmark.value / kIdBlock, j = landmark.value % kIdBlock;
+    const IdBlock& block = blocks_[b];
+    const std::uint64_t id = static_cast<std::uint64_t>(block.first_id) + j +
+                             packed_number(gaps_.data() + 8 * block.first_word(), block.bits(), j);
+    if (id >= end_of(b)) file_->fail(kNoOrder);
+    return static_cast<std::int64_t>(id);
+  }
   // Throws UnknownLandmark.
-  LandmarkIndex find(std::int64_t id) const;
+  LandmarkIndex find(std::int64_t id) const {
+    if (are_indices()) {
+      if (id < 0 || static_cast<std::uint64_t>(id) >= n_) throw UnknownLandmark(id);
+      return landmark_at(static_cast<std::size_t>(id));
+    }
+    const auto next = std::ranges::upper_bound(blocks_, id, {}, &IdBlock::first_id);
+    if (next == blocks_.begin()) throw UnknownLandmark(id);
+    std::size_t first = static_cast<std::size_t>(next - blocks_.begin() - 1) * kIdBlock;
+    for (std::size_t end = std::min(n_, first + kIdBlock); first < end;) {
+      const std::size_t half = first + (end - first) / 2;
+      (*this)[landmark_at(half)] < id ? first = half + 1 : end = half;
+    }
+    if (first == n_ || (*this)[landmark_at(first)] != id) throw UnknownLandmark(id);
+    return landmark_at(first);
+  }
   // Returns all ids. Throws FileError unless they ascend.
-  std::vector<std::int64_t> all() const;
+  std::vector<std::int64_t> all() const {
+    std::vector<std::int64_t> result(n_);
+    for (std::size_t i = 0; i < n_; ++i) {
+      result[i] = (*this)[landmark_at(i)];
+      if (i > 0 && result[i] <= result[i - 1]) file_->fail(kNoOrder);
+    }
+    return result;
+  }
 
  private:
-  std::size_t block_size(std::size_t b) const;
-  std::uint64_t end_of(std::size_t b) const;
-  void check_blocks() const;
+  static constexpr char kNoOrder[] = "its landmark ids do not ascend";
+
+  std::size_t block_size(std::size_t b) const { return std::min(kIdBlock, n_ - b * kIdBlock); }
+  // Returns a number that all ids of a block are below.
+  std::uint64_t end_of(std::size_t b) const {
+    return b + 1 < blocks_.size() ? static_cast<std::uint64_t>(blocks_[b + 1].first_id)
+                                  : std::uint64_t{1} << 63;
+  }
+  // Checks that blocks of gaps follow each other, and that ids can ascend.
+  void check_blocks() const {
+    std::size_t words = 0;
+    for (std::size_t b = 0; b < blocks_.size(); ++b) {
+      if (blocks_[b].first_word() != words)
+        file_->fail("its blocks of ids do not follow each other");
+      words += packed_words(block_size(b), blocks_[b].bits());
+      if (blocks_[b].first_id < 0) file_->fail("it has a negative landmark id");
+      // The last id of a block is at least this.
+      if (static_cast<std::uint64_t>(blocks_[b].first_id) + block_size(b) > end_of(b)) {
+        file_->fail(kNoOrder);
+      }
+    }
+    if (packed_bytes(words, 64) != gaps_.size()) file_->fail_size(section::kIdGaps);
+  }
 
   const ContainerReader* file_ = nullptr;
   std::size_t n_ = 0;
-  std::span<const IdBlock> blocks_;
-  std::span<const std::uint64_t> words_;
+  std::vector<IdBlock> blocks_;
+  Bytes gaps_;
 };
 
 }  // namespace protomark

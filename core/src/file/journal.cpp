@@ -5,12 +5,8 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include <algorithm>
 #include <cerrno>
 #include <fstream>
-#include <new>
-#include <sstream>
-#include <utility>
 
 #include "file/sections.h"
 
@@ -27,43 +23,37 @@ std::optional<ContainerHead> intact_head(Bytes bytes) {
   return head && head->has_right_checksum() ? head : std::nullopt;
 }
 
-// Returns the container that bytes begin with; nullopt if it is broken or cut off.
-std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& name) {
-  const auto head = ContainerHead::parse(bytes);
-  if (!head) return std::nullopt;
-  const std::uint64_t size = head->header.file_size;
-  if (size > bytes.size() || size % kSectionAlignment != 0) return std::nullopt;
-  try {
-    ContainerReader result(bytes.first(size), name);
-    result.verify();
-    return result;
-  } catch (const FileError&) {
-    return std::nullopt;
-  }
+// Returns the container that bytes begin with; nullopt if its header is broken or it is cut off.
+// Throws FileError if it is unreadable all the same, such as one of a later version, which no power
+// cut leaves.
+std::optional<ContainerReader> container_at(Bytes bytes, const std::string& name) {
+  const auto head = intact_head(bytes);
+  if (!head || head->header.file_size > bytes.size()) return std::nullopt;
+  return ContainerReader(bytes.first(head->header.file_size), name);
 }
 
-// Throws FileError if bytes begin with a container that is whole and yet unreadable, such as one of
-// a later version, which no power cut leaves.
-void check_known(Bytes bytes, const std::string& name) {
-  const auto head = intact_head(bytes);
-  if (!head || head->header.file_size > bytes.size()) return;
-  ContainerReader(bytes.first(head->header.file_size), name);
+// The same; nullopt, too, if anything else in it is broken.
+std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& name) try {
+  auto result = container_at(bytes, name);
+  if (!result || result->size() % kSectionAlignment != 0) return std::nullopt;
+  result->verify();
+  return result;
+} catch (const FileError&) {
+  return std::nullopt;
 }
 
 bool is_record(FileKind kind) { return kind == FileKind::commit || kind == FileKind::fold; }
 
 // Returns the number of the record that bytes begin with; 0 if they begin with none.
-std::uint64_t record_number(Bytes bytes) {
-  const auto head = intact_head(bytes);
-  if (!head || head->header.file_size > bytes.size()) return 0;
-  try {
-    const ContainerReader file(bytes.first(head->header.file_size), "");
-    // The size first, as reading the sections of many nested containers would take long.
-    if (!is_record(file.kind()) || file.map(section::kChain).size() != sizeof(ChainLink)) return 0;
-    return read_value<ChainLink>(file, section::kChain).record;
-  } catch (const FileError&) {
+std::uint64_t record_number(Bytes bytes) try {
+  const auto file = container_at(bytes, "");
+  // The size first, as reading the sections of many nested containers would take long.
+  if (!file || !is_record(file->kind()) || file->map(section::kChain).size() != sizeof(ChainLink)) {
     return 0;
   }
+  return read_value<ChainLink>(*file, section::kChain).record;
+} catch (const FileError&) {
+  return 0;
 }
 
 // Returns where a container begins that was written after the broken record at `broken`, or the
@@ -127,9 +117,8 @@ std::string holder(const FileDescriptor& file) {
 }
 
 void add_base(ContainerWriter& file, const std::string& identity) {
-  SectionWriter out;
-  out.values(identity.data(), identity.size());
-  out.add_to(file, section::kBase);
+  const Bytes bytes = std::as_bytes(std::span(identity));
+  file.add(section::kBase, std::vector(bytes.begin(), bytes.end()));
 }
 
 std::uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
@@ -224,7 +213,7 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
   const auto first = whole_container(bytes, name_);
   if (!first) {
     if (!is_unfinished(bytes)) refuse(bytes, name_);
-    check_known(bytes, name_);
+    container_at(bytes, name_);
     return;
   }
   first->expect(FileKind::journal);
@@ -235,7 +224,7 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
     const std::string where = text(name_, ": record at byte ", end_);
     const auto record = whole_container(bytes.subspan(end_), where);
     if (!record) {
-      check_known(bytes.subspan(end_), where);
+      container_at(bytes.subspan(end_), where);
       const std::size_t next = find_later(bytes, end_, last_.record);
       if (next == size_) return;
       throw FileError(text(where, " is broken, and another one follows at byte ", next,
@@ -286,13 +275,13 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
     if (!made_) file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, mode));
     if (!file_) fail_write();
     if (::flock(file_.get(), LOCK_EX | LOCK_NB) != 0) {
-      if (errno != EWOULDBLOCK) fail("cannot be locked: ", system_error());
-      fail("is held by ", holder(file_),
-           ": one map at a time may commit to it; open without journal to read");
+      if (errno != EWOULDBLOCK) fail_file(path_, "cannot be locked: ", system_error());
+      fail_file(path_, "is held by ", holder(file_),
+                ": one map at a time may commit to it; open without journal to read");
     }
     if (file_.is_at(path_)) return;
   }
-  fail("is deleted again and again, or its file system does not number files");
+  fail_file(path_, "is deleted again and again, or its file system does not number files");
 }
 
 std::vector<std::byte> Journal::read() const { return read_journal(file_, path_); }
@@ -305,7 +294,7 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
   // A process that compacted may have been killed before this: the name of the new map file must be
   // durable before the commits that it has are dropped.
-  if (!sync_folder(path_)) fail("its folder cannot be synced: ", system_error());
+  if (!sync_folder(path_)) fail_file(path_, "its folder cannot be synced: ", system_error());
   if (end_ == 0) {
     begin();
   } else if (!cut(end_) || ::fsync(file_.get()) != 0) {
@@ -328,8 +317,7 @@ void Journal::begin() {
   ContainerWriter file(FileKind::journal);
   add_base(file, base_);
   const auto first = file.serialize();
-  if (::fsync(file_.get()) != 0 || ::lseek(file_.get(), 0, SEEK_SET) != 0 || !file_.write(first) ||
-      ::fsync(file_.get()) != 0) {
+  if (::fsync(file_.get()) != 0 || !file_.write(0, first) || ::fsync(file_.get()) != 0) {
     fail_write();
   }
   end_ = first.size();
@@ -339,10 +327,11 @@ void Journal::begin() {
 
 void Journal::check_owner() const {
   if (::getpid() != process_) {
-    fail("was opened by process ", process_,
-         ", of which this one is a copy (fork); only that one may commit");
+    fail_file(path_, "was opened by process ", process_,
+              ", of which this one is a copy (fork); only that one may commit");
   }
-  if (!file_.is_at(path_)) fail("was moved or deleted since it was opened", kSaveElsewhere);
+  if (!file_.is_at(path_))
+    fail_file(path_, "was moved or deleted since it was opened", kSaveElsewhere);
 }
 
 ContainerWriter Journal::record(FileKind kind) {
@@ -357,13 +346,13 @@ void Journal::append(Bytes record) {
   check_owner();
   const auto now = identity_of(map_);
   if (now != base_ && now != folded_) {
-    fail("the map file beside it was replaced or deleted since it was opened", kSaveElsewhere);
+    fail_file(path_, "the map file beside it was replaced or deleted since it was opened",
+              kSaveElsewhere);
   }
   base_ = now;
   if (!cut(end_)) fail_write();
   tail_ = true;
-  if (::lseek(file_.get(), static_cast<off_t>(end_), SEEK_SET) < 0 || !file_.write(record) ||
-      ::fsync(file_.get()) != 0) {
+  if (!file_.write(end_, record) || ::fsync(file_.get()) != 0) {
     const int error = errno;
     cut(end_);  // or before the next one
     errno = error;

@@ -3,9 +3,6 @@
 // that the map was folded into a new map file; each names the checksum of the one before it.
 #pragma once
 
-#include <sys/types.h>
-
-#include <filesystem>
 #include <memory>
 
 #include "file/container.h"
@@ -114,11 +111,7 @@ class Journal {
   void check_owner() const;
   void begin();
   bool cut(std::size_t size);
-  template <typename... Parts>
-  [[noreturn]] void fail(const Parts&... what) const {
-    throw FileError(text(path_.string(), ": ", what...));
-  }
-  [[noreturn]] void fail_write() const { fail("cannot be written: ", system_error()); }
+  [[noreturn]] void fail_write() const { fail_file(path_, "cannot be written: ", system_error()); }
 
   std::filesystem::path map_, path_;
   FileDescriptor file_;  // locked while it is open, also in a forked child

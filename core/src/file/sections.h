@@ -1,10 +1,7 @@
 // Reads and writes plain values and texts in sections of files.
 #pragma once
 
-#include <algorithm>
-#include <string_view>
-
-#include "base/text.h"
+#include "base/packed_numbers.h"
 #include "file/container.h"
 
 namespace protomark {
@@ -14,22 +11,21 @@ namespace section {
 // Encoders.
 inline constexpr char kInfo[] = "info";
 inline constexpr char kNetwork[] = "network";
-// Maps of both kinds.
+// Maps of both kinds, and commits.
 inline constexpr char kEncoder[] = "encoder";
 inline constexpr char kShape[] = "shape";
 inline constexpr char kMetadata[] = "metadata";
 inline constexpr char kCounts[] = "counts";
-inline constexpr char kRows[] = "rows";
 inline constexpr char kPositions[] = "position";
 inline constexpr char kCentroids[] = "centroid";
+inline constexpr char kIdBlocks[] = "idblocks";
+inline constexpr char kIdGaps[] = "idgaps";
 // Learning maps and commits.
-inline constexpr char kIds[] = "ids";
 inline constexpr char kAppearanceBits[] = "appbits";
 inline constexpr char kAppearances[] = "appear";
 inline constexpr char kSums[] = "sums";
 // Sealed maps.
-inline constexpr char kIdBlocks[] = "idblocks";
-inline constexpr char kIdGaps[] = "idgaps";
+inline constexpr char kRows[] = "rows";
 inline constexpr char kPrototypes[] = "protos";
 inline constexpr char kScale[] = "sq4scale";
 inline constexpr char kSteps[] = "steps";
@@ -134,6 +130,54 @@ void add_value(ContainerWriter& file, const char* name, const T& value) {
   out.value(value);
   out.add_to(file, name);
 }
+
+// Writes packed numbers (base/packed_numbers.h) to a section.
+class PackedWriter {
+ public:
+  explicit PackedWriter(ContainerWriter::Sink sink) : sink_(std::move(sink)) {}
+
+  void add(std::uint64_t value, int bits) {
+    packer_.add(value, bits);
+    if (packer_.words().size() >= kPiece) flush();
+  }
+  // Pads the last word with zeros.
+  void align() { packer_.align(); }
+  void finish() {
+    align();
+    flush();
+  }
+
+ private:
+  static constexpr std::size_t kPiece = 8 * CheckedNumbers::kBlock;  // words
+
+  void flush() {
+    sink_(std::as_bytes(std::span(packer_.words())));
+    packer_.words().clear();
+  }
+
+  ContainerWriter::Sink sink_;
+  BitPacker packer_;
+};
+
+// Reads them one after the other.
+class PackedReader {
+ public:
+  // The section has `bits` bits, and padding up to a whole word.
+  PackedReader(const ContainerReader& file, const char* section, std::size_t bits)
+      : bytes_(file.read(section)) {
+    if (bytes_.size() != packed_bytes(bits, 1)) file.fail_size(section);
+  }
+
+  // Reading beyond the end is the caller's error.
+  std::uint64_t next(int bits) {
+    const std::size_t first = std::exchange(at_, at_ + static_cast<std::size_t>(bits));
+    return packed_number_at(bytes_.data(), bits, first);
+  }
+
+ private:
+  Bytes bytes_;
+  std::size_t at_ = 0;  // bits
+};
 
 // Hands n elements of `width` values each to a sink; fill(i, to) writes the values of element i.
 template <typename T, typename Fill>

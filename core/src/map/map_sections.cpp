@@ -1,12 +1,11 @@
 #include "map/map_sections.h"
 
-#include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <string_view>
 
-#include "base/text.h"
+#include "file/journal.h"
 #include "file/sections.h"
+#include "protomark/map_file.h"
 #include "search/coarse_quantizer.h"
 
 namespace protomark {
@@ -31,6 +30,12 @@ bool is_utc_time(std::string_view text) {
                                         std::chrono::month(static_cast<unsigned>(number(5, 2))),
                                         std::chrono::day(static_cast<unsigned>(number(8, 2)))};
   return day.ok() && number(11, 2) < 24 && number(14, 2) < 60 && number(17, 2) < 60;
+}
+
+MapKind kind_of(const ContainerReader& file) {
+  if (file.kind() == FileKind::learning_map) return MapKind::learning;
+  if (file.kind() == FileKind::sealed_map) return MapKind::sealed;
+  file.fail("it holds ", describe(file.kind()), ", not a map");
 }
 
 }  // namespace
@@ -129,6 +134,50 @@ void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {
   for (std::size_t i = 1; i < ids.size(); ++i) {
     if (ids[i] <= ids[i - 1]) file.fail("its landmark ids do not ascend");
   }
+}
+
+MapKind map_kind(const std::filesystem::path& path) {
+  return kind_of(ContainerReader(MappedFile(path).bytes(), path.string()));
+}
+
+std::shared_ptr<const Encoder> map_encoder(const std::filesystem::path& path) {
+  const MappedFile mapped(path);
+  const ContainerReader file(mapped.bytes(), path.string());
+  kind_of(file);
+  return read_encoder(file);
+}
+
+void expect_encoder(const Encoder& encoder, const Encoder& expected, const std::string& map) {
+  if (encoder.identity() == expected.identity()) return;
+  const auto describe = [](const Encoder& e) {
+    return "'" + e.info().name + "' (identity " + e.identity().substr(0, 12) + ")";
+  };
+  invalid(map, ": it was made with encoder ", describe(encoder), ", not with ", describe(expected),
+          ": use the map's encoder, or build the map with the other");
+}
+
+void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
+                       const std::string& map) {
+  if (encoder.info().descriptor == descriptor) return;
+  invalid(map, ": it is a map of ", encoder.info().descriptor, " descriptors, not of ", descriptor);
+}
+
+std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path) {
+  return ContainerReader(MappedFile(path).bytes(), path.string()).sections();
+}
+
+void verify_file(const std::filesystem::path& path) {
+  const JournaledFile both(path);
+  both.file().verify();
+  both.journal().commits(both.file().identity());
+}
+
+std::optional<FileJournal> file_journal(const std::filesystem::path& path) {
+  const JournaledFile both(path);
+  const JournalContent& journal = both.journal();
+  if (journal.size() == 0) return std::nullopt;
+  return FileJournal{journal.commits(both.file().identity()).size(), journal.size(),
+                     journal.size() - journal.end()};
 }
 
 }  // namespace protomark

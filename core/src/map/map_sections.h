@@ -1,11 +1,8 @@
 // The sections that learning and sealed maps share.
 #pragma once
 
-#include <memory>
-
 #include "file/container.h"
 #include "protomark/encoder.h"
-#include "protomark/types.h"
 
 namespace protomark {
 
@@ -27,18 +24,5 @@ Metadata merged(const Metadata& into, const Metadata& other);
 std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim);
 // Fails unless ids ascend and are not negative.
 void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
-
-// Returns the number of rows of all landmarks. Fails if a landmark has none, or a map cannot hold
-// so many.
-template <typename T>
-std::size_t sum_rows(const ContainerReader& file, std::span<const T> row_counts) {
-  std::uint64_t total = 0;
-  for (const T n : row_counts) {
-    if (n == 0) file.fail("it has a landmark without prototypes");
-    total += n;
-    if (total > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
-  }
-  return total;
-}
 
 }  // namespace protomark

@@ -1,15 +1,6 @@
 // The state of a learning map, and the guard of its changes.
 #pragma once
 
-#include <algorithm>
-#include <filesystem>
-#include <functional>
-#include <memory>
-#include <mutex>
-#include <shared_mutex>
-#include <utility>
-
-#include "base/fair_shared_mutex.h"
 #include "file/journal.h"
 #include "map/prototype_store.h"
 #include "protomark/prototype_map.h"
@@ -72,7 +63,7 @@ std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalCon
 // Measures the recall table of a store whose rounded prototypes are searched with value(v) in place
 // of each number v, where search_two finds the two nearest landmarks of queries.
 RecallTable measure_recall_of(const PrototypeStore& store,
-                              const std::function<int(std::int8_t)>& value,
+                              const std::function<std::int8_t(std::int8_t)>& value,
                               const SearchTwo& search_two);
 
 // A change of a map: while it exists no other one begins, and all that read the map for long wait.

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <functional>
 #include <locale>
-#include <sstream>
 #include <unordered_set>
 
 #include "base/text.h"

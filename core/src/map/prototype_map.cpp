@@ -1,14 +1,8 @@
 // Answers of a learning map, its index, and search.
 #include "protomark/prototype_map.h"
 
-#include <algorithm>
-#include <utility>
-
-#include "base/text.h"
 #include "map/map_state.h"
-#include "map/positions.h"
 #include "search/among.h"
-#include "search/inverted_lists.h"
 
 namespace protomark {
 namespace {
@@ -143,12 +137,7 @@ std::vector<std::int32_t> PrototypeMap::distances(std::span<const std::int64_t> 
   for (std::size_t i = 0; i < ids.size(); ++i) {
     for (Row row = store.first_row(store.at(ids[i])); row != kNoRow; row = store.next_row(row)) {
       store.rounded(row, prototype.data());
-      std::int32_t distance = 0;
-      for (std::size_t d = 0; d < prototype.size(); ++d) {
-        const int difference = codes.row(i)[d] - prototype[d];
-        distance += difference * difference;
-      }
-      result[i] = std::min(result[i], distance);
+      result[i] = std::min(result[i], squared_distance(codes.row(i), prototype.data(), dim()));
     }
   }
   return result;
@@ -223,24 +212,16 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
   check_lists(options, store.quantizer().nlist(), kRemedy);
   std::size_t nprobe = options.nprobe.value_or(SIZE_MAX);
   if (options.recall) nprobe = state_->nprobe(lock, *options.recall, options.threads);
-  const InvertedLists lists(store.lists());
-  const PackedPrototypes centroids = store.quantizer().packed();
-  if (!options.among) {
-    return search_lists(store.view(), lists, centroids, nprobe, queries, k, options);
-  }
-  Selection selection{{}, store.ids().size(), [&](LandmarkIndex landmark, std::vector<Row>& rows) {
-                        for (Row row = store.first_row(landmark); row != kNoRow;
-                             row = store.next_row(row)) {
-                          rows.push_back(row);
-                        }
-                      }};
-  for (const std::int64_t id : *options.among) selection.landmarks.push_back(store.at(id));
-  sort_unique(selection.landmarks);
-  return search_among(selection, store.view(), lists, centroids, nprobe, queries, k, options);
+  const auto append = [&](LandmarkIndex landmark, std::vector<Row>& rows) {
+    store.each_row_of(landmark, [&](Row row) { rows.push_back(row); });
+  };
+  const LandmarkRows landmarks{store.ids().size(), [&](auto id) { return store.at(id); }, append};
+  return search_map(store.view(), InvertedLists(store.lists()), store.quantizer().packed(),
+                    landmarks, nprobe, queries, k, options);
 }
 
 RecallTable measure_recall_of(const PrototypeStore& store,
-                              const std::function<int(std::int8_t)>& value,
+                              const std::function<std::int8_t(std::int8_t)>& value,
                               const SearchTwo& search_two) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
   std::vector<std::int64_t> owners;
@@ -252,11 +233,8 @@ RecallTable measure_recall_of(const PrototypeStore& store,
     std::int32_t least = INT32_MAX;
     for (const Row row : store.sorted_rows(store.at(id))) {
       store.rounded(row, prototype.data());
-      std::int32_t distance = 0;
-      for (std::size_t d = 0; d < prototype.size(); ++d) {
-        const int difference = query[d] - value(prototype[d]);
-        distance += difference * difference;
-      }
+      std::ranges::transform(prototype, prototype.begin(), value);
+      const std::int32_t distance = squared_distance(query, prototype.data(), store.dim());
       if (distance >= least) continue;
       least = distance;
       list = store.lists().list_of(row);
@@ -303,9 +281,9 @@ void MapState::measure(int threads, bool wait) {
   }
   if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
   auto measured = std::make_shared<MeasuredRecall>();
-  measured->table = measure_recall_of(
-      store, [](std::int8_t code) { return int{code}; },
-      [&](Codes queries) { return search_exact(store.view(), queries, 2, {.threads = threads}); });
+  measured->table = measure_recall_of(store, std::identity(), [&](Codes queries) {
+    return search_exact(store.view(), queries, 2, {.threads = threads});
+  });
   measured->lists_version = store.lists_version();
   measured->changes = store.changes();
   const std::scoped_lock writing(recall_mutex);

@@ -1,11 +1,6 @@
 // Changes observations, landmarks, positions and metadata of a learning map.
-#include <algorithm>
-#include <cmath>
-#include <cstdlib>
-#include <cstring>
 #include <unordered_map>
 
-#include "base/id_index.h"
 #include "base/parallel.h"
 #include "map/map_state.h"
 
@@ -168,7 +163,7 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
   }
   change.in_pieces(differences.size(), [&](std::size_t i) {
     const Difference& difference = differences[i];
-    const Row row = store.find_row(store.at(difference.id), difference.appearance);
+    const Row row = store.find_row(difference.id, difference.appearance);
     if (store.count(row) == difference.count) return store.erase_row(row);
     Sum sum = store.sum(row);
     for (std::size_t d = 0; d < dim; ++d) {
@@ -181,8 +176,7 @@ void PrototypeMap::subtract_codes(std::span<const std::int64_t> ids, Codes codes
 void PrototypeMap::remove(std::span<const std::int64_t> ids) {
   MapChange change(*state_);
   std::vector<std::int64_t> sorted(ids.begin(), ids.end());
-  std::ranges::sort(sorted);
-  sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
+  sort_unique(sorted);
   for (const std::int64_t id : sorted) state_->store.at(id);
   change.in_pieces(sorted.size(), [&](std::size_t i) { state_->store.erase(sorted[i]); });
 }

@@ -1,53 +1,35 @@
 // Writes and reads the file of a learning map, and its journal.
-#include <algorithm>
-#include <cmath>
-#include <cstdlib>
-#include <cstring>
-#include <utility>
-
-#include "file/sections.h"
+#include "file/ids.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
-#include "map/packed_sums.h"
 
 namespace protomark {
 namespace {
 
-// Bytes of an appearance in a file.
-std::size_t appearance_size(const PrototypeStore& store) {
-  return store.appearance_bits() <= 8 ? 1 : 2;
-}
-
-// Hands the packed sums of rows to a sink.
-void put_sums(const ContainerWriter::Sink& sink, const PrototypeStore& store,
-              std::span<const Row> rows) {
-  constexpr std::size_t kAhead = 16;
-  constexpr std::size_t kPiece = 1 << 16;  // bytes, and those of one row
-  std::vector<std::byte> packed;
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    const Row row = rows[i];
-    if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
-    const auto sum = pack_sum(store.sum(row), store.count(row), store.dim());
-    packed.insert(packed.end(), sum.begin(),
-                  sum.begin() + packed_sum_size(store.count(row), store.dim()));
-    if (packed.size() < kPiece && i + 1 < rows.size()) continue;
-    sink(packed);
-    packed.clear();
-  }
+// Bits per number of a sum of n codes: no such sum is beyond 127 n. n is 1 to 255.
+int sum_bits(int n) { return 8 + static_cast<int>(std::bit_width(static_cast<unsigned>(n - 1))); }
+// Bits per number of all rows with these counts.
+std::size_t sum_bits(std::span<const std::uint8_t> counts) {
+  std::size_t bits = 0;
+  for (const int n : counts) bits += static_cast<std::size_t>(sum_bits(n));
+  return bits;
 }
 
 // Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
 // must not change until the file is written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
-  std::size_t n = 0, m = 0, sum_bytes = 0;
+  std::size_t n = 0, m = 0, bits = 0;
+  std::int64_t largest = -1;
   // A map whose positions were all removed equals one that never had any.
   bool positions = false;
   const auto count = [&](LandmarkIndex landmark) {
     ++n;
-    for (Row row = store.first_row(landmark); row != kNoRow; row = store.next_row(row), ++m) {
-      sum_bytes += packed_sum_size(store.count(row), store.dim());
-    }
+    largest = std::max(largest, store.id(landmark));
+    store.each_row_of(landmark, [&](Row row) {
+      ++m;
+      bits += store.dim() * static_cast<std::size_t>(sum_bits(store.count(row)));
+    });
     positions = positions || has_position(store.position(landmark));
   };
   if (changed) {
@@ -55,50 +37,66 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   } else {
     store.each_landmark(count);
   }
+  const bool ids = IdBlockWriter::needed(n, largest), several = store.several();
+  const auto appearance_bits = static_cast<int>(store.appearance_bits());
   add_value(file, section::kShape, MapShape{n, store.dim(), {}});
-  std::vector<ContainerWriter::Part> parts{{section::kIds, n * sizeof(std::int64_t)}};
-  if (store.several()) {
-    add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(store.appearance_bits()));
-    parts.push_back({section::kRows, n * sizeof(std::uint32_t)});
-    parts.push_back({section::kAppearances, m * appearance_size(store)});
+  std::vector<ContainerWriter::Part> parts{{section::kCounts, m},
+                                           {section::kSums, packed_bytes(bits, 1)}};
+  if (several) {
+    add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(appearance_bits));
+    parts.push_back({section::kAppearances, packed_bytes(m, appearance_bits + 1)});
   }
-  parts.push_back({section::kCounts, m});
-  parts.push_back({section::kSums, sum_bytes});
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
+  if (ids) IdBlockWriter::add_to(parts, n);
 
-  const auto put_piece = [&store, positions](std::span<const ContainerWriter::Sink> sinks,
-                                             std::span<const LandmarkIndex> landmarks) {
-    const std::vector<Row> sorted = store.sorted_rows(landmarks);
-    const std::span<const Row> rows(sorted);
+  file.add_together(std::move(parts), [=, &store](auto sinks) {
     auto sink = sinks.begin();
-    put_each<std::int64_t>(*sink++, landmarks, [&](LandmarkIndex l) { return store.id(l); });
-    if (store.several()) {
-      put_each<std::uint32_t>(*sink++, landmarks, [&](LandmarkIndex l) {
-        return static_cast<std::uint32_t>(store.row_count(l));
-      });
-      const std::size_t size = appearance_size(store);
-      put_values<std::uint8_t>(*sink++, rows.size(), size, [&](std::size_t i, std::uint8_t* to) {
-        const std::uint16_t appearance = store.appearance(rows[i]);
-        std::memcpy(to, &appearance, size);
-      });
-    }
-    put_each<std::uint8_t>(*sink++, rows,
-                           [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
-    put_sums(*sink++, store, rows);
-    if (!positions) return;
-    put_each<Position>(*sink, landmarks, [&](LandmarkIndex l) { return store.position(l); });
-  };
-  file.add_together(std::move(parts), [&store, changed, put_piece](auto sinks) {
+    const auto& count_sink = *sink++;
+    PackedWriter sums(*sink++);
+    std::optional<PackedWriter> appearances;
+    if (several) appearances.emplace(*sink++);
+    const auto* position_sink = positions ? &*sink++ : nullptr;
+    std::optional<IdBlockWriter> id_writer;
+    if (ids) id_writer.emplace(sink[0], sink[1]);
+    const auto put_piece = [&](std::span<const LandmarkIndex> landmarks) {
+      constexpr std::size_t kAhead = 16;
+      const std::vector<Row> sorted = store.sorted_rows(landmarks);
+      const std::span<const Row> rows(sorted);
+      put_each<std::uint8_t>(count_sink, rows,
+                             [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
+      for (std::size_t i = 0; i < rows.size(); ++i) {
+        if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
+        const Sum sum = store.sum(rows[i]);
+        const int width = sum_bits(store.count(rows[i]));
+        const std::uint64_t mask = (std::uint64_t{1} << width) - 1;
+        for (std::size_t d = 0; d < store.dim(); ++d) {
+          sums.add(static_cast<std::uint64_t>(sum[d]) & mask, width);
+        }
+        if (!several) continue;
+        const bool last = i + 1 == rows.size() || store.owner(rows[i + 1]) != store.owner(rows[i]);
+        appearances->add(store.appearance(rows[i]) | std::uint64_t{last} << appearance_bits,
+                         appearance_bits + 1);
+      }
+      for (const LandmarkIndex l : landmarks) {
+        if (ids) id_writer->add(store.id(l));
+      }
+      if (!positions) return;
+      put_each<Position>(*position_sink, landmarks,
+                         [&](LandmarkIndex l) { return store.position(l); });
+    };
     const auto put = [&](std::span<const LandmarkIndex> landmarks) {
       constexpr std::size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
       for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
         for (std::size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
           rows += store.row_count(landmarks[end]);
         }
-        put_piece(sinks, landmarks.subspan(first, end - first));
+        put_piece(landmarks.subspan(first, end - first));
       }
     };
     changed ? put(*changed) : store.visit_sorted_landmarks(put);
+    sums.finish();
+    if (appearances) appearances->finish();
+    if (id_writer) id_writer->finish();
   });
 }
 
@@ -127,14 +125,15 @@ class Reading {
         read_appearance_bits(commit, shape.dim) != store_.appearance_bits()) {
       commit.fail("its dimension or appearance bits are not the map's");
     }
-    read_landmarks(commit, shape.landmarks);
-    for (const char* name : {section::kIds, section::kRemoved}) {
-      if (!commit.has(name)) continue;
-      const auto ids =
-          read_section<std::int64_t>(commit, name, commit.map(name).size() / sizeof(std::int64_t));
-      check_ids(commit, ids);
-      for (const std::int64_t id : ids) read_.insert(id);
+    auto ids = read_landmarks(commit, shape.landmarks);
+    if (commit.has(section::kRemoved)) {
+      const Bytes bytes = commit.map(section::kRemoved);
+      const auto removed = read_section<std::int64_t>(commit, section::kRemoved,
+                                                      bytes.size() / sizeof(std::int64_t));
+      check_ids(commit, removed);
+      ids.insert(ids.end(), removed.begin(), removed.end());
     }
+    for (const std::int64_t id : ids) read_.insert(id);
     if (commit.has(section::kCentroids)) {
       // Empty if the index was dropped.
       auto centroids = commit.map(section::kCentroids).empty() ? std::vector<std::int8_t>()
@@ -158,30 +157,23 @@ class Reading {
   }
 
  private:
-  // Checks all landmarks of a file, and takes those that no later commit names.
-  void read_landmarks(const ContainerReader& file, std::size_t n) {
+  // Checks all landmarks of a file, takes those that no later commit names, and returns their ids.
+  std::vector<std::int64_t> read_landmarks(const ContainerReader& file, std::size_t n) {
     const std::size_t dim = store_.dim();
+    const auto bits = static_cast<int>(store_.appearance_bits());
     const bool several = store_.several();
-    const auto ids = read_section<std::int64_t>(file, section::kIds, n);
-    check_ids(file, ids);
-    std::vector<std::uint32_t> row_counts;
-    std::vector<std::uint16_t> appearances;
-    std::size_t m = n;
-    if (several) {
-      row_counts = read_section<std::uint32_t>(file, section::kRows, n);
-      m = sum_rows(file, std::span<const std::uint32_t>(row_counts));
-      const std::size_t size = appearance_size(store_);
-      const auto bytes = read_section<std::uint8_t>(file, section::kAppearances, m * size);
-      appearances.resize(m);
-      for (std::size_t i = 0; i < m; ++i) std::memcpy(&appearances[i], &bytes[i * size], size);
-    }
+    const std::size_t m = several ? file.map(section::kCounts).size() : n;
+    if (m > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
+    if (m < n) file.fail_size(section::kCounts);
     const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
     if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
-    Bytes sums = file.read(section::kSums);
-    const std::size_t sum_bytes = std::accumulate(
-        counts.begin(), counts.end(), std::size_t{0},
-        [&](std::size_t size, int count) { return size + packed_sum_size(count, dim); });
-    if (sums.size() != sum_bytes) file.fail_size(section::kSums);
+    PackedReader sums(file, section::kSums, dim * sum_bits(counts));
+    std::optional<PackedReader> appearances;
+    if (several) {
+      appearances.emplace(file, section::kAppearances, m * static_cast<std::size_t>(bits + 1));
+    }
+    if (file.has(section::kIdGaps)) file.read(section::kIdGaps);  // checks what is only mapped
+    auto ids = LandmarkIds(file, n).all();
     std::vector<Position> positions;
     if (file.has(section::kPositions)) {
       positions = read_section<Position>(file, section::kPositions, n);
@@ -193,26 +185,32 @@ class Reading {
     }
     std::vector<LandmarkIndex> landmarks;  // if there are positions
     landmarks.reserve(positions.size());
-    for (std::size_t i = 0, row = 0; i < n; ++i) {
+    std::size_t row = 0;
+    for (std::size_t i = 0; i < n; ++i) {
       const bool is_newest = read_.empty() || !read_.contains(ids[i]);
       LandmarkIndex landmark = kNoLandmark;
-      const std::size_t end = row + (several ? row_counts[i] : 1);
-      for (const std::size_t first = row; row < end; ++row) {
-        const std::size_t size = packed_sum_size(counts[row], dim);
-        const Sum sum = unpack_sum(sums.first(size), counts[row], dim);
-        sums = sums.subspan(size);
-        if (std::any_of(sum.begin(), sum.begin() + dim,
-                        [&](int s) { return std::abs(s) > 127 * counts[row]; })) {
-          file.fail("landmark ", ids[i], " has an impossible prototype");
+      std::int32_t before = -1;  // the appearance of the row before
+      for (bool last = false; !last; ++row) {
+        if (row == m) file.fail("it has a landmark without prototypes");
+        const int n_codes = counts[row], width = sum_bits(n_codes), sign = 1 << (width - 1);
+        Sum sum{};
+        bool possible = true;
+        for (std::size_t d = 0; d < dim; ++d) {
+          const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
+          possible = possible && std::abs(number) <= 127 * n_codes;
+          sum[d] = static_cast<std::int16_t>(number);
         }
-        const std::uint16_t appearance = several ? appearances[row] : 0;
-        if (appearance >> store_.appearance_bits() != 0 ||
-            (row > first && appearance <= appearances[row - 1])) {
+        if (!possible) file.fail("landmark ", ids[i], " has an impossible prototype");
+        const auto marked = several ? static_cast<std::int32_t>(appearances->next(bits + 1)) : 1;
+        const std::int32_t appearance = marked & ((1 << bits) - 1);
+        last = marked >> bits != 0;
+        if (appearance <= before) {
           file.fail("the appearances of landmark ", ids[i], " do not ascend");
         }
+        before = appearance;
         if (!is_newest) continue;
-        const Row to = store_.create_row(ids[i], landmark, appearance);
-        store_.set(to, sum, counts[row]);
+        const Row to = store_.create_row(ids[i], landmark, static_cast<std::uint16_t>(appearance));
+        store_.set(to, sum, n_codes);
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);
@@ -222,10 +220,12 @@ class Reading {
         file.fail("landmark ", ids[i], " has no finite position");
       }
     }
+    if (row != m) file.fail("it has prototypes of no landmark");
     // After the landmarks, so that room for positions is made once.
     for (std::size_t i = 0; i < positions.size(); ++i) {
       if (landmarks[i] != kNoLandmark) store_.set_position(landmarks[i], positions[i]);
     }
+    return ids;
   }
 
   const Encoder& encoder_;

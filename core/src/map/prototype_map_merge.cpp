@@ -1,13 +1,8 @@
 // Merges maps into one, and splits one into parts.
-#include <algorithm>
-#include <cmath>
-#include <functional>
 #include <unordered_map>
-#include <utility>
 
 #include "map/map_sections.h"
 #include "map/map_state.h"
-#include "search/among.h"
 
 namespace protomark {
 namespace {

@@ -1,15 +1,7 @@
 // Seals a learning map, producing sections while they are written, in little memory.
-#include <algorithm>
-#include <cstring>
-#include <utility>
-
-#include "base/packed_numbers.h"
-#include "base/quantize.h"
 #include "file/ids.h"
-#include "file/sections.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
-#include "map/positions.h"
 #include "map/sealed_store.h"
 #include "search/scan.h"
 
@@ -31,12 +23,11 @@ class BlockPacker {
 
   int scale() const { return scale_; }
   // Bytes per block.
-  std::size_t size() const {
-    return scale_ == 0 ? packed_size(kPackedRows, store_->dim())
-                       : packed4_size(kPackedRows, store_->dim());
-  }
+  std::size_t size() const { return packed_size(kPackedRows, store_->dim(), scale_); }
   // Returns the number that a code is stored as.
-  int value(std::int8_t code) const { return scale_ == 0 ? code : sq4_level(u(code), scale_); }
+  std::int8_t value(std::int8_t code) const {
+    return scale_ == 0 ? code : static_cast<std::int8_t>(sq4_level(u(code), scale_));
+  }
 
   // `rows` are kPackedRows, kNoRow for padding.
   void pack(const Row* rows, std::uint8_t* to) const {
@@ -94,64 +85,40 @@ class SealedLandmarks {
   std::size_t added_ = 0;
 };
 
-// Writes rows, each list beginning a new block, and their owners if there is a sink for these.
+// Writes rows, each list beginning a new block, and their owners if there is a writer for these.
 class RowWriter {
  public:
   RowWriter(const BlockPacker& packer, std::size_t landmarks, const Sink& prototypes,
-            const Sink* owners = nullptr)
+            PackedWriter* owners = nullptr)
       : packer_(packer), landmarks_(landmarks), prototypes_(prototypes), owners_(owners) {}
 
   void add(Row row, std::size_t owner = 0) {
     block_[filled_++] = row;
-    if (owners_ != nullptr) packed_owners_.add(owner, owner_bits(landmarks_));
-    if (filled_ == kPackedRows) end_block();
-  }
-  void end_list() {
-    while (filled_ != 0) add(kNoRow, landmarks_);
-  }
-  // Returns the checksums of the owners.
-  std::vector<std::uint32_t> finish() {
-    packed_owners_.align();
-    flush_owners(1);
-    flush();
-    return std::move(checksums_);
-  }
-
- private:
-  static constexpr std::size_t kPiece = 1 << 16;  // bytes
-
-  void end_block() {
+    if (owners_ != nullptr) owners_->add(owner, owner_bits(landmarks_));
+    if (filled_ < kPackedRows) return;
     packed_.resize(packed_.size() + packer_.size());
     packer_.pack(block_.data(), packed_.data() + packed_.size() - packer_.size());
     filled_ = 0;
     if (packed_.size() >= kPiece) flush();
-    flush_owners(CheckedNumbers::kBlock);
+  }
+  void end_list() {
+    while (filled_ != 0) add(kNoRow, landmarks_);
   }
   void flush() {
     prototypes_(std::as_bytes(std::span(packed_)));
     packed_.clear();
   }
-  // Writes owners in blocks while there are at least `least` words.
-  void flush_owners(std::size_t least) {
-    std::vector<std::uint64_t>& words = packed_owners_.words();
-    while (words.size() >= least) {
-      const std::size_t n = std::min(words.size(), CheckedNumbers::kBlock);
-      const auto block = std::as_bytes(std::span(words).first(n));
-      checksums_.push_back(crc32(block));
-      (*owners_)(block);
-      words.erase(words.begin(), words.begin() + static_cast<std::ptrdiff_t>(n));
-    }
-  }
+
+ private:
+  static constexpr std::size_t kPiece = 1 << 16;  // bytes
 
   const BlockPacker& packer_;
   std::size_t landmarks_;
   const Sink& prototypes_;
-  const Sink* owners_;
+  PackedWriter* owners_;
   std::array<Row, kPackedRows> block_{};
   std::size_t filled_ = 0;
   std::vector<std::uint8_t> packed_;
-  BitPacker packed_owners_;
-  std::vector<std::uint32_t> checksums_;
 };
 
 // Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
@@ -160,27 +127,25 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
   // A piece is small compared with the map.
   const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
-  std::vector<LandmarkIndex> indices(size);  // as several rows may have the same id
-  for (std::size_t i = 0; i < size; ++i) indices[i] = landmark_at(i);
-  std::vector<std::int64_t> owners;
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.neighbours(2, {});
-  for (std::size_t first = 0; first < store.row_end(); first += size) {
-    owners.clear();
+  PackedPrototypes piece = store.view();
+  piece.data = packed.data();
+  piece.scale = packer.scale();
+  for (std::size_t first = 0; first < store.row_end(); first += piece.rows) {
+    piece.rows = std::min(size, store.row_end() - first);
     auto* to = reinterpret_cast<std::uint8_t*>(packed.data());
-    for (std::size_t i = first; i < std::min(first + size, store.row_end()); ++i) {
-      const Row row = row_at(i);
-      block[i % kPackedRows] = store.is_row(row) ? row : kNoRow;
-      owners.push_back(store.is_row(row) ? store.id(store.owner(row)) : -1);
-      if (i % kPackedRows + 1 != kPackedRows) continue;
+    for (std::size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
+      for (std::size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
       packer.pack(block.data(), to);
-      to += packer.size();
     }
-    PackedPrototypes piece{packed.data(), owners.size(), store.dim(), packer.scale()};
-    piece.landmarks.of_row = indices.data();
-    piece.landmarks.ids = owners.data();
-    PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, owners.size()});
+    PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, piece.rows});
+    if (store.several()) {
+      piece.landmarks.of_row += piece.rows;
+    } else {
+      piece.landmarks.ids += piece.rows;
+    }
   }
   Matches matches{{queries.rows, 2}, {queries.rows, 2}};
   write_answer(nearest, prepared.norms(), {}, 0, matches);
@@ -197,8 +162,7 @@ class SealedContent {
       : store_(store), map_(map), packer_(packer), codec_(codec) {
     std::int64_t largest = -1;
     for (const std::int64_t id : store.ids()) largest = std::max(largest, id);
-    // Ids 0 to n - 1 are not stored.
-    ids_are_stored_ = largest + 1 != static_cast<std::int64_t>(store.landmark_count());
+    ids_are_stored_ = IdBlockWriter::needed(store.landmark_count(), largest);
   }
 
   // Adds the sections to a file that is written while this exists.
@@ -210,14 +174,11 @@ class SealedContent {
     if (has_row_counts()) parts.push_back({section::kRows, n});
     if (codec_) parts.push_back({section::kPositions, n * codec_->size()});
     if (nlist == 0) parts.push_back(prototypes);
-    if (ids_are_stored_) {
-      parts.push_back({section::kIdBlocks, IdBlockWriter::blocks_size(n)});
-      parts.push_back({section::kIdGaps, ContainerWriter::kUnknownSize});
-    }
+    if (ids_are_stored_) IdBlockWriter::add_to(parts, n);
     file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
     if (nlist == 0) return;
     const std::size_t words = packed_words(store_.row_end(), owner_bits(n));
-    file.add_together({prototypes, {section::kOwners, words * sizeof(std::uint64_t)}},
+    file.add_together({prototypes, {section::kOwners, packed_bytes(words, 64)}},
                       [this](Sinks sinks) { put_lists(sinks); });
     file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(std::uint32_t),
              [this](const Sink& sink) { sink(std::as_bytes(std::span(owner_checksums_))); });
@@ -277,11 +238,20 @@ class SealedContent {
     if (ids) ids->finish();
     if (!prototypes) return;
     prototypes->end_list();
-    prototypes->finish();
+    prototypes->flush();
   }
 
   void put_lists(Sinks sinks) {
-    RowWriter writer(packer_, store_.landmark_count(), sinks[0], &sinks[1]);
+    owner_checksums_.clear();
+    // Comes in pieces of whole blocks.
+    PackedWriter owners([&](Bytes bytes) {
+      constexpr std::size_t kBlock = CheckedNumbers::kBlock * sizeof(std::uint64_t);
+      for (std::size_t at = 0; at < bytes.size(); at += kBlock) {
+        owner_checksums_.push_back(crc32(bytes.subspan(at, std::min(kBlock, bytes.size() - at))));
+      }
+      sinks[1](bytes);
+    });
+    RowWriter writer(packer_, store_.landmark_count(), sinks[0], &owners);
     for (std::uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
       store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
         for (const Row row : rows) {
@@ -292,7 +262,8 @@ class SealedContent {
       });
       writer.end_list();
     }
-    owner_checksums_ = writer.finish();
+    writer.flush();
+    owners.finish();
     landmarks_.reset();  // makes room for the test queries
   }
 

@@ -1,14 +1,7 @@
 #include "map/prototype_store.h"
 
-#include <algorithm>
-#include <bit>
-#include <cstring>
-#include <mutex>
 #include <numeric>
 
-#include "base/quantize.h"
-#include "base/sorted_pieces.h"
-#include "map/positions.h"
 #include "protomark/prototype_map.h"
 
 namespace protomark {
@@ -16,6 +9,9 @@ namespace {
 
 // Adding to a large map mostly waits for memory: prefetches it this many observations ahead.
 constexpr std::size_t kAhead = 16;
+
+// Rows that are assigned to lists at a time, and those that are moved at a time.
+constexpr std::size_t kAssignChunk = 1 << 14, kReassignChunk = 1 << 16;
 
 // Eight numbers, and from a byte each.
 typedef std::int16_t Eight __attribute__((vector_size(16)));
@@ -43,23 +39,11 @@ std::int16_t half(int sum, int count) {
 
 }  // namespace
 
-std::size_t PrototypeStore::row_bytes() const {
-  return rest_bytes_ + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
-}
-
-void PrototypeStore::reserve(std::size_t landmarks, std::size_t rows) {
-  // One more block, as take_row wants one to be free.
-  const std::size_t blocks = (rows + kPackedRows - 1) / kPackedRows + 1;
-  for_each_array(landmarks, blocks * kPackedRows,
-                 [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
-  lists_.reserve(blocks);
-}
-
 void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                                FairSharedMutex& searching) {
   // New rows begin in the first list, and each that moves may begin a block.
   const std::size_t moving = quantizer_.nlist() == 0 ? 0 : std::min(changed, quantizer_.nlist());
-  const std::size_t blocks = 2 * ((rows + kPackedRows - 1) / kPackedRows) + moving;
+  const std::size_t blocks = 2 * packed_blocks(rows) + moving;
   for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more, const auto&) {
     if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), searching);
   });
@@ -68,31 +52,6 @@ void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::siz
     const std::unique_lock lock(searching);
     std::swap(index_, larger);
   }
-}
-
-void PrototypeStore::make_room_for_positions(FairSharedMutex& searching) {
-  if (!positions_.empty()) return;
-  std::vector<Position> fresh(ids_.size(), kNoPosition);
-  const std::unique_lock lock(searching);
-  positions_.swap(fresh);
-}
-
-Row PrototypeStore::find_or_create_row(std::int64_t id, std::uint16_t appearance) {
-  LandmarkIndex landmark = find(id);
-  const Row row = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance);
-  return row != kNoRow ? row : create_row(id, landmark, appearance);
-}
-
-Row PrototypeStore::create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance) {
-  if (landmark == kNoLandmark) make_room_for_landmark();
-  const Row row = take_row(0);
-  if (landmark != kNoLandmark) {
-    add_row(landmark, row, appearance);
-  } else {
-    add_landmark(id, row, appearance);
-    landmark = owner(row);
-  }
-  return row;
 }
 
 // Makes room for a row at the end of a list.
@@ -112,11 +71,6 @@ Row PrototypeStore::take_row(std::uint32_t list) {
   return row;
 }
 
-void PrototypeStore::resize(std::size_t rows) {
-  for_each_array(ids_.size(), rows,
-                 [](auto& v, std::size_t n, const auto& padding) { v.resize(n, padding); });
-}
-
 void PrototypeStore::copy_row(Row from, Row to) {
   for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
     std::copy_n(v.data() + from.value * width, width, v.data() + to.value * width);
@@ -125,18 +79,6 @@ void PrototypeStore::copy_row(Row from, Row to) {
     std::memcpy(packed() + packed_index(to.value, d, dim_),
                 packed() + packed_index(from.value, d, dim_), 4);
   }
-}
-
-void PrototypeStore::vacate(Row row) {
-  for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto& padding) {
-    std::fill_n(v.data() + row.value * width, width, padding);
-  });
-}
-
-void PrototypeStore::relocate(Row from, Row to) {
-  relink(from, to);
-  copy_row(from, to);
-  vacate(from);
 }
 
 // Moves the last row of a list to where one was removed, and the last of all blocks to a block that
@@ -155,65 +97,6 @@ void PrototypeStore::close_gap(Row row) {
     if (is_row(from)) relocate(from, row_at(emptied * kPackedRows + i));
   }
   resize(row_end());
-}
-
-void PrototypeStore::erase_row(Row row) {
-  if (uncommitted) uncommitted->insert(id(owner(row)));
-  if (has_slot(row)) slots_.give_back(slot(row));
-  remove_row(row);
-  close_gap(row);
-}
-
-void PrototypeStore::erase(std::int64_t id) {
-  const LandmarkIndex landmark = at(id);
-  while (next_row(first_row(landmark)) != kNoRow) erase_row(first_row(landmark));
-  erase_row(first_row(landmark));
-}
-
-std::uint32_t PrototypeStore::observations(LandmarkIndex landmark) const {
-  std::uint32_t n = 0;
-  for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) n += counts_[row.value];
-  return n;
-}
-
-MapSummary PrototypeStore::summary() const {
-  MapSummary result;
-  each_landmark([&](LandmarkIndex l) { add_to_summary(result, observations(l), position(l)); });
-  return result;
-}
-
-void PrototypeStore::rounded(Row row, std::int8_t* to) const {
-  for (std::size_t d = 0; d < dim_; d += 4) {
-    std::copy_n(packed() + packed_index(row.value, d, dim_), std::min<std::size_t>(4, dim_ - d),
-                to + d);
-  }
-}
-
-std::vector<std::int8_t> PrototypeStore::rounded(std::span<const Row> rows) const {
-  std::vector<std::int8_t> result(rows.size() * dim_);
-  for (std::size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
-  return result;
-}
-
-void PrototypeStore::visit_sorted_landmarks(const VisitLandmarks& visit) const {
-  const auto each = [&](const auto& take) { each_landmark(take); };
-  visit_sorted<LandmarkIndex>(
-      landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
-}
-
-void PrototypeStore::visit_sorted_rows(std::uint32_t list, const VisitRows& visit) const {
-  const auto each = [&](const auto& take) { lists_.each_row(list, take); };
-  visit_sorted<Row>(
-      lists_.rows(list), each, [&](Row row) { return std::pair(id(owner(row)), appearance(row)); },
-      visit);
-}
-
-std::vector<LandmarkIndex> PrototypeStore::sorted_landmarks() const {
-  std::vector<LandmarkIndex> result;
-  result.reserve(landmark_count());
-  visit_sorted_landmarks(
-      [&](auto piece) { result.insert(result.end(), piece.begin(), piece.end()); });
-  return result;
 }
 
 std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const std::size_t> n) const {
@@ -241,8 +124,7 @@ void PrototypeStore::find_rows(std::span<const std::int64_t> ids, Codes codes,
     if (i >= kAhead && i < n + kAhead) index_.prefetch_ids(ids_, ids[i - kAhead]);
     if (i < 2 * kAhead) continue;
     const std::size_t at = i - 2 * kAhead;
-    const LandmarkIndex landmark = find(ids[at]);
-    rows[at] = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance_of(codes.row(at)));
+    rows[at] = find_row(ids[at], appearance_of(codes.row(at)));
   }
 }
 
@@ -299,14 +181,6 @@ void PrototypeStore::merge(Row row, const Sum& other, int other_count) {
     s[d] = halved ? half(both, n) : static_cast<std::int16_t>(both);
   }
   set(row, s, n);
-}
-
-void PrototypeStore::merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
-  for (Row row = from.first_row(landmark); row != kNoRow; row = from.next_row(row)) {
-    merge(find_or_create_row(id, from.appearance(row)), from.sum(row), from.count(row));
-  }
-  const LandmarkIndex into = at(id);
-  if (!has_position(position(into))) set_position(into, from.position(landmark));
 }
 
 Sum PrototypeStore::sum(Row row) const {
@@ -371,16 +245,117 @@ void PrototypeStore::set(Row row, const Sum& sum, int count) {
   }
 }
 
-void PrototypeStore::set_position(LandmarkIndex landmark, const Position& position) {
-  RowTable::set_position(landmark, position);
-  if (uncommitted) uncommitted->insert(id(landmark));
+// Finds a row by its key again before moving it, as another move may have changed its index.
+void PrototypeStore::reassign(int threads) {
+  std::vector<Key> keys;
+  std::vector<Row> rows;
+  for (std::size_t first = 0; first < to_reassign_.size(); first += kReassignChunk) {
+    keys.clear();
+    rows.clear();
+    const std::size_t end = std::min(first + kReassignChunk, to_reassign_.size());
+    for (std::size_t i = first; i < end; ++i) {
+      const Row row = find_row(to_reassign_[i].id, to_reassign_[i].appearance);
+      if (row == kNoRow) continue;
+      keys.push_back(to_reassign_[i]);
+      rows.push_back(row);
+    }
+    const std::vector<std::int8_t> codes = rounded(rows);
+    auto lists = quantizer_.assign({codes.data(), rows.size(), dim_}, threads);
+    std::size_t moving = 0;
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      if (lists_.list_of(rows[i]) == lists[i]) continue;
+      keys[moving] = keys[i];
+      lists[moving++] = lists[i];
+    }
+    for (std::size_t i = 0; i < moving; ++i) {
+      const Row row = find_row(keys[i].id, keys[i].appearance);
+      if (lists_.list_of(row) == lists[i]) continue;  // its key came twice
+      relocate(row, take_row(lists[i]));
+      close_gap(row);
+    }
+  }
+  changes_ += to_reassign_.size();
+  to_reassign_.clear();
 }
 
-PackedPrototypes PrototypeStore::view() const {
-  PackedPrototypes result{packed(), row_end(), dim_};
-  result.landmarks.ids = ids_.data();
-  if (several_) result.landmarks.of_row = owners_.data();
+PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, int threads) const {
+  const std::size_t nlist = std::max<std::size_t>(quantizer.nlist(), 1);
+  std::vector<Row> list_of_row(row_end(), kNoRow);
+  std::vector<Row> rows;
+  rows.reserve(std::min(prototype_count_, kAssignChunk));
+  const auto assign = [&] {
+    std::vector<std::uint32_t> lists(rows.size(), 0);
+    if (quantizer.nlist() != 0) {
+      const std::vector<std::int8_t> codes = rounded(rows);
+      lists = quantizer.assign({codes.data(), rows.size(), dim_}, threads);
+    }
+    for (std::size_t i = 0; i < rows.size(); ++i) list_of_row[rows[i].value].value = lists[i];
+    rows.clear();
+  };
+  each_row([&](Row row) {
+    rows.push_back(row);
+    if (rows.size() == kAssignChunk) assign();
+  });
+  assign();
+  ListOrder order(std::move(list_of_row), nlist);
+  Arrangement result{std::move(quantizer), ListBlocks(nlist), std::move(order.new_rows)};
+  result.lists.reserve(order.first_blocks.back());
+  for (std::uint32_t list = 0; list < nlist; ++list) {
+    for (std::uint32_t i = 0; i < order.sizes[list]; ++i) result.lists.append(list);
+  }
   return result;
+}
+
+void PrototypeStore::rearrange(Arrangement arrangement) {
+  const ListBlocks& lists = arrangement.lists;
+  const std::size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
+  for_each_array(0, end + kPackedRows, [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
+  relink(arrangement.to);
+  resize(end + kPackedRows);
+  permute(arrangement.to, row_at(end));
+  for (std::uint32_t list = 0; list < lists.nlist(); ++list) {
+    if (lists.rows(list) == 0) continue;
+    for (Row row{lists.last(list).value + 1}; row.value % kPackedRows != 0; ++row.value)
+      vacate(row);
+  }
+  quantizer_ = std::move(arrangement.quantizer);
+  lists_ = std::move(arrangement.lists);
+  resize(row_end());
+  ++lists_version_;
+  changes_ += prototype_count_;
+  if (uncommitted) uncommitted->centroids = true;
+}
+
+// Moves every row to to[row], and uses up `to`. A row that is there moves on in its turn, until one
+// comes to padding; `spare` and the next row hold rows meanwhile. In a large map nearly all of this
+// waits for memory, which is therefore prefetched.
+void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
+  constexpr int kAhead = 8;
+  // Where the row here goes; kNoRow if none has to leave.
+  const auto next = [&](Row row) { return row.value < to.size() ? to[row.value] : kNoRow; };
+  Row moving = spare, met{spare.value + 1};
+  for (Row first{0}; first.value < to.size(); ++first.value) {
+    if (to[first.value] == kNoRow || to[first.value] == first) continue;
+    copy_row(first, moving);
+    Row row = std::exchange(to[first.value], kNoRow), ahead = row;
+    const auto prefetch_next = [&] {
+      if (ahead == kNoRow) return;
+      prefetch(ahead);
+      RowTable::for_each_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
+        __builtin_prefetch(v.data() + ahead.value * width, 1);
+      });
+      ahead = next(ahead);
+    };
+    for (int i = 0; i < kAhead; ++i) prefetch_next();
+    while (next(row) != kNoRow) {
+      prefetch_next();
+      copy_row(row, met);
+      copy_row(moving, row);
+      std::swap(moving, met);
+      row = std::exchange(to[row.value], kNoRow);
+    }
+    copy_row(moving, row);
+  }
 }
 
 }  // namespace protomark

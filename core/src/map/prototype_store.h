@@ -1,15 +1,10 @@
 // The landmarks of a learning map, with a row for each prototype.
 #pragma once
 
-#include <cstring>
-#include <functional>
-#include <memory>
-#include <new>
-
-#include "base/fair_shared_mutex.h"
 #include "base/quantize.h"
 #include "base/slots.h"
-#include "map/row_table.h"
+#include "base/sorted_pieces.h"
+#include "map/positions.h"
 #include "search/coarse_quantizer.h"
 #include "search/list_blocks.h"
 
@@ -67,7 +62,9 @@ class PrototypeStore : public RowTable {
   std::size_t row_end() const { return lists_.blocks() * kPackedRows; }
   // Bytes per row of few observations, without what arrays have room for, so that equal maps have
   // the same.
-  std::size_t row_bytes() const;
+  std::size_t row_bytes() const {
+    return rest_bytes_ + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
+  }
 
   // Returns the appearance of a code: bit j is set if code[j] > 0, j < appearance_bits.
   std::uint16_t appearance_of(const std::int8_t* code) const {
@@ -76,24 +73,66 @@ class PrototypeStore : public RowTable {
     return static_cast<std::uint16_t>(signs);
   }
 
-  void reserve(std::size_t landmarks, std::size_t rows);
+  void reserve(std::size_t landmarks, std::size_t rows) {
+    // One more block, as take_row wants one to be free.
+    const std::size_t blocks = packed_blocks(rows) + 1;
+    for_each_array(landmarks, blocks * kPackedRows,
+                   [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
+    lists_.reserve(blocks);
+  }
   // Makes room for more landmarks and rows in a change of `changed` rows. Others may read
   // meanwhile, as `searching` is held only to swap arrays.
   void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
                  FairSharedMutex& searching);
-  void make_room_for_positions(FairSharedMutex& searching);
+  void make_room_for_positions(FairSharedMutex& searching) {
+    if (!positions_.empty()) return;
+    std::vector<Position> fresh(ids_.size(), kNoPosition);
+    const std::unique_lock lock(searching);
+    positions_.swap(fresh);
+  }
 
   // Returns the row of a landmark's appearance, if need be a new one with a sum and count of zero.
   // If memory runs out nothing has changed.
-  Row find_or_create_row(std::int64_t id, std::uint16_t appearance);
+  Row find_or_create_row(std::int64_t id, std::uint16_t appearance) {
+    LandmarkIndex landmark = find(id);
+    const Row row = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance);
+    return row != kNoRow ? row : create_row(id, landmark, appearance);
+  }
   // Creates a row for an appearance that its landmark lacks; kNoLandmark becomes a new landmark.
-  Row create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance);
+  Row create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance) {
+    if (landmark == kNoLandmark) make_room_for_landmark();
+    const Row row = take_row(0);
+    if (landmark != kNoLandmark) {
+      add_row(landmark, row, appearance);
+    } else {
+      add_landmark(id, row, appearance);
+      landmark = owner(row);
+    }
+    return row;
+  }
   // Removes a row, and with its last row a landmark.
-  void erase_row(Row row);
-  void erase(std::int64_t id);
+  void erase_row(Row row) {
+    if (uncommitted) uncommitted->insert(id(owner(row)));
+    if (has_slot(row)) slots_.give_back(slot(row));
+    remove_row(row);
+    close_gap(row);
+  }
+  void erase(std::int64_t id) {
+    const LandmarkIndex landmark = at(id);
+    while (next_row(first_row(landmark)) != kNoRow) erase_row(first_row(landmark));
+    erase_row(first_row(landmark));
+  }
 
-  std::uint32_t observations(LandmarkIndex landmark) const;
-  MapSummary summary() const;
+  std::uint32_t observations(LandmarkIndex landmark) const {
+    std::uint32_t n = 0;
+    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) n += counts_[row.value];
+    return n;
+  }
+  MapSummary summary() const {
+    MapSummary result;
+    each_landmark([&](LandmarkIndex l) { add_to_summary(result, observations(l), position(l)); });
+    return result;
+  }
   int count(Row row) const { return counts_[row.value]; }
   Sum sum(Row row) const;
   // Asks for what `sum` reads and `set` writes ahead. Inlined, as GCC drops calls of a function
@@ -110,8 +149,17 @@ class PrototypeStore : public RowTable {
   // has changed, and for a new row it does not.
   void set(Row row, const Sum& sum, int count);
   // Return the rounded prototypes of one row or several (rows x dim).
-  void rounded(Row row, std::int8_t* to) const;
-  std::vector<std::int8_t> rounded(std::span<const Row> rows) const;
+  void rounded(Row row, std::int8_t* to) const {
+    for (std::size_t d = 0; d < dim_; d += 4) {
+      std::copy_n(packed() + packed_index(row.value, d, dim_), std::min<std::size_t>(4, dim_ - d),
+                  to + d);
+    }
+  }
+  std::vector<std::int8_t> rounded(std::span<const Row> rows) const {
+    std::vector<std::int8_t> result(rows.size() * dim_);
+    for (std::size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
+    return result;
+  }
 
   // Call take(landmark) for all landmarks, or take(row) for all rows, in no order.
   template <typename Take>
@@ -130,9 +178,24 @@ class PrototypeStore : public RowTable {
   // piece (sorted_pieces.h).
   using VisitLandmarks = std::function<void(std::span<const LandmarkIndex>)>;
   using VisitRows = std::function<void(std::span<const Row>)>;
-  void visit_sorted_landmarks(const VisitLandmarks& visit) const;
-  void visit_sorted_rows(std::uint32_t list, const VisitRows& visit) const;
-  std::vector<LandmarkIndex> sorted_landmarks() const;
+  void visit_sorted_landmarks(const VisitLandmarks& visit) const {
+    const auto each = [&](const auto& take) { each_landmark(take); };
+    visit_sorted<LandmarkIndex>(
+        landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
+  }
+  void visit_sorted_rows(std::uint32_t list, const VisitRows& visit) const {
+    const auto each = [&](const auto& take) { lists_.each_row(list, take); };
+    visit_sorted<Row>(
+        lists_.rows(list), each,
+        [&](Row row) { return std::pair(id(owner(row)), appearance(row)); }, visit);
+  }
+  std::vector<LandmarkIndex> sorted_landmarks() const {
+    std::vector<LandmarkIndex> result;
+    result.reserve(landmark_count());
+    visit_sorted_landmarks(
+        [&](auto piece) { result.insert(result.end(), piece.begin(), piece.end()); });
+    return result;
+  }
   // Returns the rows that are n-th among all by id and then appearance.
   std::vector<Row> sorted_rows_at(std::span<const std::size_t> n) const;
 
@@ -145,11 +208,20 @@ class PrototypeStore : public RowTable {
   void merge(Row row, const Sum& sum, int count);
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
   // which keeps its position if it has one.
-  void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark);
+  void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
+    for (Row row = from.first_row(landmark); row != kNoRow; row = from.next_row(row)) {
+      merge(find_or_create_row(id, from.appearance(row)), from.sum(row), from.count(row));
+    }
+    const LandmarkIndex into = at(id);
+    if (!has_position(position(into))) set_position(into, from.position(landmark));
+  }
   // Puts rows that were created or set into their lists; ends every change.
   void reassign(int threads);
 
-  void set_position(LandmarkIndex landmark, const Position& position);
+  void set_position(LandmarkIndex landmark, const Position& position) {
+    RowTable::set_position(landmark, position);
+    if (uncommitted) uncommitted->insert(id(landmark));
+  }
 
   // Has no lists without an index.
   const CoarseQuantizer& quantizer() const { return quantizer_; }
@@ -164,7 +236,13 @@ class PrototypeStore : public RowTable {
   // Moves rows and takes the arrangement's centroids. After make_room_for it cannot run out of
   // memory.
   void rearrange(Arrangement arrangement);
-  void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching);
+  void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
+    // One more block is for rows while they move.
+    const std::size_t blocks = std::max(lists_.blocks(), arrangement.lists.blocks()) + 1;
+    for_each_array(0, blocks * kPackedRows, [&](auto& v, std::size_t n, const auto&) {
+      if (v.capacity() < n) enlarge(v, n, searching);
+    });
+  }
 
   // Grows with each new set of centroids.
   std::size_t lists_version() const { return lists_version_; }
@@ -173,7 +251,12 @@ class PrototypeStore : public RowTable {
   // What to commit; nullptr without a journal. A commit takes it while no change is going on.
   std::shared_ptr<Uncommitted> uncommitted;
 
-  PackedPrototypes view() const;
+  PackedPrototypes view() const {
+    PackedPrototypes result{packed(), row_end(), dim_};
+    result.landmarks.ids = ids_.data();
+    if (several_) result.landmarks.of_row = owners_.data();
+    return result;
+  }
 
  private:
   // Names a row, whose index changes when others are removed.
@@ -201,12 +284,23 @@ class PrototypeStore : public RowTable {
   }
   void add(Row row, const std::int8_t* codes, std::size_t n);
   Row take_row(std::uint32_t list);
-  void resize(std::size_t rows);
+  void resize(std::size_t rows) {
+    for_each_array(ids_.size(), rows,
+                   [](auto& v, std::size_t n, const auto& padding) { v.resize(n, padding); });
+  }
   // Copies all of a row, but not what leads to it.
   void copy_row(Row from, Row to);
-  void vacate(Row row);
+  void vacate(Row row) {
+    for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto& padding) {
+      std::fill_n(v.data() + row.value * width, width, padding);
+    });
+  }
   // Moves a row to a padding row, and leaves padding.
-  void relocate(Row from, Row to);
+  void relocate(Row from, Row to) {
+    relink(from, to);
+    copy_row(from, to);
+    vacate(from);
+  }
   void close_gap(Row row);
   void permute(std::vector<Row>& to, Row spare);
 

@@ -1,21 +1,45 @@
 // The rows of each landmark of a learning map, and the landmark of each row.
 #pragma once
 
-#include <algorithm>
+#include <cmath>
 #include <limits>
 #include <mutex>
+#include <utility>
 
 #include "base/fair_shared_mutex.h"
 #include "base/id_index.h"
-#include "base/large_vector.h"
-#include "base/rows.h"
 #include "protomark/types.h"
 
 namespace protomark {
 
 inline constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 inline constexpr Position kNoPosition = {kNaN, kNaN, kNaN};
-bool has_position(const Position& position);
+inline bool has_position(const Position& p) {
+  return !(std::isnan(p[0]) && std::isnan(p[1]) && std::isnan(p[2]));
+}
+
+// Arrays grow as with push_back, but before a change, which therefore cannot fail half-way.
+template <typename Vector>
+std::size_t larger_capacity(const Vector& v, std::size_t more) {
+  return std::max(2 * v.capacity(), v.size() + more);
+}
+template <typename Vector>
+bool has_room(const Vector& v, std::size_t more) {
+  return v.capacity() - v.size() >= more;
+}
+template <typename Vector>
+void make_room_in(Vector& v, std::size_t more) {
+  if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
+}
+// Replaces an array by one of more capacity; only the swap excludes searches.
+template <typename Vector>
+void enlarge(Vector& v, std::size_t capacity, FairSharedMutex& searching) {
+  Vector larger;
+  larger.reserve(capacity);
+  larger.assign(v.begin(), v.end());
+  const std::unique_lock lock(searching);
+  v.swap(larger);
+}
 
 // Has two layouts. With one row per landmark, a landmark has the index of its row, and only ids and
 // positions are stored, by row. With one row per appearance, landmarks have indices of their own,
@@ -33,7 +57,11 @@ class RowTable {
   std::int64_t id(LandmarkIndex landmark) const { return ids_[landmark.value]; }
   // Return the landmark with an id; if there is none, kNoLandmark, or `at` throws UnknownLandmark.
   LandmarkIndex find(std::int64_t id) const { return index_.find(ids_, id); }
-  LandmarkIndex at(std::int64_t id) const;
+  LandmarkIndex at(std::int64_t id) const {
+    const LandmarkIndex landmark = find(id);
+    if (landmark == kNoLandmark) throw UnknownLandmark(id);
+    return landmark;
+  }
 
   LandmarkIndex owner(Row row) const {
     return several_ ? owners_[row.value] : LandmarkIndex{row.value};
@@ -47,44 +75,118 @@ class RowTable {
     return several_ ? first_rows_[landmark.value] : Row{landmark.value};
   }
   Row next_row(Row row) const { return several_ ? next_rows_[row.value] : kNoRow; }
+  template <typename Take>
+  void each_row_of(LandmarkIndex landmark, const Take& take) const {
+    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) take(row);
+  }
   // Returns the row of a landmark's appearance, or kNoRow.
   Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
     Row row = first_row(landmark);
     while (several_ && row != kNoRow && appearances_[row.value] != appearance) row = next_row(row);
     return row;
   }
+  Row find_row(std::int64_t id, std::uint16_t appearance) const {
+    const LandmarkIndex landmark = find(id);
+    return landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance);
+  }
 
-  std::size_t row_count(LandmarkIndex landmark) const;
+  std::size_t row_count(LandmarkIndex landmark) const {
+    std::size_t n = 0;
+    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) ++n;
+    return n;
+  }
   // Return the rows of a landmark by ascending appearance, or of several landmarks in their order.
-  std::vector<Row> sorted_rows(LandmarkIndex landmark) const;
-  std::vector<Row> sorted_rows(std::span<const LandmarkIndex> landmarks) const;
+  std::vector<Row> sorted_rows(LandmarkIndex landmark) const {
+    return sorted_rows(std::span(&landmark, 1));
+  }
+  std::vector<Row> sorted_rows(std::span<const LandmarkIndex> landmarks) const {
+    std::vector<Row> result;
+    result.reserve(landmarks.size());
+    for (const LandmarkIndex landmark : landmarks) {
+      const auto first = static_cast<std::ptrdiff_t>(result.size());
+      for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) result.push_back(row);
+      if (several_) {
+        std::sort(result.begin() + first, result.end(),
+                  [&](Row a, Row b) { return appearance(a) < appearance(b); });
+      }
+    }
+    return result;
+  }
 
   Position position(LandmarkIndex landmark) const {
     return positions_.empty() ? kNoPosition : positions_[landmark.value];
   }
   // By landmark index; empty if no landmark ever had a position.
   const std::vector<Position>& positions() const { return positions_; }
-  bool any_position() const;
+  bool any_position() const { return std::ranges::any_of(positions_, has_position); }
 
   // Counts rows that were stepped over to remove or move others.
   std::size_t steps() const { return steps_; }
 
  protected:
   // Makes room for a landmark, without which add_landmark could run out of memory.
-  void make_room_for_landmark();
+  void make_room_for_landmark() {
+    index_.make_room(ids_, 1);
+    if (!several_) return;
+    for_each_array(1, 0, [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
+  }
   // Makes a padding row the only one of a new landmark.
-  void add_landmark(std::int64_t id, Row row, std::uint16_t appearance);
+  void add_landmark(std::int64_t id, Row row, std::uint16_t appearance) {
+    if (!several_) {
+      ids_[row.value] = id;
+      index_.insert(ids_, LandmarkIndex{row.value});
+      return;
+    }
+    const LandmarkIndex landmark = landmark_at(ids_.size());
+    ids_.push_back(id);
+    index_.insert(ids_, landmark);
+    first_rows_.push_back(kNoRow);
+    if (!positions_.empty()) positions_.push_back(kNoPosition);
+    add_row(landmark, row, appearance);
+  }
   // Makes a padding row one more of a landmark.
-  void add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance);
+  void add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance) {
+    appearances_[row.value] = appearance;
+    owners_[row.value] = landmark;
+    next_rows_[row.value] = std::exchange(first_rows_[landmark.value], row);
+  }
   // Removes a row from its landmark, and a landmark with its last row.
-  void remove_row(Row row);
+  void remove_row(Row row) {
+    if (!several_) return index_.erase(ids_, ids_[row.value]);
+    const LandmarkIndex landmark = owner(row);
+    link_to(row) = next_row(row);
+    if (first_row(landmark) == kNoRow) remove_landmark(landmark);
+  }
   // Make what leads to one row lead to another, or all that leads to rows lead to to[row].
-  void relink(Row from, Row to);
-  void relink(std::span<const Row> to);
-  void set_position(LandmarkIndex landmark, const Position& position);
+  void relink(Row from, Row to) {
+    if (several_) {
+      link_to(from) = to;
+    } else {
+      index_.move(ids_, ids_[from.value], LandmarkIndex{to.value});
+    }
+  }
+  void relink(std::span<const Row> to) {
+    if (!several_) return index_.renumber(to);
+    for (auto* links : {&first_rows_, &next_rows_}) {
+      for (Row& row : *links) {
+        if (row != kNoRow) row = to[row.value];
+      }
+    }
+  }
+  void set_position(LandmarkIndex landmark, const Position& position) {
+    if (positions_.empty()) {
+      if (!has_position(position)) return;
+      positions_.assign(ids_.size(), kNoPosition);
+    }
+    // One NaN for all, so that equal maps give equal files.
+    positions_[landmark.value] = has_position(position) ? position : kNoPosition;
+  }
 
   // Bytes per row as in a file, so that equal maps have the same.
-  std::size_t row_bytes() const;
+  std::size_t row_bytes() const {
+    if (several_) return sizeof(appearances_[0]) + sizeof(owners_[0]) + sizeof(next_rows_[0]);
+    return sizeof(ids_[0]) + (any_position() ? sizeof(Position) : 0);
+  }
   // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
   // and rows.
   template <typename Visit>
@@ -112,33 +214,31 @@ class RowTable {
   IdIndex index_;
 
  private:
-  Row& link_to(Row row);
-  void remove_landmark(LandmarkIndex landmark);
+  // What leads to a row: the landmark's first row, or the next row of another one.
+  Row& link_to(Row row) {
+    Row* link = &first_rows_[owner(row).value];
+    for (; *link != row; ++steps_) link = &next_rows_[link->value];
+    return *link;
+  }
+  // The last landmark takes the index of one that has no rows left.
+  void remove_landmark(LandmarkIndex landmark) {
+    const LandmarkIndex last = landmark_at(ids_.size() - 1);
+    index_.erase(ids_, id(landmark));
+    if (landmark != last) {
+      index_.move(ids_, id(last), landmark);
+      ids_[landmark.value] = id(last);
+      if (!positions_.empty()) positions_[landmark.value] = positions_[last.value];
+      first_rows_[landmark.value] = first_row(last);
+      for (Row row = first_row(landmark); row != kNoRow; row = next_row(row), ++steps_) {
+        owners_[row.value] = landmark;
+      }
+    }
+    ids_.pop_back();
+    if (!positions_.empty()) positions_.pop_back();
+    first_rows_.pop_back();
+  }
 
   std::size_t steps_ = 0;
 };
-
-// Arrays grow as with push_back, but before a change, which therefore cannot fail half-way.
-template <typename Vector>
-std::size_t larger_capacity(const Vector& v, std::size_t more) {
-  return std::max(2 * v.capacity(), v.size() + more);
-}
-template <typename Vector>
-bool has_room(const Vector& v, std::size_t more) {
-  return v.capacity() - v.size() >= more;
-}
-template <typename Vector>
-void make_room_in(Vector& v, std::size_t more) {
-  if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
-}
-// Replaces an array by one of more capacity; only the swap excludes searches.
-template <typename Vector>
-void enlarge(Vector& v, std::size_t capacity, FairSharedMutex& searching) {
-  Vector larger;
-  larger.reserve(capacity);
-  larger.assign(v.begin(), v.end());
-  const std::unique_lock lock(searching);
-  v.swap(larger);
-}
 
 }  // namespace protomark

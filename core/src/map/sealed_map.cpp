@@ -1,20 +1,10 @@
 #include "protomark/sealed_map.h"
 
-#include <algorithm>
-#include <mutex>
-#include <utility>
-
-#include "base/packed_numbers.h"
-#include "base/quantize.h"
 #include "file/ids.h"
 #include "file/journal.h"
-#include "file/sections.h"
 #include "map/map_sections.h"
-#include "map/positions.h"
 #include "map/sealed_store.h"
 #include "search/among.h"
-#include "search/coarse_quantizer.h"
-#include "search/inverted_lists.h"
 #include "search/recall.h"
 
 namespace protomark {
@@ -47,8 +37,7 @@ struct SealedMap::Content {
       }
       prototypes.scale = static_cast<int>(scale);
     }
-    const std::size_t size = code_bits() == 4 ? packed4_size(prototypes.rows, shape.dim)
-                                              : packed_size(prototypes.rows, shape.dim);
+    const std::size_t size = packed_size(prototypes.rows, shape.dim, prototypes.scale);
     prototypes.data = file.map<std::byte>(section::kPrototypes, size).data();
     counts = file.map<std::uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
@@ -59,12 +48,13 @@ struct SealedMap::Content {
 
   void read_row_counts() {
     row_counts = file.read<std::uint8_t>(section::kRows, shape.landmarks);
-    prototype_count = sum_rows(file, row_counts);
-    std::uint32_t row = 0;
+    prototype_count = 0;
     for (std::size_t i = 0; i < row_counts.size(); ++i) {
-      if (i % kFirstRowStep == 0) first_rows.push_back(row);
-      row += row_counts[i];
+      if (row_counts[i] == 0) file.fail("it has a landmark without prototypes");
+      if (i % kFirstRowStep == 0) first_rows.push_back(static_cast<std::uint32_t>(prototype_count));
+      prototype_count += row_counts[i];
     }
+    if (prototype_count > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
   }
 
   // Reads the inverted lists, which tell how many rows there are, padding included.
@@ -78,8 +68,7 @@ struct SealedMap::Content {
     for (const std::uint64_t n : list_rows) {
       total += n;
       if (total > prototype_count) break;
-      const std::uint64_t blocks = (n + kPackedRows - 1) / kPackedRows;
-      first_blocks.push_back(first_blocks.back() + static_cast<std::uint32_t>(blocks));
+      first_blocks.push_back(first_blocks.back() + static_cast<std::uint32_t>(packed_blocks(n)));
     }
     if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
     prototypes.rows = std::size_t{first_blocks.back()} * kPackedRows;
@@ -117,10 +106,13 @@ struct SealedMap::Content {
     return {first, first + row_counts[i]};
   }
 
-  // Returns the row of a prototype that is counted by id. With an index, the owners of all rows are
-  // read once.
-  Row row_of(std::size_t prototype) const {
-    if (nlist() == 0) return row_at(prototype);
+  // Appends the rows of a landmark. With an index, the owners of all rows are read once.
+  void append_rows(LandmarkIndex landmark, std::vector<Row>& to) const {
+    const auto [first, end] = prototypes_of(landmark);
+    if (nlist() != 0) find_rows();
+    for (std::size_t i = first; i < end; ++i) to.push_back(nlist() == 0 ? row_at(i) : rows[i]);
+  }
+  void find_rows() const {
     std::call_once(rows_found, [&] {
       std::vector<Row> found(prototype_count);
       std::vector<std::uint32_t> taken(shape.landmarks, 0);
@@ -137,7 +129,6 @@ struct SealedMap::Content {
       if (total != prototype_count) file.fail("it lacks prototypes of a landmark");
       rows = std::move(found);
     });
-    return rows[prototype];
   }
 
   int value(Row row, std::size_t d) const {
@@ -241,12 +232,14 @@ std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landm
 Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) const {
   const Content& c = unchanged();
   Matrix<float> means(landmark_ids.size(), dim());
+  std::vector<Row> rows;
   for (std::size_t i = 0; i < landmark_ids.size(); ++i) {
-    const auto [first, end] = c.prototypes_of(c.ids.find(landmark_ids[i]));
+    rows.clear();
+    c.append_rows(c.ids.find(landmark_ids[i]), rows);
     for (std::size_t d = 0; d < dim(); ++d) {
       int sum = 0;
-      for (std::size_t p = first; p < end; ++p) sum += c.value(c.row_of(p), d);
-      means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(end - first);
+      for (const Row row : rows) sum += c.value(row, d);
+      means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(rows.size());
     }
   }
   return means;
@@ -254,12 +247,12 @@ Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) 
 
 Matrix<float> SealedMap::appearances(std::int64_t id) const {
   const Content& c = unchanged();
-  const auto [first, end] = c.prototypes_of(c.ids.find(id));
-  Matrix<float> result(end - first, dim());
-  for (std::size_t i = 0; i < result.rows; ++i) {
-    const Row row = c.row_of(first + i);
+  std::vector<Row> rows;
+  c.append_rows(c.ids.find(id), rows);
+  Matrix<float> result(rows.size(), dim());
+  for (std::size_t i = 0; i < rows.size(); ++i) {
     for (std::size_t d = 0; d < dim(); ++d) {
-      result.row(i)[d] = static_cast<float>(c.value(row, d));
+      result.row(i)[d] = static_cast<float>(c.value(rows[i], d));
     }
   }
   return result;
@@ -292,21 +285,13 @@ Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOption
   check_lists(options, nlist(), kRemedy);
   const std::size_t lists =
       options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
-  const PackedPrototypes centroids{c.packed_centroids.data(), nlist(), dim()};
-  const InvertedLists inverted(c.list_rows, c.first_blocks);
-  Matches matches;
-  if (options.among) {
-    Selection selection{{}, size(), [&](LandmarkIndex landmark, std::vector<Row>& rows) {
-                          const auto [first, end] = c.prototypes_of(landmark);
-                          for (std::size_t p = first; p < end; ++p) rows.push_back(c.row_of(p));
-                        }};
-    for (const std::int64_t id : *options.among) selection.landmarks.push_back(c.ids.find(id));
-    sort_unique(selection.landmarks);
-    matches =
-        search_among(selection, c.prototypes, inverted, centroids, lists, queries, k, options);
-  } else {
-    matches = search_lists(c.prototypes, inverted, centroids, lists, queries, k, options);
-  }
+  const auto append = [&](LandmarkIndex landmark, std::vector<Row>& rows) {
+    c.append_rows(landmark, rows);
+  };
+  const LandmarkRows landmarks{size(), [&](auto id) { return c.ids.find(id); }, append};
+  Matches matches = search_map(c.prototypes, InvertedLists(c.list_rows, c.first_blocks),
+                               {c.packed_centroids.data(), nlist(), dim()}, landmarks, lists,
+                               queries, k, options);
   // Search returns landmark indices, with which ids ascend, so that ties went to the smaller id.
   if (c.ids.are_indices()) return matches;
   for (std::int64_t& id : matches.ids.data) {

@@ -1,8 +1,6 @@
 #include "search/among.h"
 
-#include <algorithm>
 #include <cmath>
-#include <cstring>
 
 namespace protomark {
 namespace {
@@ -16,21 +14,19 @@ constexpr double kReading = 40, kPacking = 900;
 // Rows that were packed anew.
 class PackedPiece {
  public:
-  void pack(const Selection& selection, std::span<const LandmarkIndex> landmarks,
+  void pack(const LandmarkRows& landmarks, std::span<const LandmarkIndex> some,
             const PackedPrototypes& from) {
     rows_.clear();
     owners_.clear();
     ids_.clear();
-    for (const LandmarkIndex landmark : landmarks) {
-      selection.append_rows(landmark, rows_);
+    for (const LandmarkIndex landmark : some) {
+      landmarks.append(landmark, rows_);
       owners_.resize(rows_.size(), landmark_at(ids_.size()));
       const std::int64_t* ids = from.landmarks.ids;
       ids_.push_back(ids != nullptr ? ids[landmark.value] : std::int64_t{landmark.value});
     }
-    const std::size_t block =
-        from.scale == 0 ? packed_size(kPackedRows, from.dim) : packed4_size(kPackedRows, from.dim);
-    const std::size_t blocks = (rows_.size() + kPackedRows - 1) / kPackedRows;
-    packed_.resize(blocks * block / sizeof(CodeVector));
+    const std::size_t block = packed_size(kPackedRows, from.dim, from.scale);
+    packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector));
     const auto* source = static_cast<const std::byte*>(from.data);
     auto* to = reinterpret_cast<std::byte*>(packed_.data());
     const auto start = [&](std::size_t row) {
@@ -68,17 +64,17 @@ class PackedPiece {
 
 }  // namespace
 
-void sort_unique(std::vector<LandmarkIndex>& landmarks) {
-  if (!std::ranges::is_sorted(landmarks)) std::ranges::sort(landmarks);
-  landmarks.erase(std::unique(landmarks.begin(), landmarks.end()), landmarks.end());
-}
-
-Matches search_among(const Selection& selection, PackedPrototypes prototypes,
-                     const InvertedLists& lists, const PackedPrototypes& centroids,
-                     std::size_t nprobe, Codes queries, std::size_t k,
-                     const SearchOptions& options) {
-  const double share = static_cast<double>(selection.landmarks.size()) /
-                       static_cast<double>(std::max<std::size_t>(selection.landmark_end, 1));
+Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
+                   const PackedPrototypes& centroids, const LandmarkRows& landmarks,
+                   std::size_t nprobe, Codes queries, std::size_t k, const SearchOptions& options) {
+  if (!options.among) {
+    return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
+  }
+  std::vector<LandmarkIndex> some;
+  for (const std::int64_t id : *options.among) some.push_back(landmarks.at(id));
+  sort_unique(some);
+  const double share = static_cast<double>(some.size()) /
+                       static_cast<double>(std::max<std::size_t>(landmarks.end, 1));
   if (options.recall && share > 0) {
     const double wanted = std::ceil(static_cast<double>(nprobe) / share);
     nprobe =
@@ -89,8 +85,8 @@ Matches search_among(const Selection& selection, PackedPrototypes prototypes,
                               : 1.0;
   const auto each = static_cast<double>(queries.rows);
   if (options.nprobe || compared * (kReading + each) < share * (kPacking + each)) {
-    std::vector<bool> among(selection.landmark_end);
-    for (const LandmarkIndex landmark : selection.landmarks) among[landmark.value] = true;
+    std::vector<bool> among(landmarks.end);
+    for (const LandmarkIndex landmark : some) among[landmark.value] = true;
     prototypes.landmarks.among = &among;
     return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
   }
@@ -98,10 +94,8 @@ Matches search_among(const Selection& selection, PackedPrototypes prototypes,
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.neighbours(k, options);
   PackedPiece piece;
-  for (std::size_t first = 0; first < selection.landmarks.size(); first += kPiece) {
-    piece.pack(selection,
-               std::span(selection.landmarks)
-                   .subspan(first, std::min(kPiece, selection.landmarks.size() - first)),
+  for (std::size_t first = 0; first < some.size(); first += kPiece) {
+    piece.pack(landmarks, std::span(some).subspan(first, std::min(kPiece, some.size() - first)),
                prototypes);
     scan_all(piece.view(), prepared, options.threads, nearest);
   }

@@ -1,6 +1,5 @@
 #include "search/coarse_quantizer.h"
 
-#include <algorithm>
 #include <bit>
 #include <cmath>
 #include <queue>
@@ -9,7 +8,6 @@
 #include "base/quantize.h"
 #include "search/inverted_lists.h"
 #include "search/recall.h"
-#include "search/scan.h"
 
 namespace protomark {
 namespace {
@@ -101,8 +99,7 @@ ListOrder::ListOrder(std::vector<Row> lists, std::size_t nlist)
   std::vector<std::uint32_t> next(nlist);
   for (std::size_t c = 0; c < nlist; ++c) {
     next[c] = first_blocks[c] * static_cast<std::uint32_t>(kPackedRows);
-    first_blocks[c + 1] =
-        first_blocks[c] + static_cast<std::uint32_t>((sizes[c] + kPackedRows - 1) / kPackedRows);
+    first_blocks[c + 1] = first_blocks[c] + static_cast<std::uint32_t>(packed_blocks(sizes[c]));
   }
   for (Row& list_or_row : new_rows) {
     if (list_or_row != kNoRow) list_or_row.value = next[list_or_row.value]++;

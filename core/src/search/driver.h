@@ -2,7 +2,6 @@
 // threads, and writes the answer.
 #pragma once
 
-#include <algorithm>
 #include <mutex>
 
 #include "base/parallel.h"

@@ -1,6 +1,5 @@
 #include "protomark/hamming.h"
 
-#include <algorithm>
 #include <cstring>
 
 #include "search/driver.h"

@@ -1,9 +1,5 @@
 #include "search/inverted_lists.h"
 
-#include <algorithm>
-
-#include "base/parallel.h"
-
 namespace protomark {
 namespace {
 
@@ -31,7 +27,7 @@ class Selection {
             std::vector<Found>& found)
       : centroids_(centroids),
         scan_(queries, batch),
-        limits_(batch.size(), CodeScan::kNoLimit),
+        limits_(batch.size(), kNoLimit),
         found_(found) {
     for (Found& of_query : found_) of_query.clear();
   }
@@ -52,7 +48,7 @@ class Selection {
         found_[q].clear();
         scan_.select({&q, 1});
         compare(
-            0, centroids_.rows, [](std::size_t) { return CodeScan::kNoLimit; },
+            0, centroids_.rows, [](std::size_t) { return kNoLimit; },
             [&](std::size_t, std::int32_t distance, std::size_t list) { take(q, distance, list); });
       }
       select(found_[q], nprobe, to + q * nprobe);
@@ -151,18 +147,6 @@ std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
     }
   });
   return result;
-}
-
-void InvertedLists::read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const {
-  blocks.clear();
-  if (chained_ != nullptr) {
-    chained_->append_blocks(list, blocks);
-    std::reverse(blocks.begin(), blocks.end());
-  } else {
-    for (std::uint32_t b = first_blocks_[list]; b < first_blocks_[list + 1]; ++b) {
-      blocks.push_back(b);
-    }
-  }
 }
 
 Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,

@@ -19,7 +19,17 @@ class InvertedLists {
     return chained_ != nullptr ? chained_->rows(list) : rows_[list];
   }
   // Replaces `blocks` by those of a list, in order, all full but the last one.
-  void read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const;
+  void read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const {
+    blocks.clear();
+    if (chained_ != nullptr) {
+      chained_->append_blocks(list, blocks);
+      std::reverse(blocks.begin(), blocks.end());
+    } else {
+      for (std::uint32_t b = first_blocks_[list]; b < first_blocks_[list + 1]; ++b) {
+        blocks.push_back(b);
+      }
+    }
+  }
 
  private:
   const ListBlocks* chained_ = nullptr;

@@ -1,8 +1,6 @@
 // The inverted lists of a learning map.
 #pragma once
 
-#include <algorithm>
-
 #include "search/packed.h"
 
 namespace protomark {
@@ -15,9 +13,9 @@ class ListBlocks {
   explicit ListBlocks(std::size_t nlist = 1) : lists_(nlist) {}
 
   std::size_t nlist() const { return lists_.size(); }
-  std::size_t blocks() const { return list_.size(); }
+  std::size_t blocks() const { return blocks_.size(); }
   std::size_t rows(std::uint32_t list) const { return lists_[list].rows; }
-  std::uint32_t list_of(Row row) const { return list_[row.value / kPackedRows]; }
+  std::uint32_t list_of(Row row) const { return blocks_[row.value / kPackedRows].list; }
   // Returns the last row of a list that is not empty.
   Row last(std::uint32_t list) const {
     const List& l = lists_[list];
@@ -28,7 +26,7 @@ class ListBlocks {
   void each_row(std::uint32_t list, const Take& take) const {
     if (lists_[list].rows == 0) return;
     std::size_t in_block = (lists_[list].rows - 1) % kPackedRows + 1;
-    for (std::uint32_t b = lists_[list].last; b != kNone; b = previous_[b]) {
+    for (std::uint32_t b = lists_[list].last; b != kNone; b = blocks_[b].previous) {
       for (std::size_t i = 0; i < in_block; ++i) {
         take(Row{static_cast<std::uint32_t>(b * kPackedRows + i)});
       }
@@ -37,16 +35,13 @@ class ListBlocks {
   }
   // Appends the blocks of a list to `to`, the last one first.
   void append_blocks(std::uint32_t list, std::vector<std::uint32_t>& to) const {
-    for (std::uint32_t b = lists_[list].last; b != kNone; b = previous_[b]) to.push_back(b);
+    for (std::uint32_t b = lists_[list].last; b != kNone; b = blocks_[b].previous) to.push_back(b);
   }
 
-  void reserve(std::size_t blocks) {
-    for (auto* v : {&list_, &previous_, &next_}) v->reserve(blocks);
-  }
+  void reserve(std::size_t blocks) { blocks_.reserve(blocks); }
   // Makes sure that the next append cannot run out of memory.
   void make_room() {
-    if (list_.size() < std::min({list_.capacity(), previous_.capacity(), next_.capacity()})) return;
-    reserve(std::max<std::size_t>(16, 2 * list_.size()));
+    if (blocks_.size() == blocks_.capacity()) reserve(std::max<std::size_t>(16, 2 * blocks()));
   }
   // Adds a row to a list, and returns it.
   Row append(std::uint32_t list) {
@@ -54,10 +49,8 @@ class ListBlocks {
     if (l.rows++ % kPackedRows == 0) {
       const auto block = static_cast<std::uint32_t>(blocks());
       make_room();
-      list_.push_back(list);
-      previous_.push_back(l.last);
-      next_.push_back(kNone);
-      if (l.last != kNone) next_[l.last] = block;
+      blocks_.push_back({list, l.last, kNone});
+      if (l.last != kNone) blocks_[l.last].next = block;
       l.last = block;
     }
     return last(list);
@@ -68,17 +61,14 @@ class ListBlocks {
     List& l = lists_[list];
     if (--l.rows % kPackedRows != 0) return kNone;
     const std::uint32_t emptied = l.last;
-    l.last = previous_[emptied];
-    if (l.last != kNone) next_[l.last] = kNone;
-    const auto moved = static_cast<std::uint32_t>(blocks() - 1);
-    if (emptied != moved) {
-      list_[emptied] = list_[moved];
-      previous_[emptied] = previous_[moved];
-      next_[emptied] = next_[moved];
-      if (previous_[emptied] != kNone) next_[previous_[emptied]] = emptied;
-      (next_[emptied] != kNone ? previous_[next_[emptied]] : lists_[list_[emptied]].last) = emptied;
+    l.last = blocks_[emptied].previous;
+    if (l.last != kNone) blocks_[l.last].next = kNone;
+    if (emptied + 1 != blocks()) {
+      const Block& moved = blocks_[emptied] = blocks_.back();
+      if (moved.previous != kNone) blocks_[moved.previous].next = emptied;
+      (moved.next != kNone ? blocks_[moved.next].previous : lists_[moved.list].last) = emptied;
     }
-    for (auto* v : {&list_, &previous_, &next_}) v->pop_back();
+    blocks_.pop_back();
     return emptied;
   }
 
@@ -87,9 +77,11 @@ class ListBlocks {
     std::uint32_t last = kNone;  // block
     std::uint32_t rows = 0;
   };
+  struct Block {
+    std::uint32_t list, previous, next;  // and the blocks before and after it in that
+  };
   std::vector<List> lists_;
-  // Of each block: its list, and the blocks before and after it in that.
-  std::vector<std::uint32_t> list_, previous_, next_;
+  std::vector<Block> blocks_;
 };
 
 }  // namespace protomark

@@ -14,23 +14,25 @@ inline constexpr std::size_t kPackedRows = 16;
 
 constexpr std::size_t packed_dim(std::size_t dim) { return (dim + 3) / 4 * 4; }
 
-constexpr std::size_t packed_size(std::size_t rows, std::size_t dim) {
-  return (rows + kPackedRows - 1) / kPackedRows * kPackedRows * packed_dim(dim);
+constexpr std::size_t packed_blocks(std::size_t rows) {
+  return (rows + kPackedRows - 1) / kPackedRows;
+}
+
+// Bytes of rows; with a `scale`, of sq4 numbers.
+constexpr std::size_t packed_size(std::size_t rows, std::size_t dim, int scale = 0) {
+  const std::size_t row = scale == 0 ? packed_dim(dim) : (dim + 7) / 8 * 4;
+  return packed_blocks(rows) * kPackedRows * row;
 }
 
 constexpr std::size_t packed_index(std::size_t row, std::size_t d, std::size_t dim) {
-  return row / kPackedRows * kPackedRows * packed_dim(dim) + d / 4 * 4 * kPackedRows +
+  return row / kPackedRows * packed_size(kPackedRows, dim) + d / 4 * 4 * kPackedRows +
          row % kPackedRows * 4 + d % 4;
 }
 
 // The same with sq4 numbers (base/quantize.h): for every 8 dimensions, 16 rows x 4 bytes, of which
 // byte j holds dimension j in its low bits and dimension 4 + j in its high ones.
-constexpr std::size_t packed4_size(std::size_t rows, std::size_t dim) {
-  return (rows + kPackedRows - 1) / kPackedRows * kPackedRows * ((dim + 7) / 8 * 4);
-}
-
 constexpr std::size_t packed4_index(std::size_t row, std::size_t d, std::size_t dim) {
-  return row / kPackedRows * kPackedRows * ((dim + 7) / 8 * 4) + d / 8 * 4 * kPackedRows +
+  return row / kPackedRows * packed_size(kPackedRows, dim, 1) + d / 8 * 4 * kPackedRows +
          row % kPackedRows * 4 + d % 4;
 }
 

@@ -1,8 +1,8 @@
 #include "search/recall.h"
 
-#include <algorithm>
 #include <cmath>
 
+#include "base/quantize.h"
 #include "search/scan.h"
 
 namespace protomark {
@@ -39,10 +39,7 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
     if (nearest < 0) continue;
     lists[q] = list_of(nearest, queries.row(q));
     const std::int8_t* centroid = &quantizer.centroids()[lists[q] * dim];
-    limits[q] = 0;
-    for (std::size_t d = 0; d < dim; ++d) {
-      limits[q] += centroid[d] * (centroid[d] - 2 * queries.row(q)[d]);
-    }
+    limits[q] = squared_distance(centroid, queries.row(q), dim) - prepared.norms()[q];
   }
   RecallTable table(n, 0);  // counts the lists up to that one
   const PackedPrototypes centroids = quantizer.packed();

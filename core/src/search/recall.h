@@ -1,8 +1,6 @@
 // Measures on a map how many inverted lists a recall takes.
 #pragma once
 
-#include <functional>
-
 #include "protomark/search.h"
 #include "search/coarse_quantizer.h"
 

@@ -1,15 +1,35 @@
 // Compares queries with packed prototypes.
 #pragma once
 
+#include <cstring>
+
 #include "search/driver.h"
 #include "search/packed.h"
 
 namespace protomark {
 
+inline std::int32_t squared_norm(const std::uint8_t* code, std::size_t dim) {
+  std::int32_t sum = 0;
+  for (std::size_t d = 0; d < dim; ++d) sum += (code[d] - 128) * (code[d] - 128);
+  return sum;
+}
+
+// Above all distances without norms, whose magnitude is below 2^24.
+inline constexpr std::int32_t kNoLimit = 1 << 25;
+
 // Queries as kernels take them: unsigned, padded to a multiple of 4 dimensions.
 class PreparedCodes {
  public:
-  explicit PreparedCodes(Codes codes);
+  explicit PreparedCodes(Codes codes)
+      : dim_(packed_dim(codes.columns)), codes_(codes.rows * dim_, 128) {
+    norms_.reserve(codes.rows);
+    for (std::size_t q = 0; q < codes.rows; ++q) {
+      for (std::size_t d = 0; d < codes.columns; ++d) {
+        codes_[q * dim_ + d] = static_cast<std::uint8_t>(codes.row(q)[d] + 128);
+      }
+      norms_.push_back(squared_norm((*this)[q], dim_));
+    }
+  }
 
   std::size_t queries() const { return norms_.size(); }
   std::size_t dim() const { return dim_; }
@@ -18,7 +38,16 @@ class PreparedCodes {
   const std::vector<std::int32_t>& norms() const { return norms_; }
 
   // Returns room for the k nearest of each query, for two if the ratio test needs them.
-  Neighbours neighbours(std::size_t k, const SearchOptions& options) const;
+  Neighbours neighbours(std::size_t k, const SearchOptions& options) const {
+    std::vector<std::int32_t> limits(queries(), kNoLimit);
+    // The ratio test needs the second nearest at any distance.
+    if (options.max_distance && !options.ratio) {
+      for (std::size_t q = 0; q < limits.size(); ++q) {
+        limits[q] = std::min(limits[q], *options.max_distance - norms_[q]);
+      }
+    }
+    return {options.ratio ? std::max<std::size_t>(k, 2) : k, limits};
+  }
 
  private:
   std::size_t dim_;
@@ -29,21 +58,48 @@ class PreparedCodes {
 // Compares queries with codes, on one thread.
 class CodeScan {
  public:
-  // Above all distances without norms, whose magnitude is below 2^24.
-  static constexpr std::int32_t kNoLimit = 1 << 25;
-
   // Compares the queries of this range, whose indices begin with 0 here.
-  CodeScan(const PreparedCodes& queries, Range range);
+  CodeScan(const PreparedCodes& queries, Range range)
+      : all_(queries),
+        range_(range),
+        codes_(queries[range.begin]),
+        n_(range.size()),
+        prefix_(queries.dim()),
+        rest_norms_(range.size(), 0) {}
   // Compares only these of them from now on.
-  void select(std::span<const std::uint32_t> queries);
+  void select(std::span<const std::uint32_t> queries) {
+    const std::size_t dim = all_.dim();
+    selected_.resize(queries.size() * dim);
+    for (std::size_t i = 0; i < queries.size(); ++i) {
+      std::copy_n(all_[range_.begin + queries[i]], dim, &selected_[i * dim]);
+    }
+    codes_ = selected_.data();
+    n_ = queries.size();
+  }
 
   // Returns how many rows to compare at a time, a multiple of 16: many queries find them in the L2
   // cache; for few, memory should deliver rows while earlier ones are compared.
-  std::size_t chunk_rows() const;
+  std::size_t chunk_rows() const {
+    const auto bytes =
+        std::clamp<std::size_t>(256 * n_, n_ <= kernels::kFewQueries ? 16384 : 8192, 65536);
+    return std::max<std::size_t>(bytes / all_.dim() / kPackedRows, 1) * kPackedRows;
+  }
 
   // Compares later rows first over a prefix of the dimensions, after `met` rows. Encoders put those
   // that tell most first, so that they usually show that a row is not among the nearest.
-  void choose_prefix(std::size_t met);
+  void choose_prefix(std::size_t met) {
+    // Few queries wait for memory, which is read as a whole. The more rows were met, the nearer are
+    // the neighbours, and the fewer dimensions suffice.
+    constexpr std::size_t kManyRows = std::size_t{1} << 18;
+    if (n_ <= kernels::kFewQueries) return;
+    const std::size_t eighths = met < kManyRows ? 6 : 5;
+    const std::size_t prefix = (all_.dim() * eighths / 8 + 3) / 4 * 4;
+    if (prefix == prefix_) return;
+    prefix_ = prefix;
+    for (std::size_t q = 0; q < range_.size(); ++q) {
+      rest_norms_[q] = squared_norm(all_[range_.begin + q] + prefix, all_.dim() - prefix);
+    }
+  }
 
   // Calls take(i, distance, row) for the rows of a packed chunk within limit_of(i) of the i-th
   // query. Distances are squared and lack the query's norm, which does not change their order.
@@ -63,7 +119,15 @@ class CodeScan {
   }
 
  private:
-  kernels::PackedCodes prepare(const std::int8_t* packed, std::size_t rows);
+  kernels::PackedCodes prepare(const std::int8_t* packed, std::size_t rows) {
+    const std::size_t dim = all_.dim(), blocks = packed_blocks(rows);
+    if (n_ <= kernels::kFewQueries) return {packed, nullptr, nullptr, blocks, dim, prefix_};
+    biases_.resize(std::max(biases_.size(), blocks * kPackedRows));
+    prefix_biases_.resize(biases_.size());
+    kernels::active().code_biases(packed, blocks, dim, prefix_, biases_.data(),
+                                  prefix_biases_.data());
+    return {packed, biases_.data(), prefix_biases_.data(), blocks, dim, prefix_};
+  }
 
   const PreparedCodes& all_;
   Range range_;
@@ -79,16 +143,46 @@ class CodeScan {
 // Reads blocks of prototypes as int8 codes, on one thread.
 class BlockReader {
  public:
-  explicit BlockReader(const PackedPrototypes& prototypes);
+  explicit BlockReader(const PackedPrototypes& prototypes)
+      : data_(static_cast<const std::uint8_t*>(prototypes.data)),
+        dim_(prototypes.dim),
+        scale_(prototypes.scale),
+        block_bytes_(packed_size(kPackedRows, dim_, scale_)),
+        code_bytes_(packed_size(kPackedRows, dim_)) {}
 
   // Returns the codes of these blocks, one after the other, valid until the next call. sq4 numbers
   // are unpacked into the cache, once for all queries.
-  const std::int8_t* read(std::size_t first_block, std::size_t n);
-  const std::int8_t* read(std::span<const std::uint32_t> blocks);
+  const std::int8_t* read(std::size_t first_block, std::size_t n) {
+    const std::uint8_t* stored = data_ + first_block * block_bytes_;
+    if (scale_ == 0) return reinterpret_cast<const std::int8_t*>(stored);
+    std::int8_t* codes = room(n);
+    copy(first_block, n, codes);
+    return codes;
+  }
+  const std::int8_t* read(std::span<const std::uint32_t> blocks) {
+    bool consecutive = true;
+    for (std::size_t i = 1; i < blocks.size(); ++i) {
+      consecutive = consecutive && blocks[i] == blocks[i - 1] + 1;
+    }
+    if (consecutive) return read(blocks[0], blocks.size());
+    std::int8_t* codes = room(blocks.size());
+    for (std::size_t i = 0; i < blocks.size(); ++i) copy(blocks[i], 1, codes + i * code_bytes_);
+    return codes;
+  }
 
  private:
-  void copy(std::size_t first_block, std::size_t n, std::int8_t* codes) const;
-  std::int8_t* room(std::size_t blocks);
+  void copy(std::size_t first_block, std::size_t n, std::int8_t* codes) const {
+    const std::uint8_t* stored = data_ + first_block * block_bytes_;
+    if (scale_ == 0) {
+      std::memcpy(codes, stored, n * block_bytes_);
+    } else {
+      kernels::active().code_unpack4(stored, n, dim_, scale_, codes);
+    }
+  }
+  std::int8_t* room(std::size_t blocks) {
+    room_.resize(std::max(room_.size(), blocks * code_bytes_ / sizeof(CodeVector)));
+    return reinterpret_cast<std::int8_t*>(room_.data());
+  }
 
   const std::uint8_t* data_;
   std::size_t dim_;
@@ -111,10 +205,37 @@ class PrototypeScan {
 
   // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16. With
   // RowLandmarks::row_counts, calls must ascend.
-  void scan(Range rows);
+  void scan(Range rows) {
+    const std::size_t chunk_rows = scan_.chunk_rows();
+    for (std::size_t row = rows.begin; row < rows.end; row += chunk_rows) {
+      const std::size_t n = std::min(chunk_rows, rows.end - row);
+      scan_.choose_prefix(row - rows.begin);
+      chunk_ = {row, row + n};
+      of_chunk_.clear();
+      scan_.compare(
+          blocks_.read(row / kPackedRows, packed_blocks(n)), n,
+          [&](std::size_t q) { return nearest_.limit(q); },
+          [&](std::size_t q, std::int32_t distance, std::size_t i) {
+            offer(nearest_[q], distance, row_at(row + i));
+          });
+    }
+  }
   // Compares some queries with the `rows` rows of some blocks, all full but the last.
   void scan(std::span<const std::uint32_t> queries, std::span<const std::uint32_t> blocks,
-            std::size_t rows);
+            std::size_t rows) {
+    constexpr std::size_t kChunk = 32;
+    scan_.select(queries);
+    for (std::size_t first = 0; first < blocks.size(); first += kChunk) {
+      const auto chunk = blocks.subspan(first, std::min(kChunk, blocks.size() - first));
+      const std::size_t n = std::min(chunk.size() * kPackedRows, rows - first * kPackedRows);
+      scan_.compare(
+          blocks_.read(chunk), n, [&](std::size_t i) { return nearest_.limit(queries[i]); },
+          [&](std::size_t i, std::int32_t distance, std::size_t at) {
+            const std::size_t row = chunk[at / kPackedRows] * kPackedRows + at % kPackedRows;
+            offer(nearest_[queries[i]], distance, row_at(row));
+          });
+    }
+  }
 
  private:
   // Offers the landmark of a row to a query, unless the row is padding.
@@ -139,7 +260,17 @@ class PrototypeScan {
     if (of_chunk_.empty()) count_chunk();
     return of_chunk_[row.value - chunk_.begin];
   }
-  void count_chunk();
+  void count_chunk() {
+    const std::uint8_t* counts = landmarks_.row_counts;
+    while (counted_ + counts[landmark_.value] <= chunk_.begin)
+      counted_ += counts[landmark_.value++];
+    LandmarkIndex landmark = landmark_;
+    std::size_t end = counted_ + counts[landmark.value];
+    for (std::size_t row = chunk_.begin; row < chunk_.end; ++row) {
+      if (row == end) end += counts[++landmark.value];
+      of_chunk_.push_back(landmark);
+    }
+  }
 
   BlockReader blocks_;
   const RowLandmarks& landmarks_;

@@ -101,7 +101,7 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     summary = scene.summary()
     sealed = scene if isinstance(scene, pm.SealedMap) else None
     landmarks = max(1, len(scene))
-    ids = sum(sections.get(name, 0) for name in ("ids", "idblocks", "idgaps")) / landmarks
+    ids = sum(sections.get(name, 0) for name in ("idblocks", "idgaps")) / landmarks
     error = None if sealed is None else sealed.position_error
     appearance_bits = scene.appearance_bits if isinstance(scene, pm.PrototypeMap) else 0
     several = appearance_bits > 0 or scene.prototype_count != len(scene)

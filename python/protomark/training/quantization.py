@@ -32,13 +32,13 @@ _MAX_MULT = 1 << 30
 class Layer(TypedDict):
     """One integer layer, as `protomark.Encoder` takes it.
 
-    weights (out, in) int8, bias (out,) int32, mult (out,) int32 > 0, shift 1..62, and table (256,)
-    uint8, None for the last layer.
+    weights (out, in) int8, bias (out,) int32, multipliers (out,) int32 > 0, shift 1..62, and table
+    (256,) uint8, None for the last layer.
     """
 
     weights: NDArray[np.int8]
     bias: NDArray[np.int32]
-    mult: NDArray[np.int32]
+    multipliers: NDArray[np.int32]
     shift: int
     table: NDArray[np.uint8] | None
 
@@ -151,12 +151,12 @@ class QuantizedNetwork(nn.Module):
             step = activation.step if activation else float(self.scale)
             ratio = real.double().cpu().numpy() / step
             shift = int(np.clip(np.floor(np.log2(_MAX_MULT / ratio.max())), 1, 62))
-            mult = np.clip(np.rint(ratio * 2.0**shift), 1, _MAX_MULT)
+            multipliers = np.clip(np.rint(ratio * 2.0**shift), 1, _MAX_MULT)
             layers.append(
                 Layer(
                     weights=weights.cpu().numpy().astype(np.int8),
                     bias=bias.cpu().numpy().astype(np.int32),
-                    mult=mult.astype(np.int32),
+                    multipliers=multipliers.astype(np.int32),
                     shift=shift,
                     table=activation.table.cpu().numpy().astype(np.uint8) if activation else None,
                 )
@@ -202,7 +202,7 @@ def integer_forward(layers: list[Layer], descriptors: NDArray[np.uint8]) -> NDAr
         # Products and sums stay far below 2^53, so float64 matrix products are exact, and fast.
         sums = x.astype(np.float64) @ layer["weights"].T.astype(np.float64)
         acc = sums.astype(np.int64) + layer["bias"]
-        t = (acc * layer["mult"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
+        t = (acc * layer["multipliers"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
         if layer["table"] is None:
             codes: NDArray[np.int8] = np.clip(t, -127, 127).astype(np.int8)
             return codes

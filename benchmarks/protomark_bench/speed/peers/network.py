@@ -39,7 +39,7 @@ def float_layers(encoder: pm.Encoder, dim: int) -> list[FloatLayer]:
         last = layer["table"] is None
         rows = slice(dim if last else None)
         whole = layer["weights"][rows].astype(np.float64)
-        scale = layer["mult"][rows] / 2.0 ** layer["shift"]
+        scale = layer["multipliers"][rows] / 2.0 ** layer["shift"]
         step, middle, next_unit, next_zero = (1.0, 0.0, 1.0, 0) if last else _fit(layer["table"])
         # sum = whole @ x + bias over the whole x; x = real / unit + zero.
         weights = whole * (scale * step / unit)[:, None]
