@@ -8,8 +8,6 @@ from typing import Any
 
 from protomark.plot import INK, MUTED, MapPictures, map_figures, svg_text
 
-_MAX_NAMES = 20
-
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width">
@@ -51,6 +49,12 @@ def markdown_table(
 def percent(share: float | None) -> str:
     """A share in percent, a dash for None."""
     return "–" if share is None else f"{100 * share:.1f}%"
+
+
+def first_of(names: Sequence[str], limit: int = 3) -> str:
+    """The first names of a list, and how many follow."""
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
 
 
 def map_page(facts: Mapping[str, Any], pictures: MapPictures, title: str) -> str:
@@ -108,9 +112,8 @@ def _map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _unregistered(by_reason: Mapping[str, Sequence[str]]) -> str:
     if not by_reason:
         return "<p>None."
-    items = []
-    for reason, names in by_reason.items():
-        more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-        shown = escape(", ".join(names[:_MAX_NAMES]))
-        items.append(f"<li>{escape(reason)} ({len(names)}): {shown}{more}")
+    items = (
+        f"<li>{escape(reason)} ({len(names)}): {escape(first_of(names, 20))}"
+        for reason, names in by_reason.items()
+    )
     return f"<ul>{''.join(items)}</ul>"

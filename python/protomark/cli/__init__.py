@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import signal
+import sys
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -79,7 +81,11 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from protomark.interrupt import Interrupted
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal may know ASCII only
     try:
+        if "" in sys.argv[1:]:
+            raise ValueError("an argument is empty: is a variable of the shell not set?")
         app(prog_name="protomark")
     except Interrupted as stop:
         from protomark.cli.terminal import note

@@ -54,12 +54,13 @@ def build(
     """
     from protomark import Encoder
     from protomark.cli.info import show
-    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.cli.terminal import progress_bar, write_json
+    from protomark.files import check_outputs
     from protomark.maps import cameras
     from protomark.maps.build import build_map
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
-    from protomark.maps.seal import SealOptions, seal_map, sealed_path
+    from protomark.maps.seal import SealRequest, seal_map, sealed_path
     from protomark.maps.selection import Views
     from protomark.threads import available_threads
     from protomark.tracks.file import Tracks
@@ -83,8 +84,8 @@ def build(
         progress("write the map", 0, 0)
         scene.save(output)
         if sealed:
-            options = SealOptions(threads=threads)
-            seal_map(scene, sealed, options, lambda: Views.of_tracks(observed), progress)
+            request = SealRequest(threads=threads)
+            seal_map(scene, sealed, request, lambda: Views.of_tracks(observed), progress)
         facts = describe(output)
         if sealed:
             facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}

@@ -38,14 +38,8 @@ def calibrate(
     protomark calibrate freak.pme tracks/*.freak.safetensors
     """
     from protomark import Encoder
-    from protomark.cli.terminal import (
-        check_outputs,
-        console,
-        progress_bar,
-        say,
-        table_of,
-        write_json,
-    )
+    from protomark.cli.terminal import console, progress_bar, say, table_of, write_json
+    from protomark.files import check_outputs
     from protomark.matching import MIN_PROBABILITY
     from protomark.threads import available_threads
     from protomark.training.match_calibration import calibrate as fit

@@ -31,8 +31,9 @@ def demo(
 
     protomark demo
     """
-    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.cli.terminal import progress_bar, write_json
     from protomark.evaluation.demo import run_demo
+    from protomark.files import check_outputs
 
     check_outputs(json_file)
     with progress_bar() as progress:

@@ -70,13 +70,7 @@ def evaluate(
 
     protomark evaluate kitchen.freak.safetensors --plot precision.png
     """
-    from protomark.cli.terminal import (
-        check_outputs,
-        comma_separated,
-        console,
-        note,
-        progress_bar,
-    )
+    from protomark.cli.terminal import comma_separated, console, note, progress_bar
     from protomark.evaluation.results import (
         caption,
         evaluation_markdown,
@@ -86,7 +80,7 @@ def evaluate(
         save_precision_plot,
     )
     from protomark.evaluation.run import EvaluationOptions, evaluate_files
-    from protomark.files import write_text
+    from protomark.files import check_outputs, write_text
     from protomark.plot import check_suffix
     from protomark.threads import available_threads
 

@@ -90,11 +90,16 @@ def localize(
 
     protomark localize kitchen new-photos/
     """
-    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.features.images import passed_over
+    from protomark.files import check_folder, check_outputs
     from protomark.localization.batch import LocalizationRequest, localize_files
     from protomark.threads import available_threads
 
+    check_folder(output)
     check_outputs(json_file, inputs=[scene, *images, camera, poses, priors])
+    for line in filter(None, map(passed_over, images)):
+        note(line)
     request = LocalizationRequest(
         scene,
         images,

@@ -9,8 +9,6 @@ import typer
 
 from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, Threads
 
-_NAMES_SHOWN = 3
-
 
 def map_(
     images: Annotated[
@@ -83,8 +81,10 @@ def map_(
 
     Ctrl-C writes the map so far, and the same command with --resume continues it.
     """
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.extras import optional
+    from protomark.features.images import passed_over
+    from protomark.files import check_folder, check_outputs
     from protomark.mapping.options import MappingOptions
     from protomark.mapping.session import MapRequest, make_map
     from protomark.threads import available_threads
@@ -94,7 +94,10 @@ def map_(
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
+    check_folder(scene)
     check_outputs(json_file, inputs=[images, camera, poses, encoder])
+    if line := passed_over(images):
+        note(line)
     if view:
         optional("rerun")
     request = MapRequest(
@@ -128,6 +131,7 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
     from rich.markup import escape
 
     from protomark.cli.terminal import say
+    from protomark.report import first_of
 
     ratio = figures["descriptor_bytes"] / max(figures["memory_bytes"], 1)
     say(f"[bold]{escape(str(scene))}[/]")
@@ -152,7 +156,5 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
         f"second; see {scene / 'report.html'}"
     )
     for reason, names in figures["not_registered"].items():
-        shown = ", ".join(names[:_NAMES_SHOWN])
-        more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
-        say(f"  [yellow]without a pose[/]: {escape(shown)}{more}: {escape(reason)}")
+        say(f"  [yellow]without a pose[/]: {escape(first_of(names))}: {escape(reason)}")
     say(f"  next: protomark localize {escape(str(scene))} IMAGES")

@@ -72,15 +72,16 @@ def seal(
     protomark seal kitchen -o kitchen.sealed.pmk --megabytes 1
     """
     from protomark.cli.info import show
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.files import check_outputs
     from protomark.maps.info import describe
     from protomark.maps.open import SCENE_MAP
-    from protomark.maps.seal import SealOptions
+    from protomark.maps.seal import SealRequest
     from protomark.maps.seal import seal as seal_source
     from protomark.threads import available_threads
 
     check_outputs(output, json_file, inputs=[source, source / SCENE_MAP])
-    options = SealOptions(
+    request = SealRequest(
         bytes_per_landmark=bytes_per_landmark or None,
         megabytes=megabytes,
         landmarks=landmarks,
@@ -89,7 +90,7 @@ def seal(
         threads=threads or available_threads(),
     )
     with progress_bar() as progress:
-        made = seal_source(source, output, options, progress)
+        made = seal_source(source, output, request, progress)
     if made["chosen_by"]:
         note(
             f"{made['landmarks']:,} of {made['landmarks_of_the_source']:,} landmarks were kept, "

@@ -42,12 +42,12 @@ def split(
     protomark split city.pmk --cell-size 50 --sealed -o tiles/
     """
     from protomark.cli.terminal import (
-        check_outputs,
         comma_separated_numbers,
         print_facts,
         progress_bar,
         write_json,
     )
+    from protomark.files import check_outputs
     from protomark.maps.split import split_file
 
     check_outputs(json_file, inputs=[file])

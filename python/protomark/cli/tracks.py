@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from protomark.cli.options import JsonFile, MaxKeypoints, Threads
-
-if TYPE_CHECKING:
-    from protomark.tracks.make import TracksInput
 
 _BAR = 30  # characters
 
@@ -102,10 +99,11 @@ def tracks(
 
     protomark tracks kitchen/ -o tracks -d freak -d orb
     """
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.files import check_folder, check_outputs
     from protomark.threads import available_threads
-    from protomark.tracks.extract import TracksOptions
-    from protomark.tracks.make import TracksInput, make_augmented_tracks, make_tracks
+    from protomark.tracks.extract import TracksOptions, find_sequence
+    from protomark.tracks.make import make_augmented_tracks, make_tracks
 
     options = [
         TracksOptions(
@@ -121,8 +119,20 @@ def tracks(
         )
         for name in dict.fromkeys(descriptors or ["freak"])
     ]
-    sources = [TracksInput(folder, images, model, database) for folder in folders]
-    _check(sources, output, augmentations)
+    if augmentations < 0:
+        raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
+    if augmentations and database:
+        raise ValueError("--augmentations needs images, which --database does not read: drop one")
+    if len(folders) > 1 and (images or model or database):
+        raise ValueError("--images, --model and --database are for one FOLDER: give only one")
+    sources = [find_sequence(folder, images, model, database) for folder in folders]
+    names = [source.name for source in sources]
+    if double := sorted({n for n in names if names.count(n) > 1}):
+        raise ValueError(
+            f"two folders are named {double[0]} and would write the same file: run the command for "
+            "each, with its own -o"
+        )
+    check_folder(output)
     check_outputs(json_file, inputs=[database])
     threads = threads or available_threads()
     facts = []
@@ -138,40 +148,25 @@ def tracks(
             _show(facts[-1], made.tracks.info)
             if not augmentations:
                 continue
-            folder = images or source.folder / "images"
             with progress_bar(f"{source.name}: ") as progress:
                 more = make_augmented_tracks(
-                    made, folder, augmentations, force=force, threads=threads, progress=progress
+                    made,
+                    source.images,
+                    augmentations,
+                    force=force,
+                    threads=threads,
+                    progress=progress,
                 )
             facts.append(more.as_dict())
             _show_augmented(facts[-1], facts[-2])
     write_json(json_file, facts)
 
 
-def _check(sources: list[TracksInput], output: Path, augmentations: int) -> None:
-    """Raise before any work if options conflict."""
-    first = sources[0]
-    if augmentations < 0:
-        raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
-    if augmentations and first.database:
-        raise ValueError("--augmentations needs images, which --database does not read: drop one")
-    if len(sources) > 1 and (first.images or first.model or first.database):
-        raise ValueError("--images, --model and --database are for one FOLDER: give only one")
-    names = [source.name for source in sources]
-    double = sorted({n for n in names if names.count(n) > 1})
-    if double:
-        raise ValueError(
-            f"two folders are named {double[0]} and would write the same file: run the command for "
-            "each, with its own -o"
-        )
-    if output.exists() and not output.is_dir():
-        raise NotADirectoryError(f"{output} is not a folder: name one for the tracks with -o")
-
-
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
     from rich.markup import escape
 
     from protomark.cli.terminal import note, say
+    from protomark.report import first_of
 
     say(f"[bold]{escape(facts['file'])}[/]")
     say(
@@ -191,10 +186,11 @@ def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
         )
         if error > 1 and not refined:
             note("  these poses are only roughly right: --refine-poses auto refines them")
-    without = info.get("images_without_pose") or []
-    if without:
-        more = f" and {len(without) - 3} more" if len(without) > 3 else ""
-        say(f"  left out without a pose: {escape(', '.join(without[:3]))}{more}")
+    if without := info.get("images_without_pose"):
+        say(f"  left out without a pose: {escape(first_of(without))}")
+    if unreadable := info.get("images_unreadable"):
+        reasons = [f"{name} ({reason})" for name, reason in unreadable.items()]
+        say(f"  left out, cannot be read: {escape(first_of(reasons))}")
     say("  observations per landmark:")
     top = max(facts["track_length_histogram"].values(), default=0) or 1
     for label, count in facts["track_length_histogram"].items():

@@ -75,14 +75,9 @@ def train(
 
     Ctrl-C leaves a checkpoint, and the same command with --resume continues.
     """
-    from protomark.cli.terminal import (
-        check_outputs,
-        comma_separated_numbers,
-        note,
-        progress_bar,
-        write_json,
-    )
+    from protomark.cli.terminal import comma_separated_numbers, note, progress_bar, write_json
     from protomark.extras import optional
+    from protomark.files import check_outputs
 
     inputs = [*tracks, *(validation or []), *(report or [])]
     check_outputs(output, json_file, inputs=inputs)

@@ -52,62 +52,37 @@ _SIZE = 33
 
 @dataclass(frozen=True)
 class DemoRow:
-    """Results of one method.
+    """Results of one method."""
 
-    Attributes:
-        name, label, family: see `methods.MethodChoice`.
-        bytes_per_landmark: all that matching needs, including the count, without the position.
-        map_bytes: bytes of all landmarks with positions.
-        precision: share of query descriptors whose nearest landmark is their own.
-        found: query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
-        frames: query keyframes.
-        median_error: median distance from the true camera centre, as a share of that depth.
-        ms_per_frame: milliseconds to match and localize a frame on one thread.
-    """
-
+    # name, label, family: see `methods.MethodChoice`.
     name: str
     label: str
     family: str
-    bytes_per_landmark: float
-    map_bytes: int
-    precision: float
-    found: int
-    frames: int
-    median_error: float
-    ms_per_frame: float
+    bytes_per_landmark: float  # all that matching needs, including the count, without the position
+    map_bytes: int  # bytes of all landmarks with positions
+    precision: float  # share of query descriptors whose nearest landmark is their own
+    found: int  # query keyframes whose pose is within 1 % of the median scene depth and 2 degrees
+    frames: int  # query keyframes
+    median_error: float  # median distance from the true camera centre, as a share of that depth
+    ms_per_frame: float  # milliseconds to match and localize a frame on one thread
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The maps of the demo, and its comparison.
-
-    Attributes:
-        sequence: name of the sequence.
-        descriptor: name of the descriptor.
-        bits: length of the descriptor in bits.
-        support_keyframes: keyframes that build the map.
-        landmarks: landmarks of the map.
-        observations: observations of the map.
-        rows: one row per method.
-        shown: name of the method that the sealed map and the picture show.
-        folder: folder of the files.
-        files: sizes in bytes by file name.
-        encoder_bytes: bytes of the encoder in the sealed map.
-        seconds: duration of the demo.
-    """
+    """The maps of the demo, and its comparison."""
 
     sequence: str
     descriptor: str
-    bits: int
-    support_keyframes: int
-    landmarks: int
-    observations: int
-    rows: list[DemoRow]
-    shown: str
-    folder: str
-    files: dict[str, int]
-    encoder_bytes: int
-    seconds: float
+    bits: int  # length of the descriptor in bits
+    support_keyframes: int  # keyframes that build the map
+    landmarks: int  # landmarks of the map
+    observations: int  # observations of the map
+    rows: list[DemoRow]  # one row per method
+    shown: str  # name of the method that the sealed map and the picture show
+    folder: str  # folder of the files
+    files: dict[str, int]  # sizes in bytes by file name
+    encoder_bytes: int  # bytes of the encoder in the sealed map
+    seconds: float  # duration of the demo
 
 
 def run_demo(

@@ -41,23 +41,14 @@ PROJECTED_DIMS = (8, 16, 32, 64)
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """A method that can be compared.
+    """A method that can be compared."""
 
-    Attributes:
-        name: short name, such as "pca-16".
-        label: its name in tables and plots.
-        family: name of methods that differ only in size, which plots connect by a line.
-        build: builds the map of a support.
-        default: whether it is compared unless methods are named.
-        upright: whether it takes upright descriptors (`protomark.features.upright`).
-    """
-
-    name: str
-    label: str
-    family: str
-    build: Callable[[Support], Method]
-    default: bool = True
-    upright: bool = False
+    name: str  # short name, such as "pca-16"
+    label: str  # its name in tables and plots
+    family: str  # name of methods that differ only in size, which plots connect by a line
+    build: Callable[[Support], Method]  # builds the map of a support
+    default: bool = True  # whether it is compared unless methods are named
+    upright: bool = False  # whether it takes upright descriptors (`protomark.features.upright`)
 
 
 class PrototypeMethod(Method):

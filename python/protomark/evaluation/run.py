@@ -34,24 +34,17 @@ POSE_FRAMES = 20
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """How an evaluation runs.
+    """How an evaluation runs."""
 
-    Attributes:
-        seeds: seeds of the splits.
-        pose_frames: limit on query keyframes to localize per seed.
-        threads: threads for all that is not timed.
-        encoders: names or files of encoders, for the tracks' descriptors or their upright forms;
-            by default the one that ships for the descriptor.
-        methods: names of methods, or of families of methods; by default the default ones.
-        discriminant_from: tracks files to learn linear discriminants from; by default each
-            sequence's support.
-    """
-
-    seeds: Sequence[int] = (0, 1, 2)
-    pose_frames: int = POSE_FRAMES
-    threads: int = 1
+    seeds: Sequence[int] = (0, 1, 2)  # seeds of the splits
+    pose_frames: int = POSE_FRAMES  # limit on query keyframes to localize per seed
+    threads: int = 1  # threads for all that is not timed
+    # Names or files of encoders, for the tracks' descriptors or their upright forms; by default the
+    # one that ships for the descriptor.
     encoders: Sequence[str] = ()
+    # Names of methods, or of families of methods; by default the default ones.
     methods: Sequence[str] = ()
+    # Tracks files to learn linear discriminants from; by default each sequence's support.
     discriminant_from: Sequence[Path] = ()
 
 

@@ -10,17 +10,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class DescriptorKind:
-    """A descriptor and the detector that it is commonly used with.
+    """A descriptor and the detector that it is commonly used with."""
 
-    Attributes:
-        name: name on the command line and in files, such as "freak".
-        bytes: length of a descriptor in bytes.
-        detector: the detector of its keypoints.
-    """
-
-    name: str
-    bytes: int
-    detector: str
+    name: str  # name on the command line and in files, such as "freak"
+    bytes: int  # length of a descriptor in bytes
+    detector: str  # the detector of its keypoints
 
     @property
     def bits(self) -> int:

@@ -15,7 +15,7 @@ import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,17 @@ class ColmapModel:
     def centers(self) -> NDArray[np.float64]:
         """(m, 3) float64, camera centres in the world."""
         return camera_centers(self.cam_from_world)
+
+    def where(self, keep: Sequence[bool]) -> ColmapModel:
+        """The model with the images for which `keep` (m,) is true."""
+        rows = np.flatnonzero(keep)
+        return replace(
+            self,
+            names=[self.names[i] for i in rows],
+            image_ids=self.image_ids[rows],
+            camera_ids=self.camera_ids[rows],
+            cam_from_world=self.cam_from_world[rows],
+        )
 
     def check_for_triangulation(self, path: Path) -> None:
         """Raise ValueError unless two images have poses at different positions."""

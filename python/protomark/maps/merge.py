@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import protomark as pm
+from protomark.files import check_outputs
 from protomark.progress import Progress, silent, tracked
 
 MAX_ID = 2**63 - 1
@@ -29,7 +30,13 @@ def merge_files(
             the first, or is the output.
         OSError: a file cannot be read or written.
     """
-    _check_inputs(inputs, output)
+    check_outputs(output, inputs=inputs)
+    if len(inputs) < 2:
+        raise ValueError("name at least two maps to merge")
+    resolved = [path.resolve() for path in inputs]
+    for path, same in zip(inputs, resolved, strict=True):
+        if resolved.count(same) > 1:
+            raise ValueError(f"{path} is named twice, and its observations would count twice")
     files: list[dict[str, Any]] = []
     merged: pm.PrototypeMap | None = None
     for path in tracked(inputs, progress, "merge"):
@@ -58,18 +65,6 @@ def merge_files(
         "appearance_bits": merged.appearance_bits or None,
         "bytes": output.stat().st_size,
     }
-
-
-def _check_inputs(inputs: Sequence[Path], output: Path) -> None:
-    if len(inputs) < 2:
-        raise ValueError("name at least two maps to merge")
-    seen: set[Path] = set()
-    for path in inputs:
-        if path.resolve() in seen:
-            raise ValueError(f"{path} is named twice, and its observations would count twice")
-        seen.add(path.resolve())
-        if path.exists() and output.exists() and path.samefile(output):
-            raise ValueError(f"{output} is one of the maps to merge: name another file to write")
 
 
 def open_learning_map(path: Path) -> pm.PrototypeMap:

@@ -32,15 +32,10 @@ _FIRST_ROUND = 8
 
 @dataclass(frozen=True)
 class Views:
-    """Which bins the landmarks of a map fall into; a pair per landmark and bin.
+    """Which bins the landmarks of a map fall into; a pair per landmark and bin."""
 
-    Attributes:
-        ids: (v,) int64, landmark ids.
-        bins: (v,) int64, from 0 on.
-    """
-
-    ids: NDArray[np.int64]
-    bins: NDArray[np.int64]
+    ids: NDArray[np.int64]  # (v,) int64, landmark ids
+    bins: NDArray[np.int64]  # (v,) int64, from 0 on
 
     @classmethod
     def of_images(

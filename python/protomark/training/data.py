@@ -22,44 +22,28 @@ MIN_LANDMARKS = 500
 
 @dataclass(frozen=True)
 class TrainingSource:
-    """A tracks file in the card.
+    """A tracks file in the card."""
 
-    Attributes:
-        name: file name up to its first dot.
-        file: file name.
-        keyframes, landmarks, observations: their numbers.
-        licence: licence that the user or the tracks' `info` states, else "".
-    """
-
-    name: str
-    file: str
+    name: str  # file name up to its first dot
+    file: str  # file name
+    # keyframes, landmarks, observations: their numbers.
     keyframes: int
     landmarks: int
     observations: int
-    licence: str
+    licence: str  # licence that the user or the tracks' `info` states, else ""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The data of a training.
+    """The data of a training."""
 
-    Attributes:
-        descriptor: name of the descriptor of all tracks.
-        bits: length of the descriptor.
-        views: training sequences.
-        trials: splits of the validation sequences.
-        sources: the training files.
-        validation_sources: the validation files.
-        fingerprint: SHA-256 of all descriptors and landmarks, hexadecimal.
-    """
-
-    descriptor: str
+    descriptor: str  # name of the descriptor of all tracks
     bits: int
-    views: list[Views]
-    trials: list[Trial]
-    sources: list[TrainingSource]
-    validation_sources: list[TrainingSource]
-    fingerprint: str
+    views: list[Views]  # training sequences
+    trials: list[Trial]  # splits of the validation sequences
+    sources: list[TrainingSource]  # the training files
+    validation_sources: list[TrainingSource]  # the validation files
+    fingerprint: str  # SHA-256 of all descriptors and landmarks, hexadecimal
 
 
 def read_tracks(path: Path, upright: bool) -> Tracks:

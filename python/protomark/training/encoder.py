@@ -41,36 +41,23 @@ _TIMED_DESCRIPTORS, _TIMED_ROUNDS = 20_000, 5
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train an encoder from, and what to write.
+    """What to train an encoder from, and what to write."""
 
-    Attributes:
-        training: tracks files to train on.
-        validation: tracks files that select the model.
-        output: the model file to write; its card (.md) and a picture of the training (.png) are
-            written beside it, and a checkpoint (`<output>.checkpoint`) until training ends.
-        options: options that determine the weights.
-        report: further tracks files to measure the encoder on.
-        resume: whether to continue from the checkpoint.
-        upright: whether to train on angles and sizes of keypoints, too.
-        name: name of the encoder; if empty, the output's stem.
-        licence: licence of the weights.
-        data_licences: licences of the sequences by name, for the card and the model file.
-        device: "cpu" or "cuda".
-        threads: CPU threads; 0: one per core.
-    """
-
-    training: Sequence[Path]
-    validation: Sequence[Path]
+    training: Sequence[Path]  # tracks files to train on
+    validation: Sequence[Path]  # tracks files that select the model
+    # The model file to write; its card (.md) and a picture of the training (.png) are written
+    # beside it, and a checkpoint (`<output>.checkpoint`) until training ends.
     output: Path
-    options: TrainingOptions
-    report: Sequence[Path] = ()
-    resume: bool = False
-    upright: bool = False
-    name: str = ""
-    licence: str = ""
+    options: TrainingOptions  # options that determine the weights
+    report: Sequence[Path] = ()  # further tracks files to measure the encoder on
+    resume: bool = False  # whether to continue from the checkpoint
+    upright: bool = False  # whether to train on angles and sizes of keypoints, too
+    name: str = ""  # name of the encoder; if empty, the output's stem
+    licence: str = ""  # licence of the weights
+    # Licences of the sequences by name, for the card and the model file.
     data_licences: Mapping[str, str] = field(default_factory=dict)
-    device: str = "cpu"
-    threads: int = 0
+    device: str = "cpu"  # "cpu" or "cuda"
+    threads: int = 0  # CPU threads; 0: one per core
 
     @property
     def card_path(self) -> Path:

@@ -31,18 +31,13 @@ Search = Callable[[NDArray[np.uint8]], tuple[NDArray[np.int64], NDArray[np.int32
 
 @dataclass(frozen=True)
 class LabelledMatches:
-    """The nearest landmarks of all n keypoints of several frames.
+    """The nearest landmarks of all n keypoints of several frames."""
 
-    Attributes:
-        distances: (n, 2) float64, squared distances to the two nearest landmarks.
-        right: (n,) bool, whether the nearest landmark is the true one, or projects to within half a
-            percent of the image's longer side.
-        frame: (n,) int64, index of each keypoint's frame.
-    """
-
-    distances: NDArray[np.float64]
+    distances: NDArray[np.float64]  # (n, 2) float64, squared distances to the two nearest landmarks
+    # (n,) bool, whether the nearest landmark is the true one, or projects to within half a percent
+    # of the image's longer side.
     right: NDArray[np.bool_]
-    frame: NDArray[np.int64]
+    frame: NDArray[np.int64]  # (n,) int64, index of each keypoint's frame
 
 
 def label_matches(tracks: Tracks, frames: Sequence[QueryFrame], search: Search) -> LabelledMatches:
@@ -102,23 +97,14 @@ def matches_by_dim(
 
 @dataclass(frozen=True)
 class CalibrationQuality:
-    """How well a calibration fits a sequence to which it was not fitted, unless it is the only one.
-
-    Attributes:
-        sequence: name of the sequence.
-        dim: code length.
-        right: share of keypoints whose nearest landmark is right.
-        precision: share of accepted matches that are right.
-        recall: share of right matches that are accepted.
-        expected: mean probability of accepted matches, to compare with `precision`.
-    """
+    """How well a calibration fits a sequence: another than those that it was fitted to, if any."""
 
     sequence: str
-    dim: int
-    right: float
-    precision: float
-    recall: float
-    expected: float
+    dim: int  # code length
+    right: float  # share of keypoints whose nearest landmark is right
+    precision: float  # share of accepted matches that are right
+    recall: float  # share of right matches that are accepted
+    expected: float  # mean probability of accepted matches, to compare with `precision`
 
 
 def measure_calibration(

@@ -17,16 +17,11 @@ from protomark.tracks.file import Tracks
 
 @dataclass(frozen=True)
 class Views:
-    """All views of one sequence's landmarks, grouped by landmark.
-
-    Attributes:
-        name: name of the sequence.
-        descriptors: (n, B) uint8, sorted by landmark.
-        starts: (l + 1,) int64; the views of landmark i are rows starts[i]:starts[i + 1].
-    """
+    """All views of one sequence's landmarks, grouped by landmark."""
 
     name: str
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[np.uint8]  # (n, B) uint8, sorted by landmark
+    # (l + 1,) int64; the views of landmark i are rows starts[i]:starts[i + 1].
     starts: NDArray[np.int64]
 
     @classmethod
@@ -50,16 +45,11 @@ class Views:
 
 @dataclass(frozen=True)
 class Batch:
-    """The views of a batch's landmarks.
+    """The views of a batch's landmarks."""
 
-    Attributes:
-        descriptors: (n, B) uint8, grouped by landmark.
-        landmarks: (n,) int64, 0..m-1, ascending.
-        queries: (q,) int64, rows whose landmark has at least two other views in the batch.
-    """
-
-    descriptors: NDArray[np.uint8]
-    landmarks: NDArray[np.int64]
+    descriptors: NDArray[np.uint8]  # (n, B) uint8, grouped by landmark
+    landmarks: NDArray[np.int64]  # (n,) int64, 0..m-1, ascending
+    # (q,) int64, rows whose landmark has at least two other views in the batch.
     queries: NDArray[np.int64]
 
 

@@ -32,39 +32,25 @@ CHECKPOINT_VERSION = 1
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Options that determine the weights, besides the data.
+    """Options that determine the weights, besides the data."""
 
-    Attributes:
-        dims: ascending prefixes that are trained to work alone; the last is the full length.
-        hidden: widths of the hidden layers; None: `default_hidden`.
-        steps: number of batches.
-        landmarks: landmarks per batch.
-        views: limit on views per landmark in a batch.
-        queries: limit on queries per landmark in a batch.
-        balance: see `BatchSampler`.
-        noise: probability that a bit is flipped.
-        learning_rate: peak rate of AdamW after a warm-up, from which it falls as a cosine.
-        weight_decay: weight decay of AdamW.
-        clip: largest norm of the gradient.
-        quantized_share: share of the steps, the last ones, with quantisation in the loop.
-        validate_every: steps between validations and checkpoints.
-        seed: seed of weights and batches.
-    """
-
+    # Ascending prefixes that are trained to work alone; the last is the full length.
     dims: tuple[int, ...] = (8, 16, 24, 32, 48, 64)
-    hidden: tuple[int, ...] | None = None
-    steps: int = 4000
-    landmarks: int = 1000
-    views: int = 9
-    queries: int = 3
-    balance: float = 0.5
-    noise: float = 0.03
+    hidden: tuple[int, ...] | None = None  # widths of the hidden layers; None: `default_hidden`
+    steps: int = 4000  # number of batches
+    landmarks: int = 1000  # landmarks per batch
+    views: int = 9  # limit on views per landmark in a batch
+    queries: int = 3  # limit on queries per landmark in a batch
+    balance: float = 0.5  # see `BatchSampler`
+    noise: float = 0.03  # probability that a bit is flipped
+    # Peak rate of AdamW after a warm-up, from which it falls as a cosine.
     learning_rate: float = 5e-3
-    weight_decay: float = 0.1
-    clip: float = 1.0
+    weight_decay: float = 0.1  # weight decay of AdamW
+    clip: float = 1.0  # largest norm of the gradient
+    # Share of the steps, the last ones, with quantisation in the loop.
     quantized_share: float = 0.25
-    validate_every: int = 500
-    seed: int = 0
+    validate_every: int = 500  # steps between validations and checkpoints
+    seed: int = 0  # seed of weights and batches
 
     def check(self) -> None:
         """Raise ValueError if an option is invalid."""
@@ -105,23 +91,14 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class ValidationStep:
-    """The result of a validation.
+    """The result of a validation."""
 
-    Attributes:
-        step: number of finished steps.
-        steps: number of all steps.
-        loss: mean training loss since the last validation.
-        precision: precision by code length, of the network in the loop.
-        quantized: whether quantisation is in the loop.
-        seconds: training time so far, over all runs.
-    """
-
-    step: int
-    steps: int
-    loss: float
-    precision: dict[int, float]
-    quantized: bool
-    seconds: float
+    step: int  # number of finished steps
+    steps: int  # number of all steps
+    loss: float  # mean training loss since the last validation
+    precision: dict[int, float]  # precision by code length, of the network in the loop
+    quantized: bool  # whether quantisation is in the loop
+    seconds: float  # training time so far, over all runs
 
     @property
     def mean_precision(self) -> float:
