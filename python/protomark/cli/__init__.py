@@ -92,7 +92,9 @@ def main() -> None:
 
         note(str(stop))
         raise SystemExit(130) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as end:
+        if isinstance(end, SystemExit) and end.code != 130:
+            raise
         _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error

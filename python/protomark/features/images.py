@@ -36,7 +36,7 @@ def passed_over(folder: Path) -> str:
     if not kinds:
         return ""
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(5))
-    return f"{folder}: passed over {len(others)} files that are no images: {listed}"
+    return f"{folder}: files that are no images are passed over: {listed}"
 
 
 def _file_names(folder: Path) -> Iterator[str]:

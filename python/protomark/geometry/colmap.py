@@ -13,7 +13,9 @@ import zlib  # noqa: F401  (must come before pycolmap, see above)
 import contextlib
 import os
 import re
+import signal
 import tempfile
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +29,11 @@ from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 
+# pycolmap takes SIGTERM for itself, to print a stack trace.
+_on_sigterm = signal.getsignal(signal.SIGTERM)
 pycolmap = optional("pycolmap")
+if _on_sigterm is not None and threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, _on_sigterm)
 
 _FILES = ("cameras", "images")
 
