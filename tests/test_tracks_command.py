@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -120,7 +121,7 @@ def test_image_without_pose_is_left_out_and_named(copy: Path, tmp_path: Path) ->
     write_model(copy / "sparse", PINHOLE, names, poses(5)[[0, 1, 3, 4]])
     done = run(copy, "-d", "orb", "-o", tmp_path / "out", *FAST)
     assert done.returncode == 0
-    assert "left out without a pose: img3.png" in done.stdout
+    assert re.search(r"left out without a pose +img3\.png", done.stdout)
     assert Tracks.load(tmp_path / "out" / "plane.orb.safetensors").keyframe_names == names
 
 
@@ -129,7 +130,7 @@ def test_image_that_cannot_be_read_is_left_out_and_named(copy: Path, tmp_path: P
     path.write_bytes(path.read_bytes()[:-500])
     done = run(copy, "-d", "orb", "-o", tmp_path / "out", *FAST)
     assert done.returncode == 0, done.stderr
-    assert "left out, cannot be read: img3.png (the image is truncated" in done.stdout
+    assert re.search(r"left out, cannot be read +img3\.png \(the image is truncated", done.stdout)
     tracks = Tracks.load(tmp_path / "out" / "plane.orb.safetensors")
     assert tracks.keyframe_names == [f"img{i}.png" for i in (1, 2, 4, 5)]
     assert "img3.png" in tracks.info["images_unreadable"]

@@ -161,3 +161,8 @@ def hash_files(named: Iterable[tuple[str, Path]]) -> str:
 def natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key under which frame2 comes before frame10."""
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", name)]
+
+
+def is_utf8(text: str) -> bool:
+    """Whether a text, such as a file name, can be written to a text file."""
+    return not re.search("[\ud800-\udfff]", text)

@@ -65,11 +65,7 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], made_by: str = "protomark", dpi: int = 160
 ) -> None:
-    """Write a figure as PNG, SVG or PDF atomically, with its origin in the file's metadata.
-
-    Raises:
-        ValueError: the path has another suffix.
-    """
+    """Write a figure as PNG, SVG or PDF atomically, with its origin in the file's metadata."""
     path = Path(path)
     check_suffix(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
@@ -338,21 +334,14 @@ def _map_quality(pictures: MapPictures) -> Figure:
 
 
 def training_figure(
-    steps: Sequence[int],
-    losses: Sequence[float],
-    precision: Mapping[int, Sequence[float]],
+    steps: Sequence[int],  # (v,) steps at which validation ran
+    losses: Sequence[float],  # (v,) mean training losses
+    precision: Mapping[int, Sequence[float]],  # (v,) precisions by number of dimensions
+    # First of the steps with quantisation in the loop, None if there is none.
     quantized_from: int | None,
     title: str = "",
 ) -> Figure:
-    """Training loss, and validation precision by dimension, over the steps of a training.
-
-    Args:
-        steps: (v,) steps at which validation ran.
-        losses: (v,) mean training losses.
-        precision: (v,) precisions by number of dimensions.
-        quantized_from: first of the steps with quantisation in the loop, None if there is none.
-        title: title of the figure.
-    """
+    """Training loss, and validation precision by dimension, over the steps of a training."""
     figure = new_figure(8, 3.4)
     left, right = figure.subplots(1, 2)
     left.plot(steps, losses, color=INK, marker="o", markersize=3)

@@ -28,25 +28,19 @@ RIDGE = 1.0
 
 
 class EuclideanMap(Method):
-    """One vector per landmark, of a linear projection of the bits.
-
-    Args:
-        vectors: (l, k) float32 or int8, which times `scale` compare with projected queries.
-        landmarks: (l,) int64, strictly ascending.
-        bytes_per_landmark: all that matching needs.
-        projection: (bits, k) float32, or None for the bits themselves.
-        offset: (k,) float32, subtracted from a projected query.
-        scale: size of one step of `vectors`.
-    """
+    """One vector per landmark, of a linear projection of the bits."""
 
     def __init__(
         self,
+        # vectors: (l, k) float32 or int8, which times `scale` compare with projected queries.
         vectors: NDArray[Any],
-        landmarks: NDArray[np.int64],
+        landmarks: NDArray[np.int64],  # (l,) int64, strictly ascending
         bytes_per_landmark: float,
+        # projection: (bits, k) float32, or None for the bits themselves.
         projection: NDArray[np.float32] | None = None,
+        # offset: (k,) float32, subtracted from a projected query.
         offset: NDArray[np.float32] | None = None,
-        scale: float = 1.0,
+        scale: float = 1.0,  # size of one step of `vectors`
     ) -> None:
         self.landmarks = landmarks
         self.bytes_per_landmark = bytes_per_landmark

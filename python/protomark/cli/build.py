@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from protomark.cli.options import EncoderName, JsonFile, Threads
+from protomark.cli.options import EncoderName, JsonFile, NoSeal, Threads
 
 
 def build(
@@ -38,9 +38,7 @@ def build(
             "that of SOURCE_DATE_EPOCH.",
         ),
     ] = None,
-    no_seal: Annotated[
-        bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
-    ] = False,
+    no_seal: NoSeal = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
@@ -62,13 +60,11 @@ def build(
     from protomark.maps.metadata import command_metadata
     from protomark.maps.seal import SealRequest, seal_map, sealed_path
     from protomark.maps.selection import Views
-    from protomark.threads import available_threads
     from protomark.tracks.file import Tracks
 
     sealed = None if no_seal else sealed_path(output)
     check_outputs(output, json_file, sealed, inputs=[tracks, encoder])
     texts = command_metadata(frame, metadata or [])
-    threads = threads or available_threads()
     with progress_bar() as progress:
         progress("read tracks", 0, 0)
         observed = Tracks.load(tracks)

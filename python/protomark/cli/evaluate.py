@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile
+from protomark.cli.options import JsonFile, Threads, TracksFiles
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(metavar="TRACKS", help="Tracks files that `protomark tracks` wrote."),
-    ],
+    tracks: TracksFiles,
     encoder: Annotated[
         list[str] | None,
         typer.Option(
@@ -49,10 +46,7 @@ def evaluate(
             "By default they are learned from the map's own observations."
         ),
     ] = None,
-    threads: Annotated[
-        int,
-        typer.Option(min=0, help="CPU threads, 0 for one per core; search is timed on one."),
-    ] = 0,
+    threads: Threads = 0,
     json_file: JsonFile = None,
     markdown_file: Annotated[
         Path | None, typer.Option("--markdown", help="Write the tables to this Markdown file, too.")
@@ -65,8 +59,8 @@ def evaluate(
     """Compare Protomark with other ways to keep descriptors.
 
     Reads tracks and prints, for each method, the precision of search, the share of poses found,
-    bytes per landmark and search time. The protocol is the paper's: a random 90 % of the keyframes
-    build the map, and the descriptors of the others query it.
+    bytes per landmark and search time on one thread. The protocol is the paper's: a random 90 % of
+    the keyframes build the map, and the descriptors of the others query it.
 
     protomark evaluate kitchen.freak.safetensors --plot precision.png
     """
@@ -82,7 +76,6 @@ def evaluate(
     from protomark.evaluation.run import EvaluationOptions, evaluate_files
     from protomark.files import check_outputs, write_text
     from protomark.plot import check_suffix
-    from protomark.threads import available_threads
 
     inputs = [*tracks, *(encoder or []), *(discriminant_from or [])]
     check_outputs(json_file, markdown_file, plot_file, inputs=inputs)
@@ -91,7 +84,7 @@ def evaluate(
     options = EvaluationOptions(
         seeds=range(seeds),
         pose_frames=pose_frames,
-        threads=threads or available_threads(),
+        threads=threads,
         encoders=encoder or [],
         methods=comma_separated(methods),
         discriminant_from=discriminant_from or [],

@@ -94,7 +94,6 @@ def localize(
     from protomark.features.images import passed_over
     from protomark.files import check_folder, check_outputs
     from protomark.localization.batch import LocalizationRequest, localize_files
-    from protomark.threads import available_threads
 
     check_folder(output)
     check_outputs(json_file, inputs=[scene, *images, camera, poses, priors])
@@ -112,7 +111,7 @@ def localize(
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
         recall=recall,
-        threads=threads or available_threads(),
+        threads=threads,
     )
     with progress_bar() as progress:
         batch = localize_files(request, output, progress)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, Threads
+from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, NoSeal, Threads
 
 
 def map_(
@@ -60,9 +60,7 @@ def map_(
     view: Annotated[
         bool, typer.Option("--view", help="Also write recording.rrd for the Rerun viewer.")
     ] = False,
-    no_seal: Annotated[
-        bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
-    ] = False,
+    no_seal: NoSeal = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
@@ -87,7 +85,6 @@ def map_(
     from protomark.files import check_folder, check_outputs
     from protomark.mapping.options import MappingOptions
     from protomark.mapping.session import MapRequest, make_map
-    from protomark.threads import available_threads
 
     scene = output or into
     if scene is None or (output is not None and into is not None):
@@ -119,7 +116,7 @@ def map_(
         force=force,
         record=view,
         seal=not no_seal,
-        threads=threads or available_threads(),
+        threads=threads,
     )
     with progress_bar() as progress:
         figures = make_map(request, progress, note)
@@ -130,31 +127,10 @@ def map_(
 def _show(figures: dict[str, Any], scene: Path) -> None:
     from rich.markup import escape
 
-    from protomark.cli.terminal import say
-    from protomark.report import first_of
+    from protomark.cli.terminal import print_facts, say
+    from protomark.report import first_of, map_rows
 
-    ratio = figures["descriptor_bytes"] / max(figures["memory_bytes"], 1)
-    say(f"[bold]{escape(str(scene))}[/]")
-    say(
-        f"  {figures['registered']} of {figures['frames']} frames registered, "
-        f"{figures['keyframes']} keyframes, {figures['landmarks']} landmarks, "
-        f"{figures['observations']} observations ({figures['track_length_mean']:.1f} per landmark)"
-    )
-    say(
-        f"  reprojection error: mean {figures['reprojection_error_mean']:.2f} pixels, "
-        f"median {figures['reprojection_error_median']:.2f}"
-    )
-    say(
-        f"  memory for matching: {figures['memory_bytes'] / 1e6:.2f} MB, "
-        f"{figures['bytes_per_landmark']:.0f} bytes per landmark; all descriptors: "
-        f"{figures['descriptor_bytes'] / 1e6:.2f} MB, {ratio:.1f} times as much"
-    )
-    if "sealed_bytes" in figures:
-        say(f"  sealed map: {figures['sealed_bytes'] / 1e6:.2f} MB, with encoder and positions")
-    say(
-        f"  {figures['seconds_total']:.1f} s, {figures['frames_per_second']:.1f} frames per "
-        f"second; see {scene / 'report.html'}"
-    )
+    print_facts([("map", f"{scene}, see {scene / 'report.html'}"), *map_rows(figures)])
     for reason, names in figures["not_registered"].items():
         say(f"  [yellow]without a pose[/]: {escape(first_of(names))}: {escape(reason)}")
     say(f"  next: protomark localize {escape(str(scene))} IMAGES")

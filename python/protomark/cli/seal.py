@@ -78,7 +78,6 @@ def seal(
     from protomark.maps.open import SCENE_MAP
     from protomark.maps.seal import SealRequest
     from protomark.maps.seal import seal as seal_source
-    from protomark.threads import available_threads
 
     check_outputs(output, json_file, inputs=[source, source / SCENE_MAP])
     request = SealRequest(
@@ -87,7 +86,7 @@ def seal(
         landmarks=landmarks,
         index=index.value,
         position_bits=0 if no_positions else position_bits,
-        threads=threads or available_threads(),
+        threads=threads,
     )
     with progress_bar() as progress:
         made = seal_source(source, output, request, progress)

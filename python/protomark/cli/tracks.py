@@ -99,9 +99,8 @@ def tracks(
 
     protomark tracks kitchen/ -o tracks -d freak -d orb
     """
-    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.cli.terminal import progress_bar, write_json
     from protomark.files import check_folder, check_outputs
-    from protomark.threads import available_threads
     from protomark.tracks.extract import TracksOptions, find_sequence
     from protomark.tracks.make import make_augmented_tracks, make_tracks
 
@@ -134,76 +133,52 @@ def tracks(
         )
     check_folder(output)
     check_outputs(json_file, inputs=[database])
-    threads = threads or available_threads()
     facts = []
     for source in sources:
         for one in options:
             with progress_bar(f"{source.name}: ") as progress:
-                made = make_tracks(
-                    source, one, output, force=force, threads=threads, progress=progress
-                )
-            if made.skipped:
-                note(f"{made.path}: up to date with these options, skipped (--force makes it anew)")
-            facts.append(made.as_dict())
-            _show(facts[-1], made.tracks.info)
-            if not augmentations:
-                continue
-            with progress_bar(f"{source.name}: ") as progress:
-                more = make_augmented_tracks(
-                    made,
-                    source.images,
-                    augmentations,
-                    force=force,
-                    threads=threads,
-                    progress=progress,
-                )
-            facts.append(more.as_dict())
-            _show_augmented(facts[-1], facts[-2])
+                made = [make_tracks(source, one, output, force, threads, progress)]
+                if augmentations:
+                    images = source.images
+                    made.append(
+                        make_augmented_tracks(
+                            made[0], images, augmentations, force, threads, progress
+                        )
+                    )
+            for file in made:
+                facts.append(file.as_dict())
+                _show(facts[-1], file.tracks.info)
     write_json(json_file, facts)
 
 
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
-    from rich.markup import escape
+    from protomark.cli.terminal import note, print_facts
+    from protomark.report import first_of, track_rows
 
-    from protomark.cli.terminal import note, say
-    from protomark.report import first_of
-
-    say(f"[bold]{escape(facts['file'])}[/]")
-    say(
-        f"  {facts['keyframes']} keyframes, {facts['keypoints']} keypoints, "
-        f"{facts['landmarks']} landmarks, {facts['observations']} observations "
-        f"({facts['track_length_mean']:.1f} per landmark)"
-    )
-    say(
-        f"  reprojection error: mean {facts['reprojection_error_mean']:.2f} pixels, "
-        f"median {facts['reprojection_error_median']:.2f}"
-    )
+    if facts["skipped"]:
+        note(f"{facts['file']}: up to date with these options, skipped (--force makes it anew)")
+    rows = [
+        ("tracks", facts["file"]),
+        ("keypoints", f"{facts['keypoints']:,} in {facts['keyframes']} keyframes"),
+        *track_rows(facts),
+    ]
+    if copies := facts.get("augmentations"):
+        rows.append(("augmentations", f"{copies} copies of each keyframe"))
     if "epipolar_error" in info:
         error, refined = info["epipolar_error"], facts["poses_refined"]
-        say(
-            f"  given poses: epipolar error {error:.2f} pixels, "
-            + ("refined by bundle adjustment" if refined else "kept as they are")
-        )
+        what = "refined by bundle adjustment" if refined else "kept as they are"
+        rows.append(("given poses", f"epipolar error {error:.2f} pixels, {what}"))
         if error > 1 and not refined:
-            note("  these poses are only roughly right: --refine-poses auto refines them")
+            note("these poses are only roughly right: --refine-poses auto refines them")
     if without := info.get("images_without_pose"):
-        say(f"  left out without a pose: {escape(first_of(without))}")
+        rows.append(("left out without a pose", first_of(without)))
     if unreadable := info.get("images_unreadable"):
         reasons = [f"{name} ({reason})" for name, reason in unreadable.items()]
-        say(f"  left out, cannot be read: {escape(first_of(reasons))}")
-    say("  observations per landmark:")
-    top = max(facts["track_length_histogram"].values(), default=0) or 1
-    for label, count in facts["track_length_histogram"].items():
+        rows.append(("left out, cannot be read", first_of(reasons)))
+    histogram = facts["track_length_histogram"]
+    top = max(histogram.values(), default=0) or 1
+    for label, count in histogram.items():
         if count:
             bar = "█" * max(1, round(_BAR * count / top))
-            say(f"  {label:>7} {bar:<{_BAR}} {count}")
-
-
-def _show_augmented(facts: dict[str, Any], plain: dict[str, Any]) -> None:
-    from rich.markup import escape
-
-    from protomark.cli.terminal import say
-
-    added = facts["observations"] - plain["observations"]
-    say(f"[bold]{escape(facts['file'])}[/]")
-    say(f"  {facts['augmentations']} copies of each keyframe, {added} more observations")
+            rows.append((f"{label} observations per landmark", f"{bar:<{_BAR}} {count}"))
+    print_facts(rows)

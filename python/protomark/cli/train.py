@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile, Threads
+from protomark.cli.options import JsonFile, Threads, TracksFiles
 
 if TYPE_CHECKING:
     from protomark.training.card import EncoderCard
@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def train(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(metavar="TRACKS", help="Tracks files to train on, one per sequence."),
-    ],
+    tracks: TracksFiles,
     validation: Annotated[
         list[Path] | None,
         typer.Option(

@@ -50,21 +50,17 @@ _POSITION_BYTES = 12
 _SIZE = 33
 
 
-@dataclass(frozen=True)
-class DemoRow:
+@dataclass
+class DemoRow(MethodSummary):
     """Results of one method."""
 
-    # name, label, family: see `methods.MethodChoice`.
-    name: str
-    label: str
-    family: str
-    bytes_per_landmark: float  # all that matching needs, including the count, without the position
-    map_bytes: int  # bytes of all landmarks with positions
-    precision: float  # share of query descriptors whose nearest landmark is their own
-    found: int  # query keyframes whose pose is within 1 % of the median scene depth and 2 degrees
-    frames: int  # query keyframes
-    median_error: float  # median distance from the true camera centre, as a share of that depth
-    ms_per_frame: float  # milliseconds to match and localize a frame on one thread
+    map_bytes: int = 0  # bytes of all landmarks with positions
+    # Query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
+    found: int = 0
+    frames: int = 0  # query keyframes
+    # Median distance from the true camera centre, as a share of that depth.
+    median_error: float = 0.0
+    ms_per_frame: float = 0.0  # milliseconds to match and localize a frame on one thread
 
 
 @dataclass(frozen=True)
@@ -86,23 +82,13 @@ class DemoResult:
 
 
 def run_demo(
-    output: Path,
+    output: Path,  # folder of the two maps and the picture, created if it does not exist
     *,
-    tracks_path: Path | None = None,
-    encoder: str | None = None,
+    tracks_path: Path | None = None,  # tracks to take in place of the sample's
+    encoder: str | None = None,  # name or path of the encoder; None: the one for the descriptor
     progress: Progress = silent,
 ) -> DemoResult:
-    """Build, save and seal a map of the sample, localize query keyframes, compare and draw.
-
-    Args:
-        output: folder of the two maps and the picture, created if it does not exist.
-        tracks_path: tracks to take in place of the sample's.
-        encoder: name or path of the encoder; None: the one for the descriptor.
-        progress: called with each method.
-
-    Raises:
-        FileExistsError: another file has the name of one that the demo writes.
-    """
+    """Build, save and seal a map of the sample, localize query keyframes, compare and draw."""
     began = time.perf_counter()
     tracks = Tracks.load(tracks_path or sample.path())
     loaded = pm.Encoder.load(encoder or tracks.descriptor)
@@ -215,12 +201,8 @@ def _draw(rows: list[DemoRow], name: str, scene: ScenePicture, path: Path) -> No
         f"From above: {shown.found} of {shown.frames} queries found, "
         f"{shown.bytes_per_landmark:.0f} bytes per landmark",
     )
-    points = [
-        MethodSummary(row.name, row.label, row.family, row.bytes_per_landmark, row.precision)
-        for row in rows
-    ]
     title = "Is the nearest landmark the right one?"
-    draw_curves(right, precision_curves(points), "bytes per landmark (log)", "precision", title)
+    draw_curves(right, precision_curves(rows), "bytes per landmark (log)", "precision", title)
     save_figure(figure, path, made_by=_MADE_BY)
 
 

@@ -94,17 +94,13 @@ def prototype_map(
 
 
 def method_choices(
+    # Encoders for the descriptor, each of which is compared at all its dims.
     encoders: Sequence[pm.Encoder] = (),
+    # Moments to learn linear discriminants from; None: those of the support.
     discriminant_from: Moments | None = None,
     threads: int = 1,
 ) -> list[MethodChoice]:
-    """Every method, in the order of tables.
-
-    Args:
-        encoders: encoders for the descriptor, each of which is compared at all its dims.
-        discriminant_from: moments to learn linear discriminants from; None: those of the support.
-        threads: threads to build a map on.
-    """
+    """Every method, in the order of tables."""
     listed = [
         MethodChoice("unaggregated", "Unaggregated", "unaggregated", unaggregated),
         MethodChoice("random", "Random sample", "random", random_sample),
@@ -185,11 +181,7 @@ def _projected(
 def choose_methods(
     listed: Sequence[MethodChoice], names: Sequence[str] | None
 ) -> list[MethodChoice]:
-    """The methods of these names or families, or the default ones.
-
-    Raises:
-        ValueError: there is no method of some name.
-    """
+    """The methods of these names or families, or the default ones."""
     if not names:
         return [choice for choice in listed if choice.default]
     chosen = {

@@ -159,12 +159,7 @@ def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -
 
 
 def load_json(path: str | os.PathLike[str]) -> list[SequenceResult]:
-    """Read results that `save_json` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not such a file.
-    """
+    """Read results that `save_json` wrote."""
     path = Path(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -265,11 +260,7 @@ def precision_curves(rows: Sequence[MethodSummary]) -> list[Curve]:
 
 
 def save_precision_plot(rows: Sequence[MethodSummary], path: Path, title: str = "") -> None:
-    """Plot precision over bytes per landmark as PNG, SVG or PDF.
-
-    Raises:
-        ValueError: the path has another suffix.
-    """
+    """Plot precision over bytes per landmark as PNG, SVG or PDF."""
     figure = new_figure(8, 5)
     axes = figure.add_subplot()
     draw_curves(axes, precision_curves(rows), "bytes per landmark (log)", "precision", title)

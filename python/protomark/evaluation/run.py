@@ -51,16 +51,7 @@ class EvaluationOptions:
 def evaluate_files(
     paths: Sequence[Path], options: EvaluationOptions, progress: Progress = silent
 ) -> Iterator[SequenceResult]:
-    """Evaluate tracks files one after the other.
-
-    Args:
-        paths: tracks files.
-        options: what to compare, and how.
-        progress: called with each method at each seed.
-
-    Raises:
-        FileNotFoundError, ValueError: a file is missing, broken, or does not fit the others.
-    """
+    """Evaluate tracks files one after the other."""
     encoders = [pm.Encoder.load(source) for source in options.encoders or models.names()]
     for path in [*paths, *options.discriminant_from]:
         if not path.is_file():
@@ -93,11 +84,7 @@ def encoders_for(
 
 
 def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
-    """Moments over several tracks files, of landmarks with at least two observations.
-
-    Raises:
-        ValueError: a file holds other descriptors than `like`.
-    """
+    """Moments over several tracks files, of landmarks with at least two observations."""
     landmarks, descriptors, offset = [], [], 0
     for path in paths:
         tracks = Tracks.load(path)

@@ -26,23 +26,16 @@ FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descr
 
 @dataclass
 class Features:
-    """n keypoints of one image with their descriptors.
+    """n keypoints of one image with their descriptors."""
 
-    Attributes:
-        keypoints: (n, 2) float32, pixels; the centre of the upper left pixel is (0.5, 0.5).
-        sizes: (n,) float32, diameter in pixels.
-        angles: (n,) float32, degrees clockwise in [0, 360), -1 where there is none.
-        responses: (n,) float32, the detector's strength.
-        octaves: (n,) int32, the detector's pyramid level.
-        descriptors: (n, bits / 8) uint8.
-    """
-
+    # (n, 2) float32, pixels; the centre of the upper left pixel is (0.5, 0.5).
     keypoints: NDArray[np.float32]
-    sizes: NDArray[np.float32]
+    sizes: NDArray[np.float32]  # (n,) float32, diameter in pixels
+    # (n,) float32, degrees clockwise in [0, 360), -1 where there is none.
     angles: NDArray[np.float32]
-    responses: NDArray[np.float32]
-    octaves: NDArray[np.int32]
-    descriptors: NDArray[np.uint8]
+    responses: NDArray[np.float32]  # (n,) float32, the detector's strength
+    octaves: NDArray[np.int32]  # (n,) int32, the detector's pyramid level
+    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
 
     def __len__(self) -> int:
         return len(self.keypoints)

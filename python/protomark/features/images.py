@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.files import natural_key
+from protomark.files import is_utf8, natural_key
 
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"),
@@ -58,11 +58,6 @@ def _kind(name: str) -> str:
     if not is_utf8(name):
         return f"whose name is not UTF-8 ({name})"
     return Path(name).suffix[1:].lower() or "without a suffix"
-
-
-def is_utf8(name: str) -> bool:
-    """Whether a file name can be written to a text file."""
-    return not any("\ud800" <= c <= "\udfff" for c in name)
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:

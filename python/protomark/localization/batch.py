@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.features.images import image_names, is_utf8, read_gray
-from protomark.files import write_text
+from protomark.features.images import image_names, read_gray
+from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength, check_pose_model
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras

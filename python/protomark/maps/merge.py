@@ -16,19 +16,10 @@ MAX_ID = 2**63 - 1
 def merge_files(
     inputs: Sequence[Path], output: Path, renumber: bool = False, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Merge learning maps, in this order, into the map file `output`; returns facts as JSON values.
+    """Merge learning maps, in this order, into the map file `output`; returns facts as JSON.
 
-    Args:
-        inputs: map files of the same encoder, dimensions and appearance bits.
-        output: the file to write, which is none of the inputs.
-        renumber: whether landmarks of different files differ, whatever their ids: those of each
-            further file then get new ids above all earlier ones.
-        progress: called with each map.
-
-    Raises:
-        ValueError: there are fewer than two inputs, or one occurs twice, is sealed, does not fit
-            the first, or is the output.
-        OSError: a file cannot be read or written.
+    With `renumber`, landmarks of different files differ, whatever their ids: those of each further
+    file get new ids above all earlier ones.
     """
     check_outputs(output, inputs=inputs)
     if len(inputs) < 2:
@@ -68,12 +59,7 @@ def merge_files(
 
 
 def open_learning_map(path: Path) -> pm.PrototypeMap:
-    """Open a map that takes observations.
-
-    Raises:
-        ValueError: the file holds a sealed map.
-        OSError: the file cannot be read.
-    """
+    """Open a map that takes observations."""
     scene = pm.open(path)
     if not isinstance(scene, pm.PrototypeMap):
         raise ValueError(f"{path} is a sealed map, which keeps no sums: give the learning map")

@@ -11,9 +11,6 @@ def creation_time() -> str:
     """The time in UTC, such as 2026-11-23T03:39:41Z, or that of SOURCE_DATE_EPOCH.
 
     The variable makes builds repeatable (https://reproducible-builds.org/specs/source-date-epoch).
-
-    Raises:
-        ValueError: SOURCE_DATE_EPOCH is not a number of seconds since 1970 up to the year 9999.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
@@ -32,11 +29,7 @@ def _utc(seconds: int) -> datetime:
 
 
 def command_metadata(frame: str | None, pairs: Sequence[str]) -> dict[str, str]:
-    """The metadata of a map that a command makes: "created", "frame" and the given pairs.
-
-    Raises:
-        ValueError: a pair is not of the form NAME=TEXT.
-    """
+    """The metadata of a map that a command makes: "created", "frame" and the given pairs."""
     metadata = {"created": creation_time()}
     if frame is not None:
         metadata["frame"] = frame

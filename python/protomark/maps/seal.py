@@ -52,22 +52,7 @@ def sealed_path(path: Path) -> Path:
 def seal(
     source: Path, output: Path, request: SealRequest | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Seal a scene; where not all landmarks may stay, those that cover it best.
-
-    Args:
-        source: a folder of `protomark map`, a learning map or a tracks file.
-        output: the file to write.
-        request: how large it may be.
-        progress: called with each stage.
-
-    Returns:
-        Facts: landmarks of the sealed map and of the source, by what they were chosen (None: all
-        were kept), and bytes.
-
-    Raises:
-        FileNotFoundError, FileError, ValueError: the source is none of these, or a size cannot be
-            met.
-    """
+    """Seal a folder of `protomark map`, a learning map or tracks; returns facts, see `seal_map`."""
     request = request or SealRequest()
     progress("read the map", 0, 0)
     if is_tracks(source):
@@ -91,24 +76,16 @@ def seal_map(
     scene: pm.PrototypeMap,
     output: Path,
     request: SealRequest | None = None,
+    # Gives the images that saw its landmarks, if landmarks have to be chosen; None: they are chosen
+    # by where they are in space.
     views: Callable[[], Views] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Seal a learning map, which stays as it is but for its index.
 
-    Args:
-        scene: the map.
-        output: the file to write.
-        request: how large it may be.
-        views: gives the images that saw its landmarks, if landmarks have to be chosen; None: they
-            are chosen by where they are in space.
-        progress: called with each stage.
-
     Returns:
-        Facts, see `seal`.
-
-    Raises:
-        FileError, ValueError: see `seal`.
+        Landmarks of the sealed map and of the source, by what they were chosen (None: all were
+        kept), and bytes.
     """
     request = request or SealRequest()
     total = len(scene)
@@ -163,11 +140,7 @@ def _seal_once(scene: pm.PrototypeMap, path: Path, request: SealRequest) -> int:
 
 
 def _fitting_count(path: Path, count: int, limit: float) -> int:
-    """How many landmarks fit into `limit` bytes, by a sealed map with `count`, which are too many.
-
-    Raises:
-        ValueError: not even `MIN_LANDMARKS` do.
-    """
+    """How many landmarks fit into `limit` bytes, by a sealed map with `count`, too many."""
     fixed = sum(size for name, size in pm.file_sections(path) if name in ("encoder", "metadata"))
     each = (path.stat().st_size - fixed) / count
     fitting = min(int((0.998 * limit - fixed) / each), count - 1)

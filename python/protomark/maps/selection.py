@@ -40,19 +40,12 @@ class Views:
     @classmethod
     def of_images(
         cls,
-        ids: NDArray[np.int64],
-        images: NDArray[np.int64],
-        pixels: NDArray[np.floating],
-        sizes: NDArray[np.floating],
+        ids: NDArray[np.int64],  # (o,) int64, landmark of each observation
+        images: NDArray[np.int64],  # (o,) int64, which image it is in, from 0 on
+        pixels: NDArray[np.floating],  # (o, 2), where in the image
+        sizes: NDArray[np.floating],  # (o, 2), width and height of the image
     ) -> Views:
-        """The bins of observations.
-
-        Args:
-            ids: (o,) int64, landmark of each observation.
-            images: (o,) int64, which image it is in, from 0 on.
-            pixels: (o, 2), where in the image.
-            sizes: (o, 2), width and height of the image.
-        """
+        """The bins of observations."""
         at = np.clip(pixels / sizes, 0, np.nextafter(1, 0))
         return cls._of_grid(ids, images, at, _IMAGE_LEVELS)
 
@@ -69,11 +62,7 @@ class Views:
 
     @classmethod
     def of_model(cls, folder: Path) -> Views:
-        """The bins of the observations of a COLMAP model whose point ids are landmark ids.
-
-        Raises:
-            FileNotFoundError, ValueError: there is no such model.
-        """
+        """The bins of the observations of a COLMAP model whose point ids are landmark ids."""
         return cls.of_images(*read_observations(find_model(folder)))
 
     @classmethod

@@ -22,13 +22,7 @@ def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
     """What the tracks are made from and how, for their `info`: equal for equal tracks.
 
     The input is a digest of the content of the database and of the model's files.
-
-    Raises:
-        FileNotFoundError: the database is missing.
-        ValueError: there is no such descriptor.
     """
-    if not database.is_file():
-        raise FileNotFoundError(f"{database}: no such COLMAP database")
     paths = (database, *sorted(p for p in model.iterdir() if p.is_file()))
     digest = hash_files((path.name, path) for path in paths)
     options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
@@ -38,20 +32,10 @@ def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
 def tracks_from_database(
     database: Path, model_path: Path, descriptor: str, name: str = ""
 ) -> Tracks:
-    """Tracks with the keypoints and descriptors of a database, and the landmarks of a model.
+    """Tracks with the binary descriptors of a database, and the landmarks of a model made from it.
 
     A landmark with two observations in one image keeps the one with the smaller reprojection error;
     landmarks with fewer than two observations are left out.
-
-    Args:
-        database: COLMAP database (SQLite) whose descriptors are binary, as uint8 blobs.
-        model_path: folder of the sparse model with points, made from this database.
-        descriptor: name of the descriptor, such as "orb".
-        name: name of the sequence, for the file's `info`.
-
-    Raises:
-        FileNotFoundError: the database or the model is missing.
-        ValueError: they are broken, or do not fit together, or the descriptors are not binary.
     """
     from protomark.geometry.colmap import model_from_reconstruction, read_reconstruction
 

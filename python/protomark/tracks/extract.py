@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import protomark
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
 from protomark.features.extractor import Extractor, Features
@@ -217,7 +218,11 @@ def extract(
         "observations_completed": added,
         "landmarks_merged": merged,
         "max_descriptor_distance": max_distance,
-        "software": _versions(),
+        "software": {
+            "opencv": optional("cv2").__version__,
+            "protomark": protomark.__version__,
+            "pycolmap": colmap.pycolmap.__version__,
+        },
     }
     tracks = Tracks.from_features(
         options.descriptor, scene.model, features, scene.labels, scene.positions, info
@@ -402,15 +407,3 @@ def _epipolar_error(matches: Pairs) -> float:
     """Median over pairs of each pair's median error, so that all pairs count alike."""
     medians = [float(np.median(m.errors)) for m in matches.values() if len(m) >= _MIN_MATCHES]
     return float(np.median(medians)) if medians else 0.0
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {"opencv": optional("cv2").__version__}
-    for package in ("protomark", "pycolmap"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -38,7 +38,6 @@ def make_tracks(
     sequence: SequenceFolder,
     options: TracksOptions,
     output: Path,
-    *,
     force: bool = False,
     threads: int = 1,
     progress: Progress = silent,
@@ -46,9 +45,6 @@ def make_tracks(
     """Make the tracks of a sequence and save them as NAME.DESCRIPTOR.safetensors.
 
     `force` makes a file anew even if it is up to date. The folder `output` need not exist.
-
-    Raises:
-        FileNotFoundError, ValueError: an input is missing or broken, or yields no landmark.
     """
     path = output / f"{sequence.name}.{options.descriptor}.safetensors"
     if sequence.database is not None:
@@ -65,7 +61,6 @@ def make_augmented_tracks(
     plain: TracksFile,
     images: Path,
     count: int,
-    *,
     force: bool = False,
     threads: int = 1,
     progress: Progress = silent,

@@ -30,6 +30,16 @@ class Scene:
         rows = np.flatnonzero(self.labels >= 0)
         return rows[np.argsort(self.labels[rows], kind="stable")]
 
+    def rows_of(
+        self, landmarks: NDArray[np.int64], rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Those of the observations `rows` that are of landmarks (n,), and their numbers (n,)."""
+        labels = self.labels[rows]
+        start = np.searchsorted(labels, landmarks, "left")
+        length = np.searchsorted(labels, landmarks, "right") - start
+        shift = np.repeat(start - np.cumsum(length) + length, length)
+        return rows[np.arange(len(shift)) + shift], length
+
     def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Reprojection errors (n,) of observations in pixels of the undistorted image."""
         return pixel_errors(

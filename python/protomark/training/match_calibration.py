@@ -54,11 +54,7 @@ def label_matches(tracks: Tracks, frames: Sequence[QueryFrame], search: Search) 
 
 
 def fit_calibration(sequences: Sequence[LabelledMatches]) -> MatchCalibration:
-    """The calibration that fits the matches of sequences best, each with the same weight.
-
-    Raises:
-        ValueError: no match is right, or all are.
-    """
+    """The calibration that fits the matches of sequences best, each with the same weight."""
     distances = np.concatenate([m.distances for m in sequences])
     right = np.concatenate([m.right for m in sequences])
     weights = np.concatenate([np.full(len(m.right), 1 / len(m.right)) for m in sequences])
@@ -72,9 +68,6 @@ def held_out_frames(
     """Keypoint rows that build a map, and frames to query it with.
 
     A random tenth of the keyframes are queries, as in `protomark evaluate`.
-
-    Raises:
-        ValueError: the tracks are too few or too short.
     """
     part = split(tracks, seed)
     return part.support_rows, draw_frames(tracks, part, frames)
@@ -130,15 +123,6 @@ def calibrate(
     """Fit the match calibration of an encoder, and measure it on each sequence.
 
     The quality on a sequence is that of a fit to the others, if there are any.
-
-    Args:
-        encoder: the encoder.
-        paths: tracks files of its plain descriptor.
-        threads: threads to encode and search on.
-        progress: called with each file.
-
-    Raises:
-        FileNotFoundError, ValueError: a file is missing or broken, or is of another descriptor.
     """
     found: dict[str, dict[int, LabelledMatches]] = {}
     for path in tracked(paths, progress, "query maps"):

@@ -76,26 +76,18 @@ def random_views(
 
 
 class BatchSampler:
-    """Draws batches from several sequences.
-
-    Args:
-        sequences: one or more sequences, each with landmarks of 3 or more views.
-        landmarks: landmarks per batch.
-        views: limit on views per landmark.
-        queries: limit on queries per landmark.
-        balance: the probability of a sequence is proportional to (number of landmarks with 3 or
-            more views) ** balance: 0 favours no sequence, 1 favours no landmark.
-        noise: probability that a bit is flipped.
-    """
+    """Draws batches from several sequences."""
 
     def __init__(
         self,
-        sequences: Sequence[Views],
-        landmarks: int = 1000,
-        views: int = 9,
-        queries: int = 3,
+        sequences: Sequence[Views],  # one or more sequences, each with landmarks of 3 or more views
+        landmarks: int = 1000,  # landmarks per batch
+        views: int = 9,  # limit on views per landmark
+        queries: int = 3,  # limit on queries per landmark
+        # The probability of a sequence is proportional to (number of landmarks with 3 or more
+        # views) ** balance: 0 favours no sequence, 1 favours no landmark.
         balance: float = 0.5,
-        noise: float = 0.0,
+        noise: float = 0.0,  # probability that a bit is flipped
     ) -> None:
         self.sequences = list(sequences)
         self.landmarks = landmarks

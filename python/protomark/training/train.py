@@ -27,7 +27,9 @@ from protomark.training.quantization import QuantizedNetwork
 from protomark.training.sampling import BatchSampler, Views
 from protomark.training.validation import Trial, mean_precision
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
+# What a checkpoint keeps of a trainer, beside weights, optimizer and history.
+_PROGRESS = ("step", "seconds", "best", "best_step", "best_state", "_losses")
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,6 @@ class ValidationStep:
     """The result of a validation."""
 
     step: int  # number of finished steps
-    steps: int  # number of all steps
     loss: float  # mean training loss since the last validation
     precision: dict[int, float]  # precision by code length, of the network in the loop
     quantized: bool  # whether quantisation is in the loop
@@ -107,27 +108,18 @@ class ValidationStep:
 
 
 class Trainer:
-    """Trains one encoder.
-
-    Args:
-        sequences: training sequences, see `data.load_training`.
-        trials: validation splits.
-        options: options that determine the weights.
-        checkpoint: file of the checkpoint, None for none.
-        fingerprint: digest of the data, so that no checkpoint is resumed with other data.
-        device: "cpu" or "cuda".
-        half: whether matrix products run in bfloat16.
-    """
+    """Trains one encoder."""
 
     def __init__(
         self,
-        sequences: Sequence[Views],
-        trials: Sequence[Trial],
+        sequences: Sequence[Views],  # training sequences, see `data.load_training`
+        trials: Sequence[Trial],  # validation splits
         options: TrainingOptions,
-        checkpoint: Path | None = None,
+        checkpoint: Path | None = None,  # file of the checkpoint, None for none
+        # Digest of the data, so that no checkpoint is resumed with other data.
         fingerprint: str = "",
-        device: str = "cpu",
-        half: bool = False,
+        device: str = "cpu",  # "cpu" or "cuda"
+        half: bool = False,  # whether matrix products run in bfloat16
     ) -> None:
         options.check()
         self.options = options
@@ -171,13 +163,7 @@ class Trainer:
     def run(self, report: Callable[[int, float, ValidationStep | None], None]) -> None:
         """Train to the end; then `quantized` holds the best model.
 
-        Args:
-            report: called after every step with the number of finished steps, the loss, and a
-                `ValidationStep` if there was a validation.
-
-        Raises:
-            Interrupted: Ctrl-C was pressed; the checkpoint is written.
-            ValueError: the loss is no longer finite.
+        `report` gets the number of finished steps, the loss, and the validation, if there was one.
         """
         options = self.options
         self.network.train()
@@ -242,7 +228,6 @@ class Trainer:
         )
         progress = ValidationStep(
             self.step,
-            self.options.steps,
             float(np.mean(self._losses)),
             found,
             in_loop,
@@ -264,27 +249,17 @@ class Trainer:
             "version": CHECKPOINT_VERSION,
             "options": asdict(self.options),
             "fingerprint": self.fingerprint,
-            "step": self.step,
-            "seconds": self.seconds,
+            "progress": {name: getattr(self, name) for name in _PROGRESS},
             "model": self.quantized.state_dict(),
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "history": [asdict(p) for p in self.history],
-            "losses": self._losses,
-            "best": self.best,
-            "best_step": self.best_step,
-            "best_state": self.best_state,
         }
         with replacing(self.checkpoint) as file:
             torch.save(state, file)
 
     def resume(self) -> None:
-        """Continue from the checkpoint.
-
-        Raises:
-            FileNotFoundError: there is no checkpoint.
-            ValueError: the checkpoint is broken, or of other data or options.
-        """
+        """Continue from the checkpoint."""
         path = self.checkpoint
         if path is None or not path.is_file():
             raise FileNotFoundError(f"{path}: no checkpoint to resume, train without --resume")
@@ -306,16 +281,12 @@ class Trainer:
                     f"{path}: the checkpoint was made with {name} {state['options'].get(name)}, "
                     f"not {value}: give the same, or train without --resume"
                 )
-        self.step = state["step"]
-        self.seconds = state["seconds"]
+        for name in _PROGRESS:
+            setattr(self, name, state["progress"][name])
         self.quantized.load_state_dict(state["model"])
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.history = [ValidationStep(**p) for p in state["history"]]
-        self._losses = state["losses"]
-        self.best = state["best"]
-        self.best_step = state["best_step"]
-        self.best_state = state["best_state"]
 
 
 def keep_freed_memory() -> None:

@@ -34,11 +34,7 @@ class Trial:
     def from_tracks(
         cls, tracks: Tracks, name: str, seed: int = 0, max_queries: int = 10_000
     ) -> Trial:
-        """A random 90/10 split of the keyframes.
-
-        Raises:
-            ValueError: the tracks are too few or too short.
-        """
+        """A random 90/10 split of the keyframes."""
         try:
             drawn = split(tracks, seed, max_queries=max_queries)
         except ValueError as error:
