@@ -153,7 +153,7 @@ def test_resume_refuses_what_does_not_fit(views, trial, tmp_path):
         ({"dims": (0, 8)}, "positive"),
         ({"dims": (8, 300)}, "255"),
         ({"steps": 0}, "steps"),
-        ({"landmarks": 1}, "2 landmarks"),
+        ({"landmarks": 1}, "landmarks is 1, it must be at least 2"),
         ({"views": 2}, "views"),
     ],
 )

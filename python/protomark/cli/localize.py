@@ -146,11 +146,10 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         text = f"{facts['median_position_error']:.4g}, {facts['median_angle_error']:.3g} degrees"
         rows.append(("median error of localized", text))
     print_facts(rows)
-    failed = [image for image in batch.images if image.error]
-    for image in failed[:5]:
-        line = printable(f"{image.name}: {image.error}")
-        console.print(line, markup=False, highlight=False)
+    failed = [f"{image.name}: {image.error}" for image in batch.images if image.error]
     if len(failed) > 5:
-        console.print(f"... and {len(failed) - 5} more, in {output / TABLE}", highlight=False)
+        failed[5:] = [f"... and {len(failed) - 5} more, in {output / TABLE}"]
+    for line in failed:
+        console.print(printable(line), markup=False, highlight=False)
     files = f"{output / POSES}, {CAMERAS} and {TABLE}"
     console.print(files, markup=False, highlight=False, soft_wrap=True)

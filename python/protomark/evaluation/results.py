@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -156,26 +156,6 @@ def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -
     ]
     document = {"format": FORMAT, "version": VERSION, "sequences": sequences}
     write_text(path, json.dumps(document, indent=1) + "\n")
-
-
-def load_json(path: str | os.PathLike[str]) -> list[SequenceResult]:
-    """Read results that `save_json` wrote."""
-    path = Path(path)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise ValueError(f"{path}: not results of `protomark evaluate --json`")
-        return [_sequence_result(entry) for entry in document["sequences"]]
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such results file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: broken results file ({error!r})") from None
-
-
-def _sequence_result(entry: dict[str, Any]) -> SequenceResult:
-    names = {f.name for f in fields(SequenceResult)} - {"methods"}
-    methods = [MethodResult(**method) for method in entry["methods"]]
-    return SequenceResult(**{key: entry[key] for key in names}, methods=methods)
 
 
 def caption(result: SequenceResult) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from datetime import datetime, timezone
 
@@ -14,18 +15,15 @@ def creation_time() -> str:
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
-        time = datetime.now(timezone.utc) if epoch is None else _utc(int(epoch))
+        seconds = time.time() if epoch is None else int(epoch)
+        if seconds < 0:
+            raise ValueError
+        utc = datetime.fromtimestamp(seconds, timezone.utc)
     except (ValueError, OverflowError, OSError):
         raise ValueError(
             f"SOURCE_DATE_EPOCH={epoch} is not a number of seconds since 1970: unset or correct it"
         ) from None
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _utc(seconds: int) -> datetime:
-    if seconds < 0:
-        raise ValueError(seconds)
-    return datetime.fromtimestamp(seconds, timezone.utc)
+    return utc.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def command_metadata(frame: str | None, pairs: Sequence[str]) -> dict[str, str]:

@@ -60,13 +60,11 @@ class TrainingOptions:
             raise ValueError(f"dims {self.dims} must be positive and ascending, as in 8,16,32")
         if self.dims[-1] > 255:
             raise ValueError(f"dims {self.dims}: a code has at most 255 numbers")
-        for name in ("steps", "landmarks", "queries", "validate_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, it must be at least 1")
-        if self.landmarks < 2:
-            raise ValueError("a batch needs at least 2 landmarks to tell apart")
-        if self.views < 3:
-            raise ValueError(f"views is {self.views}; a query and its support need at least 3")
+        # A batch tells landmarks apart, and a query needs two views in its support.
+        least = {"steps": 1, "landmarks": 2, "views": 3, "queries": 1, "validate_every": 1}
+        for name, limit in least.items():
+            if getattr(self, name) < limit:
+                raise ValueError(f"{name} is {getattr(self, name)}, it must be at least {limit}")
 
     @property
     def quantized_from(self) -> int:
