@@ -201,15 +201,8 @@ def measure_poses(
     result: MethodResult,
 ) -> None:
     """Add the numbers of localized frames and of right matches to a result."""
-    if not frames:
-        return
-    ends = np.cumsum([len(frame.keypoints) for frame in frames])
-    landmarks, distances = method.match(
-        np.concatenate([frame.descriptors for frame in frames]), threads=threads
-    )
-    for frame, end in zip(frames, ends, strict=True):
-        rows = slice(int(end) - len(frame.keypoints), int(end))
-        matches = select_matches(landmarks[rows], distances[rows])
+    for frame in frames:
+        matches = select_matches(*method.match(frame.descriptors, threads=threads))
         positions = tracks.positions_of(matches.landmarks)
         result.frames += 1
         result.selected += len(matches.landmarks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -232,32 +232,23 @@ def extract(
     return tracks
 
 
+@dataclass
 class _Matching:
-    """Matches between keyframes under poses that may be refined.
+    """Matches between keyframes under poses that may be refined."""
 
-    Attributes:
-        model: cameras and poses.
-        rays: undistorted keypoints of each keyframe.
-        matches: matches of each pair of keyframes (i, j), i < j.
-    """
+    model: colmap.ColmapModel
+    features: list[Features]
+    options: TracksOptions
+    threads: int
+    progress: Progress
+    matches: Pairs = field(default_factory=dict)  # of pairs of keyframes (i, j), i < j
 
-    def __init__(
-        self,
-        model: colmap.ColmapModel,
-        features: list[Features],
-        options: TracksOptions,
-        threads: int,
-        progress: Progress,
-    ) -> None:
-        self.model, self.features = model, features
-        self.options, self.threads, self.progress = options, threads, progress
-        self.rays = [
-            model.cameras[int(c)].rays(f.keypoints)
-            for c, f in zip(model.camera_ids, features, strict=True)
-        ]
-        self.focal = np.array([model.cameras[int(c)].focal_length for c in model.camera_ids])
+    def __post_init__(self) -> None:
+        cameras = [self.model.cameras[int(c)] for c in self.model.camera_ids]
+        # Undistorted keypoints of each keyframe.
+        self.rays = [c.rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
+        self.focal = np.array([camera.focal_length for camera in cameras])
         self.views = self._make_views()
-        self.matches: Pairs = {}
 
     def _make_views(self) -> list[View]:
         parts = (self.features, self.rays, self.model.cam_from_world, self.focal)

@@ -75,27 +75,22 @@ def random_views(
     return rows[order][keep], group[keep], rank[keep]
 
 
+@dataclass
 class BatchSampler:
     """Draws batches from several sequences."""
 
-    def __init__(
-        self,
-        sequences: Sequence[Views],  # one or more sequences, each with landmarks of 3 or more views
-        landmarks: int = 1000,  # landmarks per batch
-        views: int = 9,  # limit on views per landmark
-        queries: int = 3,  # limit on queries per landmark
-        # The probability of a sequence is proportional to (number of landmarks with 3 or more
-        # views) ** balance: 0 favours no sequence, 1 favours no landmark.
-        balance: float = 0.5,
-        noise: float = 0.0,  # probability that a bit is flipped
-    ) -> None:
-        self.sequences = list(sequences)
-        self.landmarks = landmarks
-        self.views = views
-        self.queries = queries
-        self.noise = noise
-        weight = np.array([(s.counts >= 3).sum() for s in sequences], float) ** balance
-        self.probability = weight / weight.sum()
+    sequences: Sequence[Views]  # one or more sequences, each with landmarks of 3 or more views
+    landmarks: int = 1000  # landmarks per batch
+    views: int = 9  # limit on views per landmark
+    queries: int = 3  # limit on queries per landmark
+    # The probability of a sequence is proportional to (number of landmarks with 3 or more views)
+    # ** balance: 0 favours no sequence, 1 favours no landmark.
+    balance: float = 0.5
+    noise: float = 0.0  # probability that a bit is flipped
+
+    def __post_init__(self) -> None:
+        sizes = np.array([(s.counts >= 3).sum() for s in self.sequences], float)
+        self.probability = sizes**self.balance / (sizes**self.balance).sum()
 
     def choose(self, sequence: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Distinct random landmarks (m,) int64 for a batch."""

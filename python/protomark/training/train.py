@@ -105,27 +105,21 @@ class ValidationStep:
         return sum(self.precision.values()) / len(self.precision)
 
 
+@dataclass
 class Trainer:
     """Trains one encoder."""
 
-    def __init__(
-        self,
-        sequences: Sequence[Views],  # training sequences, see `data.load_training`
-        trials: Sequence[Trial],  # validation splits
-        options: TrainingOptions,
-        checkpoint: Path | None = None,  # file of the checkpoint, None for none
-        # Digest of the data, so that no checkpoint is resumed with other data.
-        fingerprint: str = "",
-        device: str = "cpu",  # "cpu" or "cuda"
-        half: bool = False,  # whether matrix products run in bfloat16
-    ) -> None:
+    sequences: Sequence[Views]  # training sequences, see `data.load_training`
+    trials: Sequence[Trial]  # validation splits
+    options: TrainingOptions
+    checkpoint: Path | None = None  # file of the checkpoint, None for none
+    fingerprint: str = ""  # digest of the data, so that no checkpoint is resumed with other data
+    device: str = "cpu"  # "cpu" or "cuda"
+    half: bool = False  # whether matrix products run in bfloat16
+
+    def __post_init__(self) -> None:
+        options, sequences = self.options, self.sequences
         options.check()
-        self.options = options
-        self.trials = trials
-        self.checkpoint = checkpoint
-        self.fingerprint = fingerprint
-        self.device = torch.device(device)
-        self.half = half
         self.sampler = BatchSampler(
             sequences,
             options.landmarks,
@@ -194,7 +188,7 @@ class Trainer:
             group["lr"] = options.rate(self.step)
         model = self.quantized if self.step >= options.quantized_from else self.network
         signs = to_signs(batch.descriptors, self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
+        with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.half):
             embeddings = model(signs)
         loss = self.loss(
             embeddings,
