@@ -374,7 +374,7 @@ def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path
         (["split", one, "--parts", 3, "-o", tmp_path], "a map of 2 landmarks has 1 to 2"),
         (["split", one, "--ids", "3,2", "-o", tmp_path], "boundaries of parts must ascend"),
         (["split", one, "--cell-size", 0, "-o", tmp_path], "must be above 0"),
-        (["split", one, "--parts", 2, "-o", one], "is a file: name a folder"),
+        (["split", one, "--parts", 2, "-o", one], "one.pmk is not a folder"),
         (["split", sealed, "--parts", 2, "-o", tmp_path], "is a sealed map"),
     ]
     for arguments, message in calls:

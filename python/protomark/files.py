@@ -97,13 +97,18 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         file.write(text.encode())
 
 
-def check_outputs(*outputs: Path | None, inputs: Iterable[object] = ()) -> None:
+def check_outputs(
+    *outputs: Path | None, inputs: Iterable[object] = (), folder: Path | None = None
+) -> None:
     """Raise before any work if a result could not be written after it, or would replace an input.
 
     Args:
         outputs: files to write; None: not asked for.
         inputs: what the command reads: paths, texts that may be paths, or None.
+        folder: folder of further files to write, see `check_folder`.
     """
+    if folder is not None:
+        check_folder(folder)
     written: list[Path] = []
     read = [Path(str(i)) for i in inputs if i is not None]
     for path in outputs:

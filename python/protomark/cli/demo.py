@@ -35,7 +35,7 @@ def demo(
     from protomark.evaluation.demo import run_demo
     from protomark.files import check_outputs
 
-    check_outputs(json_file)
+    check_outputs(json_file, folder=output)
     with progress_bar() as progress:
         result = run_demo(output, tracks_path=tracks, encoder=encoder, progress=progress)
     write_json(json_file, asdict(result))

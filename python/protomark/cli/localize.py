@@ -92,11 +92,10 @@ def localize(
     """
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.features.images import passed_over
-    from protomark.files import check_folder, check_outputs
+    from protomark.files import check_outputs
     from protomark.localization.batch import LocalizationRequest, localize_files
 
-    check_folder(output)
-    check_outputs(json_file, inputs=[scene, *images, camera, poses, priors])
+    check_outputs(json_file, inputs=[scene, *images, camera, poses, priors], folder=output)
     for line in filter(None, map(passed_over, images)):
         note(line)
     request = LocalizationRequest(

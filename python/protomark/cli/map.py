@@ -82,7 +82,7 @@ def map_(
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.extras import optional
     from protomark.features.images import passed_over
-    from protomark.files import check_folder, check_outputs
+    from protomark.files import check_outputs
     from protomark.mapping.options import MappingOptions
     from protomark.mapping.session import MapRequest, make_map
 
@@ -91,8 +91,7 @@ def map_(
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
-    check_folder(scene)
-    check_outputs(json_file, inputs=[images, camera, poses, encoder])
+    check_outputs(json_file, inputs=[images, camera, poses, encoder], folder=scene)
     if line := passed_over(images):
         note(line)
     if view:

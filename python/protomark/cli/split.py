@@ -50,7 +50,7 @@ def split(
     from protomark.files import check_outputs
     from protomark.maps.split import split_file
 
-    check_outputs(json_file, inputs=[file])
+    check_outputs(json_file, inputs=[file], folder=output)
     boundaries = list(comma_separated_numbers("--ids", ids)) or None
     with progress_bar() as progress:
         facts = split_file(file, output, boundaries, parts, cell_size, sealed, progress)

@@ -100,7 +100,7 @@ def tracks(
     protomark tracks kitchen/ -o tracks -d freak -d orb
     """
     from protomark.cli.terminal import progress_bar, write_json
-    from protomark.files import check_folder, check_outputs
+    from protomark.files import check_outputs
     from protomark.tracks.extract import TracksOptions, find_sequence
     from protomark.tracks.make import make_augmented_tracks, make_tracks
 
@@ -131,8 +131,7 @@ def tracks(
             f"two folders are named {double[0]} and would write the same file: run the command for "
             "each, with its own -o"
         )
-    check_folder(output)
-    check_outputs(json_file, inputs=[database])
+    check_outputs(json_file, inputs=[database], folder=output)
     facts = []
     for source in sources:
         for one in options:

@@ -208,8 +208,6 @@ def _draw(rows: list[DemoRow], name: str, scene: ScenePicture, path: Path) -> No
 
 def _check_output(output: Path) -> None:
     """Raise before any work if the demo would overwrite a file that no demo wrote."""
-    if output.exists() and not output.is_dir():
-        raise FileExistsError(f"{output} is not a folder: name another one with --output")
     picture = output / PICTURE
     if picture.is_file():
         with picture.open("rb") as file:

@@ -29,8 +29,6 @@ def split_file(
     """
     if sum(option is not None for option in (ids, parts, cell_size)) != 1:
         raise ValueError("give one of --ids, --parts and --cell-size to split by")
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file: name a folder to write the parts to")
     scene = open_learning_map(path)
     named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)
     ending = ".sealed.pmk" if sealed else ".pmk"
