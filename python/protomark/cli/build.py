@@ -11,18 +11,11 @@ from protomark.cli.options import EncoderName, JsonFile, NoSeal, Threads
 
 
 def build(
-    tracks: Annotated[
-        Path, typer.Argument(metavar="TRACKS", help="Tracks file that `protomark tracks` wrote.")
-    ],
+    tracks: Annotated[Path, typer.Argument(metavar="TRACKS", help="Tracks of `protomark tracks`.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
     encoder: EncoderName = None,
-    dim: Annotated[
-        int | None,
-        typer.Option(help="Numbers per prototype; by default 48."),
-    ] = None,
-    min_observations: Annotated[
-        int, typer.Option(help="Leave out landmarks with fewer observations.")
-    ] = 2,
+    dim: Annotated[int | None, typer.Option(help="Numbers per prototype; by default 48.")] = None,
+    min_observations: Annotated[int, typer.Option(help="Smallest number of observations.")] = 2,
     frame: Annotated[
         str | None,
         typer.Option(

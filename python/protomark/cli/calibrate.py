@@ -11,10 +11,7 @@ from protomark.cli.options import JsonFile, Threads, TracksFiles
 
 
 def calibrate(
-    model: Annotated[
-        Path,
-        typer.Argument(metavar="MODEL", help="Model file (.pme) that `protomark train` wrote."),
-    ],
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model of `protomark train`.")],
     tracks: TracksFiles,
     output: Annotated[
         Path | None,

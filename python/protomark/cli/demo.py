@@ -19,9 +19,7 @@ def demo(
         Path, typer.Option("--output", "-o", help="Folder for the maps and the picture.")
     ] = Path("demo"),
     encoder: EncoderName = None,
-    tracks: Annotated[
-        Path | None, typer.Option(help="Tracks file to take in place of the bundled sample.")
-    ] = None,
+    tracks: Annotated[Path | None, typer.Option(help="Tracks in place of the sample.")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Map the bundled sample, localize frames in it, and compare.

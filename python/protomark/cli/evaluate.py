@@ -33,12 +33,8 @@ def evaluate(
             "all except those that end in -float."
         ),
     ] = "",
-    seeds: Annotated[
-        int, typer.Option(min=1, help="Number of random splits into map and queries.")
-    ] = 3,
-    pose_frames: Annotated[
-        int, typer.Option(min=0, help="Limit on query keyframes to localize per split.")
-    ] = 20,
+    seeds: Annotated[int, typer.Option(min=1, help="Random splits into map and queries.")] = 3,
+    pose_frames: Annotated[int, typer.Option(min=0, help="Frames to localize per split.")] = 20,
     discriminant_from: Annotated[
         list[Path] | None,
         typer.Option(

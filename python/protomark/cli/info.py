@@ -14,9 +14,7 @@ _BARS = "▁▂▃▄▅▆▇█"
 
 
 def info(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A map, an encoder or a tracks file.")
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A map, an encoder or tracks.")],
     verify: Annotated[
         bool,
         typer.Option(

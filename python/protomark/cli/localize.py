@@ -20,9 +20,7 @@ def localize(
             metavar="MAP", help="Map file (.pmk) with positions, or a folder of `protomark map`."
         ),
     ],
-    images: Annotated[
-        list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders of images.")
-    ],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders.")],
     output: Annotated[
         Path,
         typer.Option(
@@ -58,12 +56,8 @@ def localize(
             "searched."
         ),
     ] = None,
-    prior_distance: Annotated[
-        float, typer.Option(help="Largest error of a rough position, in the map's unit.")
-    ] = 1.0,
-    prior_degrees: Annotated[
-        float, typer.Option(help="Largest error of a rough orientation, degrees.")
-    ] = 15.0,
+    prior_distance: Annotated[float, typer.Option(help="Largest error in the map's unit.")] = 1.0,
+    prior_degrees: Annotated[float, typer.Option(help="Largest error in degrees.")] = 15.0,
     min_confidence: Annotated[
         float,
         typer.Option(

@@ -14,12 +14,8 @@ def map_(
     images: Annotated[
         Path, typer.Argument(metavar="IMAGES_OR_VIDEO", help="Folder of images, or a video file.")
     ],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the new map.")
-    ] = None,
-    into: Annotated[
-        Path | None, typer.Option("--into", help="Folder of an existing map to extend in place.")
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="New map's folder.")] = None,
+    into: Annotated[Path | None, typer.Option("--into", help="Folder of a map to extend.")] = None,
     descriptor: Annotated[
         str,
         typer.Option(
@@ -51,15 +47,9 @@ def map_(
     dim: Annotated[int, typer.Option(help="Numbers per prototype, one byte each.")] = 32,
     encoder: EncoderName = None,
     max_keypoints: MaxKeypoints = 2000,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a map that Ctrl-C or a crash ended.")
-    ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Make the map anew even if OUTPUT holds one.")
-    ] = False,
-    view: Annotated[
-        bool, typer.Option("--view", help="Also write recording.rrd for the Rerun viewer.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted map.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the map in OUTPUT.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Also write a recording for Rerun.")] = False,
     no_seal: NoSeal = False,
     threads: Threads = 1,
     json_file: JsonFile = None,

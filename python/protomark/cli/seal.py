@@ -27,9 +27,7 @@ def seal(
             help="Folder of `protomark map`, a learning map (.pmk), or a tracks file.",
         ),
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Sealed map to write (.sealed.pmk).")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Sealed map to write.")],
     bytes_per_landmark: Annotated[
         float,
         typer.Option(
@@ -42,9 +40,7 @@ def seal(
         float | None,
         typer.Option(help="Limit on the file, in MB (10^6 bytes), the encoder's 0.45 included."),
     ] = None,
-    landmarks: Annotated[
-        int | None, typer.Option(min=1, help="Limit on the number of landmarks.")
-    ] = None,
+    landmarks: Annotated[int | None, typer.Option(min=1, help="Limit on landmarks.")] = None,
     index: Annotated[
         IndexChoice,
         typer.Option(

@@ -33,12 +33,8 @@ def tracks(
             show_default="freak",
         ),
     ] = None,
-    images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the images, if not FOLDER/images.")
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option("--model", help="Folder of the COLMAP model, text or binary.")
-    ] = None,
+    images: Annotated[Path | None, typer.Option("--images", help="Folder of the images.")] = None,
+    model: Annotated[Path | None, typer.Option("--model", help="COLMAP model's folder.")] = None,
     database: Annotated[
         Path | None,
         typer.Option(
@@ -48,9 +44,7 @@ def tracks(
         ),
     ] = None,
     max_keypoints: MaxKeypoints = 2000,
-    partners: Annotated[
-        int, typer.Option(help="About how many keyframes each keyframe is matched with.")
-    ] = 24,
+    partners: Annotated[int, typer.Option(help="How many keyframes each is matched with.")] = 24,
     ratio: Annotated[
         float,
         typer.Option(help="Ratio test: a match is nearer than this share of the second nearest."),
@@ -58,12 +52,8 @@ def tracks(
     max_error: Annotated[
         float, typer.Option(help="Largest epipolar and reprojection error, pixels.")
     ] = 3.0,
-    min_angle: Annotated[
-        float, typer.Option(help="Smallest triangulation angle of a landmark, degrees.")
-    ] = 1.0,
-    min_length: Annotated[
-        int, typer.Option(help="Leave out landmarks with fewer observations.")
-    ] = 3,
+    min_angle: Annotated[float, typer.Option(help="Smallest triangulation angle, degrees.")] = 1.0,
+    min_length: Annotated[int, typer.Option(help="Smallest number of observations.")] = 3,
     refine_poses: Annotated[
         str,
         typer.Option(
@@ -86,9 +76,7 @@ def tracks(
         ),
     ] = 0,
     threads: Threads = 0,
-    force: Annotated[
-        bool, typer.Option("--force", help="Make files anew even if they are up to date.")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Make files anew.")] = False,
     json_file: JsonFile = None,
 ) -> None:
     """Make tracks from images with known poses.
