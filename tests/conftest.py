@@ -58,13 +58,15 @@ def random_layers(
 
 def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8]) -> Any:
     """The definition in core/include/protomark/encoder.h, in NumPy."""
-    x = np.unpackbits(descriptors, axis=1, bitorder="little").astype(np.int64)
+    x = np.unpackbits(descriptors, axis=1, bitorder="little")
     for layer in layers:
-        sums = x @ layer["weights"].T.astype(np.int64) + layer["bias"]
+        # Sums stay far below 2^53, so float64 matrix products are exact, and fast.
+        products = x.astype(np.float64) @ layer["weights"].T.astype(np.float64)
+        sums = products.astype(np.int64) + layer["bias"]
         t = (sums * layer["multipliers"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
         if layer["table"] is None:
             return np.clip(t, -127, 127).astype(np.int8)
-        x = layer["table"][np.clip(t, -128, 127) + 128].astype(np.int64)
+        x = layer["table"][np.clip(t, -128, 127) + 128]
     raise AssertionError("the last layer has a table")
 
 

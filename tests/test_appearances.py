@@ -1,11 +1,10 @@
-"""Several prototypes per landmark: exact after any change, searched exactly, merged by cost."""
+"""Several prototypes per landmark: exact after any change, searched exactly."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,83 +12,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import NO_DISTANCE, balanced_encoder, random_descriptors, rounded
+from appearances import (
+    Reference,
+    appearance_bits,
+    appearances_of,
+    assert_equals,
+    assert_search,
+    file_bytes,
+    observations,
+)
+from conftest import balanced_encoder, random_descriptors, rounded
 from map_container import LEARNING_MAP, container, sections
-from sealing import best_scale, four_bits, quantized
-
-Key = tuple[int, int]
-
-
-def appearances_of(codes: NDArray[np.int8], bits: int) -> list[int]:
-    return [sum(int(code[j] > 0) << j for j in range(bits)) for code in codes]
-
-
-class Reference:
-    """A sum and a count for each appearance of each landmark, halved at 255."""
-
-    def __init__(self, bits: int) -> None:
-        self.bits = bits
-        self.rows: dict[Key, tuple[NDArray[np.int64], int]] = {}
-
-    def add(self, ids: Any, codes: NDArray[np.int8]) -> None:
-        for key, code in zip(self.keys(ids, codes), codes.astype(np.int64), strict=True):
-            total, n = self.rows.get(key, (0 * code, 0))
-            if n == 255:
-                total, n = np.trunc(total / 2).astype(np.int64), 127
-            self.rows[key] = total + code, n + 1
-
-    def subtract(self, ids: Any, codes: NDArray[np.int8]) -> None:
-        for key, code in zip(self.keys(ids, codes), codes.astype(np.int64), strict=True):
-            total, n = self.rows.pop(key)
-            if n > 1:
-                self.rows[key] = total - code, n - 1
-
-    def merge_landmarks(self, into: int, source: int) -> None:
-        for _, appearance in self.of(source):
-            total, n = self.rows.pop((source, appearance))
-            old, m = self.rows.get((into, appearance), (0 * total, 0))
-            self.rows[into, appearance] = total + old, n + m
-
-    def remove(self, landmark: int) -> None:
-        for key in self.of(landmark):
-            del self.rows[key]
-
-    def keys(self, ids: Any, codes: NDArray[np.int8]) -> list[Key]:
-        return [
-            (int(i), appearance)
-            for i, appearance in zip(ids, appearances_of(codes, self.bits), strict=True)
-        ]
-
-    def of(self, landmark: int) -> list[Key]:
-        return sorted(key for key in self.rows if key[0] == landmark)
-
-    def ids(self) -> list[int]:
-        return sorted({i for i, _ in self.rows})
-
-    def means(self, landmark: int) -> NDArray[np.float64]:
-        return np.array([self.rows[key][0] / self.rows[key][1] for key in self.of(landmark)])
-
-
-def assert_equals(scene: pm.PrototypeMap, reference: Reference) -> None:
-    ids = reference.ids()
-    assert len(scene) == len(ids)
-    assert scene.prototype_count == len(reference.rows)
-    np.testing.assert_array_equal(scene.ids, ids)
-    for i in ids:
-        rows = [reference.rows[key] for key in reference.of(i)]
-        np.testing.assert_array_equal(scene.appearances(i), reference.means(i).astype(np.float32))
-        np.testing.assert_array_equal(scene.appearance_counts(i), [n for _, n in rows])
-        total, n = sum(s for s, _ in rows), sum(n for _, n in rows)
-        assert scene.counts([i]) == [n]
-        np.testing.assert_array_equal(scene.prototypes([i])[0], (total / n).astype(np.float32))
-
-
-def file_bytes(scene: pm.PrototypeMap, folder: Path) -> bytes:
-    scene.save(folder / "scene.pmk")
-    return (folder / "scene.pmk").read_bytes()
+from sealing import four_bits
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +38,6 @@ def encoder() -> pm.Encoder:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("appearances")
-
-
-observations = st.lists(st.tuples(st.integers(0, 12), st.integers(0, 30)), max_size=80)
-appearance_bits = st.sampled_from([1, 2, 5, 12])
 
 
 @settings(max_examples=60, deadline=None)
@@ -215,34 +147,6 @@ def test_each_appearance_is_halved_at_255(encoder: pm.Encoder) -> None:
     np.testing.assert_array_equal(scene.appearance_counts(3), [before[0], n // 2 if n > 255 else n])
 
 
-def expected_answers(
-    landmarks: dict[int, NDArray[np.int64]],
-    query: NDArray[np.int64],
-    k: int,
-    max_distance: int | None,
-    ratio: float | None,
-) -> list[tuple[int, int]]:
-    """The definition: a landmark's distance is that of its nearest prototype."""
-    every = sorted((int(((p - query) ** 2).sum(1).min()), i) for i, p in landmarks.items())
-    clear = len(every) < 2 or ratio is None or every[0][0] < ratio * ratio * every[1][0]
-    every = every if clear else []
-    limit = NO_DISTANCE if max_distance is None else max_distance
-    best = [(i, squared) for squared, i in every[:k] if squared <= limit]
-    return best + [(-1, NO_DISTANCE)] * (k - len(best))
-
-
-def assert_search(
-    scene: pm.PrototypeMap | pm.SealedMap, queries: NDArray[np.int8], **options: Any
-) -> None:
-    ids, distances = scene.search_codes(queries, threads=2, **options)
-    landmarks = {int(i): rounded(scene.appearances(i)) for i in scene.ids}
-    options = {"k": 2, "max_distance": None, "ratio": None} | options
-    for q, query in enumerate(queries.astype(np.int64)):
-        best = expected_answers(landmarks, query, **options)
-        np.testing.assert_array_equal(ids[q], [i for i, _ in best])
-        np.testing.assert_array_equal(distances[q], [s for _, s in best])
-
-
 @settings(max_examples=50, deadline=None)
 @given(
     n=st.integers(0, 90),
@@ -286,127 +190,6 @@ def test_search_equals_sorting(
         np.testing.assert_array_equal(a, b)
     fewer = scene.seal(folder / "s.pmk", bytes_per_landmark=four_bits(scene, 1.5))
     assert_search(fewer, queries, **options)
-
-
-def test_search_across_chunks(encoder: pm.Encoder, folder: Path) -> None:
-    """A map larger than the search's chunks, with landmarks across their borders."""
-    rng = np.random.default_rng(0)
-    scene = pm.PrototypeMap(encoder, appearance_bits=6)
-    codes = rng.integers(-127, 128, (6000, 12)).astype(np.int8)
-    scene.add_codes(rng.integers(0, 700, 6000), codes)
-    queries = rng.integers(-127, 128, (40, 12)).astype(np.int8)
-    assert scene.prototype_count > 3000
-    assert_search(scene, queries, k=3)
-    for size, kept in ((None, scene.prototype_count), (four_bits(scene, 4.3), 700 * 43 // 10)):
-        scene.seal(folder / "large.pmk", bytes_per_landmark=size)
-        sealed = pm.open(folder / "large.pmk")
-        assert f"{kept} prototypes" in repr(sealed)
-        assert_search(sealed, queries, k=3)
-        means = np.array([sealed.appearances(i).mean(axis=0) for i in range(700)])
-        np.testing.assert_allclose(sealed.prototypes(range(700)), means, rtol=1e-6, atol=1e-6)
-
-
-def merged_rows(reference: Reference, limit: int) -> dict[int, list[tuple[NDArray[np.int64], int]]]:
-    """Plain greedy merging over the whole map, every pair compared at every step."""
-    rows = {i: [reference.rows[key] for key in reference.of(i)] for i in reference.ids()}
-
-    def cost(a: tuple[NDArray[np.int64], int], b: tuple[NDArray[np.int64], int]) -> float:
-        (s, n), (t, m) = a, b
-        return int(((m * s - n * t) ** 2).sum()) / (n * m * (n + m))
-
-    while sum(map(len, rows.values())) > limit:
-        pairs = [
-            (cost(own[a], own[b]), i, a, b)
-            for i, own in rows.items()
-            for a, b in combinations(range(len(own)), 2)
-        ]
-        if not pairs:
-            break
-        _, i, a, b = min(pairs)
-        (s, n), (t, m) = rows[i][a], rows[i].pop(b)
-        rows[i][a] = s + t, n + m
-    return rows
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    observed=observations,
-    bits=st.sampled_from([0, 1, 3, 12]),
-    prototypes=st.floats(1, 6),
-    values=st.sampled_from([1, 2, 127]),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_sealing_equals_plain_merging(
-    observed: list[tuple[int, int]],
-    bits: int,
-    prototypes: float,
-    values: int,
-    seed: int,
-    encoder: pm.Encoder,
-    folder: Path,
-) -> None:
-    """Small values make many costs equal, so that the order of rows decides."""
-    pool = np.random.default_rng(seed).integers(-values, values + 1, (31, 12)).astype(np.int8)
-    ids, rows = [i for i, _ in observed], [d for _, d in observed]
-    scene, reference = pm.PrototypeMap(encoder, appearance_bits=bits), Reference(bits)
-    scene.add_codes(ids, pool[rows])
-    reference.add(ids, pool[rows])
-    size = four_bits(scene, prototypes)
-    sealed = scene.seal(folder / "w.pmk", bytes_per_landmark=size)
-    pm.verify_file(folder / "w.pmk")
-    known = reference.ids()
-    n, m = len(known), len(reference.rows)
-    # 12 numbers take 12 bytes or, of 4 bits, 8.
-    lossless = 12 * m + (2 if m > n else 1) * n <= size * n
-    assert sealed.code_bits == (8 if lossless else 4)
-    expected = merged_rows(reference, m if lossless else int(prototypes * n))
-    np.testing.assert_array_equal(sealed.ids, known)
-    assert sealed.prototype_count == sum(map(len, expected.values()))
-    means = {i: rounded(np.array([s / c for s, c in expected[i]])) for i in known}
-    scale = best_scale(np.concatenate(list(means.values()))) if not lossless else 0
-    for i in known:
-        exact = means[i] if lossless else quantized(means[i], scale)
-        np.testing.assert_array_equal(sealed.appearances(i), exact)
-        assert sealed.counts([i])[0] == sum(c for _, c in expected[i])
-
-
-def test_bytes_per_landmark(encoder: pm.Encoder, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    scene = pm.PrototypeMap(encoder, appearance_bits=8)
-    codes = rng.integers(-127, 128, (8000, 12)).astype(np.int8)
-    scene.add_codes(np.arange(8000) % 1600, codes)
-    path = tmp_path / "s.pmk"
-    # Sealed to one prototype per landmark, the file is one without appearances.
-    scene.seal(path, bytes_per_landmark=9)
-    sizes = dict(pm.file_sections(path))
-    assert set(sizes) == {"encoder", "shape", "counts", "sq4scale", "protos"}
-    plain = pm.PrototypeMap(encoder)
-    plain.add_codes(np.arange(8000) % 1600, codes)
-    plain.seal(tmp_path / "plain.pmk", bytes_per_landmark=9)
-    assert path.read_bytes() == (tmp_path / "plain.pmk").read_bytes()
-
-    sealed = scene.seal(path, bytes_per_landmark=2 * 8 + 2)
-    sizes = dict(pm.file_sections(path))
-    assert set(sizes) == {"encoder", "shape", "counts", "rows", "sq4scale", "protos"}
-    assert sealed.prototype_count == 3200
-    assert sizes["counts"] + sizes["rows"] + sizes["protos"] == 1600 * (2 * 8 + 2)
-
-
-def test_a_landmark_with_very_many_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
-    """A sealed landmark has at most 255 prototypes, and a count of at most 255."""
-    rng = np.random.default_rng(3)
-    scene = pm.PrototypeMap(encoder, appearance_bits=12)
-    scene.add_codes([5] * 900 + [6], rng.integers(-127, 128, (901, 12)).astype(np.int8))
-    rows = scene.prototype_count
-    assert len(scene.appearances(5)) == rows - 1 > 300
-    assert scene.counts([5, 6]).tolist() == [900, 1]
-    for size in (None, 1e9, 12 * 128 + 2, 12 * 128 + 1, 8 * 128 + 2):
-        sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
-        assert (len(sealed.appearances(5)), sealed.prototype_count) == (255, 256)
-        assert sealed.code_bits == (4 if size in (12 * 128 + 1, 8 * 128 + 2) else 8)
-        assert sealed.counts([5, 6]).tolist() == [255, 1]
-    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=8 * 50 + 2)
-    assert (len(sealed.appearances(5)), len(sealed.appearances(6))) == (99, 1)
 
 
 def test_maps_without_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -538,48 +321,6 @@ def test_hostile_learning_maps_are_refused(
     path.write_bytes(container([(n, c) for n, c in changed if c is not None], kind=LEARNING_MAP))
     if message is None:
         assert_search(pm.open(path), codes)
-        return
-    with pytest.raises(pm.FileError, match=message):
-        pm.open(path)
-
-
-@pytest.mark.parametrize("bits", [8, 4])
-@pytest.mark.parametrize(
-    ("section", "content", "message"),
-    [
-        ("rows", bytes([2, 0, 3]), "it has a landmark without prototypes"),
-        ("rows", bytes([2, 1]), "section 'rows' has the wrong size"),
-        ("rows", bytes([255, 255, 255]), "section 'protos' has the wrong size"),
-        ("rows", None, None),
-        ("counts", bytes(2), "section 'counts' has the wrong size"),
-        ("protos", b"", "section 'protos' has the wrong size"),
-    ],
-)
-def test_hostile_sealed_maps_are_refused(
-    bits: int,
-    section: str,
-    content: bytes | None,
-    message: str | None,
-    encoder: pm.Encoder,
-    tmp_path: Path,
-) -> None:
-    scene = pm.PrototypeMap(encoder, appearance_bits=3)
-    codes = np.full((5, 12), 9, np.int8)
-    codes[[0, 2], 1] = -9
-    scene.add_codes([4, 4, 8, 9, 9], codes)
-    scene.merge_landmarks(9, 8)
-    scene.add_codes([8], codes[:1])
-    path = tmp_path / "s.pmk"
-    scene.seal(path, bytes_per_landmark=four_bits(scene) if bits == 4 else None)
-    assert scene.prototype_count == 5
-    parts = sections(path.read_bytes())
-    assert container(parts) == path.read_bytes()
-    changed = [(name, content if name == section else old) for name, old in parts]
-    path.unlink()
-    path.write_bytes(container([(n, c) for n, c in changed if c is not None]))
-    if message is None:
-        # Five prototypes of three landmarks: what is left over is padding, which nobody reads.
-        assert len(pm.open(path).appearances(9)) == 1
         return
     with pytest.raises(pm.FileError, match=message):
         pm.open(path)

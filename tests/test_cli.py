@@ -374,7 +374,7 @@ def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path
         (["split", one, "--parts", 3, "-o", tmp_path], "a map of 2 landmarks has 1 to 2"),
         (["split", one, "--ids", "3,2", "-o", tmp_path], "boundaries of parts must ascend"),
         (["split", one, "--cell-size", 0, "-o", tmp_path], "must be above 0"),
-        (["split", one, "--parts", 2, "-o", one], "is a file: name a folder"),
+        (["split", one, "--parts", 2, "-o", one], "one.pmk is not a folder"),
         (["split", sealed, "--parts", 2, "-o", tmp_path], "is a sealed map"),
     ]
     for arguments, message in calls:
@@ -385,3 +385,40 @@ def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path
         assert message in done.stderr.replace("\n", " ")
         assert not output.exists()
     assert one.read_bytes() == before
+
+
+def test_output_that_the_terminal_cannot_show(
+    tracks: Tracks, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracks.save(tmp_path / "t.safetensors")
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    done = protomark("build", tmp_path / "t.safetensors", "-o", tmp_path / "m", "--encoder", model)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "observations per landmark" in done.stdout
+
+
+def test_arguments_that_cannot_be_meant(tracks: Tracks, model: Path, tmp_path: Path) -> None:
+    tracks.save(tmp_path / "t.safetensors")
+    build = ("build", tmp_path / "t.safetensors", "-o", tmp_path / "x.pmk", "--encoder", model)
+    for arguments, message in (
+        (("map", "", "-o", tmp_path / "x"), "an argument is empty"),
+        ((*build, "--dim", -1), "--dim -1: encoder 'tiny' has codes of 5, 12 dimensions"),
+        ((*build, "--dim", 2**70), f"--dim {2**70}: encoder 'tiny' has codes of 5, 12 dimensions"),
+    ):
+        done = protomark(*arguments)
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
+def test_sigterm_is_ctrl_c_even_after_pycolmap_was_imported() -> None:
+    script = (
+        "import os, signal\n"
+        "signal.signal(signal.SIGTERM, signal.default_int_handler)\n"
+        "import protomark.geometry.colmap\n"
+        "try: os.kill(os.getpid(), signal.SIGTERM)\n"
+        "except KeyboardInterrupt: print('stopped')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("stopped\n", "")

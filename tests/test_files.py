@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from protomark.files import replacing, write_text
+from protomark.files import check_folder, check_outputs, replacing, write_text
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -69,3 +69,16 @@ def test_file_and_folder_are_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(os, "fsync", lambda handle: synced.append(os.fstat(handle).st_ino))
     write_text(tmp_path / "a.txt", "x")
     assert synced == [(tmp_path / "a.txt").stat().st_ino, tmp_path.stat().st_ino]
+
+
+@pytest.mark.skipif(not Path("/proc/version").exists(), reason="/proc is where nobody may write")
+def test_a_folder_that_nobody_can_write_to_is_noticed_before_the_work(tmp_path: Path) -> None:
+    check_folder(tmp_path / "new" / "folder")
+    with pytest.raises(OSError, match="/proc: no file can be written"):
+        check_folder(Path("/proc/new"))
+    with pytest.raises(OSError, match="/proc: no file can be written"):
+        check_outputs(Path("/proc/version"))
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match="file is not a folder"):
+        check_folder(tmp_path / "file" / "folder")
+    assert os.listdir(tmp_path) == ["file"]

@@ -28,9 +28,9 @@ from protomark.geometry.pose import camera_centers, pose_error
 from protomark.localization import Localization, Localizer, PosePrior
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
-from protomark.tracks.extract import TracksOptions
+from protomark.tracks.extract import TracksOptions, find_sequence
 from protomark.tracks.file import Tracks
-from protomark.tracks.make import TracksInput, make_tracks
+from protomark.tracks.make import make_tracks
 from tracks_scene import PINHOLE, poses, quaternion, render, texture, write_model, write_sequence
 
 KEYPOINTS = 600
@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sequence = write_sequence(folder / "plane", count=8)
     for name in ("freak", "orb"):
         options = TracksOptions(descriptor=name, max_keypoints=KEYPOINTS)
-        make_tracks(TracksInput(sequence), options, folder)
+        make_tracks(find_sequence(sequence), options, folder)
     return folder
 
 

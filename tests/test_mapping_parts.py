@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
+from mapping_memory import check_changes, check_search, observations
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import quaternion_from_rotation
@@ -31,45 +32,12 @@ def test_near_pairs_of_nothing():
     assert len(i) == len(j) == 0
 
 
-def observations(seed=0, landmarks=12, each=5):
-    rng = np.random.default_rng(seed)
-    base = rng.integers(0, 256, (landmarks, 32), np.uint8)
-    ids = np.repeat(np.arange(1, landmarks + 1), each)
-    noise = (rng.random((len(ids), 256)) < 0.05).reshape(len(ids), 32, 8)
-    descriptors = base[ids - 1] ^ np.packbits(noise, axis=2)[:, :, 0]
-    return ids, descriptors
-
-
 def test_prototypes_find_their_landmarks(encoder):
-    memory = Prototypes(encoder, 16)
-    ids, descriptors = observations()
-    encoded = memory.encode(descriptors)
-    memory.add(ids[::2], encoded[::2])
-    found, distances = memory.search(encoded[1::2])
-    assert (found[:, 0] == ids[1::2]).mean() > 0.9
-    assert (distances[:, 0] <= distances[:, 1]).all()
-    rows = np.arange(len(found))
-    again = memory.distances(encoded[1::2], rows, found[:, 0])
-    np.testing.assert_allclose(again**2, distances[:, 0], rtol=1e-5)
+    check_search(Prototypes(encoder, 16), squared=True)
 
 
 def test_taking_back_merging_and_discarding_leave_what_adding_the_rest_gives(encoder):
-    memory, rest = Prototypes(encoder, 16), Prototypes(encoder, 16)
-    ids, descriptors = observations()
-    encoded = memory.encode(descriptors)
-    memory.add(ids, encoded)
-    removed = np.zeros(len(ids), bool)
-    removed[[0, 7, 8, 21, 40]] = True
-    memory.subtract(ids[removed], encoded[removed])
-    memory.merge_landmarks(np.array([3, 5]), np.array([4, 6]))
-    memory.remove(np.array([1, 9]))
-    np.testing.assert_array_equal(memory.contains(np.array([1, 2, 3, 4, 9])), [0, 1, 1, 0, 0])
-    ids = np.where(ids == 4, 3, np.where(ids == 6, 5, ids))
-    stays = ~removed & (ids != 1) & (ids != 9)
-    rest.add(ids[stays], encoded[stays])
-    for a, b in zip(memory.search(encoded), rest.search(encoded), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert memory.bytes == rest.bytes
+    check_changes(Prototypes(encoder, 16), Prototypes(encoder, 16))
 
 
 def test_bytes_that_matching_needs(encoder):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.match_calibration import NO_DISTANCE, MatchCalibration, with_calibration
-from protomark.matching import Matches, accept
+from protomark.matching import MatchList, accept
 
 
 def reference_probability(
@@ -32,16 +32,16 @@ def reference_probability(
 
 def reference_accept(
     nearest: NDArray[np.int64], probabilities: NDArray[np.float64], least: float
-) -> Matches:
+) -> MatchList:
     """The likeliest first, ties to the smaller row; each landmark keeps its likeliest keypoint."""
     order = np.argsort(-probabilities, kind="stable")
     order = order[(nearest[order] >= 0) & (probabilities[order] >= least)]
     _, best = np.unique(nearest[order], return_index=True)
     kept = order[np.sort(best)]
-    return Matches(kept, nearest[kept], probabilities[kept])
+    return MatchList(kept, nearest[kept], probabilities[kept])
 
 
-def assert_equal(found: Matches, expected: Matches) -> None:
+def assert_equal(found: MatchList, expected: MatchList) -> None:
     for name in ("keypoints", "landmarks", "probabilities"):
         a, b = getattr(found, name), getattr(expected, name)
         assert a.dtype == b.dtype

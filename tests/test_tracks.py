@@ -20,7 +20,7 @@ from protomark.tracks.extract import (
     provenance,
 )
 from protomark.tracks.file import Tracks
-from protomark.tracks.make import TracksInput, make_tracks
+from protomark.tracks.make import make_tracks
 from protomark.tracks.summary import reprojection_errors, summarise
 from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
@@ -200,10 +200,10 @@ def test_done_only_with_same_settings_and_input(
     sequence: Path, orb: Tracks, tmp_path: Path
 ) -> None:
     source, options = find_sequence(sequence), TracksOptions("orb", max_keypoints=600)
-    made = make_tracks(TracksInput(sequence), options, tmp_path)
+    made = make_tracks(source, options, tmp_path)
     assert not made.skipped
     path = made.path
-    assert make_tracks(TracksInput(sequence), options, tmp_path).skipped
+    assert make_tracks(source, options, tmp_path).skipped
     expected = provenance(source, options)
     assert expected == {key: orb.info[key] for key in expected}
     assert provenance(source, replace(options, max_keypoints=601)) != expected
@@ -212,5 +212,10 @@ def test_done_only_with_same_settings_and_input(
     write_model(tmp_path / "moved", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
     moved = SequenceFolder("plane", source.images, tmp_path / "moved")
     assert provenance(moved, options) != expected
+    images = shutil.copytree(source.images, tmp_path / "images")
+    data = bytearray((images / "img5.png").read_bytes())
+    data[100] ^= 1  # another image of the same size
+    (images / "img5.png").write_bytes(data)
+    assert provenance(replace(source, images=images), options) != expected
     path.write_bytes(path.read_bytes()[:-100])
-    assert not make_tracks(TracksInput(sequence), options, tmp_path).skipped
+    assert not make_tracks(source, options, tmp_path).skipped

@@ -111,7 +111,7 @@ def test_command_writes_both_and_keeps_what_is_there(folder: Path, tmp_path: Pat
     assert done.exit_code == 0, done.output
     path = tmp_path / "plane.orb.augmented.safetensors"
     assert Tracks.load(path).info["augmentations"] == 1
-    assert "more observations" in done.output
+    assert "copies of each keyframe" in done.output
     assert done.output.count("/of[today]/plane.orb.") == 2
     plain, varied = json.loads(facts.read_text())
     assert (plain["file"], varied["file"]) == (str(tmp_path / "plane.orb.safetensors"), str(path))

@@ -81,6 +81,16 @@ def change(scene: tuple[Path, Tracks], tmp_path: Path, sql: str) -> Path:
     return path
 
 
+def test_reading_writes_nothing(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
+    """COLMAP's databases are in a mode in which even a reader needs to write files beside them."""
+    path = change(scene, tmp_path, "PRAGMA journal_mode = WAL")
+    tmp_path.chmod(0o555)
+    found = tracks_from_database(path, scene[0] / "points", "orb")
+    tmp_path.chmod(0o755)
+    assert np.array_equal(found.descriptors, scene[1].descriptors)
+    assert [p.name for p in tmp_path.iterdir()] == ["changed.db"]
+
+
 def test_other_descriptor(scene: tuple[Path, Tracks]) -> None:
     with pytest.raises(ValueError, match=r"32 bytes, but freak has 64.*orb or latch or teblid"):
         tracks_from_database(scene[0] / "database.db", scene[0] / "points", "freak")

@@ -94,9 +94,9 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
 @pytest.mark.parametrize(
     ("training", "validation", "message"),
     [
-        (["a", "other"], ["unseen"], "one descriptor at a time"),
-        (["a", "longer"], ["unseen"], "one descriptor at a time"),
-        (["a"], ["other"], "one descriptor at a time"),
+        (["a", "other"], ["unseen"], "give tracks of one descriptor"),
+        (["a", "longer"], ["unseen"], "give tracks of one descriptor"),
+        (["a"], ["other"], "give tracks of one descriptor"),
         (["a", "b"], ["b"], "not trained on"),
         (["tiny"], ["unseen"], "give more or longer tracks"),
         (["a", "short"], ["unseen"], "short.*the 3 views that training needs"),
@@ -141,7 +141,7 @@ def test_a_missing_file_is_named(files, tmp_path):
         (["--data-licence", "z=MIT"], "not one of the sequences"),
         (["-o", "no/such/folder/x.pme"], "no such folder to write"),
         (["--report", "nowhere.safetensors"], "nowhere"),
-        (["--report", "{longer}"], "report on tracks of the same descriptor"),
+        (["--report", "{longer}"], "give tracks of one descriptor"),
         (["--report", "{short}"], "short"),
         (["-o", "{tmp_path}"], "is a folder"),
         (["-o", "{tmp_path}/x.md"], "name the model .pme"),

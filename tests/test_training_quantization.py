@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import protomark as pm
+from conftest import reference_encode
 from protomark import models
 from protomark.training.network import (
     MAX_WEIGHT_BYTES,
@@ -14,7 +15,7 @@ from protomark.training.network import (
     to_signs,
     weight_bytes,
 )
-from protomark.training.quantization import Layer, QuantizedNetwork, integer_forward
+from protomark.training.quantization import Layer, QuantizedNetwork
 
 
 def random_descriptors(n: int, bits: int, seed: int = 0) -> np.ndarray:
@@ -38,7 +39,7 @@ CASES = [(64, 8, (32, 16)), (256, 32, None), (512, 32, None), (512, 64, ()), (10
 def test_simulation_equals_integer_arithmetic(bits, dim, hidden):
     model = quantized(bits, dim, hidden)
     descriptors = random_descriptors(2000, bits)
-    codes = integer_forward(model.export(), descriptors)
+    codes = reference_encode(model.export(), descriptors)
     assert codes.dtype == np.int8
     assert codes.shape == (2000, dim)
     simulated = np.rint(embed(model, descriptors) / float(model.scale))
@@ -53,7 +54,7 @@ def test_integer_codes_are_close_to_the_float_network(bits, dim, hidden):
     model = quantized(bits, dim, hidden)
     descriptors = random_descriptors(2000, bits)
     real = embed(model.network, descriptors)
-    codes = integer_forward(model.export(), descriptors) * float(model.scale)
+    codes = reference_encode(model.export(), descriptors) * float(model.scale)
     error = np.sqrt(((real - codes) ** 2).mean() / (real**2).mean())
     assert error < 0.03
 
@@ -73,7 +74,7 @@ def test_the_core_encodes_the_same_bytes(bits, dim, hidden, tmp_path):
     )
     encoder.save(tmp_path / "x.pme")
     descriptors = random_descriptors(2000, bits)
-    expected = integer_forward(layers, descriptors)
+    expected = reference_encode(layers, descriptors)
     loaded = pm.Encoder.load(tmp_path / "x.pme")
     np.testing.assert_array_equal(encoder.encode(descriptors), expected)
     np.testing.assert_array_equal(loaded.encode(descriptors), expected)
@@ -85,7 +86,7 @@ def test_encoders_that_ship_encode_as_their_layers_say(name):
     encoder = pm.Encoder.load(name)
     descriptors = random_descriptors(3000, encoder.bits)
     np.testing.assert_array_equal(
-        encoder.encode(descriptors), integer_forward(encoder.layers, descriptors)
+        encoder.encode(descriptors), reference_encode(encoder.layers, descriptors)
     )
 
 
@@ -108,7 +109,7 @@ def test_integer_arithmetic_by_hand():
     # bit 7: 94*3=282 -> 284>>2=71 -> 142 -> -137 -> -136>>1=-68
     # none: -18 -> -16>>2=-4 -> 0 -> 5 -> 6>>1=3; both: 312 -> 78 -> 156 -> -151 -> -75
     descriptors = np.uint8([[1], [128], [0], [129]])
-    np.testing.assert_array_equal(integer_forward(layers, descriptors), [[0], [-68], [3], [-75]])
+    np.testing.assert_array_equal(reference_encode(layers, descriptors), [[0], [-68], [3], [-75]])
 
 
 def test_gradients_reach_every_weight():
@@ -126,7 +127,7 @@ def test_a_dead_unit_does_not_break_the_export():
     for layer in model.export():
         assert (layer["multipliers"] > 0).all()
         assert 1 <= layer["shift"] <= 62
-    integer_forward(model.export(), random_descriptors(10, 64))
+    reference_encode(model.export(), random_descriptors(10, 64))
 
 
 @pytest.mark.parametrize("bits", [64, 256, 488, 512, 1024])

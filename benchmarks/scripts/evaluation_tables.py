@@ -15,14 +15,15 @@ from pathlib import Path
 
 from protomark.evaluation.methods import method_choices
 from protomark.evaluation.results import (
+    FORMAT,
+    MethodResult,
     SequenceResult,
-    load_json,
     mean_rows,
     save_precision_plot,
     summary_markdown,
 )
 from protomark.files import write_text
-from protomark_bench.report import ReportTable, number
+from protomark_bench.report import ReportTable, load_json, number
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -51,6 +52,16 @@ BUDGETS = {
     65: ("protomark-64", None, "appearances-65"),
 }
 PAPER = {65: 0.849}  # Komorowski and Trzcinski, 16 float32 numbers and the count: 0.676 of 0.796
+
+
+def load_results(path: Path) -> list[SequenceResult]:
+    """Reads what `protomark evaluate --json` wrote."""
+    results = []
+    for entry in load_json(path, FORMAT)["sequences"]:
+        del entry["table"]
+        methods = [MethodResult(**method) for method in entry.pop("methods")]
+        results.append(SequenceResult(**entry, methods=methods))
+    return results
 
 
 def replace_tables(document: Path, tables: str) -> None:
@@ -161,7 +172,7 @@ def main() -> None:
     paths = [Path(p) for p in sys.argv[1:]] or sorted(RESULTS.glob("evaluation.*.json"))
     order = [name for members in SPLITS.values() for name in members]
     results = sorted(
-        joined([result for path in paths for result in load_json(path)]),
+        joined([result for path in paths for result in load_results(path)]),
         key=lambda result: (result.descriptor, order.index(result.sequence)),
     )
     parts = []
@@ -179,7 +190,7 @@ def main() -> None:
             replace_tables(MODELS / f"{descriptor}.md", card_text(tests))
         upright = RESULTS / f"upright.{descriptor}.json"
         if upright.is_file():
-            table = upright_table(same, load_json(upright))
+            table = upright_table(same, load_results(upright))
             parts += [f"### Cameras that do not roll: `{descriptor}-upright`", table]
             card = MODELS / f"{descriptor}-upright.md"
             replace_tables(card, f"## Beside the plain encoder\n\n{table}")

@@ -120,7 +120,7 @@ def test_a_run_that_was_cut_goes_on(folder, tmp_path, monkeypatch):
         (["--test", "z"], "no sequence is named z"),
         ([], "no training sequence among a, b, c, d, e, f"),
         ([*ROLES, "--test", "f"], "f.synthetic.*one descriptor"),
-        (["--train", "f", "--validation", "c", "--test", "a"], "one descriptor at a time"),
+        (["--train", "f", "--validation", "c", "--test", "a"], "give tracks of one descriptor"),
         (["--from", "no/such.json"], "no/such.json"),
     ],
 )

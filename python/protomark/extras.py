@@ -11,7 +11,6 @@ from urllib.parse import unquote, urlparse
 # Module -> its name, and the extra of this package that installs it.
 _EXTRAS = {
     "cv2": ("OpenCV (opencv-contrib-python-headless)", "localize"),
-    "cv2.xfeatures2d": ("OpenCV's contrib modules (opencv-contrib-python-headless)", "localize"),
     "matplotlib": ("matplotlib", "map"),
     "poselib": ("PoseLib", "localize"),
     "pycolmap": ("pycolmap", "localize"),

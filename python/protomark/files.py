@@ -1,14 +1,15 @@
-"""Writes files atomically, and sorts their names."""
+"""Writes files atomically, after a check that they can be written, and sorts their names."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -96,6 +97,77 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         file.write(text.encode())
 
 
+def check_outputs(
+    *outputs: Path | None, inputs: Iterable[object] = (), folder: Path | None = None
+) -> None:
+    """Raise before any work if a result could not be written after it, or would replace an input.
+
+    Args:
+        outputs: files to write; None: not asked for.
+        inputs: what the command reads: paths, texts that may be paths, or None.
+        folder: folder of further files to write, see `check_folder`.
+    """
+    if folder is not None:
+        check_folder(folder)
+    written: list[Path] = []
+    read = [Path(str(i)) for i in inputs if i is not None]
+    for path in outputs:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder: name a file to write")
+        if path.exists() and not path.is_file():
+            raise ValueError(f"{path} is not a regular file: name a file to write")
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"{path.parent}: no such folder to write {path.name} to")
+        check_folder(path.parent)
+        if any(_same_file(path, other) for other in read):
+            raise ValueError(f"{path} is an input of this command: name another file to write")
+        if any(_same_file(path, other) for other in written):
+            raise ValueError(f"{path} would be written twice: name different files")
+        written.append(path)
+
+
+def check_folder(folder: Path) -> None:
+    """Raise before any work if no file could be written to a folder, which need not exist.
+
+    Raises:
+        NotADirectoryError: it is a file.
+        OSError: the folder is read-only, for example.
+    """
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise NotADirectoryError(f"{existing} is not a folder: name one with -o")
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(f"{existing}: no file can be written to this folder ({reason})") from None
+
+
+def _same_file(path: Path, other: Path) -> bool:
+    try:
+        return path.resolve() == other.resolve() or path.samefile(other)
+    except (OSError, RuntimeError):  # one does not exist, or links go round in circles
+        return False
+
+
+def hash_files(named: Iterable[tuple[str, Path]]) -> str:
+    """SHA-256, hexadecimal, of names and of the content of their files."""
+    digest = hashlib.sha256()
+    for name, path in named:
+        digest.update(f"{name}\0{path.stat().st_size}\0".encode(errors="surrogateescape"))
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
 def natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key under which frame2 comes before frame10."""
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", name)]
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", name)]
+
+
+def is_utf8(text: str) -> bool:
+    """Whether a text, such as a file name, can be written to a text file."""
+    return not re.search("[\ud800-\udfff]", text)

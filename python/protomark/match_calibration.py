@@ -35,13 +35,7 @@ def calibration_features(
 def with_calibration(
     encoder: pm.Encoder, fitted: Mapping[int, MatchCalibration], source: str
 ) -> pm.Encoder:
-    """A copy of an encoder with a calibration; identity and codes are the same.
-
-    Args:
-        encoder: the encoder.
-        fitted: the calibration for each code length.
-        source: the sequences that the calibration was fitted to.
-    """
+    """A copy of an encoder with a calibration; identity and codes are the same."""
     lines = [
         " ".join([str(dim), *(f"{w:.6g}" for w in fitted[dim].weights)]) for dim in sorted(fitted)
     ]

@@ -15,7 +15,7 @@ MIN_PROBABILITY = 0.2
 
 
 @dataclass(frozen=True)
-class Matches:
+class MatchList:
     """a accepted matches of one frame, the likeliest first.
 
     Attributes:
@@ -40,7 +40,7 @@ def match(
     threads: int = 1,
     recall: float | None = None,
     among: ArrayLike | None = None,
-) -> Matches:
+) -> MatchList:
     """Match the keypoints of a frame with the landmarks of a map.
 
     Args:
@@ -58,14 +58,14 @@ def match(
         ValueError: the map's encoder was not calibrated or takes other descriptors, or
             `min_probability` is not 0 to 1.
     """
-    return Matches(*_core.match(scene, descriptors, min_probability, threads, recall, among))
+    return MatchList(*_core.match(scene, descriptors, min_probability, threads, recall, among))
 
 
 def accept(
     nearest: NDArray[np.int64],
     probabilities: NDArray[np.float64],
     min_probability: float = MIN_PROBABILITY,
-) -> Matches:
+) -> MatchList:
     """Accept the matches that are likely enough; a landmark keeps its likeliest keypoint.
 
     Args:
@@ -73,4 +73,4 @@ def accept(
         probabilities: (n,) float64, the probability that it is right.
         min_probability: smallest probability of an accepted match.
     """
-    return Matches(*_core.accept(nearest, probabilities, min_probability))
+    return MatchList(*_core.accept(nearest, probabilities, min_probability))

@@ -65,11 +65,7 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], made_by: str = "protomark", dpi: int = 160
 ) -> None:
-    """Write a figure as PNG, SVG or PDF atomically, with its origin in the file's metadata.
-
-    Raises:
-        ValueError: the path has another suffix.
-    """
+    """Write a figure as PNG, SVG or PDF atomically, with its origin in the file's metadata."""
     path = Path(path)
     check_suffix(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
@@ -92,23 +88,14 @@ def svg_text(figure: Figure) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """Values of one method at several sizes, drawn as a line.
+    """Values of one method at several sizes, drawn as a line."""
 
-    Attributes:
-        label: text beside the line.
-        x: (n,) sizes, ascending.
-        y: (n,) values.
-        spread: (n,) standard deviations, 0 where unknown.
-        colour: colour of the line.
-        ours: whether the method is Protomark's, which stands out.
-    """
-
-    label: str
-    x: Sequence[float]
-    y: Sequence[float]
-    spread: Sequence[float]
-    colour: str = MUTED
-    ours: bool = False
+    label: str  # text beside the line
+    x: Sequence[float]  # (n,) sizes, ascending
+    y: Sequence[float]  # (n,) values
+    spread: Sequence[float]  # (n,) standard deviations, 0 where unknown
+    colour: str = MUTED  # colour of the line
+    ours: bool = False  # whether the method is Protomark's, which stands out
 
 
 def draw_curves(axes: Axes, curves: Sequence[Curve], x: str, y: str, title: str = "") -> None:
@@ -159,20 +146,13 @@ def _label_curves(axes: Axes, curves: Sequence[Curve]) -> None:
 
 @dataclass(frozen=True)
 class ScenePicture:
-    """The data of a map from above, with frames that were localized in it.
+    """The data of a map from above, with frames that were localized in it."""
 
-    Attributes:
-        landmarks: (l, 3) positions of the landmarks.
-        matched: (n, 3) positions of the landmarks that support a query's pose.
-        support: (s, 3, 4) poses of the keyframes that built the map.
-        true: (q, 3, 4) true poses of the query keyframes.
-        estimated: (3, 4) pose of each query keyframe, None if none was found.
-    """
-
-    landmarks: NDArray[np.float64]
-    matched: NDArray[np.float64]
-    support: NDArray[np.float64]
-    true: NDArray[np.float64]
+    landmarks: NDArray[np.float64]  # (l, 3) positions of the landmarks
+    matched: NDArray[np.float64]  # (n, 3) positions of the landmarks that support a query's pose
+    support: NDArray[np.float64]  # (s, 3, 4) poses of the keyframes that built the map
+    true: NDArray[np.float64]  # (q, 3, 4) true poses of the query keyframes
+    # (3, 4) pose of each query keyframe, None if none was found.
     estimated: list[NDArray[np.float64] | None]
 
 
@@ -261,25 +241,16 @@ def _frame_picture(
 
 @dataclass(frozen=True)
 class MapPictures:
-    """The data of the pictures in a map's report.
+    """The data of the pictures in a map's report."""
 
-    Attributes:
-        positions: (l, 3) positions of the landmarks.
-        counts: (l,) int64, observations per landmark.
-        poses: (f, 3, 4) poses of the frames, along the camera's path.
-        errors: (o,) reprojection errors, pixels.
-        track_lengths: number of landmarks by number of observations.
-        frames: for each frame of the input `registered`, `inliers`, bytes, and seconds by stage.
-        stages: names of the stages.
-    """
-
-    positions: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    track_lengths: Mapping[str, int]
+    positions: NDArray[np.float64]  # (l, 3) positions of the landmarks
+    counts: NDArray[np.int64]  # (l,) int64, observations per landmark
+    poses: NDArray[np.float64]  # (f, 3, 4) poses of the frames, along the camera's path
+    errors: NDArray[np.float64]  # (o,) reprojection errors, pixels
+    track_lengths: Mapping[str, int]  # number of landmarks by number of observations
+    # For each frame of the input `registered`, `inliers`, bytes, and seconds by stage.
     frames: Sequence[Mapping[str, Any]] = field(default_factory=list)
-    stages: Sequence[str] = ()
+    stages: Sequence[str] = ()  # names of the stages
 
 
 def map_figures(pictures: MapPictures) -> list[Figure]:
@@ -363,21 +334,14 @@ def _map_quality(pictures: MapPictures) -> Figure:
 
 
 def training_figure(
-    steps: Sequence[int],
-    losses: Sequence[float],
-    precision: Mapping[int, Sequence[float]],
+    steps: Sequence[int],  # (v,) steps at which validation ran
+    losses: Sequence[float],  # (v,) mean training losses
+    precision: Mapping[int, Sequence[float]],  # (v,) precisions by number of dimensions
+    # First of the steps with quantisation in the loop, None if there is none.
     quantized_from: int | None,
     title: str = "",
 ) -> Figure:
-    """Training loss, and validation precision by dimension, over the steps of a training.
-
-    Args:
-        steps: (v,) steps at which validation ran.
-        losses: (v,) mean training losses.
-        precision: (v,) precisions by number of dimensions.
-        quantized_from: first of the steps with quantisation in the loop, None if there is none.
-        title: title of the figure.
-    """
+    """Training loss, and validation precision by dimension, over the steps of a training."""
     figure = new_figure(8, 3.4)
     left, right = figure.subplots(1, 2)
     left.plot(steps, losses, color=INK, marker="o", markersize=3)

@@ -8,8 +8,6 @@ from typing import Any
 
 from protomark.plot import INK, MUTED, MapPictures, map_figures, svg_text
 
-_MAX_NAMES = 20
-
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width">
@@ -53,50 +51,54 @@ def percent(share: float | None) -> str:
     return "–" if share is None else f"{100 * share:.1f}%"
 
 
-def map_page(facts: Mapping[str, Any], pictures: MapPictures, title: str) -> str:
-    """The report of a map as one HTML page with its plots.
+def first_of(names: Sequence[str], limit: int = 3) -> str:
+    """The first names of a list, and how many follow."""
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
 
-    Args:
-        facts: figures of `protomark.mapping.summary.summarise`.
-        pictures: data of the plots.
-        title: heading of the page.
-    """
+
+def map_page(facts: Mapping[str, Any], pictures: MapPictures, title: str) -> str:
+    """The report of a map as one HTML page with its plots."""
     events = "".join(f"<li>{escape(event)}" for event in facts["events"])
     return _PAGE.format(
         title=escape(title),
         ink=INK,
         muted=MUTED,
-        rows="".join(f"<tr><td>{escape(k)}<td>{escape(v)}" for k, v in _map_rows(facts)),
+        rows="".join(f"<tr><td>{escape(k)}<td>{escape(v)}" for k, v in map_rows(facts)),
         plots="\n".join(svg_text(figure) for figure in map_figures(pictures)),
         unregistered=_unregistered(facts["not_registered"]),
         events=f"<ul>{events}</ul>" if events else "<p>None.",
     )
 
 
-def _map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    ratio = facts["descriptor_bytes"] / max(facts["memory_bytes"], 1)
+def track_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and values of figures that `protomark.tracks.summary` has of tracks and of maps."""
+    mean, median = facts["reprojection_error_mean"], facts["reprojection_error_median"]
+    each = facts["track_length_mean"]
+    return [
+        ("landmarks", f"{facts['landmarks']:,}"),
+        ("observations", f"{facts['observations']:,} ({each:.1f} per landmark)"),
+        ("reprojection error", f"mean {mean:.2f} pixels, median {median:.2f}"),
+    ]
+
+
+def map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and values of figures of a map that `protomark map` made."""
     camera = facts["camera"]
     params = ", ".join(f"{p:.5g}" for p in camera["params"])
+    memory, each = facts["memory_bytes"], facts["bytes_per_landmark"]
+    descriptors = facts["descriptor_bytes"]
+    sealed = facts.get("sealed_bytes")
     return [
-        ("frames registered", f"{facts['registered']} of {facts['frames']}"),
+        ("registered", f"{facts['registered']} of {facts['frames']} frames registered"),
         ("keyframes", f"{facts['keyframes']}"),
-        ("landmarks", f"{facts['landmarks']}"),
+        *track_rows(facts),
+        ("memory for matching", f"{memory:,} bytes, {each:.0f} per landmark"),
         (
-            "observations",
-            f"{facts['observations']} ({facts['track_length_mean']:.1f} per landmark)",
+            f"all {facts['descriptor']} descriptors",
+            f"{descriptors:,} bytes, {descriptors / max(memory, 1):.1f} times as much",
         ),
-        (
-            "reprojection error",
-            f"mean {facts['reprojection_error_mean']:.2f} pixels, "
-            f"median {facts['reprojection_error_median']:.2f}",
-        ),
-        (
-            "memory for matching",
-            f"{facts['memory_bytes']:,} bytes, "
-            f"{facts['bytes_per_landmark']:.0f} per landmark; all {facts['descriptor']} "
-            f"descriptors of these observations: {facts['descriptor_bytes']:,} bytes, "
-            f"{ratio:.1f} times that",
-        ),
+        *([("sealed map", f"{sealed:,} bytes, with encoder and positions")] if sealed else []),
         ("camera", f"{camera['model']}, {camera['width']}x{camera['height']}: {params}"),
         (
             "time",
@@ -108,9 +110,8 @@ def _map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _unregistered(by_reason: Mapping[str, Sequence[str]]) -> str:
     if not by_reason:
         return "<p>None."
-    items = []
-    for reason, names in by_reason.items():
-        more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-        shown = escape(", ".join(names[:_MAX_NAMES]))
-        items.append(f"<li>{escape(reason)} ({len(names)}): {shown}{more}")
+    items = (
+        f"<li>{escape(reason)} ({len(names)}): {escape(first_of(names, 20))}"
+        for reason, names in by_reason.items()
+    )
     return f"<ul>{''.join(items)}</ul>"

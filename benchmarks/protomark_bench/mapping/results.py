@@ -182,7 +182,6 @@ class MappingResults:
             FileNotFoundError, ValueError: the file is missing or holds no such results.
         """
         values = load_json(path, FORMAT)
-        del values["format"], values["version"]
         sequences = []
         for entry in values.pop("sequences"):
             runs = {name: MappingRun.from_dict(run) for name, run in entry.pop("runs").items()}

@@ -137,7 +137,6 @@ class PaperResults:
             FileNotFoundError, ValueError: the file is missing or holds no such results.
         """
         values = load_json(path, FORMAT)
-        del values["format"], values["version"]
         values["sequences"] = [SequenceSize(**s) for s in values["sequences"]]
         for point in values["depth"]:
             point.update(training=Training(**point["training"]), hidden=tuple(point["hidden"]))

@@ -124,7 +124,6 @@ class BenchResults:
             FileNotFoundError, ValueError: the file is missing or holds no such results.
         """
         values = load_json(path, FORMAT)
-        del values["format"], values["version"]
         contests = [
             Contest(**{**entry, "timings": [Timing(**t) for t in entry["timings"]]})
             for entry in values.pop("contests")

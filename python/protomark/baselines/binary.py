@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,18 +17,13 @@ from protomark.features.descriptors import unpack_bits
 _BITS = 1 << 24
 
 
+@dataclass(eq=False)
 class HammingMap(Method):
     """Descriptors of landmarks, sorted by landmark id."""
 
-    def __init__(
-        self,
-        descriptors: NDArray[np.uint8],
-        landmarks: NDArray[np.int64],
-        bytes_per_landmark: float,
-    ) -> None:
-        self.descriptors = np.ascontiguousarray(descriptors)
-        self.landmarks = landmarks
-        self.bytes_per_landmark = bytes_per_landmark
+    descriptors: NDArray[np.uint8]
+    landmarks: NDArray[np.int64]
+    bytes_per_landmark: float
 
     def match(
         self, descriptors: NDArray[np.uint8], threads: int = 1

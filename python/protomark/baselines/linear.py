@@ -6,7 +6,7 @@ The vectors are means of bits, of principal components, or of linear discriminan
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -27,32 +27,18 @@ _VECTORS = 2048
 RIDGE = 1.0
 
 
+@dataclass(eq=False)
 class EuclideanMap(Method):
-    """One vector per landmark, of a linear projection of the bits.
+    """One vector per landmark, of a linear projection of the bits."""
 
-    Args:
-        vectors: (l, k) float32 or int8, which times `scale` compare with projected queries.
-        landmarks: (l,) int64, strictly ascending.
-        bytes_per_landmark: all that matching needs.
-        projection: (bits, k) float32, or None for the bits themselves.
-        offset: (k,) float32, subtracted from a projected query.
-        scale: size of one step of `vectors`.
-    """
+    vectors: InitVar[NDArray[Any]]  # (l, k), which times `scale` compare with projected queries
+    landmarks: NDArray[np.int64]  # (l,), strictly ascending
+    bytes_per_landmark: float
+    projection: NDArray[np.float32] | None = None  # (bits, k), None: the bits themselves
+    offset: NDArray[np.float32] | None = None  # (k,), subtracted from a projected query
+    scale: float = 1.0  # size of one step of `vectors`
 
-    def __init__(
-        self,
-        vectors: NDArray[Any],
-        landmarks: NDArray[np.int64],
-        bytes_per_landmark: float,
-        projection: NDArray[np.float32] | None = None,
-        offset: NDArray[np.float32] | None = None,
-        scale: float = 1.0,
-    ) -> None:
-        self.landmarks = landmarks
-        self.bytes_per_landmark = bytes_per_landmark
-        self.projection = projection
-        self.offset = offset
-        self.scale = scale
+    def __post_init__(self, vectors: NDArray[Any]) -> None:
         # With |p|^2 / 2 as one more dimension, one product computes |p|^2 / 2 - p.q, which has the
         # order of the distance.
         values = np.asarray(vectors, dtype=np.float32)

@@ -84,19 +84,14 @@ class Support:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Mean and covariances of descriptor bits, from which linear projections are learned.
-
-    Attributes:
-        mean: (bits,) float64.
-        total: (bits, bits) float64, covariance over all observations.
-        within: (bits, bits) float64, pooled covariance of observations of one landmark.
-    """
+    """Mean and covariances of descriptor bits, from which linear projections are learned."""
 
     # Far fewer rows than this estimate a quarter of a million numbers well.
     MAX_ROWS: ClassVar = 100_000
 
-    mean: NDArray[np.float64]
-    total: NDArray[np.float64]
+    mean: NDArray[np.float64]  # (bits,) float64
+    total: NDArray[np.float64]  # (bits, bits) float64, covariance over all observations
+    # (bits, bits) float64, pooled covariance of observations of one landmark.
     within: NDArray[np.float64]
 
     @classmethod

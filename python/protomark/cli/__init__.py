@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import signal
+import sys
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -79,14 +81,20 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from protomark.interrupt import Interrupted
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal may know ASCII only
     try:
+        if "" in sys.argv[1:]:
+            raise ValueError("an argument is empty: is a variable of the shell not set?")
         app(prog_name="protomark")
     except Interrupted as stop:
         from protomark.cli.terminal import note
 
         note(str(stop))
         raise SystemExit(130) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as end:
+        if isinstance(end, SystemExit) and end.code != 130:
+            raise
         _fail("stopped", 130)
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error

@@ -7,22 +7,15 @@ from typing import Annotated
 
 import typer
 
-from protomark.cli.options import EncoderName, JsonFile, Threads
+from protomark.cli.options import EncoderName, JsonFile, NoSeal, Threads
 
 
 def build(
-    tracks: Annotated[
-        Path, typer.Argument(metavar="TRACKS", help="Tracks file that `protomark tracks` wrote.")
-    ],
+    tracks: Annotated[Path, typer.Argument(metavar="TRACKS", help="Tracks of `protomark tracks`.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
     encoder: EncoderName = None,
-    dim: Annotated[
-        int | None,
-        typer.Option(help="Numbers per prototype; by default 48."),
-    ] = None,
-    min_observations: Annotated[
-        int, typer.Option(help="Leave out landmarks with fewer observations.")
-    ] = 2,
+    dim: Annotated[int | None, typer.Option(help="Numbers per prototype; by default 48.")] = None,
+    min_observations: Annotated[int, typer.Option(help="Smallest number of observations.")] = 2,
     frame: Annotated[
         str | None,
         typer.Option(
@@ -38,9 +31,7 @@ def build(
             "that of SOURCE_DATE_EPOCH.",
         ),
     ] = None,
-    no_seal: Annotated[
-        bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
-    ] = False,
+    no_seal: NoSeal = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
@@ -54,20 +45,19 @@ def build(
     """
     from protomark import Encoder
     from protomark.cli.info import show
-    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.cli.terminal import progress_bar, write_json
+    from protomark.files import check_outputs
     from protomark.maps import cameras
     from protomark.maps.build import build_map
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
-    from protomark.maps.seal import SealOptions, seal_map, sealed_path
+    from protomark.maps.seal import SealRequest, seal_map, sealed_path
     from protomark.maps.selection import Views
-    from protomark.threads import available_threads
     from protomark.tracks.file import Tracks
 
     sealed = None if no_seal else sealed_path(output)
     check_outputs(output, json_file, sealed, inputs=[tracks, encoder])
     texts = command_metadata(frame, metadata or [])
-    threads = threads or available_threads()
     with progress_bar() as progress:
         progress("read tracks", 0, 0)
         observed = Tracks.load(tracks)
@@ -83,8 +73,8 @@ def build(
         progress("write the map", 0, 0)
         scene.save(output)
         if sealed:
-            options = SealOptions(threads=threads)
-            seal_map(scene, sealed, options, lambda: Views.of_tracks(observed), progress)
+            request = SealRequest(threads=threads)
+            seal_map(scene, sealed, request, lambda: Views.of_tracks(observed), progress)
         facts = describe(output)
         if sealed:
             facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}

@@ -7,20 +7,12 @@ from typing import Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile, Threads
+from protomark.cli.options import JsonFile, Threads, TracksFiles
 
 
 def calibrate(
-    model: Annotated[
-        Path,
-        typer.Argument(metavar="MODEL", help="Model file (.pme) that `protomark train` wrote."),
-    ],
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="TRACKS", help="Tracks files of the model's descriptor, one per sequence."
-        ),
-    ],
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model of `protomark train`.")],
+    tracks: TracksFiles,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Model file to write; by default MODEL itself."),
@@ -38,23 +30,14 @@ def calibrate(
     protomark calibrate freak.pme tracks/*.freak.safetensors
     """
     from protomark import Encoder
-    from protomark.cli.terminal import (
-        check_outputs,
-        console,
-        progress_bar,
-        say,
-        table_of,
-        write_json,
-    )
+    from protomark.cli.terminal import console, progress_bar, say, table_of, write_json
+    from protomark.files import check_outputs
     from protomark.matching import MIN_PROBABILITY
-    from protomark.threads import available_threads
     from protomark.training.match_calibration import calibrate as fit
 
     check_outputs(output or model, json_file, inputs=tracks)
     with progress_bar() as progress:
-        encoder, quality = fit(
-            Encoder.load(model), tracks, threads or available_threads(), progress
-        )
+        encoder, quality = fit(Encoder.load(model), tracks, threads, progress)
     encoder.save(output or model)
     write_json(json_file, {"figures": [vars(one) for one in quality]})
     table = table_of("sequence", "dim", "right of all", "precision", "expected", "recall")

@@ -19,9 +19,7 @@ def demo(
         Path, typer.Option("--output", "-o", help="Folder for the maps and the picture.")
     ] = Path("demo"),
     encoder: EncoderName = None,
-    tracks: Annotated[
-        Path | None, typer.Option(help="Tracks file to take in place of the bundled sample.")
-    ] = None,
+    tracks: Annotated[Path | None, typer.Option(help="Tracks in place of the sample.")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Map the bundled sample, localize frames in it, and compare.
@@ -31,10 +29,11 @@ def demo(
 
     protomark demo
     """
-    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.cli.terminal import progress_bar, write_json
     from protomark.evaluation.demo import run_demo
+    from protomark.files import check_outputs
 
-    check_outputs(json_file)
+    check_outputs(json_file, folder=output)
     with progress_bar() as progress:
         result = run_demo(output, tracks_path=tracks, encoder=encoder, progress=progress)
     write_json(json_file, asdict(result))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile
+from protomark.cli.options import JsonFile, Threads, TracksFiles
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(metavar="TRACKS", help="Tracks files that `protomark tracks` wrote."),
-    ],
+    tracks: TracksFiles,
     encoder: Annotated[
         list[str] | None,
         typer.Option(
@@ -36,12 +33,8 @@ def evaluate(
             "all except those that end in -float."
         ),
     ] = "",
-    seeds: Annotated[
-        int, typer.Option(min=1, help="Number of random splits into map and queries.")
-    ] = 3,
-    pose_frames: Annotated[
-        int, typer.Option(min=0, help="Limit on query keyframes to localize per split.")
-    ] = 20,
+    seeds: Annotated[int, typer.Option(min=1, help="Random splits into map and queries.")] = 3,
+    pose_frames: Annotated[int, typer.Option(min=0, help="Frames to localize per split.")] = 20,
     discriminant_from: Annotated[
         list[Path] | None,
         typer.Option(
@@ -49,10 +42,7 @@ def evaluate(
             "By default they are learned from the map's own observations."
         ),
     ] = None,
-    threads: Annotated[
-        int,
-        typer.Option(min=0, help="CPU threads, 0 for one per core; search is timed on one."),
-    ] = 0,
+    threads: Threads = 0,
     json_file: JsonFile = None,
     markdown_file: Annotated[
         Path | None, typer.Option("--markdown", help="Write the tables to this Markdown file, too.")
@@ -65,18 +55,12 @@ def evaluate(
     """Compare Protomark with other ways to keep descriptors.
 
     Reads tracks and prints, for each method, the precision of search, the share of poses found,
-    bytes per landmark and search time. The protocol is the paper's: a random 90 % of the keyframes
-    build the map, and the descriptors of the others query it.
+    bytes per landmark and search time on one thread. The protocol is the paper's: a random 90 % of
+    the keyframes build the map, and the descriptors of the others query it.
 
     protomark evaluate kitchen.freak.safetensors --plot precision.png
     """
-    from protomark.cli.terminal import (
-        check_outputs,
-        comma_separated,
-        console,
-        note,
-        progress_bar,
-    )
+    from protomark.cli.terminal import comma_separated, console, note, progress_bar
     from protomark.evaluation.results import (
         caption,
         evaluation_markdown,
@@ -86,9 +70,8 @@ def evaluate(
         save_precision_plot,
     )
     from protomark.evaluation.run import EvaluationOptions, evaluate_files
-    from protomark.files import write_text
+    from protomark.files import check_outputs, write_text
     from protomark.plot import check_suffix
-    from protomark.threads import available_threads
 
     inputs = [*tracks, *(encoder or []), *(discriminant_from or [])]
     check_outputs(json_file, markdown_file, plot_file, inputs=inputs)
@@ -97,7 +80,7 @@ def evaluate(
     options = EvaluationOptions(
         seeds=range(seeds),
         pose_frames=pose_frames,
-        threads=threads or available_threads(),
+        threads=threads,
         encoders=encoder or [],
         methods=comma_separated(methods),
         discriminant_from=discriminant_from or [],

@@ -14,9 +14,7 @@ _BARS = "▁▂▃▄▅▆▇█"
 
 
 def info(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A map, an encoder or a tracks file.")
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A map, an encoder or tracks.")],
     verify: Annotated[
         bool,
         typer.Option(
@@ -30,7 +28,8 @@ def info(
     protomark info kitchen/scene.pmk --verify
     """
     from protomark import verify_file
-    from protomark.cli.terminal import check_outputs, error_console, write_json
+    from protomark.cli.terminal import error_console, write_json
+    from protomark.files import check_outputs
     from protomark.maps.info import describe, is_tracks
 
     check_outputs(json_file, inputs=[file])

@@ -20,9 +20,7 @@ def localize(
             metavar="MAP", help="Map file (.pmk) with positions, or a folder of `protomark map`."
         ),
     ],
-    images: Annotated[
-        list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders of images.")
-    ],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders.")],
     output: Annotated[
         Path,
         typer.Option(
@@ -58,12 +56,8 @@ def localize(
             "searched."
         ),
     ] = None,
-    prior_distance: Annotated[
-        float, typer.Option(help="Largest error of a rough position, in the map's unit.")
-    ] = 1.0,
-    prior_degrees: Annotated[
-        float, typer.Option(help="Largest error of a rough orientation, degrees.")
-    ] = 15.0,
+    prior_distance: Annotated[float, typer.Option(help="Largest error in the map's unit.")] = 1.0,
+    prior_degrees: Annotated[float, typer.Option(help="Largest error in degrees.")] = 15.0,
     min_confidence: Annotated[
         float,
         typer.Option(
@@ -90,11 +84,14 @@ def localize(
 
     protomark localize kitchen new-photos/
     """
-    from protomark.cli.terminal import check_outputs, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.features.images import passed_over
+    from protomark.files import check_outputs
     from protomark.localization.batch import LocalizationRequest, localize_files
-    from protomark.threads import available_threads
 
-    check_outputs(json_file, inputs=[scene, *images, camera, poses, priors])
+    check_outputs(json_file, inputs=[scene, *images, camera, poses, priors], folder=output)
+    for line in filter(None, map(passed_over, images)):
+        note(line)
     request = LocalizationRequest(
         scene,
         images,
@@ -107,7 +104,7 @@ def localize(
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
         recall=recall,
-        threads=threads or available_threads(),
+        threads=threads,
     )
     with progress_bar() as progress:
         batch = localize_files(request, output, progress)
@@ -142,11 +139,10 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         text = f"{facts['median_position_error']:.4g}, {facts['median_angle_error']:.3g} degrees"
         rows.append(("median error of localized", text))
     print_facts(rows)
-    failed = [image for image in batch.images if image.error]
-    for image in failed[:5]:
-        line = printable(f"{image.name}: {image.error}")
-        console.print(line, markup=False, highlight=False)
+    failed = [f"{image.name}: {image.error}" for image in batch.images if image.error]
     if len(failed) > 5:
-        console.print(f"... and {len(failed) - 5} more, in {output / TABLE}", highlight=False)
+        failed[5:] = [f"... and {len(failed) - 5} more, in {output / TABLE}"]
+    for line in failed:
+        console.print(printable(line), markup=False, highlight=False)
     files = f"{output / POSES}, {CAMERAS} and {TABLE}"
     console.print(files, markup=False, highlight=False, soft_wrap=True)

@@ -7,21 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, Threads
-
-_NAMES_SHOWN = 3
+from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, NoSeal, Threads
 
 
 def map_(
     images: Annotated[
         Path, typer.Argument(metavar="IMAGES_OR_VIDEO", help="Folder of images, or a video file.")
     ],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the new map.")
-    ] = None,
-    into: Annotated[
-        Path | None, typer.Option("--into", help="Folder of an existing map to extend in place.")
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="New map's folder.")] = None,
+    into: Annotated[Path | None, typer.Option("--into", help="Folder of a map to extend.")] = None,
     descriptor: Annotated[
         str,
         typer.Option(
@@ -53,18 +47,10 @@ def map_(
     dim: Annotated[int, typer.Option(help="Numbers per prototype, one byte each.")] = 32,
     encoder: EncoderName = None,
     max_keypoints: MaxKeypoints = 2000,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a map that Ctrl-C or a crash ended.")
-    ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Make the map anew even if OUTPUT holds one.")
-    ] = False,
-    view: Annotated[
-        bool, typer.Option("--view", help="Also write recording.rrd for the Rerun viewer.")
-    ] = False,
-    no_seal: Annotated[
-        bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted map.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the map in OUTPUT.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Also write a recording for Rerun.")] = False,
+    no_seal: NoSeal = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
@@ -83,18 +69,21 @@ def map_(
 
     Ctrl-C writes the map so far, and the same command with --resume continues it.
     """
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.extras import optional
+    from protomark.features.images import passed_over
+    from protomark.files import check_outputs
     from protomark.mapping.options import MappingOptions
     from protomark.mapping.session import MapRequest, make_map
-    from protomark.threads import available_threads
 
     scene = output or into
     if scene is None or (output is not None and into is not None):
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
-    check_outputs(json_file, inputs=[images, camera, poses, encoder])
+    check_outputs(json_file, inputs=[images, camera, poses, encoder], folder=scene)
+    if line := passed_over(images):
+        note(line)
     if view:
         optional("rerun")
     request = MapRequest(
@@ -116,7 +105,7 @@ def map_(
         force=force,
         record=view,
         seal=not no_seal,
-        threads=threads or available_threads(),
+        threads=threads,
     )
     with progress_bar() as progress:
         figures = make_map(request, progress, note)
@@ -127,32 +116,10 @@ def map_(
 def _show(figures: dict[str, Any], scene: Path) -> None:
     from rich.markup import escape
 
-    from protomark.cli.terminal import say
+    from protomark.cli.terminal import print_facts, say
+    from protomark.report import first_of, map_rows
 
-    ratio = figures["descriptor_bytes"] / max(figures["memory_bytes"], 1)
-    say(f"[bold]{escape(str(scene))}[/]")
-    say(
-        f"  {figures['registered']} of {figures['frames']} frames registered, "
-        f"{figures['keyframes']} keyframes, {figures['landmarks']} landmarks, "
-        f"{figures['observations']} observations ({figures['track_length_mean']:.1f} per landmark)"
-    )
-    say(
-        f"  reprojection error: mean {figures['reprojection_error_mean']:.2f} pixels, "
-        f"median {figures['reprojection_error_median']:.2f}"
-    )
-    say(
-        f"  memory for matching: {figures['memory_bytes'] / 1e6:.2f} MB, "
-        f"{figures['bytes_per_landmark']:.0f} bytes per landmark; all descriptors: "
-        f"{figures['descriptor_bytes'] / 1e6:.2f} MB, {ratio:.1f} times as much"
-    )
-    if "sealed_bytes" in figures:
-        say(f"  sealed map: {figures['sealed_bytes'] / 1e6:.2f} MB, with encoder and positions")
-    say(
-        f"  {figures['seconds_total']:.1f} s, {figures['frames_per_second']:.1f} frames per "
-        f"second; see {scene / 'report.html'}"
-    )
+    print_facts([("map", f"{scene}, see {scene / 'report.html'}"), *map_rows(figures)])
     for reason, names in figures["not_registered"].items():
-        shown = ", ".join(names[:_NAMES_SHOWN])
-        more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
-        say(f"  [yellow]without a pose[/]: {escape(shown)}{more}: {escape(reason)}")
+        say(f"  [yellow]without a pose[/]: {escape(first_of(names))}: {escape(reason)}")
     say(f"  next: protomark localize {escape(str(scene))} IMAGES")

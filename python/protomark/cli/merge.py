@@ -37,7 +37,8 @@ def merge(
 
     protomark merge monday.pmk tuesday.pmk -o week.pmk
     """
-    from protomark.cli.terminal import check_outputs, print_facts, progress_bar, write_json
+    from protomark.cli.terminal import print_facts, progress_bar, write_json
+    from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
 
     check_outputs(output, json_file, inputs=maps)

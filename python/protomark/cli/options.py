@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from protomark.threads import available_threads
+
 JsonFile = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Write the results to this JSON file, too."),
@@ -33,4 +35,20 @@ MaxKeypoints = Annotated[
     int,
     typer.Option(min=4, help="Limit on keypoints per image: the strongest, spread over the image."),
 ]
-Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for one per core.")]
+Threads = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        help="CPU threads; 0 for one per core.",
+        callback=lambda count: count or available_threads(),
+    ),
+]
+NoSeal = Annotated[
+    bool, typer.Option("--no-seal", help="Write the learning map only, no sealed one.")
+]
+TracksFiles = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="TRACKS", help="Tracks files that `protomark tracks` wrote, one per sequence."
+    ),
+]

@@ -27,9 +27,7 @@ def seal(
             help="Folder of `protomark map`, a learning map (.pmk), or a tracks file.",
         ),
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Sealed map to write (.sealed.pmk).")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Sealed map to write.")],
     bytes_per_landmark: Annotated[
         float,
         typer.Option(
@@ -42,9 +40,7 @@ def seal(
         float | None,
         typer.Option(help="Limit on the file, in MB (10^6 bytes), the encoder's 0.45 included."),
     ] = None,
-    landmarks: Annotated[
-        int | None, typer.Option(min=1, help="Limit on the number of landmarks.")
-    ] = None,
+    landmarks: Annotated[int | None, typer.Option(min=1, help="Limit on landmarks.")] = None,
     index: Annotated[
         IndexChoice,
         typer.Option(
@@ -72,24 +68,24 @@ def seal(
     protomark seal kitchen -o kitchen.sealed.pmk --megabytes 1
     """
     from protomark.cli.info import show
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
+    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.files import check_outputs
     from protomark.maps.info import describe
     from protomark.maps.open import SCENE_MAP
-    from protomark.maps.seal import SealOptions
+    from protomark.maps.seal import SealRequest
     from protomark.maps.seal import seal as seal_source
-    from protomark.threads import available_threads
 
     check_outputs(output, json_file, inputs=[source, source / SCENE_MAP])
-    options = SealOptions(
+    request = SealRequest(
         bytes_per_landmark=bytes_per_landmark or None,
         megabytes=megabytes,
         landmarks=landmarks,
         index=index.value,
         position_bits=0 if no_positions else position_bits,
-        threads=threads or available_threads(),
+        threads=threads,
     )
     with progress_bar() as progress:
-        made = seal_source(source, output, options, progress)
+        made = seal_source(source, output, request, progress)
     if made["chosen_by"]:
         note(
             f"{made['landmarks']:,} of {made['landmarks_of_the_source']:,} landmarks were kept, "

@@ -42,15 +42,15 @@ def split(
     protomark split city.pmk --cell-size 50 --sealed -o tiles/
     """
     from protomark.cli.terminal import (
-        check_outputs,
         comma_separated_numbers,
         print_facts,
         progress_bar,
         write_json,
     )
+    from protomark.files import check_outputs
     from protomark.maps.split import split_file
 
-    check_outputs(json_file, inputs=[file])
+    check_outputs(json_file, inputs=[file], folder=output)
     boundaries = list(comma_separated_numbers("--ids", ids)) or None
     with progress_bar() as progress:
         facts = split_file(file, output, boundaries, parts, cell_size, sealed, progress)

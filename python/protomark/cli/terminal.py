@@ -1,10 +1,10 @@
-"""Terminal output, progress bars, result files and checks of outputs, for all commands."""
+"""Terminal output, progress bars and result files, for all commands."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -130,38 +130,6 @@ def print_facts(rows: list[tuple[str, str]]) -> None:
 def readable_size(count: float) -> str:
     """A number of bytes in KB or MB (powers of ten)."""
     return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.0f} KB"
-
-
-def check_outputs(*outputs: Path | None, inputs: Iterable[object] = ()) -> None:
-    """Raise before any work if a result could not be written after it, or would replace an input.
-
-    Args:
-        outputs: files to write; None: not asked for.
-        inputs: what the command reads: paths, texts that may be paths, or None.
-    """
-    written: list[Path] = []
-    read = [Path(str(i)) for i in inputs if i is not None]
-    for path in outputs:
-        if path is None:
-            continue
-        if path.is_dir():
-            raise ValueError(f"{path} is a folder: name a file to write")
-        if path.exists() and not path.is_file():
-            raise ValueError(f"{path} is not a regular file: name a file to write")
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"{path.parent}: no such folder to write {path.name} to")
-        if any(_same_file(path, other) for other in read):
-            raise ValueError(f"{path} is an input of this command: name another file to write")
-        if any(_same_file(path, other) for other in written):
-            raise ValueError(f"{path} would be written twice: name different files")
-        written.append(path)
-
-
-def _same_file(path: Path, other: Path) -> bool:
-    try:
-        return path.resolve() == other.resolve() or path.samefile(other)
-    except (OSError, RuntimeError):  # one does not exist, or links go round in circles
-        return False
 
 
 def write_json(path: Path | None, facts: Any) -> None:

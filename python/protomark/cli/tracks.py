@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from protomark.cli.options import JsonFile, MaxKeypoints, Threads
-
-if TYPE_CHECKING:
-    from protomark.tracks.make import TracksInput
 
 _BAR = 30  # characters
 
@@ -36,12 +33,8 @@ def tracks(
             show_default="freak",
         ),
     ] = None,
-    images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the images, if not FOLDER/images.")
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option("--model", help="Folder of the COLMAP model, text or binary.")
-    ] = None,
+    images: Annotated[Path | None, typer.Option("--images", help="Folder of the images.")] = None,
+    model: Annotated[Path | None, typer.Option("--model", help="COLMAP model's folder.")] = None,
     database: Annotated[
         Path | None,
         typer.Option(
@@ -51,9 +44,7 @@ def tracks(
         ),
     ] = None,
     max_keypoints: MaxKeypoints = 2000,
-    partners: Annotated[
-        int, typer.Option(help="About how many keyframes each keyframe is matched with.")
-    ] = 24,
+    partners: Annotated[int, typer.Option(help="How many keyframes each is matched with.")] = 24,
     ratio: Annotated[
         float,
         typer.Option(help="Ratio test: a match is nearer than this share of the second nearest."),
@@ -61,12 +52,8 @@ def tracks(
     max_error: Annotated[
         float, typer.Option(help="Largest epipolar and reprojection error, pixels.")
     ] = 3.0,
-    min_angle: Annotated[
-        float, typer.Option(help="Smallest triangulation angle of a landmark, degrees.")
-    ] = 1.0,
-    min_length: Annotated[
-        int, typer.Option(help="Leave out landmarks with fewer observations.")
-    ] = 3,
+    min_angle: Annotated[float, typer.Option(help="Smallest triangulation angle, degrees.")] = 1.0,
+    min_length: Annotated[int, typer.Option(help="Smallest number of observations.")] = 3,
     refine_poses: Annotated[
         str,
         typer.Option(
@@ -89,9 +76,7 @@ def tracks(
         ),
     ] = 0,
     threads: Threads = 0,
-    force: Annotated[
-        bool, typer.Option("--force", help="Make files anew even if they are up to date.")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Make files anew.")] = False,
     json_file: JsonFile = None,
 ) -> None:
     """Make tracks from images with known poses.
@@ -102,10 +87,10 @@ def tracks(
 
     protomark tracks kitchen/ -o tracks -d freak -d orb
     """
-    from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
-    from protomark.threads import available_threads
-    from protomark.tracks.extract import TracksOptions
-    from protomark.tracks.make import TracksInput, make_augmented_tracks, make_tracks
+    from protomark.cli.terminal import progress_bar, write_json
+    from protomark.files import check_outputs
+    from protomark.tracks.extract import TracksOptions, find_sequence
+    from protomark.tracks.make import make_augmented_tracks, make_tracks
 
     options = [
         TracksOptions(
@@ -121,93 +106,66 @@ def tracks(
         )
         for name in dict.fromkeys(descriptors or ["freak"])
     ]
-    sources = [TracksInput(folder, images, model, database) for folder in folders]
-    _check(sources, output, augmentations)
-    check_outputs(json_file, inputs=[database])
-    threads = threads or available_threads()
-    facts = []
-    for source in sources:
-        for one in options:
-            with progress_bar(f"{source.name}: ") as progress:
-                made = make_tracks(
-                    source, one, output, force=force, threads=threads, progress=progress
-                )
-            if made.skipped:
-                note(f"{made.path}: up to date with these options, skipped (--force makes it anew)")
-            facts.append(made.as_dict())
-            _show(facts[-1], made.tracks.info)
-            if not augmentations:
-                continue
-            folder = images or source.folder / "images"
-            with progress_bar(f"{source.name}: ") as progress:
-                more = make_augmented_tracks(
-                    made, folder, augmentations, force=force, threads=threads, progress=progress
-                )
-            facts.append(more.as_dict())
-            _show_augmented(facts[-1], facts[-2])
-    write_json(json_file, facts)
-
-
-def _check(sources: list[TracksInput], output: Path, augmentations: int) -> None:
-    """Raise before any work if options conflict."""
-    first = sources[0]
     if augmentations < 0:
         raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
-    if augmentations and first.database:
+    if augmentations and database:
         raise ValueError("--augmentations needs images, which --database does not read: drop one")
-    if len(sources) > 1 and (first.images or first.model or first.database):
+    if len(folders) > 1 and (images or model or database):
         raise ValueError("--images, --model and --database are for one FOLDER: give only one")
+    sources = [find_sequence(folder, images, model, database) for folder in folders]
     names = [source.name for source in sources]
-    double = sorted({n for n in names if names.count(n) > 1})
-    if double:
+    if double := sorted({n for n in names if names.count(n) > 1}):
         raise ValueError(
             f"two folders are named {double[0]} and would write the same file: run the command for "
             "each, with its own -o"
         )
-    if output.exists() and not output.is_dir():
-        raise NotADirectoryError(f"{output} is not a folder: name one for the tracks with -o")
+    check_outputs(json_file, inputs=[database], folder=output)
+    facts = []
+    for source in sources:
+        for one in options:
+            with progress_bar(f"{source.name}: ") as progress:
+                made = [make_tracks(source, one, output, force, threads, progress)]
+                if augmentations:
+                    images = source.images
+                    made.append(
+                        make_augmented_tracks(
+                            made[0], images, augmentations, force, threads, progress
+                        )
+                    )
+            for file in made:
+                facts.append(file.as_dict())
+                _show(facts[-1], file.tracks.info)
+    write_json(json_file, facts)
 
 
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
-    from rich.markup import escape
+    from protomark.cli.terminal import note, print_facts
+    from protomark.report import first_of, track_rows
 
-    from protomark.cli.terminal import note, say
-
-    say(f"[bold]{escape(facts['file'])}[/]")
-    say(
-        f"  {facts['keyframes']} keyframes, {facts['keypoints']} keypoints, "
-        f"{facts['landmarks']} landmarks, {facts['observations']} observations "
-        f"({facts['track_length_mean']:.1f} per landmark)"
-    )
-    say(
-        f"  reprojection error: mean {facts['reprojection_error_mean']:.2f} pixels, "
-        f"median {facts['reprojection_error_median']:.2f}"
-    )
+    if facts["skipped"]:
+        note(f"{facts['file']}: up to date with these options, skipped (--force makes it anew)")
+    rows = [
+        ("tracks", facts["file"]),
+        ("keypoints", f"{facts['keypoints']:,} in {facts['keyframes']} keyframes"),
+        *track_rows(facts),
+    ]
+    if copies := facts.get("augmentations"):
+        rows.append(("augmentations", f"{copies} copies of each keyframe"))
     if "epipolar_error" in info:
         error, refined = info["epipolar_error"], facts["poses_refined"]
-        say(
-            f"  given poses: epipolar error {error:.2f} pixels, "
-            + ("refined by bundle adjustment" if refined else "kept as they are")
-        )
+        what = "refined by bundle adjustment" if refined else "kept as they are"
+        rows.append(("given poses", f"epipolar error {error:.2f} pixels, {what}"))
         if error > 1 and not refined:
-            note("  these poses are only roughly right: --refine-poses auto refines them")
-    without = info.get("images_without_pose") or []
-    if without:
-        more = f" and {len(without) - 3} more" if len(without) > 3 else ""
-        say(f"  left out without a pose: {escape(', '.join(without[:3]))}{more}")
-    say("  observations per landmark:")
-    top = max(facts["track_length_histogram"].values(), default=0) or 1
-    for label, count in facts["track_length_histogram"].items():
+            note("these poses are only roughly right: --refine-poses auto refines them")
+    if without := info.get("images_without_pose"):
+        rows.append(("left out without a pose", first_of(without)))
+    if unreadable := info.get("images_unreadable"):
+        reasons = [f"{name} ({reason})" for name, reason in unreadable.items()]
+        rows.append(("left out, cannot be read", first_of(reasons)))
+    histogram = facts["track_length_histogram"]
+    top = max(histogram.values(), default=0) or 1
+    for label, count in histogram.items():
         if count:
             bar = "█" * max(1, round(_BAR * count / top))
-            say(f"  {label:>7} {bar:<{_BAR}} {count}")
-
-
-def _show_augmented(facts: dict[str, Any], plain: dict[str, Any]) -> None:
-    from rich.markup import escape
-
-    from protomark.cli.terminal import say
-
-    added = facts["observations"] - plain["observations"]
-    say(f"[bold]{escape(facts['file'])}[/]")
-    say(f"  {facts['augmentations']} copies of each keyframe, {added} more observations")
+            rows.append((f"{label} observations per landmark", f"{bar:<{_BAR}} {count}"))
+    print_facts(rows)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile, Threads
+from protomark.cli.options import JsonFile, Threads, TracksFiles
 
 if TYPE_CHECKING:
     from protomark.training.card import EncoderCard
@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def train(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(metavar="TRACKS", help="Tracks files to train on, one per sequence."),
-    ],
+    tracks: TracksFiles,
     validation: Annotated[
         list[Path] | None,
         typer.Option(
@@ -38,9 +35,7 @@ def train(
         list[Path] | None,
         typer.Option("--report", help="Tracks file to measure the result on; may be repeated."),
     ] = None,
-    dims: Annotated[
-        str, typer.Option(help="Code lengths that maps can choose from, ascending.")
-    ] = "8,16,24,32,48,64",
+    dims: Annotated[str, typer.Option(help="Code lengths, ascending.")] = "8,16,24,32,48,64",
     steps: Annotated[int, typer.Option(help="Number of batches.")] = 4000,
     batch: Annotated[int, typer.Option(help="Landmarks per batch.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of weights and batches.")] = 0,
@@ -53,12 +48,8 @@ def train(
     ] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     threads: Threads = 0,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the checkpoint beside the output.")
-    ] = False,
-    name: Annotated[
-        str, typer.Option(help="Name of the encoder; by default that of the output.")
-    ] = "",
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint.")] = False,
+    name: Annotated[str, typer.Option(help="Name of the encoder; by default the output's.")] = "",
     licence: Annotated[str, typer.Option(help="Licence of the weights, for the model file.")] = "",
     data_licence: Annotated[
         list[str] | None,
@@ -75,14 +66,9 @@ def train(
 
     Ctrl-C leaves a checkpoint, and the same command with --resume continues.
     """
-    from protomark.cli.terminal import (
-        check_outputs,
-        comma_separated_numbers,
-        note,
-        progress_bar,
-        write_json,
-    )
+    from protomark.cli.terminal import comma_separated_numbers, note, progress_bar, write_json
     from protomark.extras import optional
+    from protomark.files import check_outputs
 
     inputs = [*tracks, *(validation or []), *(report or [])]
     check_outputs(output, json_file, inputs=inputs)

@@ -50,84 +50,45 @@ _POSITION_BYTES = 12
 _SIZE = 33
 
 
-@dataclass(frozen=True)
-class DemoRow:
-    """Results of one method.
+@dataclass
+class DemoRow(MethodSummary):
+    """Results of one method."""
 
-    Attributes:
-        name, label, family: see `methods.MethodChoice`.
-        bytes_per_landmark: all that matching needs, including the count, without the position.
-        map_bytes: bytes of all landmarks with positions.
-        precision: share of query descriptors whose nearest landmark is their own.
-        found: query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
-        frames: query keyframes.
-        median_error: median distance from the true camera centre, as a share of that depth.
-        ms_per_frame: milliseconds to match and localize a frame on one thread.
-    """
-
-    name: str
-    label: str
-    family: str
-    bytes_per_landmark: float
-    map_bytes: int
-    precision: float
-    found: int
-    frames: int
-    median_error: float
-    ms_per_frame: float
+    map_bytes: int = 0  # bytes of all landmarks with positions
+    # Query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
+    found: int = 0
+    frames: int = 0  # query keyframes
+    # Median distance from the true camera centre, as a share of that depth.
+    median_error: float = 0.0
+    ms_per_frame: float = 0.0  # milliseconds to match and localize a frame on one thread
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The maps of the demo, and its comparison.
-
-    Attributes:
-        sequence: name of the sequence.
-        descriptor: name of the descriptor.
-        bits: length of the descriptor in bits.
-        support_keyframes: keyframes that build the map.
-        landmarks: landmarks of the map.
-        observations: observations of the map.
-        rows: one row per method.
-        shown: name of the method that the sealed map and the picture show.
-        folder: folder of the files.
-        files: sizes in bytes by file name.
-        encoder_bytes: bytes of the encoder in the sealed map.
-        seconds: duration of the demo.
-    """
+    """The maps of the demo, and its comparison."""
 
     sequence: str
     descriptor: str
-    bits: int
-    support_keyframes: int
-    landmarks: int
-    observations: int
-    rows: list[DemoRow]
-    shown: str
-    folder: str
-    files: dict[str, int]
-    encoder_bytes: int
-    seconds: float
+    bits: int  # length of the descriptor in bits
+    support_keyframes: int  # keyframes that build the map
+    landmarks: int  # landmarks of the map
+    observations: int  # observations of the map
+    rows: list[DemoRow]  # one row per method
+    shown: str  # name of the method that the sealed map and the picture show
+    folder: str  # folder of the files
+    files: dict[str, int]  # sizes in bytes by file name
+    encoder_bytes: int  # bytes of the encoder in the sealed map
+    seconds: float  # duration of the demo
 
 
 def run_demo(
-    output: Path,
+    output: Path,  # folder of the two maps and the picture, created if it does not exist
     *,
-    tracks_path: Path | None = None,
-    encoder: str | None = None,
+    tracks_path: Path | None = None,  # tracks to take in place of the sample's
+    encoder: str | None = None,  # name or path of the encoder; None: the one for the descriptor
     progress: Progress = silent,
 ) -> DemoResult:
-    """Build, save and seal a map of the sample, localize query keyframes, compare and draw.
-
-    Args:
-        output: folder of the two maps and the picture, created if it does not exist.
-        tracks_path: tracks to take in place of the sample's.
-        encoder: name or path of the encoder; None: the one for the descriptor.
-        progress: called with each method.
-
-    Raises:
-        FileExistsError: another file has the name of one that the demo writes.
-    """
+    """Build, save and seal a map of the sample, localize query keyframes, compare and draw."""
     began = time.perf_counter()
     tracks = Tracks.load(tracks_path or sample.path())
     loaded = pm.Encoder.load(encoder or tracks.descriptor)
@@ -240,19 +201,13 @@ def _draw(rows: list[DemoRow], name: str, scene: ScenePicture, path: Path) -> No
         f"From above: {shown.found} of {shown.frames} queries found, "
         f"{shown.bytes_per_landmark:.0f} bytes per landmark",
     )
-    points = [
-        MethodSummary(row.name, row.label, row.family, row.bytes_per_landmark, row.precision)
-        for row in rows
-    ]
     title = "Is the nearest landmark the right one?"
-    draw_curves(right, precision_curves(points), "bytes per landmark (log)", "precision", title)
+    draw_curves(right, precision_curves(rows), "bytes per landmark (log)", "precision", title)
     save_figure(figure, path, made_by=_MADE_BY)
 
 
 def _check_output(output: Path) -> None:
     """Raise before any work if the demo would overwrite a file that no demo wrote."""
-    if output.exists() and not output.is_dir():
-        raise FileExistsError(f"{output} is not a folder: name another one with --output")
     picture = output / PICTURE
     if picture.is_file():
         with picture.open("rb") as file:

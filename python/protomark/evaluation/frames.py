@@ -23,20 +23,13 @@ PIXEL_SHARE = 0.005
 
 @dataclass(frozen=True)
 class QueryFrame:
-    """A query keyframe with all its keypoints, with and without landmark.
+    """A query keyframe with all its keypoints, with and without landmark."""
 
-    Attributes:
-        camera: its camera.
-        cam_from_world: (3, 4) float64, its true pose.
-        keypoints: (n, 2) float64, pixels.
-        descriptors: (n, bits / 8) uint8.
-        landmarks: (n,) int64, the true landmark of each keypoint, -1 if it is unknown.
-    """
-
-    camera: Camera
-    cam_from_world: NDArray[np.float64]
-    keypoints: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
+    camera: Camera  # its camera
+    cam_from_world: NDArray[np.float64]  # (3, 4) float64, its true pose
+    keypoints: NDArray[np.float64]  # (n, 2) float64, pixels
+    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    # (n,) int64, the true landmark of each keypoint, -1 if it is unknown.
     landmarks: NDArray[np.int64]
 
     @classmethod
@@ -59,32 +52,20 @@ class QueryFrame:
 
 @dataclass(frozen=True)
 class FrameMatches:
-    """a selected matches of a frame, the clearest first.
+    """a selected matches of a frame, the clearest first."""
 
-    Attributes:
-        keypoints: (a,) int64, row of the keypoint in its frame.
-        landmarks: (a,) int64.
-    """
-
-    keypoints: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
+    keypoints: NDArray[np.int64]  # (a,) int64, row of the keypoint in its frame
+    landmarks: NDArray[np.int64]  # (a,) int64
 
 
 @dataclass(frozen=True)
 class LocalizedFrame:
-    """The pose of a frame and its error.
+    """The pose of a frame and its error."""
 
-    Attributes:
-        cam_from_world: (3, 4) float64, None if RANSAC found no pose.
-        position_error: distance of the camera centres, in world units, infinite without a pose.
-        angle_error: angle between the orientations in degrees, infinite without a pose.
-        inliers: (a,) bool, whether each selected match supports the pose.
-    """
-
-    cam_from_world: NDArray[np.float64] | None
-    position_error: float
-    angle_error: float
-    inliers: NDArray[np.bool_]
+    cam_from_world: NDArray[np.float64] | None  # (3, 4) float64, None if RANSAC found no pose
+    position_error: float  # distance of the camera centres, in world units, infinite without a pose
+    angle_error: float  # angle between the orientations in degrees, infinite without a pose
+    inliers: NDArray[np.bool_]  # (a,) bool, whether each selected match supports the pose
 
     def found(self, scene_depth: float) -> bool:
         """Whether the pose is within `DEPTH_SHARE` of the depth and `DEGREES`."""

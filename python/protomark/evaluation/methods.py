@@ -41,23 +41,14 @@ PROJECTED_DIMS = (8, 16, 32, 64)
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """A method that can be compared.
+    """A method that can be compared."""
 
-    Attributes:
-        name: short name, such as "pca-16".
-        label: its name in tables and plots.
-        family: name of methods that differ only in size, which plots connect by a line.
-        build: builds the map of a support.
-        default: whether it is compared unless methods are named.
-        upright: whether it takes upright descriptors (`protomark.features.upright`).
-    """
-
-    name: str
-    label: str
-    family: str
-    build: Callable[[Support], Method]
-    default: bool = True
-    upright: bool = False
+    name: str  # short name, such as "pca-16"
+    label: str  # its name in tables and plots
+    family: str  # name of methods that differ only in size, which plots connect by a line
+    build: Callable[[Support], Method]  # builds the map of a support
+    default: bool = True  # whether it is compared unless methods are named
+    upright: bool = False  # whether it takes upright descriptors (`protomark.features.upright`)
 
 
 class PrototypeMethod(Method):
@@ -103,17 +94,13 @@ def prototype_map(
 
 
 def method_choices(
+    # Encoders for the descriptor, each of which is compared at all its dims.
     encoders: Sequence[pm.Encoder] = (),
+    # Moments to learn linear discriminants from; None: those of the support.
     discriminant_from: Moments | None = None,
     threads: int = 1,
 ) -> list[MethodChoice]:
-    """Every method, in the order of tables.
-
-    Args:
-        encoders: encoders for the descriptor, each of which is compared at all its dims.
-        discriminant_from: moments to learn linear discriminants from; None: those of the support.
-        threads: threads to build a map on.
-    """
+    """Every method, in the order of tables."""
     listed = [
         MethodChoice("unaggregated", "Unaggregated", "unaggregated", unaggregated),
         MethodChoice("random", "Random sample", "random", random_sample),
@@ -194,11 +181,7 @@ def _projected(
 def choose_methods(
     listed: Sequence[MethodChoice], names: Sequence[str] | None
 ) -> list[MethodChoice]:
-    """The methods of these names or families, or the default ones.
-
-    Raises:
-        ValueError: there is no method of some name.
-    """
+    """The methods of these names or families, or the default ones."""
     if not names:
         return [choice for choice in listed if choice.default]
     chosen = {

@@ -16,21 +16,15 @@ MAX_QUERIES = 10_000
 
 @dataclass(frozen=True)
 class SupportQuerySplit:
-    """Support and queries of one sequence at one seed.
+    """Support and queries of one sequence at one seed."""
 
-    Attributes:
-        seed: seed of the split.
-        support_keyframes: (s,) int64, ascending indices of the keyframes that build the map.
-        query_keyframes: (m - s,) int64, ascending indices of the others.
-        support_rows: (o,) int64, ascending keypoint rows whose landmark is in the map.
-        query_rows: (q,) int64, ascending keypoint rows of the queries, whose landmarks are in the
-            map.
-    """
-
-    seed: int
+    seed: int  # seed of the split
+    # (s,) int64, ascending indices of the keyframes that build the map.
     support_keyframes: NDArray[np.int64]
-    query_keyframes: NDArray[np.int64]
+    query_keyframes: NDArray[np.int64]  # (m - s,) int64, ascending indices of the others
+    # (o,) int64, ascending keypoint rows whose landmark is in the map.
     support_rows: NDArray[np.int64]
+    # (q,) int64, ascending keypoint rows of the queries, whose landmarks are in the map.
     query_rows: NDArray[np.int64]
 
 

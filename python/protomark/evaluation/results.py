@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,31 +48,24 @@ _CURVE_LABELS = {
 
 @dataclass
 class MethodResult:
-    """Results of one method on one sequence, with one entry per seed in the lists.
+    """Results of one method on one sequence, with one entry per seed in the lists."""
 
-    Attributes:
-        name, label, family: see `methods.MethodChoice`.
-        bytes_per_landmark: all that matching needs, including the count, without the position.
-        precision: share of queries whose nearest landmark is their own.
-        search_ms: milliseconds to search for 1,000 queries on one thread.
-        build_s: seconds to build the map.
-        frames: query keyframes that were localized.
-        found: query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
-        selected: matches for RANSAC, over all frames.
-        right: selected matches that are right.
-    """
-
+    # name, label, family: see `methods.MethodChoice`.
     name: str
     label: str
     family: str
+    # All that matching needs, including the count, without the position.
     bytes_per_landmark: list[float] = field(default_factory=list)
+    # Share of queries whose nearest landmark is their own.
     precision: list[float] = field(default_factory=list)
+    # Milliseconds to search for 1,000 queries on one thread.
     search_ms: list[float] = field(default_factory=list)
-    build_s: list[float] = field(default_factory=list)
-    frames: int = 0
+    build_s: list[float] = field(default_factory=list)  # seconds to build the map
+    frames: int = 0  # query keyframes that were localized
+    # Query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
     found: int = 0
-    selected: int = 0
-    right: int = 0
+    selected: int = 0  # matches for RANSAC, over all frames
+    right: int = 0  # selected matches that are right
 
     def summary(self) -> MethodSummary:
         """Means over seeds, but the least search time."""
@@ -93,58 +86,42 @@ class MethodResult:
 
 @dataclass
 class MethodSummary:
-    """One row of a table.
+    """One row of a table."""
 
-    Attributes:
-        name, label, family: see `methods.MethodChoice`.
-        bytes_per_landmark: see `MethodResult`.
-        precision: mean precision.
-        spread: standard deviation of the precision over seeds, None with one seed.
-        ratio: precision as a share of the unaggregated one, None without that.
-        pose_recall: share of query keyframes whose pose was found, None without frames.
-        right_share: share of right matches among the selected ones, None without matches.
-        search_ms: milliseconds to search for 1,000 queries on one thread.
-    """
-
+    # name, label, family: see `methods.MethodChoice`.
     name: str
     label: str
     family: str
-    bytes_per_landmark: float
-    precision: float
+    bytes_per_landmark: float  # see `MethodResult`
+    precision: float  # mean precision
+    # Standard deviation of the precision over seeds, None with one seed.
     spread: float | None = None
-    ratio: float | None = None
+    ratio: float | None = None  # precision as a share of the unaggregated one, None without that
+    # Share of query keyframes whose pose was found, None without frames.
     pose_recall: float | None = None
+    # Share of right matches among the selected ones, None without matches.
     right_share: float | None = None
-    search_ms: float = 0.0
+    search_ms: float = 0.0  # milliseconds to search for 1,000 queries on one thread
 
 
 @dataclass
 class SequenceResult:
-    """All methods on one sequence.
-
-    Attributes:
-        sequence: name of the sequence.
-        descriptor: name of the descriptor.
-        keyframes, landmarks, observations: numbers in the tracks.
-        map_landmarks, support_observations, queries: mean numbers over seeds.
-        scene_depth: median depth of the observations, in world units.
-        seeds: seeds of the splits.
-        methods: one result per method, in the order of the table.
-        discriminant: what the linear discriminants were learned from.
-    """
+    """All methods on one sequence."""
 
     sequence: str
     descriptor: str
+    # keyframes, landmarks, observations: numbers in the tracks.
     keyframes: int
     landmarks: int
     observations: int
+    # map_landmarks, support_observations, queries: mean numbers over seeds.
     map_landmarks: float
     support_observations: float
     queries: float
-    scene_depth: float
-    seeds: list[int]
-    discriminant: str
-    methods: list[MethodResult]
+    scene_depth: float  # median depth of the observations, in world units
+    seeds: list[int]  # seeds of the splits
+    discriminant: str  # what the linear discriminants were learned from
+    methods: list[MethodResult]  # one result per method, in the order of the table
 
     def rows(self) -> list[MethodSummary]:
         """The rows of the table, with the ratio to the unaggregated map."""
@@ -179,31 +156,6 @@ def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -
     ]
     document = {"format": FORMAT, "version": VERSION, "sequences": sequences}
     write_text(path, json.dumps(document, indent=1) + "\n")
-
-
-def load_json(path: str | os.PathLike[str]) -> list[SequenceResult]:
-    """Read results that `save_json` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not such a file.
-    """
-    path = Path(path)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise ValueError(f"{path}: not results of `protomark evaluate --json`")
-        return [_sequence_result(entry) for entry in document["sequences"]]
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such results file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: broken results file ({error!r})") from None
-
-
-def _sequence_result(entry: dict[str, Any]) -> SequenceResult:
-    names = {f.name for f in fields(SequenceResult)} - {"methods"}
-    methods = [MethodResult(**method) for method in entry["methods"]]
-    return SequenceResult(**{key: entry[key] for key in names}, methods=methods)
 
 
 def caption(result: SequenceResult) -> str:
@@ -288,11 +240,7 @@ def precision_curves(rows: Sequence[MethodSummary]) -> list[Curve]:
 
 
 def save_precision_plot(rows: Sequence[MethodSummary], path: Path, title: str = "") -> None:
-    """Plot precision over bytes per landmark as PNG, SVG or PDF.
-
-    Raises:
-        ValueError: the path has another suffix.
-    """
+    """Plot precision over bytes per landmark as PNG, SVG or PDF."""
     figure = new_figure(8, 5)
     axes = figure.add_subplot()
     draw_curves(axes, precision_curves(rows), "bytes per landmark (log)", "precision", title)

@@ -34,40 +34,24 @@ POSE_FRAMES = 20
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """How an evaluation runs.
+    """How an evaluation runs."""
 
-    Attributes:
-        seeds: seeds of the splits.
-        pose_frames: limit on query keyframes to localize per seed.
-        threads: threads for all that is not timed.
-        encoders: names or files of encoders, for the tracks' descriptors or their upright forms;
-            by default the one that ships for the descriptor.
-        methods: names of methods, or of families of methods; by default the default ones.
-        discriminant_from: tracks files to learn linear discriminants from; by default each
-            sequence's support.
-    """
-
-    seeds: Sequence[int] = (0, 1, 2)
-    pose_frames: int = POSE_FRAMES
-    threads: int = 1
+    seeds: Sequence[int] = (0, 1, 2)  # seeds of the splits
+    pose_frames: int = POSE_FRAMES  # limit on query keyframes to localize per seed
+    threads: int = 1  # threads for all that is not timed
+    # Names or files of encoders, for the tracks' descriptors or their upright forms; by default the
+    # one that ships for the descriptor.
     encoders: Sequence[str] = ()
+    # Names of methods, or of families of methods; by default the default ones.
     methods: Sequence[str] = ()
+    # Tracks files to learn linear discriminants from; by default each sequence's support.
     discriminant_from: Sequence[Path] = ()
 
 
 def evaluate_files(
     paths: Sequence[Path], options: EvaluationOptions, progress: Progress = silent
 ) -> Iterator[SequenceResult]:
-    """Evaluate tracks files one after the other.
-
-    Args:
-        paths: tracks files.
-        options: what to compare, and how.
-        progress: called with each method at each seed.
-
-    Raises:
-        FileNotFoundError, ValueError: a file is missing, broken, or does not fit the others.
-    """
+    """Evaluate tracks files one after the other."""
     encoders = [pm.Encoder.load(source) for source in options.encoders or models.names()]
     for path in [*paths, *options.discriminant_from]:
         if not path.is_file():
@@ -100,11 +84,7 @@ def encoders_for(
 
 
 def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
-    """Moments over several tracks files, of landmarks with at least two observations.
-
-    Raises:
-        ValueError: a file holds other descriptors than `like`.
-    """
+    """Moments over several tracks files, of landmarks with at least two observations."""
     landmarks, descriptors, offset = [], [], 0
     for path in paths:
         tracks = Tracks.load(path)
@@ -221,15 +201,8 @@ def measure_poses(
     result: MethodResult,
 ) -> None:
     """Add the numbers of localized frames and of right matches to a result."""
-    if not frames:
-        return
-    ends = np.cumsum([len(frame.keypoints) for frame in frames])
-    landmarks, distances = method.match(
-        np.concatenate([frame.descriptors for frame in frames]), threads=threads
-    )
-    for frame, end in zip(frames, ends, strict=True):
-        rows = slice(int(end) - len(frame.keypoints), int(end))
-        matches = select_matches(landmarks[rows], distances[rows])
+    for frame in frames:
+        matches = select_matches(*method.match(frame.descriptors, threads=threads))
         positions = tracks.positions_of(matches.landmarks)
         result.frames += 1
         result.selected += len(matches.landmarks)

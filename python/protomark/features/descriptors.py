@@ -1,4 +1,4 @@
-"""The binary descriptors that OpenCV computes, with their detectors, and their bits."""
+"""The binary descriptors that OpenCV computes, and their bits."""
 
 from __future__ import annotations
 
@@ -10,17 +10,10 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class DescriptorKind:
-    """A descriptor and the detector that it is commonly used with.
+    """A descriptor; docs/tracks.md names the detector that it is used with."""
 
-    Attributes:
-        name: name on the command line and in files, such as "freak".
-        bytes: length of a descriptor in bytes.
-        detector: the detector of its keypoints.
-    """
-
-    name: str
-    bytes: int
-    detector: str
+    name: str  # on the command line and in files
+    bytes: int  # length of a descriptor
 
     @property
     def bits(self) -> int:
@@ -28,18 +21,8 @@ class DescriptorKind:
         return 8 * self.bytes
 
 
-DESCRIPTORS = {
-    kind.name: kind
-    for kind in (
-        DescriptorKind("freak", 64, "BRISK (multi-scale AGAST)"),
-        DescriptorKind("orb", 32, "ORB (oriented FAST)"),
-        DescriptorKind("brisk", 64, "BRISK (multi-scale AGAST)"),
-        DescriptorKind("akaze", 61, "AKAZE"),
-        DescriptorKind("latch", 32, "ORB (oriented FAST)"),
-        DescriptorKind("beblid", 64, "ORB (oriented FAST)"),
-        DescriptorKind("teblid", 32, "ORB (oriented FAST)"),
-    )
-}
+_BYTES = {"freak": 64, "orb": 32, "brisk": 64, "akaze": 61, "latch": 32, "beblid": 64, "teblid": 32}
+DESCRIPTORS = {name: DescriptorKind(name, size) for name, size in _BYTES.items()}
 
 
 def descriptor_kind(name: str) -> DescriptorKind:

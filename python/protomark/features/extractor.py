@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.extras import missing, optional
+from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
 from protomark.geometry.neighbours import near_pairs, runs
 
@@ -26,23 +26,16 @@ FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descr
 
 @dataclass
 class Features:
-    """n keypoints of one image with their descriptors.
+    """n keypoints of one image with their descriptors."""
 
-    Attributes:
-        keypoints: (n, 2) float32, pixels; the centre of the upper left pixel is (0.5, 0.5).
-        sizes: (n,) float32, diameter in pixels.
-        angles: (n,) float32, degrees clockwise in [0, 360), -1 where there is none.
-        responses: (n,) float32, the detector's strength.
-        octaves: (n,) int32, the detector's pyramid level.
-        descriptors: (n, bits / 8) uint8.
-    """
-
+    # (n, 2) float32, pixels; the centre of the upper left pixel is (0.5, 0.5).
     keypoints: NDArray[np.float32]
-    sizes: NDArray[np.float32]
+    sizes: NDArray[np.float32]  # (n,) float32, diameter in pixels
+    # (n,) float32, degrees clockwise in [0, 360), -1 where there is none.
     angles: NDArray[np.float32]
-    responses: NDArray[np.float32]
-    octaves: NDArray[np.int32]
-    descriptors: NDArray[np.uint8]
+    responses: NDArray[np.float32]  # (n,) float32, the detector's strength
+    octaves: NDArray[np.int32]  # (n,) int32, the detector's pyramid level
+    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -63,42 +56,50 @@ class Extractor:
     """
 
     def __init__(self, name: str, max_keypoints: int = 2000) -> None:
-        cv2 = optional("cv2")
         if max_keypoints < 1:
             raise ValueError(f"max_keypoints is {max_keypoints}, but it must be at least 1")
         self.kind = descriptor_kind(name)
         self.max_keypoints = max_keypoints
-        if not hasattr(cv2, "xfeatures2d"):
-            raise missing("cv2.xfeatures2d")
-        extra = cv2.xfeatures2d
         # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
         self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
         self._high_contrast = False
-        brisk = getattr(extra, "BRISK_create", None) or cv2.BRISK_create
-        akaze = getattr(extra, "AKAZE_create", None) or cv2.AKAZE_create
-        orb = [cv2.ORB_create(nfeatures=5 * max_keypoints, fastThreshold=t) for t in (20, 7)]
         if self.kind.name in ("freak", "brisk"):
+            brisk = _opencv("BRISK_create")
             self._detect = [brisk(thresh=t, octaves=3).detect for t in (30, 18, 10)]
         elif self.kind.name == "akaze":
-            self._detect = [akaze(threshold=t).detect for t in _AKAZE_THRESHOLDS]
-            self._akaze = akaze(threshold=_AKAZE_THRESHOLDS[-1]).detectAndCompute
+            akaze = [_opencv("AKAZE_create")(threshold=t) for t in _AKAZE_THRESHOLDS]
+            self._detect = [a.detect for a in akaze]
+            self._akaze = akaze[-1].detectAndCompute
         else:
-            self._detect = [o.detect for o in orb]
+            orb = _opencv("ORB_create")
+            limit = 5 * max_keypoints
+            self._detect = [orb(nfeatures=limit, fastThreshold=t).detect for t in (20, 7)]
         self._compute = {
-            "freak": lambda: extra.FREAK_create(),
-            "orb": lambda: orb[0],
-            "brisk": lambda: brisk(),
-            "akaze": lambda: akaze(),
-            "latch": lambda: extra.LATCH_create(bytes=32),
-            "beblid": lambda: extra.BEBLID_create(1.0, extra.BEBLID_SIZE_512_BITS),
-            "teblid": lambda: extra.TEBLID_create(1.0, extra.TEBLID_SIZE_256_BITS),
+            "freak": lambda: _opencv("FREAK_create")(),
+            "orb": lambda: _opencv("ORB_create")(nfeatures=5 * max_keypoints, fastThreshold=20),
+            "brisk": lambda: _opencv("BRISK_create")(),
+            "akaze": lambda: _opencv("AKAZE_create")(),
+            "latch": lambda: _opencv("LATCH_create")(bytes=32),
+            "beblid": lambda: _opencv("BEBLID_create")(1.0, _opencv("BEBLID_SIZE_512_BITS")),
+            "teblid": lambda: _opencv("TEBLID_create")(1.0, _opencv("TEBLID_SIZE_256_BITS")),
         }[self.kind.name]().compute
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
-        """The features of a (height, width) uint8 image, the strongest first."""
+        """The features of a (height, width) uint8 image, the strongest first.
+
+        Raises:
+            ValueError: OpenCV refuses the image, for example as it is a few pixels wide.
+        """
         # Some descriptors drop keypoints near the border.
-        described, descriptors = self._describe(image)
+        try:
+            described, descriptors = self._describe(image)
+        except optional("cv2").error as error:
+            height, width = image.shape
+            raise ValueError(
+                f"OpenCV computes no {self.kind.name} features of {width}x{height} pixels "
+                f"({error.err})"
+            ) from None
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
@@ -156,6 +157,18 @@ class Extractor:
         """The keypoints to keep, and whether they reach the limit."""
         chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
         return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
+
+
+def _opencv(name: str) -> Any:
+    """Something of OpenCV or of its contrib module `xfeatures2d`, to which version 5 moved some."""
+    cv2 = optional("cv2")
+    for module in (getattr(cv2, "xfeatures2d", None), cv2):
+        if hasattr(module, name):
+            return getattr(module, name)
+    raise ModuleNotFoundError(
+        f"this OpenCV has no {name}, as another OpenCV package has overwritten "
+        "opencv-contrib-python-headless: pip uninstall all of them, and install that one again"
+    )
 
 
 def _spread(found: Sequence[Any], width: int, height: int, limit: int) -> list[int]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +12,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.files import natural_key
+from protomark.files import is_utf8, natural_key
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+IMAGE_SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"),
+    *(".bmp", ".ppm", ".pgm", ".webp"),
+)
 
 
 def image_names(folder: Path) -> list[str]:
-    """Names of the images below a folder, relative to it, in natural order (img2 before img10)."""
-    files = (f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file())
-    return sorted((f.relative_to(folder).as_posix() for f in files), key=natural_key)
+    """Names of the images below a folder, relative to it, in natural order (img2 before img10).
+
+    Links are followed. Hidden files and folders, and those of storage servers (@eaDir), do not
+    count, and neither do names that are not UTF-8.
+    """
+    return sorted(filter(_is_image, _file_names(folder)), key=natural_key)
+
+
+def passed_over(folder: Path) -> str:
+    """A sentence on the files below a folder that `image_names` leaves out, "" without any."""
+    others = [name for name in _file_names(folder) if not _is_image(name)]
+    kinds = Counter(_kind(name) for name in others)
+    if not kinds:
+        return ""
+    listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(5))
+    return f"{folder}: files that are no images are passed over: {listed}"
+
+
+def _file_names(folder: Path) -> Iterator[str]:
+    for here, folders, files in os.walk(folder, followlinks=True):
+        below = Path(here)
+        folders[:] = [f for f in folders if f[0] not in ".@" and not _is_circle(below / f)]
+        yield from ((below / f).relative_to(folder).as_posix() for f in files if f[0] not in ".@")
+
+
+def _is_circle(folder: Path) -> bool:
+    return folder.is_symlink() and folder.resolve() in (p.resolve() for p in folder.parents)
+
+
+def _is_image(name: str) -> bool:
+    return is_utf8(name) and name.lower().endswith(IMAGE_SUFFIXES)
+
+
+def _kind(name: str) -> str:
+    if not is_utf8(name):
+        return f"whose name is not UTF-8 ({name})"
+    return Path(name).suffix[1:].lower() or "without a suffix"
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:
     """Read an image as (height, width) uint8, exactly as stored (not rotated by EXIF).
+
+    Of 16 bits per pixel the upper 8 of those that the image uses are kept, as cameras store 10 or
+    12 bits in 16.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -32,17 +75,35 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
         raise FileNotFoundError(f"{path}: no such image")
     data = np.fromfile(path, dtype=np.uint8)
     # OpenCV fills the missing rows of a truncated image with grey and only warns.
-    start, end = data[:4].tobytes(), data[-4096:].tobytes()
-    for magic, last in ((b"\xff\xd8", b"\xff\xd9"), (b"\x89PNG", b"IEND")):
-        if start.startswith(magic) and last not in end:
-            raise ValueError(
-                f"{path}: the image is truncated (its end marker is missing), copy it anew"
-            )
+    if _is_truncated(data.tobytes()):
+        raise ValueError(f"{path}: the image is truncated (no end marker), copy it anew")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if len(data) else None
+    try:
+        image = cv2.imdecode(data, flags | cv2.IMREAD_ANYDEPTH) if len(data) else None
+        if image is not None and image.dtype not in (np.uint8, np.uint16):
+            image = cv2.imdecode(data, flags)
+    except cv2.error as error:
+        raise ValueError(f"{path}: OpenCV cannot decode this image ({error.err})") from None
     if image is None:
         raise ValueError(f"{path}: the image is truncated, or of an unknown format: copy it anew")
+    if image.dtype == np.uint16:
+        used = int(image.max()).bit_length()
+        image = image >> next(bits - 8 for bits in (8, 10, 12, 14, 16) if used <= bits)
     return np.asarray(image, dtype=np.uint8)
+
+
+def _is_truncated(data: bytes) -> bool:
+    """Whether a JPEG or PNG file lacks its end marker, behind which phones append a video."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    # The segments before the scan may hold a thumbnail, which has an end marker of its own.
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
+        padding = data[at + 1 : at + 2] == b"\xff"
+        at += 1 if padding else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return b"\xff\xd9" not in data[at:]
 
 
 def to_gray(image: NDArray[Any]) -> NDArray[np.uint8]:

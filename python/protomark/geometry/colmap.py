@@ -13,9 +13,11 @@ import zlib  # noqa: F401  (must come before pycolmap, see above)
 import contextlib
 import os
 import re
+import signal
 import tempfile
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,11 @@ from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 
+# pycolmap takes SIGTERM for itself, to print a stack trace.
+_on_sigterm = signal.getsignal(signal.SIGTERM)
 pycolmap = optional("pycolmap")
+if _on_sigterm is not None and threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, _on_sigterm)
 
 _FILES = ("cameras", "images")
 
@@ -56,6 +62,17 @@ class ColmapModel:
     def centers(self) -> NDArray[np.float64]:
         """(m, 3) float64, camera centres in the world."""
         return camera_centers(self.cam_from_world)
+
+    def where(self, keep: Sequence[bool]) -> ColmapModel:
+        """The model with the images for which `keep` (m,) is true."""
+        rows = np.flatnonzero(keep)
+        return replace(
+            self,
+            names=[self.names[i] for i in rows],
+            image_ids=self.image_ids[rows],
+            camera_ids=self.camera_ids[rows],
+            cam_from_world=self.cam_from_world[rows],
+        )
 
     def check_for_triangulation(self, path: Path) -> None:
         """Raise ValueError unless two images have poses at different positions."""

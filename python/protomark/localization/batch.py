@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.features.images import image_names, read_gray
-from protomark.files import write_text
+from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength, check_pose_model
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras
@@ -177,6 +177,7 @@ class LocalizationBatch:
 
     def write(self, folder: Path) -> None:
         """Write a COLMAP model of the accepted poses, and a table of all images."""
+        folder.mkdir(parents=True, exist_ok=True)
         camera_lines: dict[str, int] = {}
         poses, camera_ids = {}, {}
         for image in self.images:
@@ -247,7 +248,6 @@ def localize_files(
         check_pose_model(camera)
     true_poses = _poses_of(request.true_poses, images)
     priors = _poses_of(request.priors, images)
-    output.mkdir(parents=True, exist_ok=True)
 
     def localize(image: tuple[str, Path]) -> ImageResult:
         name, path = image
@@ -295,6 +295,8 @@ def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
         else:
             raise FileNotFoundError(f"{source}: no such image or folder")
         for name, path in names:
+            if not is_utf8(name):
+                raise ValueError(f"{path}: the name of this image is not UTF-8, rename it")
             if name in found:
                 raise ValueError(
                     f"{found[name]} and {path} have the same name {name}: localize them apart"

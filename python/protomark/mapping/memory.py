@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 import protomark as pm
 from protomark.features.descriptors import descriptor_kind
 from protomark.mapping.options import MappingOptions
+from protomark.maps.build import chosen_dim
 from protomark.maps.info import matching_bytes
 from protomark.match_calibration import NO_DISTANCE, MatchCalibration
 from protomark.matching import MIN_PROBABILITY
@@ -105,12 +106,7 @@ class Prototypes(Memory):
     """Prototypes of landmarks, and no descriptors (the paper's method)."""
 
     def __init__(self, encoder: pm.Encoder, dim: int, appearance_bits: int = 0) -> None:
-        if dim not in encoder.dims:
-            raise ValueError(
-                f"--dim {dim}: encoder '{encoder.name}' has codes of "
-                f"{', '.join(map(str, encoder.dims))} dimensions"
-            )
-        self.encoder, self.dim = encoder, dim
+        self.encoder, self.dim = encoder, chosen_dim(encoder, dim)
         self.map = pm.PrototypeMap(encoder, dim, appearance_bits)
         self.calibration: MatchCalibration | None = None
         with contextlib.suppress(ValueError):

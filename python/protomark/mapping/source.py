@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from protomark.mapping.frame import InputImage
 
 # Number of a video's frames that are held in memory to read it backward.
 _CHUNK = 64
+# Number of images of a folder by which its images' size is told.
+_SAMPLE = 9
 _GUESSED_MODEL = "SIMPLE_RADIAL"
 
 
@@ -64,16 +67,23 @@ class FrameSource(ABC):
             pose = self.poses.find(image.name, image.time) if self.poses else None
             yield replace(image, name=self.prefix + image.name, pose=pose)
 
-    def size(self) -> tuple[int, int]:
-        """Width and height of the first image that can be read.
+    @cached_property
+    def example(self) -> InputImage:
+        """The first image that can be read.
 
         Raises:
             ValueError: none can be read.
         """
         for image in self._read(0, None, False):
             if image.image is not None:
-                return image.image.shape[1], image.image.shape[0]
+                return image
         raise ValueError(f"{self.path}: none of its {len(self)} frames can be read, copy it anew")
+
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images; raises ValueError if none can be read."""
+        image = self.example.image
+        assert image is not None
+        return image.shape[1], image.shape[0]
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length.
@@ -129,8 +139,18 @@ class ImageFolder(FrameSource):
                 problem = str(error)
             yield InputImage(index, name, self._times[index], image, problem=problem)
 
+    @cached_property
+    def example(self) -> InputImage:
+        """The first image of the most frequent size, of a sample that can be read."""
+        chosen = self._names[:: max(1, len(self._names) // _SAMPLE)]
+        sample = [image for image in self._read(0, {*chosen}, False) if image.image is not None]
+        if not sample:
+            return super().example
+        sizes = [image.image.shape for image in sample if image.image is not None]
+        return sample[sizes.index(max(sizes, key=sizes.count))]
+
     def _exif_focal_length(self) -> float | None:
-        camera = camera_from_exif(self.path / self._names[0])
+        camera = camera_from_exif(self.path / self.example.name)
         return None if camera is None else camera.params[0]
 
 

@@ -14,9 +14,20 @@ DIM = 48
 APPEARANCE_BITS = 5
 
 
-def default_dim(encoder: Encoder) -> int:
-    """Dimensions of a prototype unless the user asks for others: `DIM`, or what comes nearest."""
-    return max((dim for dim in encoder.dims if dim <= DIM), default=min(encoder.dims))
+def chosen_dim(encoder: Encoder, dim: int | None = None) -> int:
+    """Dimensions of a prototype; None: `DIM`, or what comes nearest.
+
+    Raises:
+        ValueError: the encoder has no codes of so many.
+    """
+    if dim is None:
+        return max((d for d in encoder.dims if d <= DIM), default=min(encoder.dims))
+    if dim not in encoder.dims:
+        raise ValueError(
+            f"--dim {dim}: encoder '{encoder.name}' has codes of "
+            f"{', '.join(map(str, encoder.dims))} dimensions"
+        )
+    return dim
 
 
 def build_map(
@@ -33,7 +44,7 @@ def build_map(
     Args:
         tracks: the observations.
         encoder: an encoder for their descriptor, or for its upright form.
-        dim: numbers per prototype, one of `encoder.dims`; None: `default_dim`.
+        dim: numbers per prototype, one of `encoder.dims`; None: `chosen_dim`.
         min_observations: landmarks with fewer observations are left out.
         appearance_bits: number of signs of a code that tell the appearances of a landmark apart;
             0: each landmark has one prototype; None: `APPEARANCE_BITS`.
@@ -53,7 +64,7 @@ def build_map(
             f"no landmark has {min_observations} observations: give longer tracks or lower "
             "min_observations"
         )
-    dim = default_dim(encoder) if dim is None else dim
+    dim = chosen_dim(encoder, dim)
     if appearance_bits is None:
         appearance_bits = min(APPEARANCE_BITS, dim)
     scene = PrototypeMap(encoder, dim, appearance_bits)

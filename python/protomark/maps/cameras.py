@@ -18,11 +18,7 @@ def cameras_text(cameras: Iterable[Camera]) -> str:
 
 
 def map_cameras(scene: pm.PrototypeMap | pm.SealedMap) -> CameraSet:
-    """The cameras that a map was made with; none if nobody stored them.
-
-    Raises:
-        ValueError: the metadata under `KEY` are something else.
-    """
+    """The cameras that a map was made with; none if nobody stored them."""
     cameras = []
     for line in scene.metadata.get(KEY, "").splitlines():
         try:

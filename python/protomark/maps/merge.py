@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import protomark as pm
+from protomark.files import check_outputs
 from protomark.progress import Progress, silent, tracked
 
 MAX_ID = 2**63 - 1
@@ -15,21 +16,18 @@ MAX_ID = 2**63 - 1
 def merge_files(
     inputs: Sequence[Path], output: Path, renumber: bool = False, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Merge learning maps, in this order, into the map file `output`; returns facts as JSON values.
+    """Merge learning maps, in this order, into the map file `output`; returns facts as JSON.
 
-    Args:
-        inputs: map files of the same encoder, dimensions and appearance bits.
-        output: the file to write, which is none of the inputs.
-        renumber: whether landmarks of different files differ, whatever their ids: those of each
-            further file then get new ids above all earlier ones.
-        progress: called with each map.
-
-    Raises:
-        ValueError: there are fewer than two inputs, or one occurs twice, is sealed, does not fit
-            the first, or is the output.
-        OSError: a file cannot be read or written.
+    With `renumber`, landmarks of different files differ, whatever their ids: those of each further
+    file get new ids above all earlier ones.
     """
-    _check_inputs(inputs, output)
+    check_outputs(output, inputs=inputs)
+    if len(inputs) < 2:
+        raise ValueError("name at least two maps to merge")
+    resolved = [path.resolve() for path in inputs]
+    for path, same in zip(inputs, resolved, strict=True):
+        if resolved.count(same) > 1:
+            raise ValueError(f"{path} is named twice, and its observations would count twice")
     files: list[dict[str, Any]] = []
     merged: pm.PrototypeMap | None = None
     for path in tracked(inputs, progress, "merge"):
@@ -60,25 +58,8 @@ def merge_files(
     }
 
 
-def _check_inputs(inputs: Sequence[Path], output: Path) -> None:
-    if len(inputs) < 2:
-        raise ValueError("name at least two maps to merge")
-    seen: set[Path] = set()
-    for path in inputs:
-        if path.resolve() in seen:
-            raise ValueError(f"{path} is named twice, and its observations would count twice")
-        seen.add(path.resolve())
-        if path.exists() and output.exists() and path.samefile(output):
-            raise ValueError(f"{output} is one of the maps to merge: name another file to write")
-
-
 def open_learning_map(path: Path) -> pm.PrototypeMap:
-    """Open a map that takes observations.
-
-    Raises:
-        ValueError: the file holds a sealed map.
-        OSError: the file cannot be read.
-    """
+    """Open a map that takes observations."""
     scene = pm.open(path)
     if not isinstance(scene, pm.PrototypeMap):
         raise ValueError(f"{path} is a sealed map, which keeps no sums: give the learning map")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from datetime import datetime, timezone
 
@@ -11,32 +12,22 @@ def creation_time() -> str:
     """The time in UTC, such as 2026-11-23T03:39:41Z, or that of SOURCE_DATE_EPOCH.
 
     The variable makes builds repeatable (https://reproducible-builds.org/specs/source-date-epoch).
-
-    Raises:
-        ValueError: SOURCE_DATE_EPOCH is not a number of seconds since 1970 up to the year 9999.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
-        time = datetime.now(timezone.utc) if epoch is None else _utc(int(epoch))
+        seconds = time.time() if epoch is None else int(epoch)
+        if seconds < 0:
+            raise ValueError
+        utc = datetime.fromtimestamp(seconds, timezone.utc)
     except (ValueError, OverflowError, OSError):
         raise ValueError(
             f"SOURCE_DATE_EPOCH={epoch} is not a number of seconds since 1970: unset or correct it"
         ) from None
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _utc(seconds: int) -> datetime:
-    if seconds < 0:
-        raise ValueError(seconds)
-    return datetime.fromtimestamp(seconds, timezone.utc)
+    return utc.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def command_metadata(frame: str | None, pairs: Sequence[str]) -> dict[str, str]:
-    """The metadata of a map that a command makes: "created", "frame" and the given pairs.
-
-    Raises:
-        ValueError: a pair is not of the form NAME=TEXT.
-    """
+    """The metadata of a map that a command makes: "created", "frame" and the given pairs."""
     metadata = {"created": creation_time()}
     if frame is not None:
         metadata["frame"] = frame

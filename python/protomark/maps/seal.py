@@ -29,28 +29,19 @@ INDEX_FROM = 100_000
 # The smallest map that is tried: a pose needs four landmarks.
 MIN_LANDMARKS = 4
 MODEL = "sparse"
-_SIZE_STEPS = 8
 
 
 @dataclass(frozen=True)
-class SealOptions:
-    """How large a sealed map may be, and what it holds.
+class SealRequest:
+    """How large a sealed map may be, and what it holds."""
 
-    Attributes:
-        bytes_per_landmark: for prototypes, their number and count, on average; None: lossless.
-        megabytes: of the whole file, 10^6 bytes; None: no limit.
-        landmarks: how many to keep at most; None: all.
-        index: whether to build one: "auto" from `INDEX_FROM` prototypes on.
-        position_bits: per coordinate: 32, 16, or 0 for no positions.
-        threads: threads to encode and build the index on.
-    """
-
+    # For prototypes, their number and count, on average; None: lossless.
     bytes_per_landmark: float | None = BYTES_PER_LANDMARK
-    megabytes: float | None = None
-    landmarks: int | None = None
-    index: Index = "auto"
-    position_bits: int = 16
-    threads: int = 1
+    megabytes: float | None = None  # of the whole file, 10^6 bytes; None: no limit
+    landmarks: int | None = None  # how many to keep at most; None: all
+    index: Index = "auto"  # whether to build one: "auto" from `INDEX_FROM` prototypes on
+    position_bits: int = 16  # per coordinate: 32, 16, or 0 for no positions
+    threads: int = 1  # threads to encode and build the index on
 
 
 def sealed_path(path: Path) -> Path:
@@ -59,33 +50,18 @@ def sealed_path(path: Path) -> Path:
 
 
 def seal(
-    source: Path, output: Path, options: SealOptions | None = None, progress: Progress = silent
+    source: Path, output: Path, request: SealRequest | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Seal a scene; where not all landmarks may stay, those that cover it best.
-
-    Args:
-        source: a folder of `protomark map`, a learning map or a tracks file.
-        output: the file to write.
-        options: how large it may be.
-        progress: called with each stage.
-
-    Returns:
-        Facts: landmarks of the sealed map and of the source, by what they were chosen (None: all
-        were kept), and bytes.
-
-    Raises:
-        FileNotFoundError, FileError, ValueError: the source is none of these, or a size cannot be
-            met.
-    """
-    options = options or SealOptions()
+    """Seal a folder of `protomark map`, a learning map or tracks; returns facts, see `seal_map`."""
+    request = request or SealRequest()
     progress("read the map", 0, 0)
     if is_tracks(source):
         tracks = Tracks.load(source)
-        scene = build_map(tracks, pm.Encoder.load(tracks.descriptor), threads=options.threads)
+        scene = build_map(tracks, pm.Encoder.load(tracks.descriptor), threads=request.threads)
         scene.metadata = {KEY: cameras_text(tracks.cameras.values())}
-        return seal_map(scene, output, options, lambda: Views.of_tracks(tracks), progress)
+        return seal_map(scene, output, request, lambda: Views.of_tracks(tracks), progress)
     if not source.is_dir():
-        return seal_map(open_learning_map(source), output, options, None, progress)
+        return seal_map(open_learning_map(source), output, request, None, progress)
     if not (source / SCENE_MAP).is_file():
         raise FileNotFoundError(
             f"{source}: no {SCENE_MAP} in this folder; name a learning map or tracks"
@@ -93,38 +69,30 @@ def seal(
     scene = open_learning_map(source / SCENE_MAP)
     model = source / MODEL
     views = (lambda: Views.of_model(model)) if model.is_dir() else None
-    return seal_map(scene, output, options, views, progress)
+    return seal_map(scene, output, request, views, progress)
 
 
 def seal_map(
     scene: pm.PrototypeMap,
     output: Path,
-    options: SealOptions | None = None,
+    request: SealRequest | None = None,
+    # Gives the images that saw its landmarks, if landmarks have to be chosen; None: they are chosen
+    # by where they are in space.
     views: Callable[[], Views] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Seal a learning map, which stays as it is but for its index.
 
-    Args:
-        scene: the map.
-        output: the file to write.
-        options: how large it may be.
-        views: gives the images that saw its landmarks, if landmarks have to be chosen; None: they
-            are chosen by where they are in space.
-        progress: called with each stage.
-
     Returns:
-        Facts, see `seal`.
-
-    Raises:
-        FileError, ValueError: see `seal`.
+        Landmarks of the sealed map and of the source, by what they were chosen (None: all were
+        kept), and bytes.
     """
-    options = options or SealOptions()
+    request = request or SealRequest()
     total = len(scene)
-    limit = total if options.landmarks is None else options.landmarks
+    limit = total if request.landmarks is None else request.landmarks
     if not 0 < limit <= max(total, 1):
         raise ValueError(f"{limit} landmarks cannot be kept: the map has {total}")
-    if options.position_bits and not scene.summary()["landmarks_with_position"]:
+    if request.position_bits and not scene.summary()["landmarks_with_position"]:
         raise ValueError(
             "no landmark of the map has a position: seal it without positions (--no-positions)"
         )
@@ -141,14 +109,12 @@ def seal_map(
 
     progress("seal", 0, 0)
     count = limit
-    if options.megabytes is not None:
+    if request.megabytes is not None:
         with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
-            count = _fitting_count(
-                lambda n: _seal_once(best(n), Path(folder) / "map.pmk", options),
-                limit,
-                options.megabytes * 1e6,
-            )
-    size = _seal_once(best(count), output, options)
+            path = Path(folder) / "map.pmk"
+            while _seal_once(best(count), path, request) > request.megabytes * 1e6:
+                count = _fitting_count(path, count, request.megabytes * 1e6)
+    size = _seal_once(best(count), output, request)
     by = "images" if views else "space"
     return {
         "landmarks": count,
@@ -158,51 +124,32 @@ def seal_map(
     }
 
 
-def _seal_once(scene: pm.PrototypeMap, path: Path, options: SealOptions) -> int:
+def _seal_once(scene: pm.PrototypeMap, path: Path, request: SealRequest) -> int:
     """Seal a whole map; returns the bytes of the file."""
-    wanted = options.index == "yes" or (
-        options.index == "auto" and scene.prototype_count >= INDEX_FROM
+    wanted = request.index == "yes" or (
+        request.index == "auto" and scene.prototype_count >= INDEX_FROM
     )
     if wanted and not scene.nlist:
-        scene.build_index(threads=options.threads)
-    elif options.index == "no":
+        scene.build_index(threads=request.threads)
+    elif request.index == "no":
         scene.drop_index()
     scene.seal(
-        path, bytes_per_landmark=options.bytes_per_landmark, position_bits=options.position_bits
+        path, bytes_per_landmark=request.bytes_per_landmark, position_bits=request.position_bits
     )
     return path.stat().st_size
 
 
-def _fitting_count(seal: Callable[[int], int], count: int, limit: float) -> int:
-    """The most landmarks that take at most `limit` bytes, within a hundredth of them.
-
-    Args:
-        seal: gives the bytes of a sealed map of so many landmarks.
-        count: all of them.
-        limit: bytes.
-    """
-    size = seal(count)
-    if size <= limit:
-        return count
-    fits, above = min(MIN_LANDMARKS, count), count
-    fitting = seal(fits)
-    if fitting > limit:
+def _fitting_count(path: Path, count: int, limit: float) -> int:
+    """How many landmarks fit into `limit` bytes, by a sealed map with `count`, too many."""
+    fixed = sum(size for name, size in pm.file_sections(path) if name in ("encoder", "metadata"))
+    each = (path.stat().st_size - fixed) / count
+    fitting = min(int((0.998 * limit - fixed) / each), count - 1)
+    if fitting < MIN_LANDMARKS:
         raise ValueError(
-            f"{limit / 1e6:g} MB are too few: {fits} landmarks and the encoder take "
-            f"{fitting / 1e6:.2f} MB"
+            f"{limit / 1e6:g} MB are too few: {MIN_LANDMARKS} landmarks and the encoder take "
+            f"{(fixed + MIN_LANDMARKS * each) / 1e6:.2f} MB"
         )
-    for _ in range(_SIZE_STEPS):
-        if above - fits <= 1 or fitting >= 0.99 * limit:
-            break
-        # By the line through the smaller and the larger map, a little below the limit.
-        share = (0.998 * limit - fitting) / max(size - fitting, 1)
-        tried = min(max(fits + int(share * (above - fits)), fits + 1), above - 1)
-        tried_size = seal(tried)
-        if tried_size <= limit:
-            fits, fitting = tried, tried_size
-        else:
-            above, size = tried, tried_size
-    return fits
+    return fitting
 
 
 def _by_usefulness(

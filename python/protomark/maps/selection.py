@@ -32,32 +32,20 @@ _FIRST_ROUND = 8
 
 @dataclass(frozen=True)
 class Views:
-    """Which bins the landmarks of a map fall into; a pair per landmark and bin.
+    """Which bins the landmarks of a map fall into; a pair per landmark and bin."""
 
-    Attributes:
-        ids: (v,) int64, landmark ids.
-        bins: (v,) int64, from 0 on.
-    """
-
-    ids: NDArray[np.int64]
-    bins: NDArray[np.int64]
+    ids: NDArray[np.int64]  # (v,) int64, landmark ids
+    bins: NDArray[np.int64]  # (v,) int64, from 0 on
 
     @classmethod
     def of_images(
         cls,
-        ids: NDArray[np.int64],
-        images: NDArray[np.int64],
-        pixels: NDArray[np.floating],
-        sizes: NDArray[np.floating],
+        ids: NDArray[np.int64],  # (o,) int64, landmark of each observation
+        images: NDArray[np.int64],  # (o,) int64, which image it is in, from 0 on
+        pixels: NDArray[np.floating],  # (o, 2), where in the image
+        sizes: NDArray[np.floating],  # (o, 2), width and height of the image
     ) -> Views:
-        """The bins of observations.
-
-        Args:
-            ids: (o,) int64, landmark of each observation.
-            images: (o,) int64, which image it is in, from 0 on.
-            pixels: (o, 2), where in the image.
-            sizes: (o, 2), width and height of the image.
-        """
+        """The bins of observations."""
         at = np.clip(pixels / sizes, 0, np.nextafter(1, 0))
         return cls._of_grid(ids, images, at, _IMAGE_LEVELS)
 
@@ -74,11 +62,7 @@ class Views:
 
     @classmethod
     def of_model(cls, folder: Path) -> Views:
-        """The bins of the observations of a COLMAP model whose point ids are landmark ids.
-
-        Raises:
-            FileNotFoundError, ValueError: there is no such model.
-        """
+        """The bins of the observations of a COLMAP model whose point ids are landmark ids."""
         return cls.of_images(*read_observations(find_model(folder)))
 
     @classmethod

@@ -13,37 +13,22 @@ from protomark.progress import Progress, silent, tracked
 
 
 def split_file(
-    path: Path,
-    folder: Path,
-    ids: list[int] | None = None,
-    parts: int | None = None,
+    path: Path,  # the map file, NAME.pmk
+    folder: Path,  # folder of the parts, created if it does not exist
+    ids: list[int] | None = None,  # ascending ids, at each of which a part starts
+    parts: int | None = None,  # number of parts by id, of equally many landmarks (give or take one)
+    # Edge of the cubes that divide space, in the unit of the positions.
     cell_size: float | None = None,
-    sealed: bool = False,
+    sealed: bool = False,  # whether to seal the parts
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Split a learning map by `ids`, `parts` or `cell_size`; returns facts as JSON values.
 
     The files are NAME.0.pmk, NAME.1.pmk, ... by id, and NAME.I_J_K.pmk and NAME.nowhere.pmk by
     space; sealed ones are NAME.0.sealed.pmk and so on. A part without landmarks has no file.
-
-    Args:
-        path: the map file, NAME.pmk.
-        folder: folder of the parts, created if it does not exist.
-        ids: ascending ids, at each of which a part starts.
-        parts: number of parts by id, of equally many landmarks (give or take one).
-        cell_size: edge of the cubes that divide space, in the unit of the positions.
-        sealed: whether to seal the parts.
-        progress: called with each part.
-
-    Raises:
-        ValueError: none or several of the three are given, or the one does not fit the map, the
-            map is sealed, or a part would replace it.
-        OSError: a file cannot be read or written.
     """
     if sum(option is not None for option in (ids, parts, cell_size)) != 1:
         raise ValueError("give one of --ids, --parts and --cell-size to split by")
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file: name a folder to write the parts to")
     scene = open_learning_map(path)
     named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)
     ending = ".sealed.pmk" if sealed else ".pmk"

@@ -67,9 +67,9 @@ def augment(
 
 
 def add_augmentations(
-    tracks: Tracks,
-    images: Path,
-    count: int,
+    tracks: Tracks,  # tracks that `extract` made
+    images: Path,  # folder of the images that the keyframes name
+    count: int,  # copies of each keyframe, at least 1
     threads: int = 1,
     progress: Progress = silent,
 ) -> Tracks:
@@ -77,17 +77,6 @@ def add_augmentations(
 
     Copies are keyframes of their own, named image#1, image#2, ..., with the original's pose.
     Keypoints without a landmark are left out. The result does not depend on the number of threads.
-
-    Args:
-        tracks: tracks that `extract` made.
-        images: folder of the images that the keyframes name.
-        count: copies of each keyframe, at least 1.
-        threads: keyframes to work on at a time.
-        progress: called with each keyframe.
-
-    Raises:
-        FileNotFoundError: an image is missing.
-        ValueError: `count` is below 1, an image is broken, or the tracks are augmented already.
     """
     if count < 1:
         raise ValueError(f"{count} augmentations: give at least 1")

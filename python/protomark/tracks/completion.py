@@ -60,22 +60,12 @@ def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> 
 
 
 def complete(
-    scene: Scene,
-    partners: list[NDArray[np.int64]],
-    max_error: float,
-    max_distance: int,
+    scene: Scene,  # labelled keypoints; labels and positions change
+    partners: list[NDArray[np.int64]],  # for each keyframe, the keyframes with an overlapping view
+    max_error: float,  # largest distance in pixels between projection and keypoint
+    max_distance: int,  # largest Hamming distance in bits to the nearest descriptor of the landmark
 ) -> tuple[int, int]:
-    """Add observations in one pass over the keyframes, then merge landmarks, in place.
-
-    Args:
-        scene: labelled keypoints; labels and positions change.
-        partners: for each keyframe, the keyframes with an overlapping view.
-        max_error: largest distance in pixels between projection and keypoint.
-        max_distance: largest Hamming distance in bits to the nearest descriptor of the landmark.
-
-    Returns:
-        Numbers of added observations and of merged landmarks.
-    """
+    """Add observations in one pass over the keyframes, merge landmarks; returns both numbers."""
     added = 0
     votes: list[NDArray[np.int64]] = []
     rows = scene.observations()
@@ -117,8 +107,7 @@ def _candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Landmarks that partners but not this keyframe observe, and keypoints they project to.
 
-    Returns:
-        Landmark, keypoint row, and Hamming distance to the landmark's nearest descriptor.
+    The third array is the Hamming distance of the keypoint to the landmark's nearest descriptor.
     """
     nothing = np.zeros(0, np.int64)
     here = slice(int(scene.offsets[keyframe]), int(scene.offsets[keyframe + 1]))
@@ -139,12 +128,8 @@ def _candidates(
         return nothing, nothing, nothing
     landmarks, keypoints = landmarks[a], b + here.start
     # Pair all descriptors of each landmark with the keypoint's.
-    sorted_labels = scene.labels[rows]
-    start = np.searchsorted(sorted_labels, landmarks, "left")
-    length = np.searchsorted(sorted_labels, landmarks, "right") - start
-    pair = np.repeat(np.arange(len(landmarks)), length)
-    at = np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]
-    bits = scene.descriptors[rows[at]] ^ scene.descriptors[keypoints[pair]]
+    at, length = scene.rows_of(landmarks, rows)
+    bits = scene.descriptors[at] ^ scene.descriptors[np.repeat(keypoints, length)]
     distance = _POPCOUNT[bits].sum(1, dtype=np.int64)
     smallest = np.minimum.reduceat(distance, np.cumsum(length) - length)
     return landmarks, keypoints, smallest

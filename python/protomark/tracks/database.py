@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import sqlite3
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,55 +12,30 @@ from numpy.typing import NDArray
 
 from protomark.features.descriptors import DESCRIPTORS, descriptor_kind
 from protomark.features.extractor import Features
+from protomark.files import hash_files
 from protomark.tracks.file import Tracks
 
 _MAX_PIXEL = 1e9  # a product of two such numbers is still a float32
-
-
-@dataclass(frozen=True)
-class _Image:
-    keypoints: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
 
 
 def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
     """What the tracks are made from and how, for their `info`: equal for equal tracks.
 
     The input is a digest of the content of the database and of the model's files.
-
-    Raises:
-        FileNotFoundError: the database is missing.
-        ValueError: there is no such descriptor.
     """
-    if not database.is_file():
-        raise FileNotFoundError(f"{database}: no such COLMAP database")
-    digest = hashlib.sha256()
-    for path in (database, *sorted(p for p in model.iterdir() if p.is_file())):
-        digest.update(path.name.encode())
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
+    paths = (database, *sorted(p for p in model.iterdir() if p.is_file()))
+    digest = hash_files((path.name, path) for path in paths)
     options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
-    return {"options": options, "input": digest.hexdigest()}
+    return {"options": options, "input": digest}
 
 
 def tracks_from_database(
     database: Path, model_path: Path, descriptor: str, name: str = ""
 ) -> Tracks:
-    """Tracks with the keypoints and descriptors of a database, and the landmarks of a model.
+    """Tracks with the binary descriptors of a database, and the landmarks of a model made from it.
 
     A landmark with two observations in one image keeps the one with the smaller reprojection error;
     landmarks with fewer than two observations are left out.
-
-    Args:
-        database: COLMAP database (SQLite) whose descriptors are binary, as uint8 blobs.
-        model_path: folder of the sparse model with points, made from this database.
-        descriptor: name of the descriptor, such as "orb".
-        name: name of the sequence, for the file's `info`.
-
-    Raises:
-        FileNotFoundError: the database or the model is missing.
-        ValueError: they are broken, or do not fit together, or the descriptors are not binary.
     """
     from protomark.geometry.colmap import model_from_reconstruction, read_reconstruction
 
@@ -84,7 +57,7 @@ def tracks_from_database(
         image = reconstruction.images[int(image_id)]
         if image_name not in by_name:
             raise ValueError(f"{database}: image {image_name} of the model is not in the database")
-        found = _features(by_name[image_name])
+        found = by_name[image_name]
         if len(found) != image.num_points2D():
             raise ValueError(
                 f"{database}: image {image_name} has {len(found)} keypoints, but "
@@ -118,11 +91,14 @@ def tracks_from_database(
     return Tracks.from_features(kind.name, model, features, number[label], positions[keep], info)
 
 
-def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
+def _read(database: Path, descriptor: str, width: int) -> dict[str, Features]:
     """Keypoints and descriptors by image name."""
+    # Read-only mode neither creates nor changes a database, which may be open elsewhere. COLMAP's
+    # own mode needs to write files beside it, unless nobody has it open.
+    busy = database.with_name(f"{database.name}-wal").exists()
+    uri = f"{database.resolve().as_uri()}?mode=ro{'' if busy else '&immutable=1'}"
     try:
-        # Read-only mode neither creates nor changes a database, which may be open elsewhere.
-        connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
+        connection = sqlite3.connect(uri, uri=True)
         try:
             _check_tables(connection, database)
             names = _by_image(connection, database, "images", "name")
@@ -132,7 +108,7 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
             connection.close()
     except sqlite3.Error as error:
         raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
-    images: dict[str, _Image] = {}
+    images: dict[str, Features] = {}
     empty = (None, None, None)
     for image_id, (name,) in names.items():
         kr, kc, kd = keypoints.get(image_id, empty)
@@ -159,7 +135,7 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, _Image]:
         points = np.frombuffer(kd, "<f4").reshape(kr, kc)
         if not (np.abs(points) < _MAX_PIXEL).all():
             raise ValueError(f"{database}: image {name} has keypoints far outside of any image")
-        images[name] = _Image(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
+        images[name] = _features(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
     return images
 
 
@@ -199,9 +175,8 @@ def _check_tables(connection: sqlite3.Connection, database: Path) -> None:
             raise ValueError(f"{database}: not a COLMAP database, as {table} is no plain table")
 
 
-def _features(image: _Image) -> Features:
+def _features(k: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Features:
     """Features with COLMAP's scale and angle: none, (scale, radians), or an affine shape."""
-    k = image.keypoints
     n = len(k)
     sizes, angles = np.ones(n, np.float32), np.full(n, -1, np.float32)
     if k.shape[1] == 4:
@@ -211,11 +186,7 @@ def _features(image: _Image) -> Features:
         sizes = 2 * np.sqrt(np.abs(k[:, 2] * k[:, 5] - k[:, 3] * k[:, 4]))
         angles = np.mod(np.degrees(np.arctan2(k[:, 4], k[:, 2])), 360).astype(np.float32)
     angles[angles >= 360] = 0
-    return Features(
-        np.ascontiguousarray(k[:, :2], np.float32),
-        np.asarray(sizes, np.float32),
-        np.asarray(angles, np.float32),
-        np.zeros(n, np.float32),
-        np.zeros(n, np.int32),
-        np.ascontiguousarray(image.descriptors),
-    )
+    zeros = np.zeros(n, np.float32)
+    xy = np.ascontiguousarray(k[:, :2], np.float32)
+    sizes = np.asarray(sizes, np.float32)
+    return Features(xy, sizes, angles, zeros, zeros.astype(np.int32), descriptors.copy())

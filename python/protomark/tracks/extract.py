@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import protomark
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
 from protomark.features.extractor import Extractor, Features
 from protomark.features.images import image_names, read_gray
+from protomark.files import hash_files
 from protomark.geometry import colmap
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
@@ -37,7 +39,7 @@ _REFINE_ERRORS = (12.0, 4.0)
 _REFINE_KEYPOINTS = 700
 _COMPLETION_PASSES = 3
 # Increased whenever the same options yield other tracks, so that old files are made anew.
-_METHOD = 3
+_METHOD = 4
 
 
 @dataclass(frozen=True)
@@ -88,35 +90,38 @@ class TracksOptions:
 
 @dataclass(frozen=True)
 class SequenceFolder:
-    """The folders of a sequence.
-
-    Attributes:
-        name: name of the sequence.
-        images: folder of the images, to which names in the model are relative.
-        model: folder of the sparse model.
-    """
+    """What to make tracks from."""
 
     name: str
-    images: Path
-    model: Path
+    images: Path  # folder of the images, to which names in the model are relative
+    model: Path  # folder of the sparse model
+    # A COLMAP database with binary descriptors, which are read in place of the images.
+    database: Path | None = None
 
 
 def find_sequence(
-    folder: Path, images: Path | None = None, model: Path | None = None
+    folder: Path,
+    images: Path | None = None,
+    model: Path | None = None,
+    database: Path | None = None,
 ) -> SequenceFolder:
     """Find images/ and sparse/ or sparse/0/ in a folder, unless they are given.
 
     Raises:
-        FileNotFoundError: the folder, its images or its model are missing.
+        FileNotFoundError: the folder, its images, its model or the database are missing.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder")
     images = images or folder / "images"
-    if not images.is_dir():
+    if database is not None:
+        if not database.is_file():
+            raise FileNotFoundError(f"{database}: no such COLMAP database")
+    elif not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder of images, name it with --images")
-    if not any(file.is_file() for file in images.rglob("*")):
+    elif not any(images.iterdir()):
         raise FileNotFoundError(f"{images}: the folder of images is empty, name it with --images")
-    return SequenceFolder(folder.resolve().name, images, model or colmap.find_model(folder))
+    model = model or colmap.find_model(folder)
+    return SequenceFolder(folder.resolve().name, images, model, database)
 
 
 def provenance(
@@ -124,22 +129,22 @@ def provenance(
 ) -> dict[str, Any]:
     """What the tracks are made from and how, for their `info`: equal for equal tracks.
 
-    The input is a digest of cameras, poses, image names and file sizes.
+    The input is a digest of cameras, poses and images.
 
     Raises:
         FileNotFoundError: the model, or an image that it names, is missing.
         ValueError: the model is broken, or no landmark can be triangulated from its poses.
     """
     model = model or _read_posed_model(sequence.model)
-    digest = hashlib.sha256(model.cam_from_world.tobytes())
-    digest.update(repr((sorted(model.cameras.items()), model.camera_ids.tolist())).encode())
-    for name in model.names:
-        path = sequence.images / name
+    paths = {name: sequence.images / name for name in model.names}
+    for path in paths.values():
         if not path.is_file():
             raise FileNotFoundError(
                 f"{path}: the image is missing, but the model {sequence.model} has a pose for it"
             )
-        digest.update(f"{name}\0{path.stat().st_size}\0".encode())
+    digest = hashlib.sha256(model.cam_from_world.tobytes())
+    digest.update(repr((sorted(model.cameras.items()), model.camera_ids.tolist())).encode())
+    digest.update(hash_files(paths.items()).encode())
     return {"method": _METHOD, "options": asdict(options), "input": digest.hexdigest()}
 
 
@@ -157,6 +162,8 @@ def extract(
 ) -> Tracks:
     """Make the tracks of a sequence: detect, describe, match, triangulate and complete.
 
+    Images that cannot be read are left out and named in `info`.
+
     Args:
         sequence: images and model, see `find_sequence`.
         options: how to make the tracks.
@@ -165,11 +172,12 @@ def extract(
 
     Raises:
         FileNotFoundError: an image or the model is missing.
-        ValueError: an image or the model is broken, or no landmark can be triangulated.
+        ValueError: the model is broken or does not fit the images, fewer than two images can be
+            read, or no landmark can be triangulated.
     """
     given = _read_posed_model(sequence.model)
     made_from = provenance(sequence, options, given)
-    features = _detect(sequence, given, options, threads, progress)
+    given, features, unreadable = _detect(sequence, given, options, threads, progress)
     work = _Matching(given, features, options, threads, progress)
     overlap = work.match_covisible()
     if not any(len(m) for m in work.matches.values()):
@@ -203,13 +211,18 @@ def extract(
         "poses_refined": refine,
         "pose_shift_median": float(np.median(shift)),
         "images_without_pose": sorted(
-            {*given.unposed, *image_names(sequence.images)} - set(given.names)
+            {*given.unposed, *image_names(sequence.images)} - {*given.names, *unreadable}
         ),
+        "images_unreadable": unreadable,
         "pairs": len(matches),
         "observations_completed": added,
         "landmarks_merged": merged,
         "max_descriptor_distance": max_distance,
-        "software": _versions(),
+        "software": {
+            "opencv": optional("cv2").__version__,
+            "protomark": protomark.__version__,
+            "pycolmap": colmap.pycolmap.__version__,
+        },
     }
     tracks = Tracks.from_features(
         options.descriptor, scene.model, features, scene.labels, scene.positions, info
@@ -219,32 +232,23 @@ def extract(
     return tracks
 
 
+@dataclass
 class _Matching:
-    """Matches between keyframes under poses that may be refined.
+    """Matches between keyframes under poses that may be refined."""
 
-    Attributes:
-        model: cameras and poses.
-        rays: undistorted keypoints of each keyframe.
-        matches: matches of each pair of keyframes (i, j), i < j.
-    """
+    model: colmap.ColmapModel
+    features: list[Features]
+    options: TracksOptions
+    threads: int
+    progress: Progress
+    matches: Pairs = field(default_factory=dict)  # of pairs of keyframes (i, j), i < j
 
-    def __init__(
-        self,
-        model: colmap.ColmapModel,
-        features: list[Features],
-        options: TracksOptions,
-        threads: int,
-        progress: Progress,
-    ) -> None:
-        self.model, self.features = model, features
-        self.options, self.threads, self.progress = options, threads, progress
-        self.rays = [
-            model.cameras[int(c)].rays(f.keypoints)
-            for c, f in zip(model.camera_ids, features, strict=True)
-        ]
-        self.focal = np.array([model.cameras[int(c)].focal_length for c in model.camera_ids])
+    def __post_init__(self) -> None:
+        cameras = [self.model.cameras[int(c)] for c in self.model.camera_ids]
+        # Undistorted keypoints of each keyframe.
+        self.rays = [c.rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
+        self.focal = np.array([camera.focal_length for camera in cameras])
         self.views = self._make_views()
-        self.matches: Pairs = {}
 
     def _make_views(self) -> list[View]:
         parts = (self.features, self.rays, self.model.cam_from_world, self.focal)
@@ -349,47 +353,48 @@ def _detect(
     options: TracksOptions,
     threads: int,
     progress: Progress,
-) -> list[Features]:
+) -> tuple[colmap.ColmapModel, list[Features], dict[str, str]]:
+    """The images that can be read, their features, and what is wrong with each of the others."""
     cv2 = optional("cv2")
     # OpenCV's detectors are costly to create and not thread-safe, so each thread has its own.
     local = threading.local()
 
-    def one(index: int) -> Features:
+    def one(index: int) -> Features | str:
         if not hasattr(local, "extractor"):
             local.extractor = Extractor(options.descriptor, options.max_keypoints)
         path = sequence.images / model.names[index]
-        image = read_gray(path)
+        try:
+            image = read_gray(path)
+            features: Features = local.extractor(image)
+        except ValueError as error:
+            return str(error).removeprefix(f"{path}: ")
         camera = model.cameras[int(model.camera_ids[index])]
         if image.shape != (camera.height, camera.width):
             raise ValueError(
                 f"{path} has {image.shape[1]}x{image.shape[0]} pixels, but its camera in the model "
                 f"{camera.width}x{camera.height}: give the images of this model"
             )
-        features: Features = local.extractor(image)
         return features
 
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         indices = range(len(model.names))
-        return parallel_map(one, indices, threads, progress, "detect and describe")
+        found = parallel_map(one, indices, threads, progress, "detect and describe")
     finally:
         cv2.setNumThreads(before)
+    problems = {n: f for n, f in zip(model.names, found, strict=True) if isinstance(f, str)}
+    if len(found) - len(problems) < 2:
+        name, problem = next(iter(problems.items()))
+        raise ValueError(
+            f"{sequence.images}: {len(problems)} of {len(found)} images cannot be read, such as "
+            f"{name}: {problem}"
+        )
+    readable = model.where([isinstance(f, Features) for f in found])
+    return readable, [f for f in found if isinstance(f, Features)], problems
 
 
 def _epipolar_error(matches: Pairs) -> float:
     """Median over pairs of each pair's median error, so that all pairs count alike."""
     medians = [float(np.median(m.errors)) for m in matches.values() if len(m) >= _MIN_MATCHES]
     return float(np.median(medians)) if medians else 0.0
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {"opencv": optional("cv2").__version__}
-    for package in ("protomark", "pycolmap"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from protomark.extras import optional
 from protomark.features.extractor import FEATURE_ARRAYS, Features
 from protomark.features.upright import SUFFIX, upright_descriptors
-from protomark.files import replacing
+from protomark.files import is_utf8, replacing
 from protomark.geometry.camera import Camera, cameras_from_json
 
 if TYPE_CHECKING:
@@ -194,41 +194,35 @@ class Tracks:
                     f"tracks: {name} is {array.dtype} {array.shape}, "
                     f"expected {np.dtype(dtype)} {want}"
                 )
-        if sizes["b"] < 1:
-            raise ValueError("tracks: descriptors have no bytes")
-        if (
-            self.offsets[0] != 0
-            or self.offsets[-1] != sizes["n"]
-            or (np.diff(self.offsets) < 0).any()
-        ):
-            raise ValueError("tracks: offsets do not run from 0 to the number of keypoints")
-        if (np.diff(self.landmark_ids) <= 0).any():
-            raise ValueError("tracks: landmark_ids are not strictly ascending")
-        if len(self.landmark_ids) and self.landmark_ids[0] < 0:
-            raise ValueError("tracks: landmark_ids contains a negative id")
+        ids, offsets = self.landmark_ids, self.offsets
         seen = self.landmark_of_keypoint[self.landmark_of_keypoint != -1]
-        if not np.isin(seen, self.landmark_ids).all():
-            raise ValueError(
-                "tracks: landmark_of_keypoint names a landmark that landmark_ids lacks"
-            )
-        for name, (dtype, _) in _ARRAYS.items():
-            if issubclass(dtype, np.floating) and not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"tracks: {name} contains NaN or infinity")
-        if not isinstance(self.info, dict) or not _is_text(
+        floats = [name for name, (dtype, _) in _ARRAYS.items() if issubclass(dtype, np.floating)]
+        endless = [name for name in floats if not np.isfinite(getattr(self, name)).all()]
+        runs = offsets[0] == 0 and offsets[-1] == sizes["n"] and (np.diff(offsets) >= 0).all()
+        lacking = [int(i) for i in self.keyframe_camera if int(i) not in self.cameras]
+        has_texts = isinstance(self.info, dict) and _is_text(
             json.dumps(self.info, ensure_ascii=False)
+        )
+        for wrong, problem in (
+            (sizes["b"] < 1, "descriptors have no bytes"),
+            (not runs, "offsets do not run from 0 to the number of keypoints"),
+            ((np.diff(ids) <= 0).any(), "landmark_ids are not strictly ascending"),
+            ((ids[:1] < 0).any(), "landmark_ids contains a negative id"),
+            (
+                not np.isin(seen, ids).all(),
+                "landmark_of_keypoint names a landmark that landmark_ids lacks",
+            ),
+            (endless, f"{', '.join(endless)} contains NaN or infinity"),
+            (not has_texts, "info is not a JSON object of texts and numbers"),
+            (lacking, f"a keyframe names camera {lacking[:1]}, which is missing"),
         ):
-            raise ValueError("tracks: info is not a JSON object of texts and numbers")
+            if wrong:
+                raise ValueError(f"tracks: {problem}")
         for number, c in self.cameras.items():
             try:
                 c.check()
             except ValueError as error:
                 raise ValueError(f"tracks: camera {number}: {error}") from None
-        for i, camera in enumerate(self.keyframe_camera):
-            if int(camera) not in self.cameras:
-                raise ValueError(
-                    f"tracks: keyframe {self.keyframe_names[i]} names camera {camera}, "
-                    "which is missing"
-                )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file atomically."""
@@ -301,7 +295,7 @@ def _json(header: dict[str, str], name: str) -> Any:
 
 def _is_text(value: Any) -> bool:
     # JSON may contain lone surrogates, which cannot be written or printed.
-    return isinstance(value, str) and not re.search("[\ud800-\udfff]", value)
+    return isinstance(value, str) and is_utf8(value)
 
 
 def sequence_name(path: Path) -> str:

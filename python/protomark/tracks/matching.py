@@ -14,34 +14,23 @@ from protomark.geometry.triangulation import epipolar_error
 
 @dataclass
 class View:
-    """The data of a keyframe that matching needs.
+    """The data of a keyframe that matching needs."""
 
-    Attributes:
-        descriptors: (n, bits / 8) uint8.
-        rays: (n, 2) float64, undistorted x / z and y / z, NaN where undistortion fails.
-        pose: (3, 4) float64, cam_from_world.
-        focal: focal length in pixels.
-    """
-
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    # (n, 2) float64, undistorted x / z and y / z, NaN where undistortion fails.
     rays: NDArray[np.float64]
-    pose: NDArray[np.float64]
-    focal: float
+    pose: NDArray[np.float64]  # (3, 4) float64, cam_from_world
+    focal: float  # focal length in pixels
 
 
 @dataclass
 class VerifiedMatches:
-    """k matches between two keyframes.
+    """k matches between two keyframes."""
 
-    Attributes:
-        rows: (k, 2) int64, rows of the keypoints in the first and the second keyframe.
-        distances: (k,) int32, Hamming distance in bits.
-        errors: (k,) float64, epipolar (Sampson) error in pixels.
-    """
-
+    # (k, 2) int64, rows of the keypoints in the first and the second keyframe.
     rows: NDArray[np.int64]
-    distances: NDArray[np.int32]
-    errors: NDArray[np.float64]
+    distances: NDArray[np.int32]  # (k,) int32, Hamming distance in bits
+    errors: NDArray[np.float64]  # (k,) float64, epipolar (Sampson) error in pixels
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -24,11 +24,6 @@ def merge(scene: Scene, votes: NDArray[np.int64], max_error: float) -> int:
     landmark. In each round a landmark takes part in one merge, so that a chain of duplicates merges
     over several rounds.
 
-    Args:
-        scene: labelled keypoints; labels and positions change.
-        votes: (v, 2) rows of positions, one pair per keypoint at which two landmarks coincide.
-        max_error: largest reprojection error in pixels.
-
     Returns:
         Number of landmarks that were merged into another.
     """
@@ -110,11 +105,8 @@ def _share_keyframe(
 
 def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Median distance (n,) in pixels between the landmarks of pairs, in keyframes of the first."""
-    labels = scene.labels[rows]
-    start = np.searchsorted(labels, pairs[:, 0], "left")
-    length = np.searchsorted(labels, pairs[:, 0], "right") - start
+    at, length = scene.rows_of(pairs[:, 0], rows)
     pair = np.repeat(np.arange(len(pairs)), length)
-    at = rows[np.arange(len(pair)) - np.repeat(np.cumsum(length) - length, length) + start[pair]]
     poses = scene.model.cam_from_world[scene.keyframe[at]]
     first, second = (
         reprojection_residuals(scene.positions[pairs[pair, k]], poses, np.zeros((len(at), 2)))[0]

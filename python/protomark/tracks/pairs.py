@@ -86,12 +86,7 @@ def overlaps(model: ColmapModel, depths: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def covisible_pairs(overlap: NDArray[np.float64], partners: int) -> list[tuple[int, int]]:
-    """Pairs of keyframes to match, smaller index first, sorted.
-
-    Args:
-        overlap: (m, m) share of view i that view j sees.
-        partners: about how many partners a keyframe gets.
-    """
+    """Pairs of keyframes to match, smaller index first, sorted."""
     m = len(overlap)
     both = np.minimum(overlap, overlap.T)
     chosen = set(neighbour_pairs(m))

@@ -13,34 +13,32 @@ from protomark.geometry.triangulation import pixel_errors
 
 @dataclass
 class Scene:
-    """All keypoints of all keyframes, and their landmarks.
+    """All keypoints of all keyframes, and their landmarks."""
 
-    Attributes:
-        model: cameras and m poses.
-        offsets: (m + 1,) int64, rows of each keyframe.
-        keyframe: (n,) int64, keyframe of each keypoint.
-        keypoints: (n, 2) float32, pixels.
-        rays: (n, 2) float64, undistorted, NaN where undistortion fails.
-        focal: (n,) float64, focal length in pixels.
-        descriptors: (n, bits / 8) uint8.
-        labels: (n,) int64, row of the landmark in positions, -1 for none.
-        positions: (l, 3) float64.
-    """
-
-    model: ColmapModel
-    offsets: NDArray[np.int64]
-    keyframe: NDArray[np.int64]
-    keypoints: NDArray[np.float32]
-    rays: NDArray[np.float64]
-    focal: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
-    labels: NDArray[np.int64]
-    positions: NDArray[np.float64]
+    model: ColmapModel  # cameras and m poses
+    offsets: NDArray[np.int64]  # (m + 1,) int64, rows of each keyframe
+    keyframe: NDArray[np.int64]  # (n,) int64, keyframe of each keypoint
+    keypoints: NDArray[np.float32]  # (n, 2) float32, pixels
+    rays: NDArray[np.float64]  # (n, 2) float64, undistorted, NaN where undistortion fails
+    focal: NDArray[np.float64]  # (n,) float64, focal length in pixels
+    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    labels: NDArray[np.int64]  # (n,) int64, row of the landmark in positions, -1 for none
+    positions: NDArray[np.float64]  # (l, 3) float64
 
     def observations(self) -> NDArray[np.int64]:
         """Rows with a landmark, sorted by landmark, then by row."""
         rows = np.flatnonzero(self.labels >= 0)
         return rows[np.argsort(self.labels[rows], kind="stable")]
+
+    def rows_of(
+        self, landmarks: NDArray[np.int64], rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Those of the observations `rows` that are of landmarks (n,), and their numbers (n,)."""
+        labels = self.labels[rows]
+        start = np.searchsorted(labels, landmarks, "left")
+        length = np.searchsorted(labels, landmarks, "right") - start
+        shift = np.repeat(start - np.cumsum(length) + length, length)
+        return rows[np.arange(len(shift)) + shift], length
 
     def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Reprojection errors (n,) of observations in pixels of the undistorted image."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,8 @@ def reprojection_errors(tracks: Tracks) -> NDArray[np.float64]:
     """Reprojection errors (n,) in pixels, in the order of `tracks.observations`."""
     rows = tracks.observations
     keyframe = tracks.keyframe_of_keypoint[rows]
-    index = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[rows])
     pose = tracks.cam_from_world[keyframe]
-    positions = tracks.landmark_positions[index]
+    positions = tracks.positions_of(tracks.landmark_of_keypoint[rows])
     local = np.einsum("nij,nj->ni", pose[:, :, :3], positions) + pose[:, :, 3]
     pixels = np.zeros((len(rows), 2))
     for camera_id, camera in tracks.cameras.items():
@@ -59,12 +59,6 @@ def track_figures(lengths: NDArray[np.int64], errors: NDArray[np.float64]) -> di
 def length_histogram(lengths: NDArray[np.int64]) -> dict[str, int]:
     """Number of landmarks by number of observations, such as {"2": 17, "4-5": 9}."""
     edges = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
-    histogram = {}
-    for low, end in zip(edges, (*edges[1:], None), strict=True):
-        if end is None:
-            label, inside = f"{low}+", lengths >= low
-        else:
-            label = str(low) if end == low + 1 else f"{low}-{end - 1}"
-            inside = (lengths >= low) & (lengths < end)
-        histogram[label] = int(inside.sum())
-    return histogram
+    labels = [str(a) if b == a + 1 else f"{a}-{b - 1}" for a, b in pairwise(edges)]
+    counts, _ = np.histogram(lengths, (*edges, np.inf))
+    return dict(zip([*labels, f"{edges[-1]}+"], counts.tolist(), strict=True))

@@ -25,20 +25,13 @@ _POINTS_PER_POSE = 200
 
 
 def triangulate(
-    model: ColmapModel,
-    keypoints: list[NDArray[np.float32]],
-    matches: dict[tuple[int, int], VerifiedMatches],
-    max_error: float,
-    min_angle: float,
+    model: ColmapModel,  # cameras and m poses
+    keypoints: list[NDArray[np.float32]],  # m arrays (n, 2), pixels
+    matches: dict[tuple[int, int], VerifiedMatches],  # matches by pairs of keyframes (i, j), i < j
+    max_error: float,  # largest reprojection error in pixels
+    min_angle: float,  # smallest triangulation angle of a landmark, degrees
 ) -> Any:
     """Triangulate landmarks from matches under the poses of `model`.
-
-    Args:
-        model: cameras and m poses.
-        keypoints: m arrays (n, 2), pixels.
-        matches: matches by pairs of keyframes (i, j), i < j.
-        max_error: largest reprojection error in pixels.
-        min_angle: smallest triangulation angle of a landmark, degrees.
 
     Returns:
         A `pycolmap.Reconstruction` whose image ids are keyframe indices plus one.

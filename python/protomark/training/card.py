@@ -19,74 +19,43 @@ _PRECISION_HEAD = (
 
 @dataclass(frozen=True)
 class SequencePrecision:
-    """Precision on one sequence, averaged over splits.
-
-    Attributes:
-        sequence: name of the sequence.
-        role: "validation" or "report".
-        seeds: number of splits.
-        unaggregated: precision of all raw descriptors.
-        medoid: precision of one descriptor per landmark, the one closest to the others.
-        majority: precision of the quantised mean of each landmark's descriptors.
-        float_precision: precision of the float network, by code length.
-        integer_precision: precision of the integer encoder with int8 prototypes, by code length.
-    """
+    """Precision on one sequence, averaged over splits."""
 
     sequence: str
-    role: str
-    seeds: int
-    unaggregated: float
-    medoid: float
-    majority: float
-    float_precision: dict[int, float]
+    role: str  # "validation" or "report"
+    seeds: int  # number of splits
+    unaggregated: float  # precision of all raw descriptors
+    medoid: float  # precision of one descriptor per landmark, the one closest to the others
+    majority: float  # precision of the quantised mean of each landmark's descriptors
+    float_precision: dict[int, float]  # precision of the float network, by code length
+    # Precision of the integer encoder with int8 prototypes, by code length.
     integer_precision: dict[int, float]
 
 
 @dataclass(frozen=True)
 class EncoderCard:
-    """The content of a card, which `protomark train --json` writes, too.
-
-    Attributes:
-        name: name of the encoder.
-        descriptor: descriptor that it encodes.
-        bits: length of the descriptor.
-        widths: units per layer, including input and output.
-        dims: prefixes that maps may use alone.
-        bytes: size of the model file.
-        encode_ns: nanoseconds to encode one descriptor on one thread.
-        licence: licence of the weights.
-        sources: training sequences.
-        validation: validation sequences.
-        command: command that trains the encoder again.
-        seconds: duration of the training.
-        machine: processor or accelerator, threads and arithmetic of the training.
-        steps: number of batches.
-        best_step: step whose weights the encoder has.
-        figures: precision by sequence.
-        history: (step, loss, mean validation precision) of each validation.
-        plot: file name of the picture of the training, beside the card, or "".
-        calibrated_on: sequences that the match calibration was fitted to, or "".
-    """
+    """The content of a card, which `protomark train --json` writes, too."""
 
     name: str
-    descriptor: str
+    descriptor: str  # descriptor that it encodes
     bits: int
-    widths: list[int]
-    dims: list[int]
-    bytes: int
-    encode_ns: float
-    licence: str
-    sources: list[TrainingSource]
-    validation: list[TrainingSource]
-    command: str
-    seconds: float
-    machine: str
-    steps: int
-    best_step: int
-    figures: list[SequencePrecision]
+    widths: list[int]  # units per layer, including input and output
+    dims: list[int]  # prefixes that maps may use alone
+    bytes: int  # size of the model file
+    encode_ns: float  # nanoseconds to encode one descriptor on one thread
+    licence: str  # licence of the weights
+    sources: list[TrainingSource]  # training sequences
+    validation: list[TrainingSource]  # validation sequences
+    command: str  # command that trains the encoder again
+    seconds: float  # duration of the training
+    machine: str  # processor or accelerator, threads and arithmetic of the training
+    steps: int  # number of batches
+    best_step: int  # step whose weights the encoder has
+    figures: list[SequencePrecision]  # precision by sequence
+    # (step, loss, mean validation precision) of each validation.
     history: list[tuple[int, float, float]] = field(default_factory=list)
-    plot: str = ""
-    calibrated_on: str = ""
+    plot: str = ""  # file name of the picture of the training, beside the card, or ""
+    calibrated_on: str = ""  # sequences that the match calibration was fitted to, or ""
 
     @property
     def multiply_adds(self) -> int:

@@ -16,50 +16,35 @@ from protomark.training.validation import Trial
 
 MIN_BITS = 64
 MAX_BITS = 1024
+REPORT_SEEDS = (0, 1, 2)
 # Number of landmarks with 3 or more views that training needs.
 MIN_LANDMARKS = 500
 
 
 @dataclass(frozen=True)
 class TrainingSource:
-    """A tracks file in the card.
+    """A tracks file in the card."""
 
-    Attributes:
-        name: file name up to its first dot.
-        file: file name.
-        keyframes, landmarks, observations: their numbers.
-        licence: licence that the user or the tracks' `info` states, else "".
-    """
-
-    name: str
-    file: str
+    name: str  # file name up to its first dot
+    file: str  # file name
+    # keyframes, landmarks, observations: their numbers.
     keyframes: int
     landmarks: int
     observations: int
-    licence: str
+    licence: str  # licence that the user or the tracks' `info` states, else ""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The data of a training.
+    """The data of a training."""
 
-    Attributes:
-        descriptor: name of the descriptor of all tracks.
-        bits: length of the descriptor.
-        views: training sequences.
-        trials: splits of the validation sequences.
-        sources: the training files.
-        validation_sources: the validation files.
-        fingerprint: SHA-256 of all descriptors and landmarks, hexadecimal.
-    """
-
-    descriptor: str
+    descriptor: str  # name of the descriptor of all tracks
     bits: int
-    views: list[Views]
-    trials: list[Trial]
-    sources: list[TrainingSource]
-    validation_sources: list[TrainingSource]
-    fingerprint: str
+    views: list[Views]  # training sequences
+    trials: list[Trial]  # splits of the validation sequences
+    sources: list[TrainingSource]  # the training files
+    validation_sources: list[TrainingSource]  # the validation files
+    fingerprint: str  # SHA-256 of all descriptors and landmarks, hexadecimal
 
 
 def read_tracks(path: Path, upright: bool) -> Tracks:
@@ -69,11 +54,7 @@ def read_tracks(path: Path, upright: bool) -> Tracks:
 
 
 def hold_out(training: Sequence[Path], validation: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """The files to train on, and those to validate on: by default the last one.
-
-    Raises:
-        ValueError: there is only one file.
-    """
+    """The files to train on, and those to validate on: by default the last one."""
     if validation:
         return list(training), list(validation)
     if len(training) < 2:
@@ -92,30 +73,16 @@ def load_trials(
 
 
 def load_training(
-    training: Sequence[Path],
-    validation: Sequence[Path],
-    seeds: Sequence[int] = (0,),
-    max_queries: int = 5_000,
-    licences: Mapping[str, str] | None = None,
-    upright: bool = False,
+    training: Sequence[Path],  # tracks files to train on
+    validation: Sequence[Path],  # tracks files that select the model, none of them in `training`
+    seeds: Sequence[int] = (0,),  # seeds of the splits of each validation sequence
+    max_queries: int = 5_000,  # limit on queries per split
+    licences: Mapping[str, str] | None = None,  # licences of the sequences by name, for the card
+    upright: bool = False,  # whether to train on angles and sizes of keypoints, too
+    report: Sequence[Path] = (),  # tracks files to measure the encoder on
     progress: Progress = silent,
 ) -> TrainingData:
-    """Read and check training and validation tracks.
-
-    Args:
-        training: tracks files to train on.
-        validation: tracks files that select the model, none of them in `training`.
-        seeds: seeds of the splits of each validation sequence.
-        max_queries: limit on queries per split.
-        licences: licences of the sequences by name, for the card.
-        upright: whether to train on angles and sizes of keypoints, too.
-        progress: called with each file.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is broken, a sequence is for training and for validation, descriptors
-            differ or have an unsuitable length, or there are too few landmarks.
-    """
+    """Read and check training and validation tracks."""
     if not training:
         raise ValueError("there are no training tracks: give at least one tracks file")
     if not validation:
@@ -139,7 +106,8 @@ def load_training(
     sources: list[TrainingSource] = []
     learned: dict[str, str] = {}  # training files by the digest of their input
     digest = hashlib.sha256()
-    for i, path in enumerate(tracked([*training, *validation], progress, "read tracks")):
+    known = len(training) + len(validation)
+    for i, path in enumerate(tracked([*training, *validation, *report], progress, "read tracks")):
         tracks = read_tracks(path, upright)
         if not views and not trials:
             descriptor, bits = tracks.descriptor, tracks.bits
@@ -151,8 +119,11 @@ def load_training(
         elif (tracks.descriptor, tracks.bits) != (descriptor, bits):
             raise ValueError(
                 f"{path} has {tracks.descriptor} descriptors of {tracks.bits} bits, but "
-                f"{training[0]} has {descriptor} of {bits}: train on one descriptor at a time"
+                f"{training[0]} has {descriptor} of {bits}: give tracks of one descriptor"
             )
+        if i >= known:
+            load_trials(tracks, path, REPORT_SEEDS)  # whether it can be measured at the end
+            continue
         made_from = str(tracks.info.get("input", ""))
         if i < len(training):
             learned[made_from] = path.name

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shlex
 import time
@@ -16,14 +15,20 @@ import torch
 import protomark as pm
 from protomark.baselines import binary
 from protomark.baselines.support import Support
-from protomark.files import write_text
+from protomark.files import check_outputs, write_text
 from protomark.match_calibration import SOURCE_KEY
 from protomark.plot import save_figure, training_figure
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.card import EncoderCard, SequencePrecision, describe_data
-from protomark.training.data import TrainingData, load_training, load_trials, read_tracks
+from protomark.training.data import (
+    REPORT_SEEDS,
+    TrainingData,
+    load_training,
+    load_trials,
+    read_tracks,
+)
 from protomark.training.match_calibration import calibrate
 from protomark.training.network import embed
 from protomark.training.train import (
@@ -33,44 +38,30 @@ from protomark.training.train import (
     has_fast_bfloat16,
     keep_freed_memory,
 )
-from protomark.training.validation import Trial, precision
+from protomark.training.validation import Trial, mean_precision
 
-REPORT_SEEDS = (0, 1, 2)
 _TIMED_DESCRIPTORS, _TIMED_ROUNDS = 20_000, 5
 
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train an encoder from, and what to write.
+    """What to train an encoder from, and what to write."""
 
-    Attributes:
-        training: tracks files to train on.
-        validation: tracks files that select the model.
-        output: the model file to write; its card (.md) and a picture of the training (.png) are
-            written beside it, and a checkpoint (`<output>.checkpoint`) until training ends.
-        options: options that determine the weights.
-        report: further tracks files to measure the encoder on.
-        resume: whether to continue from the checkpoint.
-        upright: whether to train on angles and sizes of keypoints, too.
-        name: name of the encoder; if empty, the output's stem.
-        licence: licence of the weights.
-        data_licences: licences of the sequences by name, for the card and the model file.
-        device: "cpu" or "cuda".
-        threads: CPU threads; 0: one per core.
-    """
-
-    training: Sequence[Path]
-    validation: Sequence[Path]
+    training: Sequence[Path]  # tracks files to train on
+    validation: Sequence[Path]  # tracks files that select the model
+    # The model file to write; its card (.md) and a picture of the training (.png) are written
+    # beside it, and a checkpoint (`<output>.checkpoint`) until training ends.
     output: Path
-    options: TrainingOptions
-    report: Sequence[Path] = ()
-    resume: bool = False
-    upright: bool = False
-    name: str = ""
-    licence: str = ""
+    options: TrainingOptions  # options that determine the weights
+    report: Sequence[Path] = ()  # further tracks files to measure the encoder on
+    resume: bool = False  # whether to continue from the checkpoint
+    upright: bool = False  # whether to train on angles and sizes of keypoints, too
+    name: str = ""  # name of the encoder; if empty, the output's stem
+    licence: str = ""  # licence of the weights
+    # Licences of the sequences by name, for the card and the model file.
     data_licences: Mapping[str, str] = field(default_factory=dict)
-    device: str = "cpu"
-    threads: int = 0
+    device: str = "cpu"  # "cpu" or "cuda"
+    threads: int = 1
 
     @property
     def card_path(self) -> Path:
@@ -94,13 +85,8 @@ class TrainingRequest:
                 f"{self.output}: {self.output.suffix} is the suffix of a file that is written "
                 "beside the model: name the model .pme"
             )
-        for path in (self.output, self.card_path, self.plot_path):
-            if path.is_dir():
-                raise ValueError(f"{path} is a folder: name a file to write")
-            if not path.absolute().parent.is_dir():
-                raise FileNotFoundError(
-                    f"{path}: the folder {path.absolute().parent} does not exist"
-                )
+        inputs = (*self.training, *self.validation, *self.report)
+        check_outputs(self.output, self.card_path, self.plot_path, inputs=inputs)
 
     def command(self, data: TrainingData) -> str:
         """The command that trains this encoder again, with file names instead of paths."""
@@ -130,38 +116,24 @@ class TrainingRequest:
 
 
 def train_encoder(
-    request: TrainingRequest,
+    request: TrainingRequest,  # what to train from, and what to write
     progress: Progress = silent,
+    # Called with a line per validation, and with warnings.
     note: Callable[[str], None] = lambda line: None,
 ) -> EncoderCard:
-    """Train an encoder, write it with its card and a picture, and measure it.
-
-    Args:
-        request: what to train from, and what to write.
-        progress: called with each step.
-        note: called with a line per validation, and with warnings.
-
-    Raises:
-        FileNotFoundError: a tracks file, the output's folder, or the checkpoint is missing.
-        ValueError: tracks, outputs, options, device or checkpoint are invalid.
-        Interrupted: Ctrl-C was pressed; `resume` continues.
-    """
+    """Train an encoder, write it with its card and a picture, and measure it."""
     request.check()
     keep_freed_memory()
-    threads = request.threads or os.cpu_count() or 1
+    threads = request.threads
     torch.set_num_threads(threads)
-    for path in request.report:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such tracks file")
     data = load_training(
         request.training,
         request.validation,
         licences=request.data_licences,
         upright=request.upright,
+        report=request.report,
         progress=progress,
     )
-    for path in request.report:
-        _check_report(path, data, request.upright)
     half = has_fast_bfloat16(request.device)
     checkpoint = request.output.with_name(request.output.name + ".checkpoint")
     trainer = Trainer(
@@ -223,27 +195,12 @@ def train_encoder(
 
 
 def default_output(tracks: Path, resume: bool = False, upright: bool = False) -> Path:
-    """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file.
-
-    Raises:
-        FileExistsError: the model, its card or its picture exists already.
-    """
+    """`<descriptor>.pme` in the working directory, for the descriptor of a tracks file."""
     output = Path(f"{read_tracks(tracks, upright).descriptor}.pme")
     for path in (output, output.with_suffix(".md"), output.with_suffix(".png")):
         if path.exists() and not resume:
             raise FileExistsError(f"{path} exists already: name another file with -o")
     return output
-
-
-def _check_report(path: Path, data: TrainingData, upright: bool) -> None:
-    """Raise before the first step if the encoder could not be measured on these tracks."""
-    tracks = read_tracks(path, upright)
-    if (tracks.descriptor, tracks.bits) != (data.descriptor, data.bits):
-        raise ValueError(
-            f"{path} has {tracks.descriptor} descriptors of {tracks.bits} bits, but the encoder is "
-            f"for {data.descriptor} of {data.bits}: report on tracks of the same descriptor"
-        )
-    load_trials(tracks, path, REPORT_SEEDS)
 
 
 def _run(
@@ -312,10 +269,8 @@ def _measure(
     device = request.device
     trials = load_trials(read_tracks(path, request.upright), path, REPORT_SEEDS)
     plain = load_trials(Tracks.load(path), path, REPORT_SEEDS) if request.upright else trials
-    floats = [precision(t, lambda d: embed(trainer.network, d, device), dims) for t in trials]
-    integers = [precision(t, lambda d: encoder.encode(d, threads=threads), dims) for t in trials]
-    shares = [binary_precision(t, threads) for t in plain]
-    unaggregated, medoid, majority = np.mean(shares, axis=0).tolist()
+    shares = np.mean([binary_precision(t, threads) for t in plain], axis=0)
+    unaggregated, medoid, majority = shares.tolist()
     return SequencePrecision(
         sequence_name(path),
         role,
@@ -323,8 +278,8 @@ def _measure(
         unaggregated,
         medoid,
         majority,
-        {d: float(np.mean([p[d] for p in floats])) for d in dims},
-        {d: float(np.mean([p[d] for p in integers])) for d in dims},
+        mean_precision(trials, lambda d: embed(trainer.network, d, device), dims),
+        mean_precision(trials, lambda d: encoder.encode(d, threads=threads), dims),
     )
 
 

@@ -44,9 +44,6 @@ class PrototypeLoss(nn.Module):
     For every d in `dims` the first d numbers of an embedding are trained to work alone (Kusupati et
     al., Matryoshka Representation Learning, NeurIPS 2022), with a learned temperature, as distances
     grow with d.
-
-    Args:
-        dims: lengths of the prefixes, the largest at most the embedding's length.
     """
 
     def __init__(self, dims: Sequence[int]) -> None:

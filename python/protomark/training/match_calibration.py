@@ -31,18 +31,13 @@ Search = Callable[[NDArray[np.uint8]], tuple[NDArray[np.int64], NDArray[np.int32
 
 @dataclass(frozen=True)
 class LabelledMatches:
-    """The nearest landmarks of all n keypoints of several frames.
+    """The nearest landmarks of all n keypoints of several frames."""
 
-    Attributes:
-        distances: (n, 2) float64, squared distances to the two nearest landmarks.
-        right: (n,) bool, whether the nearest landmark is the true one, or projects to within half a
-            percent of the image's longer side.
-        frame: (n,) int64, index of each keypoint's frame.
-    """
-
-    distances: NDArray[np.float64]
+    distances: NDArray[np.float64]  # (n, 2) float64, squared distances to the two nearest landmarks
+    # (n,) bool, whether the nearest landmark is the true one, or projects to within half a percent
+    # of the image's longer side.
     right: NDArray[np.bool_]
-    frame: NDArray[np.int64]
+    frame: NDArray[np.int64]  # (n,) int64, index of each keypoint's frame
 
 
 def label_matches(tracks: Tracks, frames: Sequence[QueryFrame], search: Search) -> LabelledMatches:
@@ -59,11 +54,7 @@ def label_matches(tracks: Tracks, frames: Sequence[QueryFrame], search: Search) 
 
 
 def fit_calibration(sequences: Sequence[LabelledMatches]) -> MatchCalibration:
-    """The calibration that fits the matches of sequences best, each with the same weight.
-
-    Raises:
-        ValueError: no match is right, or all are.
-    """
+    """The calibration that fits the matches of sequences best, each with the same weight."""
     distances = np.concatenate([m.distances for m in sequences])
     right = np.concatenate([m.right for m in sequences])
     weights = np.concatenate([np.full(len(m.right), 1 / len(m.right)) for m in sequences])
@@ -77,9 +68,6 @@ def held_out_frames(
     """Keypoint rows that build a map, and frames to query it with.
 
     A random tenth of the keyframes are queries, as in `protomark evaluate`.
-
-    Raises:
-        ValueError: the tracks are too few or too short.
     """
     part = split(tracks, seed)
     return part.support_rows, draw_frames(tracks, part, frames)
@@ -102,23 +90,14 @@ def matches_by_dim(
 
 @dataclass(frozen=True)
 class CalibrationQuality:
-    """How well a calibration fits a sequence to which it was not fitted, unless it is the only one.
-
-    Attributes:
-        sequence: name of the sequence.
-        dim: code length.
-        right: share of keypoints whose nearest landmark is right.
-        precision: share of accepted matches that are right.
-        recall: share of right matches that are accepted.
-        expected: mean probability of accepted matches, to compare with `precision`.
-    """
+    """How well a calibration fits a sequence: another than those that it was fitted to, if any."""
 
     sequence: str
-    dim: int
-    right: float
-    precision: float
-    recall: float
-    expected: float
+    dim: int  # code length
+    right: float  # share of keypoints whose nearest landmark is right
+    precision: float  # share of accepted matches that are right
+    recall: float  # share of right matches that are accepted
+    expected: float  # mean probability of accepted matches, to compare with `precision`
 
 
 def measure_calibration(
@@ -144,15 +123,6 @@ def calibrate(
     """Fit the match calibration of an encoder, and measure it on each sequence.
 
     The quality on a sequence is that of a fit to the others, if there are any.
-
-    Args:
-        encoder: the encoder.
-        paths: tracks files of its plain descriptor.
-        threads: threads to encode and search on.
-        progress: called with each file.
-
-    Raises:
-        FileNotFoundError, ValueError: a file is missing or broken, or is of another descriptor.
     """
     found: dict[str, dict[int, LabelledMatches]] = {}
     for path in tracked(paths, progress, "query maps"):

@@ -41,10 +41,7 @@ def default_hidden(bits: int, dim: int) -> tuple[int, ...]:
 class EncoderNetwork(nn.Module):
     """Maps signs (n, bits) float32 of -1 and +1 to embeddings (n, dim) float32.
 
-    Args:
-        bits: length of a descriptor.
-        dim: length of an embedding.
-        hidden: widths of the hidden layers; None: `default_hidden(bits, dim)`.
+    `hidden` are the widths of the hidden layers; None: `default_hidden`.
     """
 
     def __init__(self, bits: int, dim: int, hidden: Sequence[int] | None = None) -> None:

@@ -2,8 +2,7 @@
 
 `QuantizedNetwork` computes in floating point what the integer encoder computes, including
 rounding, and passes gradients straight through the rounding; training ends with it in the loop.
-`export` returns the same network as integer layers, and `integer_forward` is a plain NumPy version
-of the integer arithmetic, which the C++ encoder must equal byte for byte.
+`export` returns the same network as integer layers.
 
 Weights are int8 with one scale per output. A pre-activation is rounded to 8 bits over a range
 [low, high] of its layer, looked up in a 256-entry table that holds SELU, and comes out as uint8.
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from protomark.features.descriptors import unpack_bits
 from protomark.training.network import EncoderNetwork
 
 _QUANTILE = 0.9999  # share of the pre-activations of calibration descriptors that ranges cover
@@ -188,23 +186,3 @@ def _quantile(x: Tensor, q: float) -> float:
     flat = x.flatten()
     k = min(max(round(q * flat.numel()), 1), flat.numel())
     return float(flat.kthvalue(k).values)
-
-
-def integer_forward(layers: list[Layer], descriptors: NDArray[np.uint8]) -> NDArray[np.int8]:
-    """Codes (n, dim) int8 of packed descriptors (n, B) uint8, in exact integer arithmetic.
-
-    Args:
-        layers: layers that `QuantizedNetwork.export` returned.
-        descriptors: (n, B) uint8; bit i of a descriptor is bit i % 8 of byte i / 8, lowest first.
-    """
-    x = unpack_bits(descriptors)
-    for layer in layers:
-        # Products and sums stay far below 2^53, so float64 matrix products are exact, and fast.
-        sums = x.astype(np.float64) @ layer["weights"].T.astype(np.float64)
-        acc = sums.astype(np.int64) + layer["bias"]
-        t = (acc * layer["multipliers"] + (1 << (layer["shift"] - 1))) >> layer["shift"]
-        if layer["table"] is None:
-            codes: NDArray[np.int8] = np.clip(t, -127, 127).astype(np.int8)
-            return codes
-        x = layer["table"][np.clip(t, -128, 127) + 128]
-    raise ValueError("the last layer has a table, but an encoder ends with a layer without one")

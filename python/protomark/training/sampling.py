@@ -17,16 +17,11 @@ from protomark.tracks.file import Tracks
 
 @dataclass(frozen=True)
 class Views:
-    """All views of one sequence's landmarks, grouped by landmark.
-
-    Attributes:
-        name: name of the sequence.
-        descriptors: (n, B) uint8, sorted by landmark.
-        starts: (l + 1,) int64; the views of landmark i are rows starts[i]:starts[i + 1].
-    """
+    """All views of one sequence's landmarks, grouped by landmark."""
 
     name: str
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[np.uint8]  # (n, B) uint8, sorted by landmark
+    # (l + 1,) int64; the views of landmark i are rows starts[i]:starts[i + 1].
     starts: NDArray[np.int64]
 
     @classmethod
@@ -50,16 +45,11 @@ class Views:
 
 @dataclass(frozen=True)
 class Batch:
-    """The views of a batch's landmarks.
+    """The views of a batch's landmarks."""
 
-    Attributes:
-        descriptors: (n, B) uint8, grouped by landmark.
-        landmarks: (n,) int64, 0..m-1, ascending.
-        queries: (q,) int64, rows whose landmark has at least two other views in the batch.
-    """
-
-    descriptors: NDArray[np.uint8]
-    landmarks: NDArray[np.int64]
+    descriptors: NDArray[np.uint8]  # (n, B) uint8, grouped by landmark
+    landmarks: NDArray[np.int64]  # (n,) int64, 0..m-1, ascending
+    # (q,) int64, rows whose landmark has at least two other views in the batch.
     queries: NDArray[np.int64]
 
 
@@ -85,35 +75,22 @@ def random_views(
     return rows[order][keep], group[keep], rank[keep]
 
 
+@dataclass
 class BatchSampler:
-    """Draws batches from several sequences.
+    """Draws batches from several sequences."""
 
-    Args:
-        sequences: one or more sequences, each with landmarks of 3 or more views.
-        landmarks: landmarks per batch.
-        views: limit on views per landmark.
-        queries: limit on queries per landmark.
-        balance: the probability of a sequence is proportional to (number of landmarks with 3 or
-            more views) ** balance: 0 favours no sequence, 1 favours no landmark.
-        noise: probability that a bit is flipped.
-    """
+    sequences: Sequence[Views]  # one or more sequences, each with landmarks of 3 or more views
+    landmarks: int = 1000  # landmarks per batch
+    views: int = 9  # limit on views per landmark
+    queries: int = 3  # limit on queries per landmark
+    # The probability of a sequence is proportional to (number of landmarks with 3 or more views)
+    # ** balance: 0 favours no sequence, 1 favours no landmark.
+    balance: float = 0.5
+    noise: float = 0.0  # probability that a bit is flipped
 
-    def __init__(
-        self,
-        sequences: Sequence[Views],
-        landmarks: int = 1000,
-        views: int = 9,
-        queries: int = 3,
-        balance: float = 0.5,
-        noise: float = 0.0,
-    ) -> None:
-        self.sequences = list(sequences)
-        self.landmarks = landmarks
-        self.views = views
-        self.queries = queries
-        self.noise = noise
-        weight = np.array([(s.counts >= 3).sum() for s in sequences], float) ** balance
-        self.probability = weight / weight.sum()
+    def __post_init__(self) -> None:
+        sizes = np.array([(s.counts >= 3).sum() for s in self.sequences], float)
+        self.probability = sizes**self.balance / (sizes**self.balance).sum()
 
     def choose(self, sequence: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Distinct random landmarks (m,) int64 for a batch."""

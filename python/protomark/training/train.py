@@ -27,44 +27,32 @@ from protomark.training.quantization import QuantizedNetwork
 from protomark.training.sampling import BatchSampler, Views
 from protomark.training.validation import Trial, mean_precision
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
+# What a checkpoint keeps of a trainer, beside weights, optimizer and history.
+_PROGRESS = ("step", "seconds", "best", "best_step", "best_state", "_losses")
 
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Options that determine the weights, besides the data.
+    """Options that determine the weights, besides the data."""
 
-    Attributes:
-        dims: ascending prefixes that are trained to work alone; the last is the full length.
-        hidden: widths of the hidden layers; None: `default_hidden`.
-        steps: number of batches.
-        landmarks: landmarks per batch.
-        views: limit on views per landmark in a batch.
-        queries: limit on queries per landmark in a batch.
-        balance: see `BatchSampler`.
-        noise: probability that a bit is flipped.
-        learning_rate: peak rate of AdamW after a warm-up, from which it falls as a cosine.
-        weight_decay: weight decay of AdamW.
-        clip: largest norm of the gradient.
-        quantized_share: share of the steps, the last ones, with quantisation in the loop.
-        validate_every: steps between validations and checkpoints.
-        seed: seed of weights and batches.
-    """
-
+    # Ascending prefixes that are trained to work alone; the last is the full length.
     dims: tuple[int, ...] = (8, 16, 24, 32, 48, 64)
-    hidden: tuple[int, ...] | None = None
-    steps: int = 4000
-    landmarks: int = 1000
-    views: int = 9
-    queries: int = 3
-    balance: float = 0.5
-    noise: float = 0.03
+    hidden: tuple[int, ...] | None = None  # widths of the hidden layers; None: `default_hidden`
+    steps: int = 4000  # number of batches
+    landmarks: int = 1000  # landmarks per batch
+    views: int = 9  # limit on views per landmark in a batch
+    queries: int = 3  # limit on queries per landmark in a batch
+    balance: float = 0.5  # see `BatchSampler`
+    noise: float = 0.03  # probability that a bit is flipped
+    # Peak rate of AdamW after a warm-up, from which it falls as a cosine.
     learning_rate: float = 5e-3
-    weight_decay: float = 0.1
-    clip: float = 1.0
+    weight_decay: float = 0.1  # weight decay of AdamW
+    clip: float = 1.0  # largest norm of the gradient
+    # Share of the steps, the last ones, with quantisation in the loop.
     quantized_share: float = 0.25
-    validate_every: int = 500
-    seed: int = 0
+    validate_every: int = 500  # steps between validations and checkpoints
+    seed: int = 0  # seed of weights and batches
 
     def check(self) -> None:
         """Raise ValueError if an option is invalid."""
@@ -72,13 +60,11 @@ class TrainingOptions:
             raise ValueError(f"dims {self.dims} must be positive and ascending, as in 8,16,32")
         if self.dims[-1] > 255:
             raise ValueError(f"dims {self.dims}: a code has at most 255 numbers")
-        for name in ("steps", "landmarks", "queries", "validate_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, it must be at least 1")
-        if self.landmarks < 2:
-            raise ValueError("a batch needs at least 2 landmarks to tell apart")
-        if self.views < 3:
-            raise ValueError(f"views is {self.views}; a query and its support need at least 3")
+        # A batch tells landmarks apart, and a query needs two views in its support.
+        least = {"steps": 1, "landmarks": 2, "views": 3, "queries": 1, "validate_every": 1}
+        for name, limit in least.items():
+            if getattr(self, name) < limit:
+                raise ValueError(f"{name} is {getattr(self, name)}, it must be at least {limit}")
 
     @property
     def quantized_from(self) -> int:
@@ -105,23 +91,13 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class ValidationStep:
-    """The result of a validation.
+    """The result of a validation."""
 
-    Attributes:
-        step: number of finished steps.
-        steps: number of all steps.
-        loss: mean training loss since the last validation.
-        precision: precision by code length, of the network in the loop.
-        quantized: whether quantisation is in the loop.
-        seconds: training time so far, over all runs.
-    """
-
-    step: int
-    steps: int
-    loss: float
-    precision: dict[int, float]
-    quantized: bool
-    seconds: float
+    step: int  # number of finished steps
+    loss: float  # mean training loss since the last validation
+    precision: dict[int, float]  # precision by code length, of the network in the loop
+    quantized: bool  # whether quantisation is in the loop
+    seconds: float  # training time so far, over all runs
 
     @property
     def mean_precision(self) -> float:
@@ -129,36 +105,21 @@ class ValidationStep:
         return sum(self.precision.values()) / len(self.precision)
 
 
+@dataclass
 class Trainer:
-    """Trains one encoder.
+    """Trains one encoder."""
 
-    Args:
-        sequences: training sequences, see `data.load_training`.
-        trials: validation splits.
-        options: options that determine the weights.
-        checkpoint: file of the checkpoint, None for none.
-        fingerprint: digest of the data, so that no checkpoint is resumed with other data.
-        device: "cpu" or "cuda".
-        half: whether matrix products run in bfloat16.
-    """
+    sequences: Sequence[Views]  # training sequences, see `data.load_training`
+    trials: Sequence[Trial]  # validation splits
+    options: TrainingOptions
+    checkpoint: Path | None = None  # file of the checkpoint, None for none
+    fingerprint: str = ""  # digest of the data, so that no checkpoint is resumed with other data
+    device: str = "cpu"  # "cpu" or "cuda"
+    half: bool = False  # whether matrix products run in bfloat16
 
-    def __init__(
-        self,
-        sequences: Sequence[Views],
-        trials: Sequence[Trial],
-        options: TrainingOptions,
-        checkpoint: Path | None = None,
-        fingerprint: str = "",
-        device: str = "cpu",
-        half: bool = False,
-    ) -> None:
+    def __post_init__(self) -> None:
+        options, sequences = self.options, self.sequences
         options.check()
-        self.options = options
-        self.trials = trials
-        self.checkpoint = checkpoint
-        self.fingerprint = fingerprint
-        self.device = torch.device(device)
-        self.half = half
         self.sampler = BatchSampler(
             sequences,
             options.landmarks,
@@ -194,13 +155,7 @@ class Trainer:
     def run(self, report: Callable[[int, float, ValidationStep | None], None]) -> None:
         """Train to the end; then `quantized` holds the best model.
 
-        Args:
-            report: called after every step with the number of finished steps, the loss, and a
-                `ValidationStep` if there was a validation.
-
-        Raises:
-            Interrupted: Ctrl-C was pressed; the checkpoint is written.
-            ValueError: the loss is no longer finite.
+        `report` gets the number of finished steps, the loss, and the validation, if there was one.
         """
         options = self.options
         self.network.train()
@@ -233,7 +188,7 @@ class Trainer:
             group["lr"] = options.rate(self.step)
         model = self.quantized if self.step >= options.quantized_from else self.network
         signs = to_signs(batch.descriptors, self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
+        with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.half):
             embeddings = model(signs)
         loss = self.loss(
             embeddings,
@@ -265,7 +220,6 @@ class Trainer:
         )
         progress = ValidationStep(
             self.step,
-            self.options.steps,
             float(np.mean(self._losses)),
             found,
             in_loop,
@@ -287,27 +241,17 @@ class Trainer:
             "version": CHECKPOINT_VERSION,
             "options": asdict(self.options),
             "fingerprint": self.fingerprint,
-            "step": self.step,
-            "seconds": self.seconds,
+            "progress": {name: getattr(self, name) for name in _PROGRESS},
             "model": self.quantized.state_dict(),
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "history": [asdict(p) for p in self.history],
-            "losses": self._losses,
-            "best": self.best,
-            "best_step": self.best_step,
-            "best_state": self.best_state,
         }
         with replacing(self.checkpoint) as file:
             torch.save(state, file)
 
     def resume(self) -> None:
-        """Continue from the checkpoint.
-
-        Raises:
-            FileNotFoundError: there is no checkpoint.
-            ValueError: the checkpoint is broken, or of other data or options.
-        """
+        """Continue from the checkpoint."""
         path = self.checkpoint
         if path is None or not path.is_file():
             raise FileNotFoundError(f"{path}: no checkpoint to resume, train without --resume")
@@ -329,16 +273,12 @@ class Trainer:
                     f"{path}: the checkpoint was made with {name} {state['options'].get(name)}, "
                     f"not {value}: give the same, or train without --resume"
                 )
-        self.step = state["step"]
-        self.seconds = state["seconds"]
+        for name in _PROGRESS:
+            setattr(self, name, state["progress"][name])
         self.quantized.load_state_dict(state["model"])
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.history = [ValidationStep(**p) for p in state["history"]]
-        self._losses = state["losses"]
-        self.best = state["best"]
-        self.best_step = state["best_step"]
-        self.best_state = state["best_state"]
 
 
 def keep_freed_memory() -> None:

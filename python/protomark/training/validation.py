@@ -16,21 +16,13 @@ Embed = Callable[[NDArray[np.uint8]], NDArray[np.floating] | NDArray[np.int8]]
 
 @dataclass(frozen=True)
 class Trial:
-    """Support and queries of a sequence at a seed.
-
-    Attributes:
-        name: name of the sequence.
-        support: (n, B) uint8, grouped by landmark.
-        starts: (l,) int64, first row of each landmark in `support`.
-        queries: (q, B) uint8.
-        targets: (q,) int64, landmarks of the queries, 0..l-1.
-    """
+    """Support and queries of a sequence at a seed."""
 
     name: str
-    support: NDArray[np.uint8]
-    starts: NDArray[np.int64]
-    queries: NDArray[np.uint8]
-    targets: NDArray[np.int64]
+    support: NDArray[np.uint8]  # (n, B) uint8, grouped by landmark
+    starts: NDArray[np.int64]  # (l,) int64, first row of each landmark in `support`
+    queries: NDArray[np.uint8]  # (q, B) uint8
+    targets: NDArray[np.int64]  # (q,) int64, landmarks of the queries, 0..l-1
 
     @property
     def landmarks(self) -> NDArray[np.int64]:
@@ -42,11 +34,7 @@ class Trial:
     def from_tracks(
         cls, tracks: Tracks, name: str, seed: int = 0, max_queries: int = 10_000
     ) -> Trial:
-        """A random 90/10 split of the keyframes.
-
-        Raises:
-            ValueError: the tracks are too few or too short.
-        """
+        """A random 90/10 split of the keyframes."""
         try:
             drawn = split(tracks, seed, max_queries=max_queries)
         except ValueError as error:

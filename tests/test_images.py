@@ -1,0 +1,93 @@
+"""Which images a folder holds, and images that cameras and copies make in odd ways."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from protomark.features.extractor import Extractor
+from protomark.features.images import image_names, passed_over, read_gray
+from protomark.mapping.source import ImageFolder
+from tracks_scene import texture
+
+
+def encoded(suffix: str, image: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(suffix, image)[1])
+
+
+def test_links_are_followed_and_hidden_files_are_not_taken(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
+    for path in (folder / "@eaDir", folder / ".trash", elsewhere):
+        path.mkdir(parents=True)
+    for name in ("10.jpg", "9.jpg", "1²3.JPE", "._9.jpg", "@eaDir/a.jpg", ".trash/a.jpg", "a.heic"):
+        (folder / name).touch()
+    (elsewhere / "b.png").touch()
+    (folder / "linked").symlink_to(elsewhere)
+    (folder / "circle").symlink_to(folder)
+    with open(os.fsencode(folder) + b"/caf\xe9.jpg", "wb"):
+        pass
+    assert image_names(folder) == ["1²3.JPE", "9.jpg", "10.jpg", "linked/b.png"]
+    assert "1 heic" in passed_over(folder)
+    assert "1 whose name is not UTF-8 (caf" in passed_over(folder)
+    assert passed_over(elsewhere) == ""
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_only_what_lacks_its_end_is_truncated(tmp_path: Path, suffix: str) -> None:
+    path, data = tmp_path / f"a{suffix}", encoded(suffix, texture(200))
+    path.write_bytes(data)
+    expected = read_gray(path)
+    if suffix == ".jpg":  # with a thumbnail in front, which has an end marker of its own
+        thumbnail = b"\xff\xe1" + struct.pack(">H", 12) + b"Exif\0\0\xff\xd8\xff\xd9"
+        data = data[:2] + thumbnail + data[2:]
+    path.write_bytes(data + bytes(8000))  # as phones append videos
+    np.testing.assert_array_equal(read_gray(path), expected)
+    path.write_bytes(data[:-500])
+    with pytest.raises(ValueError, match="truncated"):
+        read_gray(path)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_all_bits_that_16_bit_images_use_count(tmp_path: Path, bits: int) -> None:
+    image = texture(64)
+    image[0] = 255
+    cv2.imwrite(str(tmp_path / "a.png"), image.astype(np.uint16) << (bits - 8))
+    np.testing.assert_array_equal(read_gray(tmp_path / "a.png"), image)
+
+
+def test_what_opencv_refuses_is_named(tmp_path: Path) -> None:
+    size = 50_000
+    header = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(99))), (b"IEND", b"")]
+    data = b"\x89PNG\r\n\x1a\n"
+    for name, content in chunks:
+        checksum = struct.pack(">I", zlib.crc32(name + content))
+        data += struct.pack(">I", len(content)) + name + content + checksum
+    (tmp_path / "huge.png").write_bytes(data)
+    with pytest.raises(ValueError, match=r"huge\.png.*cannot decode"):
+        read_gray(tmp_path / "huge.png")
+    with pytest.raises(ValueError, match="no freak features of 2x3 pixels"):
+        Extractor("freak")(np.zeros((3, 2), np.uint8))
+
+
+def test_an_overwritten_opencv_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(cv2, "xfeatures2d")
+    monkeypatch.delattr(cv2, "BRISK_create", raising=False)
+    assert len(Extractor("orb")(texture(200)))
+    with pytest.raises(ModuleNotFoundError, match=r"no BRISK_create.*uninstall all of them"):
+        Extractor("freak")
+
+
+def test_the_most_frequent_size_is_that_of_the_folder(tmp_path: Path) -> None:
+    for i, size in enumerate((20, 20, 40, 40, 40)):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), texture(size))
+    (tmp_path / "00.png").write_bytes(b"")
+    folder = ImageFolder(tmp_path)
+    assert folder.size() == (40, 40)
+    assert folder.example.name == "2.png"
