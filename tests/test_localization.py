@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
 import re
 import shutil
 from dataclasses import replace
@@ -111,7 +112,7 @@ def test_every_kind_of_map(folder: Path, images: list[Any], kind: str, tmp_path:
 
 def test_the_camera_of_the_map(scene: pm.PrototypeMap, images: list[Any], tmp_path: Path) -> None:
     scene = scene.part(scene.ids)  # others share the fixture
-    other = replace(PINHOLE, width=640, height=480)
+    other = replace(PINHOLE, width=300, height=250)
     scene.metadata = {KEY: cameras_text([PINHOLE, other, PINHOLE])}
     sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=33, position_bits=16)
     for made in (scene, sealed):
@@ -127,7 +128,9 @@ def test_the_camera_of_the_map(scene: pm.PrototypeMap, images: list[Any], tmp_pa
             found.cam_from_world, localizer.localize(image).cam_from_world
         )
     # Two cameras of one size: nobody knows which.
-    scene.metadata = {KEY: cameras_text([PINHOLE, replace(PINHOLE, params=(9.0, 9.0, 5.0, 5.0))])}
+    scene.metadata = {
+        KEY: cameras_text([PINHOLE, replace(PINHOLE, params=(310.0, 310.0, 160.0, 120.0))])
+    }
     assert Localizer(scene).map_camera(PINHOLE.width, PINHOLE.height) is None
     scene.metadata = {KEY: "1 PINHOLE 640 480 nonsense"}
     with pytest.raises(ValueError, match="the map's metadata 'cameras' hold no COLMAP camera"):
@@ -206,7 +209,7 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     with pytest.raises(ValueError, match="320 x 240 pixels, but its camera 640 x 480"):
         localizer.localize(images[0], replace(PINHOLE, width=640, height=480))
     with pytest.raises(ValueError, match="undistort"):
-        localizer.localize(images[0], replace(PINHOLE, model="FOV"))
+        localizer.localize(images[0], replace(PINHOLE, model="FOV", params=(*PINHOLE.params, 1.0)))
     with pytest.raises(ValueError, match="PINHOLE has 4 parameters, not 3"):
         localizer.localize(images[0], replace(PINHOLE, params=(300.0, 160.0, 120.0)))
     with pytest.raises(ValueError, match="uint8"):
@@ -218,6 +221,38 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     other.set_positions([1], [[0, 0, 0]])
     with pytest.raises(ValueError, match="protomark calibrate"):
         Localizer(other)
+
+
+def test_what_users_have_in_python(
+    scene: pm.PrototypeMap, images: list[Any], tmp_path: Path
+) -> None:
+    from PIL import Image
+
+    from protomark.geometry.colmap import pycolmap
+
+    localizer = Localizer(scene, max_keypoints=KEYPOINTS)
+    expected = localizer.localize(images[0], PINHOLE).cam_from_world
+    write_model(tmp_path / "model", PINHOLE, ["a.png"], NEW_POSES[:1])
+    Image.fromarray(images[0]).save(tmp_path / "a.png")
+    for image in (Image.fromarray(images[0]), images[0][:, :, None], tmp_path / "a.png"):
+        for camera in (
+            pycolmap.Camera(PINHOLE.as_dict()),
+            "PINHOLE:300,300,160,120",
+            str(tmp_path / "model"),
+        ):
+            found = localizer.localize(image, camera)
+            np.testing.assert_array_equal(found.cam_from_world, expected)
+    with pytest.raises(ValueError, match=r"the image is None, as cv2.imread"):
+        localizer.localize(None, PINHOLE)  # type: ignore[arg-type]
+    with pytest.raises(FileNotFoundError, match="no such image"):
+        localizer.localize("gone.jpg", PINHOLE)
+    with pytest.raises(TypeError, match=r"a pycolmap.Camera or a str, not int"):
+        localizer.localize(images[0], 7)
+    with pytest.raises(TypeError, match="give each process the map's path"):
+        pickle.dumps(localizer)
+    camera = replace(PINHOLE, params=(300.0, 300.0, 320.0, 240.0))
+    with pytest.raises(ValueError, match="principal point lies outside"):
+        localizer.localize(images[0], camera)
 
 
 def test_real_frames_of_the_sample() -> None:

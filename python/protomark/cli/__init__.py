@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import warnings
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -77,6 +78,7 @@ def main() -> None:
     130.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    warnings.showwarning = _warn
     from protomark.interrupt import Interrupted
 
     try:
@@ -91,6 +93,12 @@ def main() -> None:
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         _fail(str(text), 1)
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    from protomark.cli.terminal import note
+
+    note(f"warning: {message}")
 
 
 def _fail(text: str, code: int) -> None:

@@ -14,6 +14,8 @@ import contextlib
 import os
 import re
 import tempfile
+import warnings
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +28,7 @@ from protomark.extras import optional
 from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
+from protomark.geometry.pose_files import check_images_txt
 
 pycolmap = optional("pycolmap")
 
@@ -90,11 +93,17 @@ def find_model(folder: Path) -> Path:
     """
     for candidate in (folder / "sparse", folder / "sparse" / "0", folder):
         if _suffix(candidate):
-            return candidate
-    raise FileNotFoundError(
-        f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/: "
-        "name its folder with --model"
-    )
+            break
+    else:
+        raise FileNotFoundError(
+            f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or "
+            "sparse/0/: name its folder with --model"
+        )
+    others = [p for p in sorted((folder / "sparse").glob("*")) if p != candidate and _suffix(p)]
+    if others:
+        names = ", ".join(str(p) for p in others[:5])
+        warnings.warn(f"{candidate} is read, other models exist: {names}", stacklevel=2)
+    return candidate
 
 
 def _suffix(path: Path) -> str | None:
@@ -122,13 +131,20 @@ def read_reconstruction(path: Path) -> Any:
     for name in _FILES:
         if (path / f"{name}{suffix}").stat().st_size == 0:
             raise ValueError(f"{path / (name + suffix)}: empty file, export the COLMAP model anew")
+    if suffix == ".txt":
+        check_images_txt(path / "images.txt")
+    elif all((path / f"{name}.txt").is_file() for name in _FILES):
+        warnings.warn(f"{path}: the binary model is read, not the text beside it", stacklevel=2)
     with quiet(), tempfile.TemporaryDirectory(prefix="protomark-") as temporary:
-        source = path
-        if not (path / f"points3D{suffix}").is_file():
-            source = Path(temporary)
-            for file in path.iterdir():
-                if file.is_file() and file.suffix == suffix:
-                    os.symlink(file.resolve(), source / file.name)
+        source = Path(temporary)
+        for file in path.iterdir():
+            if not file.is_file() or file.suffix != suffix:
+                continue
+            if suffix == ".txt" and _has_bom(file):
+                (source / file.name).write_bytes(file.read_bytes()[len(BOM_UTF8) :])
+            else:
+                os.symlink(file.resolve(), source / file.name)
+        if not (source / f"points3D{suffix}").exists():
             (source / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             return pycolmap.Reconstruction(str(source))
@@ -137,6 +153,11 @@ def read_reconstruction(path: Path) -> Any:
             raise ValueError(
                 f"{path}: broken COLMAP model ({reason}), export it anew from COLMAP"
             ) from None
+
+
+def _has_bom(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(BOM_UTF8)) == BOM_UTF8
 
 
 def read_observations(
@@ -257,9 +278,13 @@ def model_from_reconstruction(reconstruction: Any, path: Path) -> ColmapModel:
     """
     cameras = {}
     for camera_id, c in reconstruction.cameras.items():
-        camera = Camera(c.model.name, c.width, c.height, tuple(float(p) for p in c.params))
+        camera = Camera.from_colmap(c)
         if not np.isfinite(camera.params).all() or c.mean_focal_length() <= 0:
             raise ValueError(f"{path}: camera {camera_id} has no valid focal length")
+        try:
+            camera.check_lens()
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
         cameras[int(camera_id)] = camera
     images = sorted(reconstruction.images.values(), key=lambda image: natural_key(image.name))
     posed = [image for image in images if image.has_pose]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -81,18 +81,23 @@ def read_poses(path: Path) -> PoseSet:
         return PoseSet(dict(zip(model.names, model.cam_from_world, strict=True)))
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder of poses")
+    rows = _rows(path)
+    filled = [row for row in rows if row[1]]
+    if filled and all(len(words) == 8 for _, words in filled):
+        return _read_tum(path, filled)
+    return _read_images_txt(path, rows)
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Numbers and words of the lines that are no comment."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ValueError(
             f"{path} is not a text file: give a COLMAP images.txt, a folder with a model, or a TUM "
             "trajectory"
         ) from None
-    rows = [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
-    filled = [row for row in rows if row[1]]
-    if filled and all(len(words) == 8 for _, words in filled):
-        return _read_tum(path, filled)
-    return _read_images_txt(path, rows)
+    return [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
 
 
 def _read_tum(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
@@ -107,11 +112,8 @@ def _read_tum(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
 
 
 def _read_images_txt(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
-    # A second line per image is for its points, and may be empty.
     by_name = {}
-    for number, words in rows[::2]:
-        if not words:
-            continue
+    for number, words in _image_rows(path, rows):
         if len(words) < 10:
             raise ValueError(
                 f"{path}, line {number}: write a line of COLMAP's images.txt or of a TUM "
@@ -123,6 +125,27 @@ def _read_images_txt(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
     if not by_name:
         raise ValueError(f"{path} holds no poses: give a COLMAP images.txt or a TUM trajectory")
     return PoseSet(by_name)
+
+
+def check_images_txt(path: Path) -> None:
+    """Raise ValueError if an image of an images.txt lacks the line for its points."""
+    for _ in _image_rows(path, _rows(path)):
+        pass
+
+
+def _image_rows(path: Path, rows: list[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    """The first of the two lines per image; the second has points, x y id each, or none."""
+    left = iter(rows)
+    for row in left:
+        if not row[1]:
+            continue
+        yield row
+        number, points = next(left, (0, []))
+        if len(points) >= 10 and (len(points) % 3 or not points[-1].lstrip("-").isdigit()):
+            raise ValueError(
+                f"{path}, line {number}: the line for the points of the image above is missing: "
+                "each image of an images.txt has two lines, of which the second may be empty"
+            )
 
 
 def _numbers(path: Path, line: int, words: list[str]) -> NDArray[np.float64]:
