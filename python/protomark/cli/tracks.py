@@ -168,6 +168,10 @@ def _check(sources: list[TracksInput], output: Path, augmentations: int) -> None
         raise NotADirectoryError(f"{output} is not a folder: name one for the tracks with -o")
 
 
+# Poses that move by more than this share of the extent deserve a warning.
+_FAR = 0.02
+
+
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
     from rich.markup import escape
 
@@ -184,13 +188,22 @@ def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
         f"median {facts['reprojection_error_median']:.2f}"
     )
     if "epipolar_error" in info:
-        error, refined = info["epipolar_error"], facts["poses_refined"]
-        say(
-            f"  given poses: epipolar error {error:.2f} pixels, "
-            + ("refined by bundle adjustment" if refined else "kept as they are")
+        fate = "kept as they are"
+        if facts["poses_refined"]:
+            share = info["pose_shift_max"] / info["extent"] if info["extent"] else 0.0
+            fate = (
+                f"refined by bundle adjustment, moved by {info['pose_shift_median']:.3g} (median), "
+                f"{info['pose_shift_max']:.3g} (at most, {share:.1%} of the extent)"
+            )
+            if share > _FAR:
+                note("  warning: poses moved far; --refine-poses no keeps them as they are")
+        say(f"  given poses: epipolar error {info['epipolar_error']:.2f} pixels, {fate}")
+    if info.get("static_region"):
+        box = ", ".join(map(str, info["static_region"]))
+        note(
+            f"  left out: what never moves while the rest does, within left, top, right, bottom = "
+            f"{box} pixels (an overlay, the camera's own vehicle?)"
         )
-        if error > 1 and not refined:
-            note("  these poses are only roughly right: --refine-poses auto refines them")
     without = info.get("images_without_pose") or []
     if without:
         more = f" and {len(without) - 3} more" if len(without) > 3 else ""

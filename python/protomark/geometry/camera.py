@@ -161,6 +161,14 @@ class Camera:
         camera.check_lens()
         return camera
 
+    def resembles(self, other: Camera) -> bool:
+        """Whether both project alike: same size, and rays within 1 % of the image."""
+        if (self.width, self.height) != (other.width, other.height):
+            return False
+        corners = np.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]]) * (self.width, self.height)
+        difference = (self.rays(corners) - other.rays(corners)) * other.focal_length
+        return bool(np.abs(difference).max() <= 0.01 * max(self.width, self.height))
+
     def check_lens(self) -> None:
         """Warn if the camera is unlikely to be the image's, for example of another resolution.
 

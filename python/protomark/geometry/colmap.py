@@ -226,6 +226,8 @@ def bundle_adjust(
     loss_scale: float = 1.0,
     intrinsics: bool = False,
     threads: int = 1,
+    priors: NDArray[np.float64] | None = None,
+    spread: float = 1.0,
 ) -> bool:
     """Move poses and points to the least (Cauchy) reprojection error; returns whether that worked.
 
@@ -237,6 +239,8 @@ def bundle_adjust(
         loss_scale: pixels beyond which an error counts less.
         intrinsics: whether focal length and distortion move, too.
         threads: threads of the solver; their number changes the last digits.
+        priors: (m, 3) camera centres that images 1 to m are likely to have.
+        spread: standard deviation of the priors along each axis.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = intrinsics
@@ -255,9 +259,28 @@ def bundle_adjust(
     if len(fixed) < 2:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    if priors is None:
+        adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    else:
+        known = [_prior(reconstruction.images[i], p, spread) for i, p in enumerate(priors, 1)]
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+            options,
+            pycolmap.PosePriorBundleAdjustmentOptions(),
+            config,
+            known,
+            reconstruction,
+        )
     with quiet():
         return bool(adjuster.solve().is_solution_usable())
+
+
+def _prior(image: Any, position: NDArray[np.float64], spread: float) -> Any:
+    return pycolmap.PosePrior(
+        corr_data_id=image.data_id,
+        position=position,
+        position_covariance=spread**2 * np.eye(3),
+        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+    )
 
 
 def read_model(folder: Path) -> ColmapModel:

@@ -29,6 +29,8 @@ from protomark.maps.open import open_map
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
+# With more keypoints outside the image they are not pixels (x, y).
+_MAX_OUTSIDE = 0.01
 # In place of a camera: have it estimated, although the map has one.
 ESTIMATE = "estimate"
 
@@ -200,13 +202,16 @@ class Localizer:
             See `localize`.
 
         Raises:
-            ValueError: the lengths differ, the encoder takes other descriptors, or poses cannot be
-                estimated for this camera model.
+            ValueError: the lengths differ, keypoints lie outside the image, the encoder takes other
+                descriptors, or poses cannot be estimated for this camera.
         """
         check_pose_model(camera)
         camera.check_lens()
+        if descriptors is None:  # what OpenCV computes for no keypoints
+            descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)
         if len(keypoints) != len(descriptors):
             raise ValueError(f"{len(keypoints)} keypoints, but {len(descriptors)} descriptors")
+        _check_pixels(np.asarray(keypoints), camera)
         stages = dict(seconds or {})
         with _timed(stages, "encode"):
             codes = self.scene.encoder.encode(descriptors, self.scene.dim, self.threads)
@@ -225,7 +230,8 @@ class Localizer:
                 self._positions_of(ids),
                 self.calibration.probability(distances),
             )
-            result = solve_pose(candidates, camera, self.min_probability, focal_length)
+            of_map = any(camera.resembles(c) for c in self.cameras.cameras)
+            result = solve_pose(candidates, camera, self.min_probability, focal_length, of_map)
         return replace(result, seconds={**stages, "total": sum(stages.values())})
 
     @cached_property
@@ -272,6 +278,18 @@ def _gray(image: Any) -> NDArray[np.uint8]:
     if np.ndim(image) == 3 and np.shape(image)[2] == 1:
         image = image[:, :, 0]
     return to_gray(image)
+
+
+def _check_pixels(keypoints: NDArray[np.floating], camera: Camera) -> None:
+    if not len(keypoints):
+        return
+    size = (camera.width, camera.height)
+    outside = ((keypoints < -1) | (keypoints > np.add(size, 1))).any(1).mean()
+    if outside > _MAX_OUTSIDE or (len(keypoints) > 1 and np.ptp(keypoints, axis=0).max() <= 1):
+        raise ValueError(
+            f"keypoints are (x, y) in pixels of an image of {size[0]} x {size[1]}, but these reach "
+            f"from {keypoints.min(0)} to {keypoints.max(0)}: normalised, or (row, column)?"
+        )
 
 
 def _has_positions(scene: pm.PrototypeMap | pm.SealedMap) -> bool:
