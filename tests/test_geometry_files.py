@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, read_cameras
@@ -102,3 +103,36 @@ def test_several_models_are_named(tmp_path: Path) -> None:
     pycolmap.Reconstruction(str(both)).write_binary(str(both))
     with pytest.warns(UserWarning, match="the binary model is read"):
         np.testing.assert_allclose(read_model(both).cam_from_world, text.cam_from_world)
+
+
+def test_base_names_only_where_they_are_unique(tmp_path: Path) -> None:
+    write_model(tmp_path / "one", PINHOLE, ["x/a.png", "b.png"], poses(2))
+    for names, expected in (
+        (["a.png", "y/b.png"], {"a.png": 0, "y/b.png": 1}),
+        (["1/b.png", "2/b.png", "x/a.png"], {"x/a.png": 0}),
+    ):
+        found = read_poses(tmp_path / "one").for_images(names)
+        assert {n: i for n in names for i in (0, 1) if _is(found.find(n), poses(2)[i])} == expected
+        cameras = read_cameras(str(tmp_path / "one")).for_images(names)
+        assert set(cameras.by_image) == set(expected)
+
+
+def _is(pose: NDArray[np.float64] | None, expected: NDArray[np.float64]) -> bool:
+    return pose is not None and np.allclose(pose, expected)
+
+
+def test_seconds_are_no_numbers_of_images(tmp_path: Path) -> None:
+    def trajectory(times: list[float]) -> Path:
+        file = tmp_path / "tum.txt"
+        file.write_text("".join(f"{t} 0 0 {t} 0 0 0 1\n" for t in times))
+        return file
+
+    seconds = read_poses(trajectory([0.0, 0.1, 0.2, 0.3, 1.0]))
+    assert seconds.find("00001.png") is None
+    assert seconds.find("0.1.png") is not None
+    assert seconds.find("00001.png", time=0.1) is not None  # a frame of a video
+    numbers = read_poses(trajectory([1.0, 2.0, 3.0]))
+    assert numbers.find("00001.png") is not None
+    names = [f"{i}.png" for i in range(3, 20)]
+    with pytest.warns(UserWarning, match="1 of 17 images have one of 3 poses"):
+        numbers.for_images(names)

@@ -48,9 +48,9 @@ from protomark_bench.report import ReportTable
 
 FOCAL_SCALES = (0.5, 0.8, 1.25, 2.0)
 SHIFTS = (0.1, 0.25)  # of the principal point, as a share of the image
-# How much more a wrong pose counts than a right one, by the camera's origin: the map's own camera
-# can only be wrong with wrong pixels, and its right poses must stay believed.
-WRONG_WEIGHT: dict[CameraOrigin, float] = {"map": 0.1, "user": 2.0, "estimate": 2.0}
+# How much a wrong pose counts beside a right one if the map was made with the camera: then only
+# wrong pixels can be the cause, and right poses must stay believed.
+WRONG_OF_MAP = 0.1
 BELIEVED = 0.9
 
 
@@ -206,7 +206,8 @@ def fit(found: list[ConfidenceSample]) -> None:
     features = np.array([f.evidence.place() for f in plain])
     place = fit_logistic(features, np.array([f.right for f in plain]), weights)
     confidences.PLACE_WEIGHTS = rounded(place)
-    for origin, wrong in WRONG_WEIGHT.items():
+    for origin in confidences.LENS_WEIGHTS:
+        wrong = WRONG_OF_MAP if origin == "map" else 1.0
         # The lens decides only where the place is right; a wrong camera that does no harm is
         # neither right nor wrong.
         chosen = [

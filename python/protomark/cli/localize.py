@@ -26,7 +26,9 @@ def localize(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", help="Folder for images.txt, cameras.txt (COLMAP) and poses.csv."
+            "--output",
+            "-o",
+            help="Folder for images.txt, cameras.txt (COLMAP), trajectory.txt (TUM) and poses.csv.",
         ),
     ] = Path("localized"),
     camera: Annotated[
@@ -119,7 +121,7 @@ def localize(
 
 def _show(batch: LocalizationBatch, output: Path) -> None:
     from protomark.cli.terminal import console, print_facts, printable
-    from protomark.localization.batch import CAMERAS, POSES, TABLE
+    from protomark.localization.batch import CAMERAS, POSES, TABLE, TRAJECTORY
 
     facts = batch.summary()
     rows = [
@@ -148,5 +150,5 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         console.print(line, markup=False, highlight=False)
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more, in {output / TABLE}", highlight=False)
-    files = f"{output / POSES}, {CAMERAS} and {TABLE}"
+    files = f"{output / POSES}, {CAMERAS}, {TRAJECTORY} and {TABLE}"
     console.print(files, markup=False, highlight=False, soft_wrap=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from protomark.geometry.camera import CAMERA_EXAMPLE, CAMERA_MODELS, Camera
+from protomark.geometry.pose_files import match_names
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,11 @@ class CameraSet:
     cameras: tuple[Camera, ...] = ()
     by_image: Mapping[str, Camera] = field(default_factory=dict)
 
+    def for_images(self, names: Iterable[str]) -> CameraSet:
+        """The cameras of these images, whose names `match_names` finds."""
+        matched = match_names(names, self.by_image)
+        return CameraSet(self.cameras, {name: self.by_image[key] for name, key in matched.items()})
+
     def of_size(self, width: int, height: int) -> list[Camera]:
         """The different cameras that images of this size may come from."""
         sized = {c.sized(width, height) for c in self.cameras}
@@ -32,9 +38,8 @@ class CameraSet:
         Raises:
             ValueError: no camera fits, or several do.
         """
-        for key in (name, Path(name).name):
-            if key in self.by_image:
-                return self.by_image[key]
+        if name in self.by_image:
+            return self.by_image[name]
         fitting = self.of_size(width, height)
         if len(fitting) == 1:
             return fitting[0]

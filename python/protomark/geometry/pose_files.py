@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ from protomark.geometry.pose import (
     rotation_from_quaternion,
 )
 
+# Fewer images with a pose than this share deserve a warning.
+_FEW = 0.5
 # An image has the pose whose time differs by less than this share of the median step between poses.
 _TIME_SHARE = 0.5
 
@@ -47,22 +51,62 @@ class PoseSet:
         """The image name or time of the first pose, for error messages."""
         return next(iter(self.by_name), None) or f"time {self.times[0]:g}"
 
+    def for_images(self, names: Sequence[str]) -> PoseSet:
+        """The poses of these images, and a warning if few of them have one.
+
+        Args:
+            names: names of all images; one in another folder has the pose of its base name if that
+                is unique among them and among the poses.
+        """
+        poses = PoseSet(
+            {name: self.by_name[key] for name, key in match_names(names, self.by_name).items()},
+            self.times,
+            self.poses,
+        )
+        found = sum(poses.find(name) is not None for name in names)
+        if 0 < found < _FEW * min(len(names), len(self)):
+            warnings.warn(
+                f"{found} of {len(names)} images have one of {len(self)} poses (such as that of "
+                f"{self.example}): are these the poses of these images?",
+                stacklevel=2,
+            )
+        return poses
+
     def find(self, name: str, time: float | None = None) -> NDArray[np.float64] | None:
         """The pose of an image, None if the set has none for it.
 
         Args:
-            name: the image's name, which is also looked up without its folders.
-            time: the image's time in seconds; None: that of a name like 1305031102.175304.png.
+            name: the image's name.
+            time: the image's time in seconds; None: that of a name like 1305031102.175304.png, or,
+                if all times of the poses are whole numbers, like 000012.png.
         """
-        path = Path(name)
         if not len(self.times):
-            return self.by_name.get(name, self.by_name.get(path.name))
+            return self.by_name.get(name)
+        stem = Path(name).stem
         try:
-            time = float(path.stem) if time is None else time
+            if time is None and "." not in stem and (self.times % 1).any():
+                return None
+            time = float(stem) if time is None else time
         except ValueError:
             return None
         nearest = int(np.argmin(np.abs(self.times - time)))
         return self.poses[nearest] if abs(self.times[nearest] - time) <= self._limit else None
+
+
+def match_names(images: Iterable[str], known: Iterable[str]) -> dict[str, str]:
+    """For each image its name in another list: the same, or one with the same unique base name."""
+    images, known = list(images), list(known)
+    ours, theirs = (Counter(Path(name).name for name in names) for names in (images, known))
+    full = {Path(name).name: name for name in known}
+    same = set(known)
+    out = {}
+    for name in images:
+        base = Path(name).name
+        if name in same:
+            out[name] = name
+        elif ours[base] == theirs[base] == 1:
+            out[name] = full[base]
+    return out
 
 
 def read_poses(path: Path) -> PoseSet:
@@ -186,6 +230,19 @@ def tum_trajectory(times: NDArray[np.float64], cam_from_world: NDArray[np.float6
     lines = ["# time tx ty tz qx qy qz qw (camera in world)"]
     for time, pose in zip(times, cam_from_world, strict=True):
         w, x, y, z = quaternion_from_rotation(pose[:, :3].T)
-        numbers = [f"{v + 0.0:.9g}" for v in (*camera_centers(pose), x, y, z, w)]
+        numbers = [f"{v + 0.0:.12g}" for v in (*camera_centers(pose), x, y, z, w)]
         lines.append(" ".join([f"{time:.6f}", *numbers]))
     return "\n".join(lines) + "\n"
+
+
+def image_times(names: Sequence[str]) -> list[float]:
+    """Seconds if all names are ascending numbers like 1305031102.175304.png, else indices."""
+    stems = [Path(name).stem for name in names]
+    try:
+        if all("." in stem for stem in stems):
+            times = [float(stem) for stem in stems]
+            if np.isfinite(times).all() and (np.diff(times) > 0).all():
+                return times
+    except ValueError:
+        pass
+    return [float(i) for i in range(len(names))]

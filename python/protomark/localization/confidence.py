@@ -25,11 +25,11 @@ CameraOrigin = Literal["map", "user", "estimate"]
 # Fitted by benchmarks/scripts/localization_confidence.py to the training and validation sequences,
 # with codes of 16 and 32 numbers: the constant, then the weights of `Evidence.place`; and, for each
 # origin, the weights of `Evidence.lens`.
-PLACE_WEIGHTS: tuple[float, ...] = (-14.94, 3.716, 4.628, 3.015)
+PLACE_WEIGHTS: tuple[float, ...] = (-21.38, 4.15, 11.97, 5.738)
 LENS_WEIGHTS: dict[CameraOrigin, tuple[float, ...]] = {
-    "map": (20.0, 0.0, 0.0, 0.0, 0.0),
-    "user": (20.0, 0.0, 0.0, 0.0, 0.0),
-    "estimate": (20.0, 0.0, 0.0, 0.0, 0.0),
+    "map": (2.777, -0.6036, 1.13, -23.42, -2.489),
+    "user": (3.14, -3.816, 2.177, -11.86, 0.3014),
+    "estimate": (-1.518, -1.413, 1.484, -1.539, -0.5986),
 }
 
 

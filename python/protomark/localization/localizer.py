@@ -120,7 +120,7 @@ class Localizer:
             camera = self.map_camera(width, height)
         elif isinstance(camera, str):
             name = str(image) if isinstance(image, (str, Path)) else ""
-            given = None if camera == ESTIMATE else read_cameras(camera)
+            given = None if camera == ESTIMATE else read_cameras(camera).for_images([name])
             camera = given.find(name, width, height) if given else None
         elif not isinstance(camera, Camera):
             camera = Camera.from_colmap(camera)

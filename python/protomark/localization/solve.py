@@ -117,6 +117,9 @@ def solve_pose(
         of_map: whether the map was made with this camera.
     """
     keypoints, positions = candidates.keypoints, candidates.positions
+    # Geographic coordinates are large; around their middle nothing is lost by rounding.
+    middle = np.nanmedian(positions.reshape(-1, 3), axis=0) if np.isfinite(positions).any() else 0.0
+    positions = positions - middle
     landmarks = np.where(np.isfinite(positions).all(axis=2), candidates.landmarks, -1)
     if len(keypoints) < MIN_MATCHES:
         return Localization(
@@ -154,9 +157,10 @@ def solve_pose(
             max_error,
         ),
     )
+    cam_from_world = np.column_stack([pose[:, :3], pose[:, 3] - pose[:, :3] @ middle])
     return Localization(
         found.camera,
-        pose,
+        cam_from_world,
         rows,
         keypoints[rows],
         landmarks[rows, columns],
