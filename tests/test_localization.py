@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
 import re
 import shutil
 from dataclasses import replace
@@ -25,6 +26,7 @@ from protomark.geometry.absolute_pose import pose_covariance, refine_pose
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose import camera_centers, pose_error
+from protomark.geometry.pose_files import read_poses
 from protomark.localization import Localization, Localizer, PosePrior
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
@@ -111,7 +113,7 @@ def test_every_kind_of_map(folder: Path, images: list[Any], kind: str, tmp_path:
 
 def test_the_camera_of_the_map(scene: pm.PrototypeMap, images: list[Any], tmp_path: Path) -> None:
     scene = scene.part(scene.ids)  # others share the fixture
-    other = replace(PINHOLE, width=640, height=480)
+    other = replace(PINHOLE, width=300, height=250)
     scene.metadata = {KEY: cameras_text([PINHOLE, other, PINHOLE])}
     sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=33, position_bits=16)
     for made in (scene, sealed):
@@ -127,7 +129,9 @@ def test_the_camera_of_the_map(scene: pm.PrototypeMap, images: list[Any], tmp_pa
             found.cam_from_world, localizer.localize(image).cam_from_world
         )
     # Two cameras of one size: nobody knows which.
-    scene.metadata = {KEY: cameras_text([PINHOLE, replace(PINHOLE, params=(9.0, 9.0, 5.0, 5.0))])}
+    scene.metadata = {
+        KEY: cameras_text([PINHOLE, replace(PINHOLE, params=(310.0, 310.0, 160.0, 120.0))])
+    }
     assert Localizer(scene).map_camera(PINHOLE.width, PINHOLE.height) is None
     scene.metadata = {KEY: "1 PINHOLE 640 480 nonsense"}
     with pytest.raises(ValueError, match="the map's metadata 'cameras' hold no COLMAP camera"):
@@ -206,7 +210,7 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     with pytest.raises(ValueError, match="320 x 240 pixels, but its camera 640 x 480"):
         localizer.localize(images[0], replace(PINHOLE, width=640, height=480))
     with pytest.raises(ValueError, match="undistort"):
-        localizer.localize(images[0], replace(PINHOLE, model="FOV"))
+        localizer.localize(images[0], replace(PINHOLE, model="FOV", params=(*PINHOLE.params, 1.0)))
     with pytest.raises(ValueError, match="PINHOLE has 4 parameters, not 3"):
         localizer.localize(images[0], replace(PINHOLE, params=(300.0, 160.0, 120.0)))
     with pytest.raises(ValueError, match="uint8"):
@@ -218,6 +222,65 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     other.set_positions([1], [[0, 0, 0]])
     with pytest.raises(ValueError, match="protomark calibrate"):
         Localizer(other)
+
+
+def test_wrong_cameras_are_not_believed(
+    folder: Path, scene: pm.PrototypeMap, images: list[Any]
+) -> None:
+    tracks = Tracks.load(sample.path())
+    sampled = Localizer(build_map(tracks, pm.Encoder.load("freak"), 32))
+    frames = [QueryFrame.of(tracks, keyframe) for keyframe in (2, 10, 20, 30)]
+
+    def believed(frame: QueryFrame, scale: float, share: float) -> bool:
+        params = np.array(frame.camera.params)
+        params[frame.camera.colmap.focal_length_idxs()] *= scale
+        params[frame.camera.colmap.principal_point_idxs()] += share * frame.camera.width
+        camera = replace(frame.camera, params=tuple(params.tolist()))
+        found = sampled.localize_features(frame.keypoints, frame.descriptors, camera)
+        return found.confidence >= 0.9
+
+    assert sum(believed(frame, 1.0, 0.0) for frame in frames) >= 3
+    for scale, share in ((0.5, 0), (0.8, 0), (1.25, 0), (2, 0), (1, 0.2), (1, -0.2)):
+        assert not any(believed(frame, scale, share) for frame in frames), (scale, share)
+    camera, keypoints = frames[0].camera, frames[0].keypoints
+    for wrong in (keypoints / (camera.width, camera.height), keypoints[:, ::-1]):
+        with pytest.raises(ValueError, match=r"normalised, or \(row, column\)"):
+            sampled.localize_features(wrong, frames[0].descriptors, camera)
+    for image in images:
+        mirrored = Localizer(scene).localize(np.ascontiguousarray(image[:, ::-1]), PINHOLE)
+        assert mirrored.confidence < 0.5
+
+
+def test_what_users_have_in_python(
+    scene: pm.PrototypeMap, images: list[Any], tmp_path: Path
+) -> None:
+    from PIL import Image
+
+    from protomark.geometry.colmap import pycolmap
+
+    localizer = Localizer(scene, max_keypoints=KEYPOINTS)
+    expected = localizer.localize(images[0], PINHOLE).cam_from_world
+    write_model(tmp_path / "model", PINHOLE, ["a.png"], NEW_POSES[:1])
+    Image.fromarray(images[0]).save(tmp_path / "a.png")
+    for image in (Image.fromarray(images[0]), images[0][:, :, None], tmp_path / "a.png"):
+        for camera in (
+            pycolmap.Camera(PINHOLE.as_dict()),
+            "PINHOLE:300,300,160,120",
+            str(tmp_path / "model"),
+        ):
+            found = localizer.localize(image, camera)
+            np.testing.assert_array_equal(found.cam_from_world, expected)
+    with pytest.raises(ValueError, match=r"the image is None, as cv2.imread"):
+        localizer.localize(None, PINHOLE)  # type: ignore[arg-type]
+    with pytest.raises(FileNotFoundError, match="no such image"):
+        localizer.localize("gone.jpg", PINHOLE)
+    with pytest.raises(TypeError, match=r"a pycolmap.Camera or a str, not int"):
+        localizer.localize(images[0], 7)
+    with pytest.raises(TypeError, match="give each process the map's path"):
+        pickle.dumps(localizer)
+    camera = replace(PINHOLE, params=(300.0, 300.0, 320.0, 240.0))
+    with pytest.raises(ValueError, match="principal point lies outside"):
+        localizer.localize(images[0], camera)
 
 
 def test_real_frames_of_the_sample() -> None:
@@ -236,6 +299,9 @@ def test_real_frames_of_the_sample() -> None:
 @pytest.fixture
 def query(folder: Path, scene: pm.PrototypeMap, images: list[Any], tmp_path: Path) -> Path:
     """A map, three images with true poses, a black image and a file that is no image."""
+    scene = scene.part(scene.ids)  # others share the fixture
+    # A plane does not tell one focal length from another, so that of the map is needed.
+    scene.metadata = {KEY: cameras_text([PINHOLE])}
     scene.save(tmp_path / "scene.pmk")
     (tmp_path / "images").mkdir()
     for i, image in enumerate(images):
@@ -271,7 +337,7 @@ def test_command(query: Path) -> None:
     assert "truncated" in rows["torn.png"]["reason"]
     assert "0 keypoints" in rows["black.png"]["reason"]
     assert "32 x 24 pixels" in rows["small.png"]["reason"]
-    position = [float(rows["2.png"][axis]) for axis in "xyz"]
+    position = [float(rows["2.png"][f"center_{axis}"]) for axis in "xyz"]
     assert position == pytest.approx(camera_centers(NEW_POSES[1]), abs=0.02)
 
     from protomark.geometry.colmap import pycolmap
@@ -280,10 +346,20 @@ def test_command(query: Path) -> None:
     assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
     for image in model.images.values():
         row = rows[image.name]
-        assert image.projection_center() == pytest.approx([float(row[a]) for a in "xyz"], abs=1e-6)
-        rotation = [float(row[f"r{i}{j}"]) for i in range(3) for j in range(3)]
+        assert image.projection_center() == pytest.approx(
+            [float(row[f"center_{a}"]) for a in "xyz"], abs=1e-6
+        )
+        rotation = [float(row[f"cam_from_world_{i}{j}"]) for i in range(3) for j in range(3)]
         turned = image.cam_from_world().rotation.matrix().ravel()
         assert turned == pytest.approx(rotation, abs=1e-6)
+
+    trajectory = read_poses(out / "trajectory.txt")
+    assert trajectory.times.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(
+        trajectory.poses[1],
+        model.find_image_with_name("2.png").cam_from_world().matrix(),
+        atol=1e-9,
+    )
 
     # What it wrote it may write again, but not over another's model.
     assert run(query / "scene.pmk", query / "images" / "1.png", "-o", out).exit_code == 0
@@ -312,8 +388,32 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
         assert facts["recall"][0]["recall"] == 1
 
 
+def test_geographic_coordinates(query: Path, scene: pm.PrototypeMap) -> None:
+    offset = np.array([371234.5, 5412345.25, 520.0])
+    moved = scene.part(scene.ids)
+    moved.set_positions(moved.ids, scene.positions(scene.ids) + offset)
+    moved.save(query / "utm.pmk")
+    for name in ("scene", "utm"):
+        done = run(
+            *(query / f"{name}.pmk", query / "images", "-o", query / name),
+            *("--camera", "estimate"),
+        )
+        assert done.exit_code == 0, done.output + str(done.exception)
+    here, there = (
+        [
+            [float(row[f"center_{axis}"]) for axis in "xyz"]
+            for row in csv.DictReader((query / name / "poses.csv").open())
+        ]
+        for name in ("scene", "utm")
+    )
+    np.testing.assert_allclose(np.subtract(there, offset), here, atol=1e-4)
+
+
 def test_without_a_camera(query: Path) -> None:
-    done = run(query / "scene.pmk", query / "images", "-o", query / "o", "--json", query / "f.json")
+    done = run(
+        *(query / "scene.pmk", query / "images", "--camera", "estimate", "--min-confidence", 0),
+        *("-o", query / "o", "--json", query / "f.json"),
+    )
     assert done.exit_code == 0, done.output + str(done.exception)
     facts = json.loads((query / "f.json").read_text())
     assert facts["localized"] == 3

@@ -5,13 +5,17 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from protomark.features.descriptors import DESCRIPTORS
 from protomark.features.extractor import Extractor
+from protomark.geometry.colmap import ColmapModel
+from protomark.geometry.pose import camera_centers
 from protomark.tracks.extract import (
     SequenceFolder,
     TracksOptions,
@@ -111,15 +115,20 @@ def test_keyframes_are_in_order_of_capture(tmp_path: Path) -> None:
     assert tracks.keyframe_names == [f"img{i}.png" for i in range(1, 12)]
 
 
+def moved_sequence(folder: Path, sequence: Path, cam_from_world: NDArray[np.float64]) -> Path:
+    shutil.copytree(sequence / "images", folder / "images")
+    names = [f"img{i}.png" for i in range(1, 9)]
+    write_model(folder / "sparse", PINHOLE, names, cam_from_world)
+    return folder
+
+
 def test_rough_poses_are_noticed_and_refined(sequence: Path, tmp_path: Path) -> None:
-    shutil.copytree(sequence / "images", tmp_path / "images")
     rng = np.random.default_rng(0)
     rough = poses(8)
     for pose in rough:
         turn = cv2.Rodrigues(rng.normal(0, 0.008, 3))[0]
         pose[:] = turn @ pose
-    write_model(tmp_path / "sparse", PINHOLE, [f"img{i}.png" for i in range(1, 9)], rough)
-    source = find_sequence(tmp_path)
+    source = find_sequence(moved_sequence(tmp_path, sequence, rough))
     kept = extract(source, TracksOptions("orb", max_keypoints=500, refine_poses="no"))
     refined = extract(source, TracksOptions("orb", max_keypoints=500))
     assert not kept.info["poses_refined"]
@@ -133,6 +142,57 @@ def test_rough_poses_are_noticed_and_refined(sequence: Path, tmp_path: Path) -> 
     assert np.linalg.norm(np.subtract(centers, true), axis=1).max() < 0.08
     points = refined.landmark_positions - refined.landmark_positions.mean(0)
     assert np.linalg.svd(points)[1][2] / np.sqrt(len(points)) < 0.03
+
+
+@pytest.mark.parametrize("kind", ["camera-to-world", "axes", "names"])
+def test_poses_of_something_else_are_refused(kind: str, sequence: Path, tmp_path: Path) -> None:
+    wrong = poses(8)
+    if kind == "camera-to-world":
+        turned = wrong[:, :, :3].transpose(0, 2, 1)
+        wrong = np.concatenate([turned, camera_centers(wrong)[:, :, None]], axis=2)
+    elif kind == "axes":
+        wrong = np.diag([1.0, -1.0, -1.0]) @ wrong
+    else:
+        wrong = wrong[np.random.default_rng(0).permutation(8)]
+    source = find_sequence(moved_sequence(tmp_path, sequence, wrong))
+    for refine in ("auto", "no"):
+        with pytest.raises(ValueError, match="these poses do not fit these images"):
+            extract(source, TracksOptions("orb", max_keypoints=500, refine_poses=refine))
+
+
+def test_refined_poses_are_dropped_unless_clearly_more_fits(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rough = poses(8)
+    rough[4] = np.column_stack([rough[4][:, :3], rough[4][:, 3] + 0.02])
+    source = find_sequence(moved_sequence(tmp_path, sequence, rough))
+    monkeypatch.setattr("protomark.tracks.extract._ROUGH_POSES", 0.0)
+
+    def worse(given: ColmapModel, *_: Any) -> ColmapModel:
+        shifted = given.cam_from_world.copy()
+        shifted[1::2, 0, 3] += 0.1
+        return replace(given, cam_from_world=shifted)
+
+    monkeypatch.setattr("protomark.tracks.triangulation.refine_poses", worse)
+    tracks = extract(source, TracksOptions("orb", max_keypoints=500))
+    assert not tracks.info["poses_refined"]
+    np.testing.assert_allclose(tracks.cam_from_world, rough, atol=1e-12)
+
+
+def test_what_never_moves_is_left_out(sequence: Path, orb: Tracks, tmp_path: Path) -> None:
+    still = cv2.resize(texture(300, seed=11), (320, 60))
+    shutil.copytree(sequence, tmp_path / "hood")
+    for path in (tmp_path / "hood" / "images").iterdir():
+        image = cv2.imread(str(path))
+        image[180:] = still[:, :, None]
+        cv2.imwrite(str(path), image)
+    tracks = extract(find_sequence(tmp_path / "hood"), TracksOptions("orb", max_keypoints=500))
+    left, top, right, bottom = tracks.info["static_region"]
+    assert (left < 60, 160 < top < 200, right > 260, bottom > 200) == (True,) * 4
+    assert not orb.info["static_region"]
+    assert not tracks.info["poses_refined"]
+    observed = tracks.keypoints[tracks.observations]
+    assert (observed[:, 1] > 195).mean() < 0.02
 
 
 def test_exact_poses_are_kept(orb: Tracks) -> None:

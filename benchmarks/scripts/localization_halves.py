@@ -159,7 +159,7 @@ def localize_halves(
         probabilities = calibration.probability(distances)
         candidates = Candidates(frame.keypoints, ids, positions, probabilities)
         begin = time.perf_counter()
-        result = solve_pose(candidates, frame.camera, MIN_PROBABILITY, "known")
+        result = solve_pose(candidates, frame.camera, MIN_PROBABILITY, "known", of_map=True)
         pose_seconds.append(time.perf_counter() - begin)
         found.append(result)
         errors.append(

@@ -105,7 +105,7 @@ def measure(
                 values, least = score(distances.astype(np.float64))
                 matches = accept(ids[:, 0], values, least)
                 candidates = Candidates(frame.keypoints, ids, positions, values)
-                found = solve_pose(candidates, frame.camera, least, "known")
+                found = solve_pose(candidates, frame.camera, least, "known", of_map=True)
                 good = False
                 if found.cam_from_world is not None:
                     off, angle = pose_error(found.cam_from_world, frame.cam_from_world)

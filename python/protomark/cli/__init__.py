@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -79,6 +80,7 @@ def main() -> None:
     130.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    warnings.showwarning = _warn
     from protomark.interrupt import Interrupted
 
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -99,6 +101,12 @@ def main() -> None:
     except (ValueError, OSError, KeyError, ModuleNotFoundError) as error:
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         _fail(str(text), 1)
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    from protomark.cli.terminal import note
+
+    note(f"warning: {message}")
 
 
 def _fail(text: str, code: int) -> None:

@@ -24,7 +24,9 @@ def localize(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", help="Folder for images.txt, cameras.txt (COLMAP) and poses.csv."
+            "--output",
+            "-o",
+            help="Folder for images.txt, cameras.txt (COLMAP), trajectory.txt (TUM) and poses.csv.",
         ),
     ] = Path("localized"),
     camera: Annotated[
@@ -116,7 +118,7 @@ def localize(
 
 def _show(batch: LocalizationBatch, output: Path) -> None:
     from protomark.cli.terminal import console, print_facts, printable
-    from protomark.localization.batch import CAMERAS, POSES, TABLE
+    from protomark.localization.batch import CAMERAS, POSES, TABLE, TRAJECTORY
 
     facts = batch.summary()
     rows = [
@@ -144,5 +146,5 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         failed[5:] = [f"... and {len(failed) - 5} more, in {output / TABLE}"]
     for line in failed:
         console.print(printable(line), markup=False, highlight=False)
-    files = f"{output / POSES}, {CAMERAS} and {TABLE}"
+    files = f"{output / POSES}, {CAMERAS}, {TRAJECTORY} and {TABLE}"
     console.print(files, markup=False, highlight=False, soft_wrap=True)

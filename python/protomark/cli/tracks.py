@@ -138,6 +138,10 @@ def tracks(
     write_json(json_file, facts)
 
 
+# Poses that move by more than this share of the extent deserve a warning.
+_FAR = 0.02
+
+
 def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
     from protomark.cli.terminal import note, print_facts
     from protomark.report import first_of, track_rows
@@ -152,11 +156,22 @@ def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
     if copies := facts.get("augmentations"):
         rows.append(("augmentations", f"{copies} copies of each keyframe"))
     if "epipolar_error" in info:
-        error, refined = info["epipolar_error"], facts["poses_refined"]
-        what = "refined by bundle adjustment" if refined else "kept as they are"
-        rows.append(("given poses", f"epipolar error {error:.2f} pixels, {what}"))
-        if error > 1 and not refined:
-            note("these poses are only roughly right: --refine-poses auto refines them")
+        fate = "kept as they are"
+        if facts["poses_refined"]:
+            share = info["pose_shift_max"] / info["extent"] if info["extent"] else 0.0
+            fate = (
+                f"refined by bundle adjustment, moved by {info['pose_shift_median']:.3g} (median), "
+                f"{info['pose_shift_max']:.3g} (at most, {share:.1%} of the extent)"
+            )
+            if share > _FAR:
+                note("warning: poses moved far; --refine-poses no keeps them as they are")
+        rows.append(("given poses", f"epipolar error {info['epipolar_error']:.2f} pixels, {fate}"))
+    if info.get("static_region"):
+        box = ", ".join(map(str, info["static_region"]))
+        note(
+            f"left out: what never moves while the rest does, within left, top, right, bottom = "
+            f"{box} pixels (an overlay, the camera's own vehicle?)"
+        )
     if without := info.get("images_without_pose"):
         rows.append(("left out without a pose", first_of(without)))
     if unreadable := info.get("images_unreadable"):

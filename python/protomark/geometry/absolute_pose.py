@@ -36,6 +36,8 @@ POSE_MODELS = (
 _LOSS_SHARE = 0.5
 _MAX_LOSS = 20.0
 _REFINE_STEPS = 30
+# Matches that determine the nine numbers of a pose with a free lens.
+_MIN_FREE = 6
 # Normal equations of a larger condition do not determine a pose.
 _MAX_CONDITION = 1e12
 
@@ -172,42 +174,133 @@ def refine_pose(
     pose = cam_from_world
     if len(pixels) >= 4:
         scale = (_LOSS_SHARE * max_error / camera.focal_length) ** 2
-        pose = _minimise(pose, positions, camera.rays(pixels), weights, scale)
+        pose, _ = _minimise(pose, positions, camera.rays(pixels), weights, scale)
     error = np.sqrt(weights) * reprojection_error(pose, pixels, positions, camera)
     return pose, error <= max_error
 
 
-def _minimise(pose: Array, positions: Array, rays: Array, weights: Array, scale: float) -> Array:
-    def evaluate(pose: Array) -> tuple[Array, Array, float]:
-        poses = np.broadcast_to(pose, (len(positions), 3, 4))
-        residual, depth = reprojection_residuals(positions, poses, rays)
+@dataclass(frozen=True)
+class FreeLens:
+    """What changes if focal length and principal point may move together with the pose.
+
+    Attributes:
+        cam_from_world: (3, 4) float64, the pose that fits best.
+        gain: by how much the mean loss falls, log(1 + (error / s)^2) with half the largest error s.
+        spread: standard deviation of the camera centre in world units, infinite if it is open.
+    """
+
+    cam_from_world: Array
+    gain: float
+    spread: float
+
+
+def free_lens(
+    cam_from_world: Array, pixels: Array, positions: Array, camera: Camera, max_error: float
+) -> FreeLens:
+    """Refine a pose with focal length and principal point free.
+
+    Args:
+        cam_from_world: (3, 4) float64, the pose to start from.
+        pixels: (n, 2) float64, keypoints.
+        positions: (n, 3) float64, their landmarks in world coordinates.
+        camera: the camera to start from.
+        max_error: largest reprojection error of an inlier, pixels.
+    """
+    rays = camera.rays(pixels)
+    seen = np.isfinite(rays).all(1) & (transform(cam_from_world, positions)[:, 2] > 0)
+    if seen.sum() < _MIN_FREE:
+        return FreeLens(cam_from_world, 0.0, np.inf)
+    rays, positions = rays[seen], positions[seen]
+    scale = (_LOSS_SHARE * max_error / camera.focal_length) ** 2
+    weights, fixed = np.ones(len(rays)), np.array([1.0, 0.0, 0.0])
+
+    def square(pose: Array, lens: Array) -> Array:
+        x, y, z = transform(pose, positions).T
+        z = np.where(z > 0, z, np.nan)
+        error = lens[0] * np.stack([x / z, y / z], 1) + lens[1:] - rays
+        return np.nan_to_num((error**2).sum(1), nan=np.inf)
+
+    pose, lens = _minimise(cam_from_world, positions, rays, weights, scale, fixed)
+    before, after = square(cam_from_world, fixed), square(pose, lens)
+    losses = [np.minimum(np.log1p(s / scale), _MAX_LOSS).mean() for s in (before, after)]
+    inlier = after <= scale / _LOSS_SHARE**2
+    count, spread = int(inlier.sum()), np.inf
+    if count >= _MIN_FREE:
+        x, y, z = transform(pose, positions[inlier]).T
+        projected = np.stack([x / z, y / z], 1)
+        jacobian = np.concatenate(
+            [
+                lens[0] * _jacobian(pose, positions[inlier], np.ones(count, bool)),
+                _lens_jacobian(projected),
+            ],
+            axis=2,
+        ).reshape(2 * count, -1)
+        unit = np.linalg.norm(jacobian, axis=0)
+        normal = (jacobian / unit).T @ (jacobian / unit)
+        if np.linalg.cond(normal) < _MAX_CONDITION:
+            variance = after[inlier].sum() / (2 * count - len(unit))
+            diagonal = np.diag(np.linalg.inv(normal)) / unit**2
+            spread = float(np.sqrt(variance * diagonal[3:6].sum()))
+    return FreeLens(pose, float(losses[0] - losses[1]), spread)
+
+
+def _minimise(
+    pose: Array,
+    positions: Array,
+    rays: Array,
+    weights: Array,
+    scale: float,
+    lens: Array | None = None,
+) -> tuple[Array, Array]:
+    """Returns pose and lens: by how much rays are stretched, and shifted along x and y.
+
+    The lens moves only if it is given.
+    """
+    free = lens is not None
+
+    def evaluate(pose: Array, lens: Array) -> tuple[Array, Array, float]:
+        x, y, depth = transform(pose, positions).T
+        safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+        residual = lens[0] * np.stack([x / safe, y / safe], 1) + lens[1:] - rays
         square = np.where(depth > 0, (residual**2).sum(1), np.inf)
         loss = np.minimum(np.log1p(weights * square / scale), _MAX_LOSS)
         return residual, square, float(loss.sum())
 
     cv2 = optional("cv2")
     pose, damping = np.ascontiguousarray(pose), 1e-4
-    residual, square, cost = evaluate(pose)
+    lens = np.array([1.0, 0.0, 0.0]) if lens is None else lens
+    residual, square, cost = evaluate(pose, lens)
     for _ in range(_REFINE_STEPS):
         in_front = square < np.inf
-        jacobian = _jacobian(pose, positions, in_front)
+        jacobian = lens[0] * _jacobian(pose, positions, in_front)
+        if free:
+            projected = (residual + rays - lens[1:]) / lens[0]
+            jacobian = np.concatenate([jacobian, _lens_jacobian(projected)], axis=2)
         finite = np.where(in_front, square, 0.0)
         robust = np.where(in_front, weights / (scale + weights * finite), 0.0)
         gradient = np.einsum("n,nij,ni->j", robust, jacobian, residual)
         normal = np.einsum("n,nij,nik->jk", robust, jacobian, jacobian)
-        damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
+        damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(normal))
         step = -np.linalg.solve(damped, gradient)
         moved = cv2.Rodrigues(step[:3])[0] @ pose
-        moved[:, 3] += step[3:]
-        after = evaluate(moved)
-        if not after[2] <= cost:
+        moved[:, 3] += step[3:6]
+        stretched = lens + step[6:] if free else lens
+        after = evaluate(moved, stretched)
+        if not after[2] <= cost or stretched[0] <= 0:
             damping = min(10 * damping, 1e6)
             continue
         converged = cost - after[2] <= 1e-9 * cost
-        pose, (residual, square, cost), damping = moved, after, 0.1 * damping
+        pose, lens, (residual, square, cost) = moved, stretched, after
+        damping = max(0.1 * damping, 1e-9)
         if converged:
             break
-    return pose
+    return pose, lens
+
+
+def _lens_jacobian(projected: Array) -> Array:
+    """Derivatives (n, 2, 3) of rays by their stretch and shift."""
+    shift = np.broadcast_to(np.eye(2), (len(projected), 2, 2))
+    return np.concatenate([projected[:, :, None], shift], axis=2)
 
 
 def _jacobian(pose: Array, positions: Array, in_front: NDArray[np.bool_]) -> Array:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
 from typing import Any
@@ -34,6 +35,13 @@ CAMERA_MODELS = {
 }
 # COLMAP's guess of an unknown focal length, as a share of the image's longer side.
 DEFAULT_FOCAL_RATIO = 1.2
+# Models whose field of view may reach behind the camera, where rays are no x / z.
+_WIDE_MODELS = ("FISHEYE", "FOV", "EUCM", "DIVISION", "EQUIRECTANGULAR")
+_MIN_VIEW, _MAX_VIEW = 1.0, 170.0  # degrees
+# Lenses do not bend rays to less than this share of their distance from the axis.
+_MIN_BENDING = 0.5
+# Calibrations put the principal point at most this share of the image from its middle.
+_MAX_OFFSET = 0.2
 CAMERA_EXAMPLE = "PINHOLE:525,525,320,240 or 'PINHOLE 640 480 525 525 320 240'"
 
 
@@ -64,7 +72,7 @@ class Camera:
         has_size = ":" not in text
         words = text.replace(":", " ").replace(",", " ").split()
         try:
-            size = (int(words[1]), int(words[2])) if has_size else (0, 0)
+            size = (_pixels(words[1]), _pixels(words[2])) if has_size else (0, 0)
             params = tuple(map(float, words[3 if has_size else 1 :]))
             name = words[0].upper()
         except IndexError:
@@ -82,6 +90,8 @@ class Camera:
         camera.check_params()
         if camera.params[0] <= 0:
             raise ValueError(f"camera {text!r} has a focal length that is not positive")
+        if has_size:
+            camera.check_lens()
         return camera
 
     @classmethod
@@ -89,6 +99,21 @@ class Camera:
         """A pinhole camera for an image of this size, with the focal length that COLMAP guesses."""
         focal = DEFAULT_FOCAL_RATIO * max(width, height)
         return cls("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
+    @classmethod
+    def from_colmap(cls, camera: Any) -> Camera:
+        """The camera of a `pycolmap.Camera`.
+
+        Raises:
+            TypeError: it is something else.
+        """
+        try:
+            params = tuple(float(p) for p in camera.params)
+            return cls(camera.model.name, camera.width, camera.height, params)
+        except AttributeError:
+            raise TypeError(
+                f"a camera is a pm.Camera, a pycolmap.Camera or a str, not {type(camera).__name__}"
+            ) from None
 
     def as_dict(self) -> dict[str, Any]:
         """The camera as JSON values, in the form that PoseLib and pycolmap take."""
@@ -126,6 +151,34 @@ class Camera:
         if not all(isinstance(p, Real) and math.isfinite(p) for p in self.params):
             raise ValueError(f"the parameters {self.params} are not all finite numbers")
 
+    def sized(self, width: int, height: int) -> Camera:
+        """The camera for images of this size, if it fits any size; else itself.
+
+        Raises:
+            ValueError: see `check_lens`.
+        """
+        camera = self if self.width else replace(self, width=width, height=height)
+        camera.check_lens()
+        return camera
+
+    def resembles(self, other: Camera) -> bool:
+        """Whether both project alike: same size, and rays within 1 % of the image."""
+        if (self.width, self.height) != (other.width, other.height):
+            return False
+        corners = np.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]]) * (self.width, self.height)
+        difference = (self.rays(corners) - other.rays(corners)) * other.focal_length
+        return bool(np.abs(difference).max() <= 0.01 * max(self.width, self.height))
+
+    def check_lens(self) -> None:
+        """Warn if the camera is unlikely to be the image's, for example of another resolution.
+
+        Raises:
+            ValueError: no lens is like that: its principal point lies outside the image, its field
+                of view is below 1 or above 170 degrees (wide-angle models may see more), or its
+                distortion cannot be undone all over the image.
+        """
+        _check_lens(self)
+
     @property
     def colmap(self) -> Any:
         """The camera as a `pycolmap.Camera`.
@@ -154,6 +207,58 @@ class Camera:
         if front.any():
             out[front] = np.asarray(self.colmap.img_from_cam(np.asarray(points[front], np.float64)))
         return out
+
+
+def _pixels(word: str) -> int:
+    number = float(word)
+    if not number.is_integer():
+        raise ValueError
+    return int(number)
+
+
+@lru_cache(maxsize=256)
+def _check_lens(camera: Camera) -> None:
+    size = np.array([camera.width, camera.height])
+    middle = np.array(camera.colmap.params)[camera.colmap.principal_point_idxs()]
+    if not len(middle):  # equirectangular
+        return
+    if not ((middle > 0) & (middle < size)).all():
+        raise ValueError(
+            f"camera {camera}: its principal point lies outside the image: was it calibrated at "
+            "another resolution?"
+        )
+    if any(word in camera.model for word in _WIDE_MODELS):
+        view = math.degrees(size.max() / camera.focal_length)
+    else:
+        view = _perspective_view(camera, middle)
+    if not view >= _MIN_VIEW:
+        raise ValueError(f"camera {camera}: its field of view is {view:.2g} degrees, below 1")
+    if (abs(middle - size / 2) > _MAX_OFFSET * size).any():
+        at = "{:.0f} x {:.0f}".format(*(2 * middle))
+        warnings.warn(
+            f"camera {camera}: its principal point is far from the middle of the image: was it "
+            f"calibrated at {at} pixels?",
+            stacklevel=4,
+        )
+
+
+def _perspective_view(camera: Camera, middle: NDArray[np.float64]) -> float:
+    """Field of view along the longer side, degrees; raises ValueError if distortion is absurd."""
+    share = np.linspace(0, 1, 9)
+    grid = np.stack(np.meshgrid(share * camera.width, share * camera.height), -1).reshape(-1, 2)
+    rays, straight = camera.rays(grid), (grid - middle) / camera.focal_length
+    reach = np.linalg.norm(straight, axis=1)
+    bending = np.linalg.norm(rays, axis=1)[reach > 0] / reach[reach > 0]
+    if not (bending > _MIN_BENDING).mean() > 0.9:  # false for NaN
+        raise ValueError(f"camera {camera}: no lens distorts like that, check its coefficients")
+    angles = np.degrees(np.arctan(rays))
+    view = float(np.nanmax(np.nanmax(angles, axis=0) - np.nanmin(angles, axis=0)))
+    if view > _MAX_VIEW:
+        raise ValueError(
+            f"camera {camera}: its field of view is {view:.1f} degrees, above {_MAX_VIEW:g}, as "
+            "only wide-angle models have it (OPENCV_FISHEYE)"
+        )
+    return view
 
 
 @lru_cache(maxsize=256)

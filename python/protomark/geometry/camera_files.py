@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from protomark.geometry.camera import CAMERA_EXAMPLE, CAMERA_MODELS, Camera
+from protomark.geometry.pose_files import match_names
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,14 @@ class CameraSet:
     cameras: tuple[Camera, ...] = ()
     by_image: Mapping[str, Camera] = field(default_factory=dict)
 
+    def for_images(self, names: Iterable[str]) -> CameraSet:
+        """The cameras of these images, whose names `match_names` finds."""
+        matched = match_names(names, self.by_image)
+        return CameraSet(self.cameras, {name: self.by_image[key] for name, key in matched.items()})
+
     def of_size(self, width: int, height: int) -> list[Camera]:
         """The different cameras that images of this size may come from."""
-        sized = {c if c.width else replace(c, width=width, height=height) for c in self.cameras}
+        sized = {c.sized(width, height) for c in self.cameras}
         return [c for c in sized if (c.width, c.height) == (width, height)]
 
     def find(self, name: str, width: int, height: int) -> Camera:
@@ -32,10 +38,8 @@ class CameraSet:
         Raises:
             ValueError: no camera fits, or several do.
         """
-        for key in (name, Path(name).name):
-            if key in self.by_image:
-                return self.by_image[key]
-        sized = {c if c.width else replace(c, width=width, height=height) for c in self.cameras}
+        if name in self.by_image:
+            return self.by_image[name]
         fitting = self.of_size(width, height)
         if len(fitting) == 1:
             return fitting[0]
@@ -44,7 +48,7 @@ class CameraSet:
                 f"{len(fitting)} cameras have {width} x {height} pixels, and none names this "
                 "image: give a COLMAP model with images, or one camera"
             )
-        sizes = ", ".join(sorted({f"{c.width} x {c.height}" for c in sized}))
+        sizes = ", ".join(sorted({f"{c.width} x {c.height}" for c in self.cameras}))
         raise ValueError(
             f"the image has {width} x {height} pixels, and no camera does ({sizes}): scale the "
             "image or a camera"
@@ -75,25 +79,25 @@ def read_cameras(source: str) -> CameraSet:
 
 
 def _read_text(path: Path) -> CameraSet:
-    cameras = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+    cameras: dict[int, Camera] = {}
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].split(maxsplit=1)
+        if not words:
             continue
         try:
-            params = tuple(float(word) for word in words[4:])
-            camera = Camera(words[1], int(words[2]), int(words[3]), params)
-            if not camera.focal_length > 0:
-                raise ValueError
-        except (ValueError, IndexError, OverflowError, TypeError):
+            camera_id, camera = int(words[0]), Camera.parse(words[1])
+        except (ValueError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"{path}, line {number}: write a COLMAP camera as id, model, width, height, "
-                "parameters"
+                f"parameters ({error})"
             ) from None
-        cameras.append(camera)
+        if camera_id in cameras:
+            raise ValueError(f"{path}, line {number}: a second camera {camera_id}")
+        cameras[camera_id] = camera
     if not cameras:
         raise ValueError(f"{path} holds no cameras")
-    return CameraSet(tuple(cameras))
+    return CameraSet(tuple(cameras.values()))
 
 
 def _read_model(folder: Path) -> CameraSet:
@@ -119,5 +123,4 @@ def camera_from_exif(image: Path) -> Camera | None:
             return None
     if not camera.has_prior_focal_length:
         return None
-    params = tuple(float(p) for p in camera.params)
-    return Camera(camera.model.name, camera.width, camera.height, params)
+    return Camera.from_colmap(camera)

@@ -16,6 +16,8 @@ import re
 import signal
 import tempfile
 import threading
+import warnings
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +30,7 @@ from protomark.extras import optional
 from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
+from protomark.geometry.pose_files import check_images_txt
 
 # pycolmap takes SIGTERM for itself, to print a stack trace.
 _on_sigterm = signal.getsignal(signal.SIGTERM)
@@ -107,11 +110,17 @@ def find_model(folder: Path) -> Path:
     """
     for candidate in (folder / "sparse", folder / "sparse" / "0", folder):
         if _suffix(candidate):
-            return candidate
-    raise FileNotFoundError(
-        f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or sparse/0/: "
-        "name its folder with --model"
-    )
+            break
+    else:
+        raise FileNotFoundError(
+            f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or "
+            "sparse/0/: name its folder with --model"
+        )
+    others = [p for p in sorted((folder / "sparse").glob("*")) if p != candidate and _suffix(p)]
+    if others:
+        names = ", ".join(str(p) for p in others[:5])
+        warnings.warn(f"{candidate} is read, other models exist: {names}", stacklevel=2)
+    return candidate
 
 
 def _suffix(path: Path) -> str | None:
@@ -139,13 +148,20 @@ def read_reconstruction(path: Path) -> Any:
     for name in _FILES:
         if (path / f"{name}{suffix}").stat().st_size == 0:
             raise ValueError(f"{path / (name + suffix)}: empty file, export the COLMAP model anew")
+    if suffix == ".txt":
+        check_images_txt(path / "images.txt")
+    elif all((path / f"{name}.txt").is_file() for name in _FILES):
+        warnings.warn(f"{path}: the binary model is read, not the text beside it", stacklevel=2)
     with quiet(), tempfile.TemporaryDirectory(prefix="protomark-") as temporary:
-        source = path
-        if not (path / f"points3D{suffix}").is_file():
-            source = Path(temporary)
-            for file in path.iterdir():
-                if file.is_file() and file.suffix == suffix:
-                    os.symlink(file.resolve(), source / file.name)
+        source = Path(temporary)
+        for file in path.iterdir():
+            if not file.is_file() or file.suffix != suffix:
+                continue
+            if suffix == ".txt" and _has_bom(file):
+                (source / file.name).write_bytes(file.read_bytes()[len(BOM_UTF8) :])
+            else:
+                os.symlink(file.resolve(), source / file.name)
+        if not (source / f"points3D{suffix}").exists():
             (source / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             return pycolmap.Reconstruction(str(source))
@@ -154,6 +170,11 @@ def read_reconstruction(path: Path) -> Any:
             raise ValueError(
                 f"{path}: broken COLMAP model ({reason}), export it anew from COLMAP"
             ) from None
+
+
+def _has_bom(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(BOM_UTF8)) == BOM_UTF8
 
 
 def read_observations(
@@ -222,6 +243,8 @@ def bundle_adjust(
     loss_scale: float = 1.0,
     intrinsics: bool = False,
     threads: int = 1,
+    priors: NDArray[np.float64] | None = None,
+    spread: float = 1.0,
 ) -> bool:
     """Move poses and points to the least (Cauchy) reprojection error; returns whether that worked.
 
@@ -233,6 +256,8 @@ def bundle_adjust(
         loss_scale: pixels beyond which an error counts less.
         intrinsics: whether focal length and distortion move, too.
         threads: threads of the solver; their number changes the last digits.
+        priors: (m, 3) camera centres that images 1 to m are likely to have.
+        spread: standard deviation of the priors along each axis.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = intrinsics
@@ -251,9 +276,28 @@ def bundle_adjust(
     if len(fixed) < 2:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    if priors is None:
+        adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    else:
+        known = [_prior(reconstruction.images[i], p, spread) for i, p in enumerate(priors, 1)]
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+            options,
+            pycolmap.PosePriorBundleAdjustmentOptions(),
+            config,
+            known,
+            reconstruction,
+        )
     with quiet():
         return bool(adjuster.solve().is_solution_usable())
+
+
+def _prior(image: Any, position: NDArray[np.float64], spread: float) -> Any:
+    return pycolmap.PosePrior(
+        corr_data_id=image.data_id,
+        position=position,
+        position_covariance=spread**2 * np.eye(3),
+        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+    )
 
 
 def read_model(folder: Path) -> ColmapModel:
@@ -274,9 +318,13 @@ def model_from_reconstruction(reconstruction: Any, path: Path) -> ColmapModel:
     """
     cameras = {}
     for camera_id, c in reconstruction.cameras.items():
-        camera = Camera(c.model.name, c.width, c.height, tuple(float(p) for p in c.params))
+        camera = Camera.from_colmap(c)
         if not np.isfinite(camera.params).all() or c.mean_focal_length() <= 0:
             raise ValueError(f"{path}: camera {camera_id} has no valid focal length")
+        try:
+            camera.check_lens()
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
         cameras[int(camera_id)] = camera
     images = sorted(reconstruction.images.values(), key=lambda image: natural_key(image.name))
     posed = [image for image in images if image.has_pose]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ from protomark.geometry.pose import (
     rotation_from_quaternion,
 )
 
+# Fewer images with a pose than this share deserve a warning.
+_FEW = 0.5
 # An image has the pose whose time differs by less than this share of the median step between poses.
 _TIME_SHARE = 0.5
 
@@ -47,22 +51,62 @@ class PoseSet:
         """The image name or time of the first pose, for error messages."""
         return next(iter(self.by_name), None) or f"time {self.times[0]:g}"
 
+    def for_images(self, names: Sequence[str]) -> PoseSet:
+        """The poses of these images, and a warning if few of them have one.
+
+        Args:
+            names: names of all images; one in another folder has the pose of its base name if that
+                is unique among them and among the poses.
+        """
+        poses = PoseSet(
+            {name: self.by_name[key] for name, key in match_names(names, self.by_name).items()},
+            self.times,
+            self.poses,
+        )
+        found = sum(poses.find(name) is not None for name in names)
+        if 0 < found < _FEW * min(len(names), len(self)):
+            warnings.warn(
+                f"{found} of {len(names)} images have one of {len(self)} poses (such as that of "
+                f"{self.example}): are these the poses of these images?",
+                stacklevel=2,
+            )
+        return poses
+
     def find(self, name: str, time: float | None = None) -> NDArray[np.float64] | None:
         """The pose of an image, None if the set has none for it.
 
         Args:
-            name: the image's name, which is also looked up without its folders.
-            time: the image's time in seconds; None: that of a name like 1305031102.175304.png.
+            name: the image's name.
+            time: the image's time in seconds; None: that of a name like 1305031102.175304.png, or,
+                if all times of the poses are whole numbers, like 000012.png.
         """
-        path = Path(name)
         if not len(self.times):
-            return self.by_name.get(name, self.by_name.get(path.name))
+            return self.by_name.get(name)
+        stem = Path(name).stem
         try:
-            time = float(path.stem) if time is None else time
+            if time is None and "." not in stem and (self.times % 1).any():
+                return None
+            time = float(stem) if time is None else time
         except ValueError:
             return None
         nearest = int(np.argmin(np.abs(self.times - time)))
         return self.poses[nearest] if abs(self.times[nearest] - time) <= self._limit else None
+
+
+def match_names(images: Iterable[str], known: Iterable[str]) -> dict[str, str]:
+    """For each image its name in another list: the same, or one with the same unique base name."""
+    images, known = list(images), list(known)
+    ours, theirs = (Counter(Path(name).name for name in names) for names in (images, known))
+    full = {Path(name).name: name for name in known}
+    same = set(known)
+    out = {}
+    for name in images:
+        base = Path(name).name
+        if name in same:
+            out[name] = name
+        elif ours[base] == theirs[base] == 1:
+            out[name] = full[base]
+    return out
 
 
 def read_poses(path: Path) -> PoseSet:
@@ -81,18 +125,23 @@ def read_poses(path: Path) -> PoseSet:
         return PoseSet(dict(zip(model.names, model.cam_from_world, strict=True)))
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder of poses")
+    rows = _rows(path)
+    filled = [row for row in rows if row[1]]
+    if filled and all(len(words) == 8 for _, words in filled):
+        return _read_tum(path, filled)
+    return _read_images_txt(path, rows)
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Numbers and words of the lines that are no comment."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ValueError(
             f"{path} is not a text file: give a COLMAP images.txt, a folder with a model, or a TUM "
             "trajectory"
         ) from None
-    rows = [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
-    filled = [row for row in rows if row[1]]
-    if filled and all(len(words) == 8 for _, words in filled):
-        return _read_tum(path, filled)
-    return _read_images_txt(path, rows)
+    return [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
 
 
 def _read_tum(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
@@ -107,11 +156,8 @@ def _read_tum(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
 
 
 def _read_images_txt(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
-    # A second line per image is for its points, and may be empty.
     by_name = {}
-    for number, words in rows[::2]:
-        if not words:
-            continue
+    for number, words in _image_rows(path, rows):
         if len(words) < 10:
             raise ValueError(
                 f"{path}, line {number}: write a line of COLMAP's images.txt or of a TUM "
@@ -123,6 +169,27 @@ def _read_images_txt(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
     if not by_name:
         raise ValueError(f"{path} holds no poses: give a COLMAP images.txt or a TUM trajectory")
     return PoseSet(by_name)
+
+
+def check_images_txt(path: Path) -> None:
+    """Raise ValueError if an image of an images.txt lacks the line for its points."""
+    for _ in _image_rows(path, _rows(path)):
+        pass
+
+
+def _image_rows(path: Path, rows: list[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    """The first of the two lines per image; the second has points, x y id each, or none."""
+    left = iter(rows)
+    for row in left:
+        if not row[1]:
+            continue
+        yield row
+        number, points = next(left, (0, []))
+        if len(points) >= 10 and (len(points) % 3 or not points[-1].lstrip("-").isdigit()):
+            raise ValueError(
+                f"{path}, line {number}: the line for the points of the image above is missing: "
+                "each image of an images.txt has two lines, of which the second may be empty"
+            )
 
 
 def _numbers(path: Path, line: int, words: list[str]) -> NDArray[np.float64]:
@@ -163,6 +230,19 @@ def tum_trajectory(times: NDArray[np.float64], cam_from_world: NDArray[np.float6
     lines = ["# time tx ty tz qx qy qz qw (camera in world)"]
     for time, pose in zip(times, cam_from_world, strict=True):
         w, x, y, z = quaternion_from_rotation(pose[:, :3].T)
-        numbers = [f"{v + 0.0:.9g}" for v in (*camera_centers(pose), x, y, z, w)]
+        numbers = [f"{v + 0.0:.12g}" for v in (*camera_centers(pose), x, y, z, w)]
         lines.append(" ".join([f"{time:.6f}", *numbers]))
     return "\n".join(lines) + "\n"
+
+
+def image_times(names: Sequence[str]) -> list[float]:
+    """Seconds if all names are ascending numbers like 1305031102.175304.png, else indices."""
+    stems = [Path(name).stem for name in names]
+    try:
+        if all("." in stem for stem in stems):
+            times = [float(stem) for stem in stems]
+            if np.isfinite(times).all() and (np.diff(times) > 0).all():
+                return times
+    except ValueError:
+        pass
+    return [float(i) for i in range(len(names))]

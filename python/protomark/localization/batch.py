@@ -19,7 +19,13 @@ from protomark.geometry.absolute_pose import FocalLength, check_pose_model
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras
 from protomark.geometry.pose import camera_centers, pose_error
-from protomark.geometry.pose_files import PoseSet, images_txt, read_poses
+from protomark.geometry.pose_files import (
+    PoseSet,
+    image_times,
+    images_txt,
+    read_poses,
+    tum_trajectory,
+)
 from protomark.interrupt import deferred_interrupt
 from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
@@ -27,6 +33,7 @@ from protomark.localization.solve import Localization
 from protomark.progress import Progress, silent, tracked
 
 POSES, CAMERAS, POINTS, TABLE = "images.txt", "cameras.txt", "points3D.txt", "poses.csv"
+TRAJECTORY = "trajectory.txt"
 # Distances in world units (metres if the map is metric) and angles in degrees, as in hloc.
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 STAGES = ("features", "encode", "search", "pose", "total")
@@ -176,7 +183,10 @@ class LocalizationBatch:
         return {**self.summary(), "each": [i.as_dict() for i in self.images]}
 
     def write(self, folder: Path) -> None:
-        """Write a COLMAP model of the accepted poses, and a table of all images."""
+        """Write a COLMAP model and a TUM trajectory of accepted poses, and a table of all images.
+
+        Times of the trajectory are those of `image_times`.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         camera_lines: dict[str, int] = {}
         poses, camera_ids = {}, {}
@@ -192,13 +202,27 @@ class LocalizationBatch:
         write_text(folder / POSES, images_txt(poses, camera_ids))
         write_text(folder / POINTS, "# The landmarks are in the map\n")
         write_text(folder / TABLE, self.table())
+        times = image_times([image.name for image in self.images])
+        posed = [
+            (time, poses[image.name])
+            for time, image in zip(times, self.images, strict=True)
+            if image.name in poses
+        ]
+        write_text(
+            folder / TRAJECTORY,
+            tum_trajectory(np.array([t for t, _ in posed]), np.array([p for _, p in posed])),
+        )
 
     def table(self) -> str:
-        """All images as CSV; a pose is the camera centre and the rows of the rotation."""
+        """All images as CSV; a pose is the camera's centre in the world, and its orientation.
+
+        The latter is the rotation from the world to the camera, row by row, as in `images.txt`.
+        """
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        header = ["image", "accepted", "confidence", "inliers", "matches", "x", "y", "z"]
-        header += [f"r{i}{j}" for i in range(3) for j in range(3)]
+        header = ["image", "accepted", "confidence", "inliers", "matches"]
+        header += [f"center_{axis}" for axis in "xyz"]
+        header += [f"cam_from_world_{i}{j}" for i in range(3) for j in range(3)]
         header += ["focal_length", "position_error", "angle_error"]
         writer.writerow([*header, *(f"seconds_{stage}" for stage in STAGES), "reason"])
         for image in self.images:
@@ -206,7 +230,7 @@ class LocalizationBatch:
             pose = image.found.cam_from_world if image.found else None
             numbers = [""] * 12
             if pose is not None:
-                numbers = [f"{n:.9g}" for n in (*camera_centers(pose), *pose[:, :3].ravel())]
+                numbers = [f"{n:.12g}" for n in (*camera_centers(pose), *pose[:, :3].ravel())]
             writer.writerow(
                 [
                     *(row["image"], int(self.accepted(image))),
@@ -243,11 +267,12 @@ def localize_files(
         )
     localizer = Localizer(request.scene, max_keypoints=request.max_keypoints, recall=request.recall)
     given = request.camera is not None and request.camera != ESTIMATE
-    cameras = read_cameras(request.camera) if given and request.camera else None
+    names = [name for name, _ in images]
+    cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
     for camera in cameras.cameras if cameras else ():
         check_pose_model(camera)
-    true_poses = _poses_of(request.true_poses, images)
-    priors = _poses_of(request.priors, images)
+    true_poses = _poses_of(request.true_poses, names)
+    priors = _poses_of(request.priors, names)
 
     def localize(image: tuple[str, Path]) -> ImageResult:
         name, path = image
@@ -305,15 +330,16 @@ def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
     return list(found.items())
 
 
-def _poses_of(source: Path | None, images: Sequence[tuple[str, Path]]) -> PoseSet:
+def _poses_of(source: Path | None, names: Sequence[str]) -> PoseSet:
     """Poses from a file or folder, of which one must belong to an image."""
     if source is None:
         return PoseSet({})
-    poses = read_poses(source)
-    if all(poses.find(name) is None for name, _ in images):
+    given = read_poses(source)
+    poses = given.for_images(names)
+    if all(poses.find(name) is None for name in names):
         raise ValueError(
-            f"{source}: none of its {len(poses)} poses (such as that of {poses.example}) belongs "
-            f"to an image (such as {images[0][0]}): give poses of these images"
+            f"{source}: none of its {len(given)} poses (such as that of {given.example}) belongs "
+            f"to an image (such as {names[0]}): give poses of these images"
         )
     return poses
 

@@ -1,8 +1,14 @@
-"""The probability that a pose is right, given the matches that agree with it."""
+"""The probability that a pose is right, given the matches that agree with it.
+
+Two things must hold: the matches are of this place, and the camera is the one that took the image.
+The second shows when the lens is set free: if focal length and principal point may move, a right
+camera hardly moves and explains no more matches, unless the scene is too flat to tell.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +16,21 @@ from numpy.typing import NDArray
 from protomark.geometry.camera import Camera
 from protomark.match_calibration import sigmoid
 
+# A pose is right if it is off by at most this share of the median depth, and this angle.
+DEPTH_SHARE, DEGREES = 0.05, 5.0
 # Cells per side of a grid over the image: inliers in few cells are weak evidence.
 CELLS = 10
+# The origin of a camera: the map was made with it, the user knows it, or localizing estimates it.
+CameraOrigin = Literal["map", "user", "estimate"]
 # Fitted by benchmarks/scripts/localization_confidence.py to the training and validation sequences,
-# with codes of 16 and 32 numbers: the constant, then the weights of `Evidence.features`.
-WEIGHTS = (-14.94, 3.716, 4.628, 3.015)
+# with codes of 16 and 32 numbers: the constant, then the weights of `Evidence.place`; and, for each
+# origin, the weights of `Evidence.lens`.
+PLACE_WEIGHTS: tuple[float, ...] = (-21.38, 4.15, 11.97, 5.738)
+LENS_WEIGHTS: dict[CameraOrigin, tuple[float, ...]] = {
+    "map": (2.777, -0.6036, 1.13, -23.42, -2.489),
+    "user": (3.14, -3.816, 2.177, -11.86, 0.3014),
+    "estimate": (-1.518, -1.413, 1.484, -1.539, -0.5986),
+}
 
 
 @dataclass(frozen=True)
@@ -25,26 +41,48 @@ class Evidence:
         inliers: number of matches that agree with the pose.
         matches: number of accepted matches.
         cells: number of cells, of `CELLS` x `CELLS` over the image, with an inlier.
+        origin: where the camera comes from.
+        shift: by how much the pose moves if the lens is set free, in units of `DEPTH_SHARE` of the
+            median depth or of `DEGREES`, whichever is more.
+        gain: by how much that lowers the mean (Cauchy) loss of the matches.
+        spread: standard deviation of the camera centre, as a share of the depth, with a free lens.
     """
 
     inliers: int
     matches: int
     cells: int
+    origin: CameraOrigin = "user"
+    shift: float = np.inf
+    gain: float = 0.0
+    spread: float = np.inf
 
-    @classmethod
-    def of(cls, camera: Camera, inliers: NDArray[np.float64], matches: int) -> Evidence:
-        """The evidence of inliers at pixels (i, 2), among a number of accepted matches."""
-        size = np.array([camera.width, camera.height])
-        cell = np.clip(inliers * CELLS / size, 0, CELLS - 1).astype(np.int64)
-        occupied = len(np.unique(cell[:, 0] * CELLS + cell[:, 1]))
-        return cls(len(inliers), matches, occupied)
-
-    def features(self) -> NDArray[np.float64]:
-        """The features (3,) float64 of the logistic regression."""
+    def place(self) -> NDArray[np.float64]:
+        """Features (3,) float64 of whether the matches are of this place."""
         share = self.inliers / max(self.matches, 1)
         return np.array([np.log(max(self.inliers, 1)), share, np.log(max(self.cells, 1))])
+
+    def lens(self) -> NDArray[np.float64]:
+        """Features (4,) float64 of whether the camera is the right one."""
+        shift = np.log(np.clip(self.shift, 0.3, 20))
+        return np.array(
+            [
+                shift,
+                max(shift, 0.0),
+                np.sqrt(np.clip(self.gain, 0, 1)),
+                np.log(np.clip(self.spread, 1e-3, 1)),
+            ]
+        )
+
+
+def occupied_cells(camera: Camera, pixels: NDArray[np.float64]) -> int:
+    """Number of cells of a grid over the image with one of the pixels (n, 2)."""
+    size = np.array([camera.width, camera.height])
+    cell = np.clip(pixels * CELLS / size, 0, CELLS - 1).astype(np.int64)
+    return len(np.unique(cell[:, 0] * CELLS + cell[:, 1]))
 
 
 def confidence(evidence: Evidence) -> float:
     """Probability that a pose with this evidence is right."""
-    return float(sigmoid(WEIGHTS[0] + evidence.features() @ np.array(WEIGHTS[1:])))
+    place = PLACE_WEIGHTS[0] + evidence.place() @ np.array(PLACE_WEIGHTS[1:])
+    weights = LENS_WEIGHTS[evidence.origin]
+    return float(sigmoid(place) * sigmoid(weights[0] + evidence.lens() @ np.array(weights[1:])))

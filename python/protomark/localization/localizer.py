@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from protomark.features.images import read_gray, to_gray
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.geometry.absolute_pose import FocalLength, check_pose_model
 from protomark.geometry.camera import Camera
+from protomark.geometry.camera_files import read_cameras
 from protomark.localization.prior import PosePrior, visible
 from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
 from protomark.maps.cameras import map_cameras
@@ -27,6 +29,8 @@ from protomark.maps.open import open_map
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
+# With more keypoints outside the image they are not pixels (x, y).
+_MAX_OUTSIDE = 0.01
 # In place of a camera: have it estimated, although the map has one.
 ESTIMATE = "estimate"
 
@@ -85,7 +89,7 @@ class Localizer:
     def localize(
         self,
         image: str | Path | NDArray[np.uint8],
-        camera: Camera | str | None = None,
+        camera: Camera | Any | str | None = None,
         prior: PosePrior | None = None,
         *,
         focal_length: FocalLength = "known",
@@ -93,10 +97,12 @@ class Localizer:
         """Find the pose of an image.
 
         Args:
-            image: a file, or a (height, width) grey or (height, width, 3) BGR uint8 array.
-            camera: its camera, or the camera written out as "MODEL:PARAMETERS". None: the camera
-                that the map was made with, if that has the image's size. "estimate", or None if the
-                map has no such camera: a pinhole camera whose focal length is estimated.
+            image: a file, a PIL image, or a (height, width) grey or (height, width, 3) BGR uint8
+                array.
+            camera: its camera, a `pycolmap.Camera`, or what `--camera` takes: the camera written
+                out as "MODEL:PARAMETERS", a cameras.txt or a folder with a COLMAP model. None: the
+                camera that the map was made with, if that has the image's size. "estimate", or None
+                if the map has no such camera: a pinhole camera whose focal length is estimated.
             prior: a rough pose; only landmarks that are visible from near it are searched.
             focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
 
@@ -108,17 +114,20 @@ class Localizer:
                 or OpenCV does not compute the map's descriptor.
         """
         began = time.perf_counter()
-        gray = read_gray(Path(image)) if isinstance(image, (str, Path)) else to_gray(image)
+        gray = _gray(image)
         height, width = gray.shape
         if camera is None:
             camera = self.map_camera(width, height)
         elif isinstance(camera, str):
-            camera = None if camera == ESTIMATE else Camera.parse(camera)
+            name = str(image) if isinstance(image, (str, Path)) else ""
+            given = None if camera == ESTIMATE else read_cameras(camera).for_images([name])
+            camera = given.find(name, width, height) if given else None
+        elif not isinstance(camera, Camera):
+            camera = Camera.from_colmap(camera)
         if camera is None:
             camera, focal_length = Camera.guess(width, height), "unknown"
-        elif not camera.width:
-            camera = replace(camera, width=width, height=height)
-        elif (camera.width, camera.height) != (width, height):
+        camera = camera.sized(width, height)
+        if (camera.width, camera.height) != (width, height):
             raise ValueError(
                 f"the image has {width} x {height} pixels, but its camera {camera.width} x "
                 f"{camera.height}: scale one of them"
@@ -158,6 +167,12 @@ class Localizer:
             threads or available_threads(),
         )
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a Localizer cannot be pickled or copied: give each process the map's path and make "
+            "one there; threads can share one"
+        )
+
     def map_camera(self, width: int, height: int) -> Camera | None:
         """The camera that the map was made with, if it has one of this size and no other."""
         fitting = self.cameras.of_size(width, height)
@@ -187,12 +202,16 @@ class Localizer:
             See `localize`.
 
         Raises:
-            ValueError: the lengths differ, the encoder takes other descriptors, or poses cannot be
-                estimated for this camera model.
+            ValueError: the lengths differ, keypoints lie outside the image, the encoder takes other
+                descriptors, or poses cannot be estimated for this camera.
         """
         check_pose_model(camera)
+        camera.check_lens()
+        if descriptors is None:  # what OpenCV computes for no keypoints
+            descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)
         if len(keypoints) != len(descriptors):
             raise ValueError(f"{len(keypoints)} keypoints, but {len(descriptors)} descriptors")
+        _check_pixels(np.asarray(keypoints), camera)
         stages = dict(seconds or {})
         with _timed(stages, "encode"):
             codes = self.scene.encoder.encode(descriptors, self.scene.dim, self.threads)
@@ -211,7 +230,8 @@ class Localizer:
                 self._positions_of(ids),
                 self.calibration.probability(distances),
             )
-            result = solve_pose(candidates, camera, self.min_probability, focal_length)
+            of_map = any(camera.resembles(c) for c in self.cameras.cameras)
+            result = solve_pose(candidates, camera, self.min_probability, focal_length, of_map)
         return replace(result, seconds={**stages, "total": sum(stages.values())})
 
     @cached_property
@@ -244,6 +264,32 @@ class Localizer:
                 features.descriptors, features.angles, features.sizes
             )
         return features
+
+
+def _gray(image: Any) -> NDArray[np.uint8]:
+    if isinstance(image, (str, Path)):
+        return read_gray(Path(image))
+    if image is None:
+        raise ValueError(
+            "the image is None, as cv2.imread returns it for a file that it can't read"
+        )
+    if hasattr(image, "convert"):  # PIL
+        image = np.asarray(image.convert("L"))
+    if np.ndim(image) == 3 and np.shape(image)[2] == 1:
+        image = image[:, :, 0]
+    return to_gray(image)
+
+
+def _check_pixels(keypoints: NDArray[np.floating], camera: Camera) -> None:
+    if not len(keypoints):
+        return
+    size = (camera.width, camera.height)
+    outside = ((keypoints < -1) | (keypoints > np.add(size, 1))).any(1).mean()
+    if outside > _MAX_OUTSIDE or (len(keypoints) > 1 and np.ptp(keypoints, axis=0).max() <= 1):
+        raise ValueError(
+            f"keypoints are (x, y) in pixels of an image of {size[0]} x {size[1]}, but these reach "
+            f"from {keypoints.min(0)} to {keypoints.max(0)}: normalised, or (row, column)?"
+        )
 
 
 def _has_positions(scene: pm.PrototypeMap | pm.SealedMap) -> bool:

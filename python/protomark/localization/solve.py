@@ -11,16 +11,27 @@ from protomark.geometry.absolute_pose import (
     AbsolutePose,
     FocalLength,
     estimate_pose,
+    free_lens,
     pose_covariance,
     refine_pose,
+    reprojection_error,
 )
 from protomark.geometry.camera import Camera
-from protomark.geometry.pose import transform
-from protomark.localization.confidence import Evidence, confidence
+from protomark.geometry.pose import pose_error, transform
+from protomark.localization.confidence import (
+    DEGREES,
+    DEPTH_SHARE,
+    CameraOrigin,
+    Evidence,
+    confidence,
+    occupied_cells,
+)
 from protomark.matching import accept
 
 # Reprojection error of an inlier, as a share of the image's longer side.
 MAX_ERROR = 0.005
+# Matches with up to so many times this error tell whether another lens would explain more.
+_NEAR = 4
 # Number of nearest landmarks per keypoint that are candidates once there is a pose.
 CANDIDATES = 3
 MIN_MATCHES = 4
@@ -90,7 +101,11 @@ class Candidates:
 
 
 def solve_pose(
-    candidates: Candidates, camera: Camera, min_probability: float, focal_length: FocalLength
+    candidates: Candidates,
+    camera: Camera,
+    min_probability: float,
+    focal_length: FocalLength,
+    of_map: bool,
 ) -> Localization:
     """Solve the pose by RANSAC over likely matches, and refine it on all nearest landmarks.
 
@@ -99,8 +114,12 @@ def solve_pose(
         camera: the frame's camera.
         min_probability: smallest probability of a match for RANSAC.
         focal_length: see `geometry.absolute_pose.estimate_pose`.
+        of_map: whether the map was made with this camera.
     """
     keypoints, positions = candidates.keypoints, candidates.positions
+    # Geographic coordinates are large; around their middle nothing is lost by rounding.
+    middle = np.nanmedian(positions.reshape(-1, 3), axis=0) if np.isfinite(positions).any() else 0.0
+    positions = positions - middle
     landmarks = np.where(np.isfinite(positions).all(axis=2), candidates.landmarks, -1)
     if len(keypoints) < MIN_MATCHES:
         return Localization(
@@ -123,11 +142,25 @@ def solve_pose(
         reason = f"no pose agrees with {MIN_MATCHES} of {len(matches)} likely matches"
         return Localization(camera, evidence=evidence, reason=reason)
     agreeing = matches.keypoints[found.inliers]
-    evidence = Evidence.of(found.camera, keypoints[agreeing], len(matches))
     pose, rows, columns = _complete(found, keypoints, landmarks, positions, max_error)
+    origin: CameraOrigin = "estimate" if focal_length != "known" else "map" if of_map else "user"
+    evidence = Evidence(
+        len(agreeing),
+        len(matches),
+        occupied_cells(found.camera, keypoints[agreeing]),
+        origin,
+        *_lens_evidence(
+            pose,
+            keypoints[matches.keypoints],
+            positions[matches.keypoints, 0],
+            found.camera,
+            max_error,
+        ),
+    )
+    cam_from_world = np.column_stack([pose[:, :3], pose[:, 3] - pose[:, :3] @ middle])
     return Localization(
         found.camera,
-        pose,
+        cam_from_world,
         rows,
         keypoints[rows],
         landmarks[rows, columns],
@@ -135,6 +168,24 @@ def solve_pose(
         confidence(evidence),
         covariance=pose_covariance(pose, keypoints[rows], positions[rows, columns], found.camera),
     )
+
+
+def _lens_evidence(
+    pose: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    camera: Camera,
+    max_error: float,
+) -> tuple[float, float, float]:
+    """Shift, gain and spread of `Evidence`, from all accepted matches that are roughly right."""
+    near = reprojection_error(pose, pixels, positions, camera) <= _NEAR * max_error
+    if not near.any():
+        return np.inf, 0.0, np.inf
+    free = free_lens(pose, pixels[near], positions[near], camera, max_error)
+    depth = abs(float(np.median(transform(pose, positions[near])[:, 2])))
+    distance, degrees = pose_error(free.cam_from_world, pose)
+    shift = max(distance / (DEPTH_SHARE * depth), degrees / DEGREES)
+    return shift, free.gain, free.spread / depth
 
 
 def _complete(

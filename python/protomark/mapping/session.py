@@ -125,7 +125,8 @@ class _Session:
         self.request, self.source = request, source
         self.progress, self.note = progress, note
         self.cursor = 0
-        source.poses = read_poses(request.poses) if request.poses else None
+        if request.poses:
+            source.poses = read_poses(request.poses).for_images(source.names())
         if request.resume:
             self._resume()
         elif request.extend:

@@ -15,7 +15,7 @@ from protomark.extras import optional
 from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray, to_gray
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
 from protomark.geometry.camera_files import camera_from_exif
-from protomark.geometry.pose_files import PoseSet
+from protomark.geometry.pose_files import PoseSet, image_times
 from protomark.mapping.frame import InputImage
 
 # Number of a video's frames that are held in memory to read it backward.
@@ -33,6 +33,9 @@ class FrameSource(ABC):
         prefix: prefix of the frames' names in the map.
         poses: known poses, or None.
     """
+
+    # Whether frames have times of their own; those of images are in their names, or none.
+    timed = False
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -64,7 +67,8 @@ class FrameSource(ABC):
             size = len(self.prefix)
             only = {name[size:] for name in only if name.startswith(self.prefix)}
         for image in self._read(start, only, backward):
-            pose = self.poses.find(image.name, image.time) if self.poses else None
+            time = image.time if self.timed else None
+            pose = self.poses.find(image.name, time) if self.poses else None
             yield replace(image, name=self.prefix + image.name, pose=pose)
 
     @cached_property
@@ -117,7 +121,7 @@ class ImageFolder(FrameSource):
         if not self._names:
             suffixes = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
             raise FileNotFoundError(f"{path}: no images in this folder ({suffixes})")
-        self._times = _times(self._names)
+        self._times = image_times(self._names)
 
     def __len__(self) -> int:
         return len(self._names)
@@ -156,6 +160,8 @@ class ImageFolder(FrameSource):
 
 class Video(FrameSource):
     """A video file, of which every n-th frame is taken."""
+
+    timed = True
 
     def __init__(self, path: Path, every: int = 1) -> None:
         super().__init__(path)
@@ -233,18 +239,6 @@ def open_source(path: Path, every: int = 1) -> FrameSource:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such folder of images or video file")
     return Video(path, every)
-
-
-def _times(names: list[str]) -> list[float]:
-    stems = [Path(name).stem for name in names]
-    try:
-        if all("." in stem for stem in stems):
-            times = [float(stem) for stem in stems]
-            if np.isfinite(times).all() and (np.diff(times) > 0).all():
-                return times
-    except ValueError:
-        pass
-    return [float(i) for i in range(len(names))]
 
 
 def _open_video(path: Path) -> Any:

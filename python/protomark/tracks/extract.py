@@ -20,7 +20,7 @@ from protomark.files import hash_files
 from protomark.geometry import colmap
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
-from protomark.tracks import completion, pairs, triangulation
+from protomark.tracks import completion, pairs, triangulation, verification
 from protomark.tracks.file import Tracks
 from protomark.tracks.matching import VerifiedMatches, View, match, with_errors
 from protomark.tracks.scene import Scene
@@ -29,10 +29,14 @@ Pairs = dict[tuple[int, int], VerifiedMatches]
 
 # Matches may be this far (pixels) from the epipolar line until the error of the poses is known.
 _ROUGH_ERROR = 16.0
-# `refine_poses="auto"` refines poses with a larger epipolar error (pixels, median over pairs of the
-# pair's median). Structure from motion has 0.2 to 0.7, rough poses have 1.3 and more.
-_ROUGH_POSES = 1.0
-_MIN_MATCHES = 15
+# Epipolar error (pixels, median over pairs of the pair's median of verified matches) from which on
+# `refine_poses="auto"` tries to refine poses. Structure from motion has 0.2 to 0.6, poses of other
+# sensors have 0.5 to 1.3.
+_ROUGH_POSES = 0.6
+# Poses are not of these images if a quarter of the pairs has a larger error.
+_FOREIGN_POSES = 4.0
+# Refined poses are kept if so much more of the verified matches fit them within a pixel.
+_CLEARLY_MORE = 1.1
 _REFINE_ERRORS = (12.0, 4.0)
 # Each image's strongest keypoints take part in refinement; more cost time and do not lower the
 # error.
@@ -179,15 +183,19 @@ def extract(
     made_from = provenance(sequence, options, given)
     given, features, unreadable = _detect(sequence, given, options, threads, progress)
     work = _Matching(given, features, options, threads, progress)
+    error, quartile, region = work.judge_poses()
+    if quartile > _FOREIGN_POSES and options.refine_poses != "yes":
+        raise ValueError(
+            f"{sequence.model}: these poses do not fit these images (a quarter of the pairs has "
+            f"epipolar errors above {quartile:.1f} pixels): camera-to-world? other axes? other "
+            "names? --refine-poses yes takes them nevertheless"
+        )
     overlap = work.match_covisible()
     if not any(len(m) for m in work.matches.values()):
         raise _nothing_triangulated(sequence)
-    error = _epipolar_error(work.matches)
-    refine = options.refine_poses == "yes" or (
-        options.refine_poses == "auto" and error > _ROUGH_POSES
-    )
-    if refine and not work.refine_poses():
-        raise _nothing_triangulated(sequence)
+    refined = (
+        options.refine_poses == "yes" or (options.refine_poses == "auto" and error > _ROUGH_POSES)
+    ) and work.refine_poses(error)
     matches = {p: m.where(m.errors <= options.max_error) for p, m in work.matches.items()}
     progress("triangulate", 0, 1)
     keypoints = [f.keypoints for f in features]
@@ -208,8 +216,11 @@ def extract(
         "sequence": sequence.name,
         **made_from,
         "epipolar_error": round(error, 3),
-        "poses_refined": refine,
+        "poses_refined": refined,
         "pose_shift_median": float(np.median(shift)),
+        "pose_shift_max": float(shift.max()),
+        "extent": float(np.linalg.norm(np.ptp(given.centers, axis=0))),
+        "static_region": region,
         "images_without_pose": sorted(
             {*given.unposed, *image_names(sequence.images)} - {*given.names, *unreadable}
         ),
@@ -249,6 +260,7 @@ class _Matching:
         self.rays = [c.rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
         self.focal = np.array([camera.focal_length for camera in cameras])
         self.views = self._make_views()
+        self.verified: Pairs = {}
 
     def _make_views(self) -> list[View]:
         parts = (self.features, self.rays, self.model.cam_from_world, self.focal)
@@ -262,6 +274,29 @@ class _Matching:
         found = parallel_map(one, chosen, self.threads, self.progress, stage)
         self.matches |= dict(zip(chosen, found, strict=True))
 
+    def judge_poses(self) -> tuple[float, float, list[int]]:
+        """Judges the given poses, and drops what never moves.
+
+        Returns:
+            Median and upper quartile over pairs of the epipolar error in pixels, 0 if no pair can
+            tell, and a box around what never moves, see `StaticRegion.box`.
+
+        Keypoints of what never moves get no rays, so that nothing matches them.
+        """
+        sample = verification.sample_matches(
+            self.views, self.options.ratio, self.threads, self.progress
+        )
+        keypoints = [f.keypoints for f in self.features]
+        cameras = self.model.cameras.values()
+        size = max(c.width for c in cameras), max(c.height for c in cameras)
+        region = verification.StaticRegion(keypoints, sample, size)
+        for rays, at in zip(self.rays, keypoints, strict=True):
+            rays[region.contains(at)] = np.nan
+        self.verified = verification.verify(self.views, sample)
+        errors = verification.pose_errors(self.views, self.verified)
+        medians = [float(np.median(e)) for e in errors] or [0.0]
+        return float(np.median(medians)), float(np.percentile(medians, 75)), region.box()
+
     def match_covisible(self) -> NDArray[np.float64]:
         """Match keyframes with overlapping views; returns the overlap (m, m)."""
         self._match(pairs.neighbour_pairs(len(self.views)), "match neighbours")
@@ -270,8 +305,13 @@ class _Matching:
         self._match([p for p in chosen if p not in self.matches], "match covisible")
         return overlap
 
-    def refine_poses(self) -> bool:
-        """Bundle-adjust the poses; returns False if no landmark can be triangulated."""
+    def refine_poses(self, error: float) -> bool:
+        """Bundle-adjust the poses, and keep the result if clearly more matches fit it.
+
+        Args:
+            error: epipolar error of the given poses, pixels.
+        """
+        given, fitting = (self.model, self.matches), self._fitting()
         keypoints = [f.keypoints for f in self.features]
         for step, limit in enumerate(_REFINE_ERRORS):
             self.progress("refine poses", step, len(_REFINE_ERRORS))
@@ -283,15 +323,26 @@ class _Matching:
                 self.model, keypoints, near, limit, self.options.min_angle
             )
             if not reconstruction.points3D:
-                return False
-            self.model = triangulation.refine_poses(self.model, reconstruction)
-            self.views = self._make_views()
-            self.matches = {
-                (i, j): with_errors(m, self.views[i], self.views[j])
-                for (i, j), m in self.matches.items()
-            }
+                break
+            self._move(triangulation.refine_poses(given[0], reconstruction, error), self.matches)
         self.progress("refine poses", len(_REFINE_ERRORS), len(_REFINE_ERRORS))
-        return True
+        better = self._fitting() > _CLEARLY_MORE * fitting
+        if not better and self.options.refine_poses == "auto":
+            self._move(*given)
+            return False
+        return self.model is not given[0]
+
+    def _move(self, model: colmap.ColmapModel, matches: Pairs) -> None:
+        self.model = model
+        self.views = self._make_views()
+        self.matches = {
+            (i, j): with_errors(m, self.views[i], self.views[j]) for (i, j), m in matches.items()
+        }
+
+    def _fitting(self) -> float:
+        """Number of verified matches within a pixel of their epipolar lines."""
+        errors = verification.pose_errors(self.views, self.verified)
+        return float(sum((e < 1).sum() for e in errors))
 
 
 def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.float64]) -> Scene:
@@ -392,9 +443,3 @@ def _detect(
         )
     readable = model.where([isinstance(f, Features) for f in found])
     return readable, [f for f in found if isinstance(f, Features)], problems
-
-
-def _epipolar_error(matches: Pairs) -> float:
-    """Median over pairs of each pair's median error, so that all pairs count alike."""
-    medians = [float(np.median(m.errors)) for m in matches.values() if len(m) >= _MIN_MATCHES]
-    return float(np.median(medians)) if medians else 0.0

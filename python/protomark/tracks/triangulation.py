@@ -128,19 +128,34 @@ def labels_of(
     return labels, positions
 
 
-def refine_poses(model: ColmapModel, reconstruction: Any) -> ColmapModel:
+def refine_poses(given: ColmapModel, reconstruction: Any, error: float) -> ColmapModel:
     """Adjust poses and points (not cameras) robustly against wrong matches.
 
-    The result stays in the world of `model`: its scale, rotation and origin bring the refined
-    cameras closest to the given ones. Points that the poses do not need are deleted.
+    The given positions are priors, as uncertain as the error makes them, and the result stays in
+    their world: its scale, rotation and origin bring the refined cameras closest to the given ones.
+    Points that the poses do not need are deleted.
+
+    Args:
+        given: the given poses.
+        reconstruction: points, and poses to start from; changed.
+        error: epipolar error of the given poses, pixels.
     """
     _thin(reconstruction)
-    if not bundle_adjust(reconstruction, list(reconstruction.images)):
+    images = [reconstruction.images[i + 1] for i in range(len(given.names))]
+    depths = [
+        image.cam_from_world() * reconstruction.points3D[point.point3D_id].xyz
+        for image in images
+        for point in image.points2D
+        if point.has_point3D()
+    ]
+    focal = min(camera.focal_length for camera in given.cameras.values())
+    spread = error / focal * float(np.median([depth[2] for depth in depths]))
+    if not bundle_adjust(
+        reconstruction, list(reconstruction.images), priors=given.centers, spread=spread
+    ):
         raise ValueError("bundle adjustment failed: try --refine-poses no")
-    poses = np.array(
-        [reconstruction.images[i + 1].cam_from_world().matrix() for i in range(len(model.names))]
-    )
-    return _aligned(replace(model, cam_from_world=poses), model)
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    return _aligned(replace(given, cam_from_world=poses), given)
 
 
 def _thin(reconstruction: Any) -> None:
