@@ -42,10 +42,10 @@ def positions(first: int, count: int) -> NDArray[np.float64]:
     return rng.uniform((-2.5, -2, 4), (2.5, 2, 8), (count, 3)) + center(places)
 
 
-def center(places: NDArray[np.int64]) -> NDArray[np.float64]:
+def center(places: NDArray[np.int64] | np.int64) -> NDArray[np.float64]:
     """Where (n, 3) the camera stands at these places (n,), which form a grid."""
     row, column = np.divmod(places, GRID)
-    return 10.0 * np.stack([column, np.zeros_like(row), row], axis=-1)
+    return np.asarray(10.0 * np.stack([column, np.zeros_like(row), row], axis=-1))
 
 
 def make_map(path: Path, synthetic: SyntheticLandmarks, encoder: pm.Encoder, count: int) -> None:
@@ -61,7 +61,10 @@ def make_map(path: Path, synthetic: SyntheticLandmarks, encoder: pm.Encoder, cou
 
 
 def frame(
-    scene: pm.SealedMap, synthetic: SyntheticLandmarks, place: int, rng: np.random.Generator
+    scene: pm.PrototypeMap | pm.SealedMap,
+    synthetic: SyntheticLandmarks,
+    place: int,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Keypoints and descriptors of a frame that was taken at a place."""
     seen = np.sort(place * PLACE + rng.choice(PLACE, SEEN, replace=False))

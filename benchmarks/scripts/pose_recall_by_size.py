@@ -136,24 +136,17 @@ def main() -> None:
                 spread = np.linspace(0, len(queries) - 1, args.queries).astype(int)
                 frames = [QueryFrame.of(tracks, int(i)) for i in queries[np.unique(spread)]]
                 curves: dict[str, list[tuple[float, float]]] = {name: [] for name in KINDS}
-                for name, megabytes, recall in recalls(tracks, mapped, frames):
-                    curves[name].append((megabytes, recall))
+                for name, *point in recalls(tracks, mapped, frames):
+                    curves[name].append((point[0], point[1]))
                 for name, points in curves.items():
                     found.setdefault((split, name), []).append([recall for _, recall in points])
+                series = []
+                for name, (_, color) in KINDS.items():
+                    megabytes, recall = zip(*curves[name], strict=True)
+                    series.append(Series(name, megabytes, recall, color))
                 title = f"{path.name.split('.')[0]}, {split}: {len(frames)} frames"
                 panels.append(
-                    Panel(
-                        title,
-                        "megabytes",
-                        "poses found",
-                        [
-                            Series(name, *zip(*curves[name], strict=True), color)
-                            for name, (_, color) in KINDS.items()
-                        ],
-                        log="x",
-                        bottom=0,
-                        top=1.02,
-                    )
+                    Panel(title, "megabytes", "poses found", series, log="x", bottom=0, top=1.02)
                 )
     heads = ["queries", "map", *(f"{100 * share:g} %" for share in SHARES)]
     rows = [
