@@ -124,7 +124,8 @@ void PrototypeStore::find_rows(std::span<const std::int64_t> ids, Codes codes,
     if (i >= kAhead && i < n + kAhead) index_.prefetch_ids(ids_, ids[i - kAhead]);
     if (i < 2 * kAhead) continue;
     const std::size_t at = i - 2 * kAhead;
-    rows[at] = find_row(ids[at], appearance_of(codes.row(at)));
+    const LandmarkIndex landmark = find(ids[at]);
+    rows[at] = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance_of(codes.row(at)));
   }
 }
 
@@ -330,7 +331,7 @@ void PrototypeStore::rearrange(Arrangement arrangement) {
 // comes to padding; `spare` and the next row hold rows meanwhile. In a large map nearly all of this
 // waits for memory, which is therefore prefetched.
 void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
-  constexpr int kAhead = 8;
+  constexpr int kMovesAhead = 8;
   // Where the row here goes; kNoRow if none has to leave.
   const auto next = [&](Row row) { return row.value < to.size() ? to[row.value] : kNoRow; };
   Row moving = spare, met{spare.value + 1};
@@ -346,7 +347,7 @@ void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
       });
       ahead = next(ahead);
     };
-    for (int i = 0; i < kAhead; ++i) prefetch_next();
+    for (int i = 0; i < kMovesAhead; ++i) prefetch_next();
     while (next(row) != kNoRow) {
       prefetch_next();
       copy_row(row, met);
