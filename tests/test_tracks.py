@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protomark.features.descriptors import DESCRIPTORS
 from protomark.features.extractor import Extractor
-from protomark.geometry.colmap import ColmapModel
+from protomark.geometry.colmap import ColmapModel, new_reconstruction, pycolmap
 from protomark.geometry.pose import camera_centers
 from protomark.tracks.extract import (
     SequenceFolder,
@@ -26,6 +26,7 @@ from protomark.tracks.extract import (
 from protomark.tracks.file import Tracks
 from protomark.tracks.make import make_tracks
 from protomark.tracks.summary import reprojection_errors, summarise
+from protomark.tracks.triangulation import refine_poses
 from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
 
@@ -177,6 +178,31 @@ def test_refined_poses_are_dropped_unless_clearly_more_fits(
     tracks = extract(source, TracksOptions("orb", max_keypoints=500))
     assert not tracks.info["poses_refined"]
     np.testing.assert_allclose(tracks.cam_from_world, rough, atol=1e-12)
+
+
+def test_given_positions_are_priors(orb: Tracks) -> None:
+    cameras = {1: orb.cameras[1]}
+    rng = np.random.default_rng(0)
+    given = poses(8)
+    given[:, :, 3] += rng.normal(0, 0.03, (8, 3))
+    names = [str(i) for i in range(8)]
+    numbers = np.arange(1, 9)
+    model = ColmapModel(cameras, names, numbers, np.ones(8, np.int32), given, [])
+    moved = []
+    for error in (0.01, 100.0):
+        keypoints = [orb.keypoints[orb.keypoints_of(i)] for i in range(8)]
+        images = [(i + 1, names[i], 1, keypoints[i], given[i]) for i in range(8)]
+        reconstruction = new_reconstruction(cameras, images)
+        labels = [orb.landmark_of_keypoint[orb.keypoints_of(i)] for i in range(8)]
+        for landmark, position in zip(orb.landmark_ids, orb.landmark_positions, strict=True):
+            track = pycolmap.Track()
+            for i in range(8):
+                for row in np.flatnonzero(labels[i] == landmark):
+                    track.add_element(i + 1, int(row))
+            reconstruction.add_point3D(position, track)
+        refined = refine_poses(model, reconstruction, error)
+        moved.append(float(np.linalg.norm(refined.centers - model.centers, axis=1).mean()))
+    assert moved[0] < 0.2 * moved[1]
 
 
 def test_what_never_moves_is_left_out(sequence: Path, orb: Tracks, tmp_path: Path) -> None:

@@ -83,6 +83,22 @@ def occupied_cells(camera: Camera, pixels: NDArray[np.float64]) -> int:
 
 def confidence(evidence: Evidence) -> float:
     """Probability that a pose with this evidence is right."""
-    place = PLACE_WEIGHTS[0] + evidence.place() @ np.array(PLACE_WEIGHTS[1:])
+    return _place(evidence) * _lens(evidence)
+
+
+def doubt(evidence: Evidence) -> str:
+    """A sentence if the camera is what makes a pose unlikely, else ""."""
+    if _place(evidence) < 0.5 or _lens(evidence) >= 0.5:
+        return ""
+    return (
+        "the matches do not confirm this camera: is its calibration right, and of this resolution?"
+    )
+
+
+def _place(evidence: Evidence) -> float:
+    return float(sigmoid(PLACE_WEIGHTS[0] + evidence.place() @ np.array(PLACE_WEIGHTS[1:])))
+
+
+def _lens(evidence: Evidence) -> float:
     weights = LENS_WEIGHTS[evidence.origin]
-    return float(sigmoid(place) * sigmoid(weights[0] + evidence.lens() @ np.array(weights[1:])))
+    return float(sigmoid(weights[0] + evidence.lens() @ np.array(weights[1:])))

@@ -24,6 +24,7 @@ from protomark.localization.confidence import (
     CameraOrigin,
     Evidence,
     confidence,
+    doubt,
     occupied_cells,
 )
 from protomark.matching import accept
@@ -53,7 +54,7 @@ class Localization:
         landmarks: (i,) int64, ids of the landmarks that they observe.
         evidence: evidence for the pose.
         confidence: probability that the pose is right, 0 without a pose.
-        reason: why there is no pose, else "".
+        reason: why there is no pose, or only an unlikely one, else "".
         seconds: seconds of each stage: features, encode, search, pose, and total.
     """
 
@@ -166,6 +167,7 @@ def solve_pose(
         landmarks[rows, columns],
         evidence,
         confidence(evidence),
+        doubt(evidence),
         covariance=pose_covariance(pose, keypoints[rows], positions[rows, columns], found.camera),
     )
 
