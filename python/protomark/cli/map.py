@@ -13,6 +13,7 @@ _NAMES_SHOWN = 3
 
 
 def map_(
+    ctx: typer.Context,
     images: Annotated[
         Path, typer.Argument(metavar="IMAGES_OR_VIDEO", help="Folder of images, or a video file.")
     ],
@@ -33,7 +34,7 @@ def map_(
         float | None,
         typer.Option(
             help="Focal length to start calibration with, pixels; by default that of EXIF data, "
-            "else 1.2 times the longer side of the image."
+            "else what most pairs of the first frames agree on."
         ),
     ] = None,
     poses: Annotated[
@@ -42,6 +43,10 @@ def map_(
             help="Known poses, which are not adjusted: a COLMAP model folder or images.txt, or a "
             "TUM trajectory."
         ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(help="Image that is black where the camera sees no scene, as in COLMAP."),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
     window: Annotated[
@@ -81,12 +86,14 @@ def map_(
 
     protomark localize kitchen new-images/
 
-    Ctrl-C writes the map so far, and the same command with --resume continues it.
+    Ctrl-C writes the map so far, and the same command with --resume continues it. The exit code is
+    1 if there is no map, or one that cannot be trusted: sentences say why.
     """
     from protomark.cli.terminal import check_outputs, note, progress_bar, write_json
     from protomark.extras import optional
     from protomark.mapping.options import MappingOptions
-    from protomark.mapping.session import MapRequest, make_map
+    from protomark.mapping.request import MapRequest
+    from protomark.mapping.session import make_map
     from protomark.threads import available_threads
 
     scene = output or into
@@ -94,7 +101,7 @@ def map_(
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
-    check_outputs(json_file, inputs=[images, camera, poses, encoder])
+    check_outputs(json_file, inputs=[images, camera, poses, mask, encoder])
     if view:
         optional("rerun")
     request = MapRequest(
@@ -110,6 +117,7 @@ def map_(
         camera=camera,
         focal=focal,
         poses=poses,
+        mask=mask,
         every=every,
         resume=resume,
         extend=into is not None,
@@ -117,11 +125,19 @@ def map_(
         record=view,
         seal=not no_seal,
         threads=threads or available_threads(),
+        chosen=frozenset(name for name in ctx.params if _is_chosen(ctx, name)),
     )
     with progress_bar() as progress:
         figures = make_map(request, progress, note)
     write_json(json_file, figures)
     _show(figures, scene)
+    if figures["warnings"]:
+        raise typer.Exit(1)
+
+
+def _is_chosen(ctx: typer.Context, name: str) -> bool:
+    source = ctx.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"
 
 
 def _show(figures: dict[str, Any], scene: Path) -> None:
@@ -155,4 +171,9 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
         shown = ", ".join(names[:_NAMES_SHOWN])
         more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
         say(f"  [yellow]without a pose[/]: {escape(shown)}{more}: {escape(reason)}")
-    say(f"  next: protomark localize {escape(str(scene))} IMAGES")
+    if figures["left_out"]:
+        say(f"  left out: {escape(figures['left_out'])}")
+    for warning in figures["warnings"]:
+        say(f"  [red]cannot be trusted[/]: {escape(warning)}")
+    if not figures["warnings"]:
+        say(f"  next: protomark localize {escape(str(scene))} IMAGES")

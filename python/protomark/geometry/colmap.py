@@ -11,6 +11,7 @@ import zlib  # noqa: F401  (must come before pycolmap, see above)
 
 # isort: split
 import contextlib
+import math
 import os
 import re
 import tempfile
@@ -26,10 +27,13 @@ from protomark.extras import optional
 from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
+from protomark.interrupt import raise_if_overdue
 
 pycolmap = optional("pycolmap")
 
 _FILES = ("cameras", "images")
+# Steps of the solver in one call.
+_SLICE = 10
 
 
 @dataclass
@@ -217,6 +221,57 @@ def bundle_adjust(
         intrinsics: whether focal length and distortion move, too.
         threads: threads of the solver; their number changes the last digits.
     """
+    images, usable = list(image_ids), False
+    # Python sees signals only between two calls of the solver.
+    for start in range(0, iterations, _SLICE):
+        raise_if_overdue()
+        limit = min(_SLICE, iterations - start)
+        adjuster = _adjuster(reconstruction, images, fixed, limit, loss_scale, intrinsics, threads)
+        with quiet():
+            summary = adjuster.solve()
+        usable = bool(summary.is_solution_usable())
+        if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
+            break
+    return usable
+
+
+def focal_deviations(reconstruction: Any, image_ids: Iterable[int]) -> dict[int, float]:
+    """Relative standard deviation of each camera's focal length after bundle adjustment.
+
+    Poses, points and distortion are free, and the residuals say how accurate a keypoint is. The
+    value is infinite where the images do not determine the focal length.
+
+    Args:
+        reconstruction: an adjusted `pycolmap.Reconstruction`.
+        image_ids: images that take part.
+    """
+    adjuster = _adjuster(reconstruction, image_ids, intrinsics=True)
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    with quiet():
+        covariance = pycolmap.estimate_ba_covariance(options, reconstruction, adjuster)
+    reconstruction.update_point_3d_errors()
+    # The mean length of an error with this deviation in x and in y is sqrt(pi / 2) times it.
+    noise = reconstruction.compute_mean_reprojection_error() / math.sqrt(math.pi / 2)
+    deviations = {}
+    for camera_id, camera in reconstruction.cameras.items():
+        block = None if covariance is None else covariance.get_other_params_cov(camera.params)
+        variance = float(block[0, 0]) if block is not None else math.inf
+        valid = math.isfinite(variance) and variance >= 0
+        deviation = noise * math.sqrt(variance) / camera.mean_focal_length() if valid else math.inf
+        deviations[int(camera_id)] = deviation
+    return deviations
+
+
+def _adjuster(
+    reconstruction: Any,
+    image_ids: Iterable[int],
+    fixed: Sequence[int] = (),
+    iterations: int = 30,
+    loss_scale: float = 1.0,
+    intrinsics: bool = False,
+    threads: int = 1,
+) -> Any:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = intrinsics
     options.refine_principal_point = False
@@ -234,9 +289,7 @@ def bundle_adjust(
     if len(fixed) < 2:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    with quiet():
-        return bool(adjuster.solve().is_solution_usable())
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
 
 
 def read_model(folder: Path) -> ColmapModel:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +17,19 @@ import numpy as np
 from protomark.extras import optional
 from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray, to_gray
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
-from protomark.geometry.camera_files import camera_from_exif
+from protomark.geometry.camera_files import CameraSet, camera_from_exif
 from protomark.geometry.pose_files import PoseSet
 from protomark.mapping.frame import InputImage
+from protomark.mapping.prediction import MAX_STEP
+from protomark.mapping.structure import Structure
 
 # Number of a video's frames that are held in memory to read it backward.
 _CHUNK = 64
 _GUESSED_MODEL = "SIMPLE_RADIAL"
+# Of so many images, spread over a folder, most have the size of the map's images.
+_SIZE_SAMPLES = 15
+# Origins of a focal length that is no guess.
+GIVEN, EXIF = "given", "from EXIF data"
 
 
 class FrameSource(ABC):
@@ -29,12 +39,19 @@ class FrameSource(ABC):
         path: the folder or video.
         prefix: prefix of the frames' names in the map.
         poses: known poses, or None.
+        timed: whether frames have times in seconds, not numbers.
+        first_index: index of the first frame in the map.
+        time_shift: what is added to the times of frames in the map.
     """
+
+    timed = False
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.prefix = ""
         self.poses: PoseSet | None = None
+        self.first_index, self.time_shift = 0, 0.0
+        self._size: tuple[int, int] | None = None
 
     @abstractmethod
     def __len__(self) -> int:
@@ -44,8 +61,29 @@ class FrameSource(ABC):
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]: ...
 
     @abstractmethod
+    def listing(self) -> list[tuple[str, float]]:
+        """Names of all frames, without the prefix, and their times."""
+
     def names(self) -> list[str]:
         """Names of all frames, without the prefix."""
+        return [name for name, _ in self.listing()]
+
+    def shift(self, first_index: int, time_shift: float) -> None:
+        """Number and time the frames so that they come after those of a map."""
+        self.first_index, self.time_shift = first_index, time_shift
+
+    def follow(self, structure: Structure, records: Collection[str]) -> None:
+        """Number the frames after those of a map, and shift their times if these overlap.
+
+        Args:
+            structure: frames of the map.
+            records: names in the map; frames of these names are not new.
+        """
+        first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
+        old = [f.time for f in structure.frames]
+        new = [time for name, time in self.listing() if self.prefix + name not in records]
+        overlap = bool(old and new) and min(new) <= max(old) and min(old) <= max(new)
+        self.shift(first, math.ceil(1 + max(old) - min(new)) if overlap else 0.0)
 
     def images(
         self, start: int = 0, only: set[str] | None = None, backward: bool = False
@@ -61,19 +99,50 @@ class FrameSource(ABC):
             size = len(self.prefix)
             only = {name[size:] for name in only if name.startswith(self.prefix)}
         for image in self._read(start, only, backward):
-            pose = self.poses.find(image.name, image.time) if self.poses else None
-            yield replace(image, name=self.prefix + image.name, pose=pose)
+            yield replace(
+                image,
+                index=self.first_index + image.index,
+                name=self.prefix + image.name,
+                time=self.time_shift + image.time,
+                pose=self.poses.find(image.name, image.time) if self.poses else None,
+            )
 
     def size(self) -> tuple[int, int]:
-        """Width and height of the first image that can be read.
+        """Width and height of most images.
 
         Raises:
             ValueError: none can be read.
         """
-        for image in self._read(0, None, False):
-            if image.image is not None:
-                return image.image.shape[1], image.image.shape[0]
-        raise ValueError(f"{self.path}: none of its {len(self)} frames can be read, copy it anew")
+        if self._size is None:
+            images = (image.image for image in self._samples())
+            sizes = Counter(image.shape[::-1] for image in images if image is not None)
+            if not sizes:
+                raise ValueError(
+                    f"{self.path}: none of its {len(self)} frames can be read, copy it anew"
+                )
+            self._size = sizes.most_common(1)[0][0]
+        return self._size
+
+    def _samples(self) -> Iterator[InputImage]:
+        """Images that show the size of most."""
+        return self._read(0, None, False)
+
+    def find_camera(self, cameras: CameraSet) -> Camera:
+        """The one camera of all images.
+
+        Raises:
+            ValueError: there is none of their size, or images have different ones.
+        """
+        size = self.size()
+        named = {cameras.by_image[n] for n, _ in self.listing() if n in cameras.by_image}
+        of_size = [c for c in named if (c.width, c.height) == size]
+        if len(of_size) > 1:
+            raise ValueError(
+                f"the images have {len(of_size)} different cameras, and a map takes one: give the "
+                "one to use with --camera, such as "
+                f"'{min(of_size, key=lambda camera: camera.params)}'"
+            )
+        return of_size[0] if of_size else cameras.find("", *size)
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length.
@@ -82,9 +151,9 @@ class FrameSource(ABC):
             focal: focal length in pixels; None: from EXIF data, else COLMAP's guess.
         """
         width, height = self.size()
-        origin = "given"
+        origin = GIVEN
         if focal is None:
-            focal, origin = self._exif_focal_length(), "from EXIF data"
+            focal, origin = self._exif_focal_length(), EXIF
         if focal is None:
             focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), "a guess"
         if not (np.isfinite(focal) and focal > 0):
@@ -98,7 +167,8 @@ class FrameSource(ABC):
 class ImageFolder(FrameSource):
     """A folder of images, in natural order of their names (img2 before img10).
 
-    Times are seconds if all names are decimal numbers such as 1305031102.175304.png, else indices.
+    Times are seconds if all names are decimal numbers such as 1305031102.175304.png, the numbers if
+    they are whole, else indices.
     """
 
     def __init__(self, path: Path, every: int = 1) -> None:
@@ -107,14 +177,20 @@ class ImageFolder(FrameSource):
         if not self._names:
             suffixes = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
             raise FileNotFoundError(f"{path}: no images in this folder ({suffixes})")
-        self._times = _times(self._names)
+        self._times, self.timed = _times(self._names)
 
     def __len__(self) -> int:
         return len(self._names)
 
-    def names(self) -> list[str]:
-        """See `FrameSource.names`."""
-        return self._names
+    def listing(self) -> list[tuple[str, float]]:
+        """See `FrameSource.listing`."""
+        return list(zip(self._names, self._times, strict=True))
+
+    def _samples(self) -> Iterator[InputImage]:
+        step = -(-len(self._names) // _SIZE_SAMPLES)
+        images = self._read(0, set(self._names[::step]), False)
+        found = [image for image in images if image.image is not None]
+        return iter(found or self._read(0, None, False))
 
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]:
         indices = range(start, len(self._names))
@@ -137,6 +213,8 @@ class ImageFolder(FrameSource):
 class Video(FrameSource):
     """A video file, of which every n-th frame is taken."""
 
+    timed = True
+
     def __init__(self, path: Path, every: int = 1) -> None:
         super().__init__(path)
         self._every = every
@@ -152,9 +230,12 @@ class Video(FrameSource):
     def __len__(self) -> int:
         return self._count
 
-    def names(self) -> list[str]:
-        """See `FrameSource.names`."""
-        return [image.name for image in self._read_forward(0, None, decode=False)]
+    def listing(self) -> list[tuple[str, float]]:
+        """See `FrameSource.listing`."""
+        return [(f.name, f.time) for f in self._read_forward(0, None, decode=False)]
+
+    def _samples(self) -> Iterator[InputImage]:
+        return islice((i for i in self._read_forward(0, None) if i.image is not None), 1)
 
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]:
         if not backward:
@@ -184,13 +265,14 @@ class Video(FrameSource):
                     continue
                 if chunk is not None and index not in chunk:
                     continue
+                time = number / self._rate
                 if not decode:
-                    yield InputImage(index, name, 0.0, None)
+                    yield InputImage(index, name, time, None)
                     continue
                 decoded, image = video.retrieve()
                 gray = to_gray(np.asarray(image)) if decoded else None
                 problem = "" if decoded else "this frame does not decode"
-                yield InputImage(index, name, number / self._rate, gray, problem=problem)
+                yield InputImage(index, name, time, gray, problem=problem)
         finally:
             video.release()
 
@@ -215,16 +297,16 @@ def open_source(path: Path, every: int = 1) -> FrameSource:
     return Video(path, every)
 
 
-def _times(names: list[str]) -> list[float]:
+def _times(names: list[str]) -> tuple[list[float], bool]:
+    """Times of images by their names, and whether these are seconds."""
     stems = [Path(name).stem for name in names]
-    try:
-        if all("." in stem for stem in stems):
+    seconds = all("." in stem for stem in stems)
+    if seconds or all(stem.isdecimal() for stem in stems):
+        with suppress(ValueError):
             times = [float(stem) for stem in stems]
             if np.isfinite(times).all() and (np.diff(times) > 0).all():
-                return times
-    except ValueError:
-        pass
-    return [float(i) for i in range(len(names))]
+                return times, seconds
+    return [float(i) for i in range(len(names))], False
 
 
 def _open_video(path: Path) -> Any:
