@@ -73,6 +73,7 @@ def test_frames_of_a_plane_elect_no_focal_length() -> None:
         (150, 0.0, False),
         (610, 3.0, False),
         (320, -0.9, False),
+        (1340, 2.4, False),
     ],
 )
 def test_what_a_lens_can_be(focal: float, distortion: float, plausible: bool) -> None:

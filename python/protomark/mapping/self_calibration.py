@@ -15,14 +15,14 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import focal_deviations
 from protomark.mapping.survey import MatchedPair
 
-# Focal lengths of lenses, as shares of the image's longer side, and the largest displacement by
-# distortion in a corner of the image, as a share of its distance from the centre.
+# Focal lengths of lenses, as shares of the image's longer side. Distortion moves a point that is
+# seen at an angle of tangent r by at most this share of its distance from the centre, and by this
+# times r squared: only wide lenses distort much.
 MIN_FOCAL, MAX_FOCAL = 0.3, 3.0
-_MAX_DISTORTION = 0.3
-# A calibration is determined once its focal length has at most this relative deviation; a focal
-# length that was given yields to a smaller one only.
-MAX_DEVIATION = 0.03
-_MAX_DEVIATION_GIVEN = 0.01
+_MAX_DISTORTION, _MAX_COEFFICIENT = 0.3, 0.6
+# A calibration is determined once its focal length has at most this relative deviation: larger ones
+# come with errors of 20 %, as errors of neighbouring frames are alike.
+MAX_DEVIATION = 0.01
 # A pair of frames votes if some focal length makes the singular values of its essential matrix
 # equal up to this share.
 _MAX_ASYMMETRY = 0.02
@@ -71,7 +71,7 @@ class Calibration:
             if not np.isfinite(params).all() or params[0] <= 0 or not is_plausible(ours):
                 return False
         deviation = max(focal_deviations(reconstruction, image_ids).values())
-        if not deviation <= (min(self.limit, _MAX_DEVIATION_GIVEN) if self.given else self.limit):
+        if not deviation <= self.limit:
             return False
         self.deviation = deviation
         return True
@@ -93,12 +93,11 @@ def is_plausible(camera: Camera) -> bool:
     focal = camera.focal_length
     if not MIN_FOCAL <= focal / max(camera.width, camera.height) <= MAX_FOCAL:
         return False
-    corner = np.array([[camera.width, camera.height]]) / (2 * focal)
-    pixel = camera.project(np.column_stack([corner, [1.0]])) - np.array(
-        [[camera.width / 2, camera.height / 2]]
-    )
-    stretch = float(np.linalg.norm(pixel) / (focal * np.linalg.norm(corner)))
-    return abs(stretch - 1) <= _MAX_DISTORTION
+    half = np.array([camera.width, camera.height]) / 2
+    pixel = camera.project(np.append(half / focal, 1.0)[None])[0]
+    radius = float(np.linalg.norm(half / focal))
+    stretch = float(np.linalg.norm(pixel - half) / focal) / radius
+    return abs(stretch - 1) <= min(_MAX_DISTORTION, _MAX_COEFFICIENT * radius**2)
 
 
 def elect_focal_length(pairs: Sequence[MatchedPair], size: tuple[int, int]) -> float | None:
