@@ -28,6 +28,8 @@ _CHUNK = 64
 _GUESSED_MODEL = "SIMPLE_RADIAL"
 # Of so many images, spread over a folder, most have the size of the map's images.
 _SIZE_SAMPLES = 15
+# Cameras whose parameters differ by this share of the focal length count as one.
+_SAME_CAMERA = 0.01
 # Origins of a focal length that is no guess.
 GIVEN, EXIF = "given", "from EXIF data"
 
@@ -136,13 +138,17 @@ class FrameSource(ABC):
         size = self.size()
         named = {cameras.by_image[n] for n, _ in self.listing() if n in cameras.by_image}
         of_size = [c for c in named if (c.width, c.height) == size]
-        if len(of_size) > 1:
+        of_size.sort(key=lambda camera: (camera.model, camera.params))
+        params = [c.params for c in of_size]
+        if len({c.model for c in of_size}) > 1 or (
+            of_size and np.ptp(params, axis=0).max() > _SAME_CAMERA * params[0][0]
+        ):
             raise ValueError(
                 f"the images have {len(of_size)} different cameras, and a map takes one: give the "
-                "one to use with --camera, such as "
-                f"'{min(of_size, key=lambda camera: camera.params)}'"
+                f"one to use with --camera, such as '{of_size[0]}'"
             )
-        return of_size[0] if of_size else cameras.find("", *size)
+        # COLMAP calibrates each image of one camera for itself, unless told otherwise.
+        return of_size[len(of_size) // 2] if of_size else cameras.find("", *size)
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length.

@@ -147,7 +147,14 @@ def no_map(mapper: Mapper, source: FrameSource, known: int = 0) -> str:
             f"{source.path}: no map: of {len(mapper.history.records)} frames {common[0][1]} have "
             f"this in common: {common[0][0]}"
         )
+    if len(records) < 2:
+        return f"{source.path}: no map: one image shows no depth, give several"
     parallax = mapper.initialiser.best_parallax
+    if parallax >= MIN_PARALLAX:
+        return (
+            f"{source.path}: no map: frames are taken far enough apart, but no pair of them fits "
+            "what the others see: check --camera, and that nothing but the camera moves"
+        )
     return (
         f"{source.path}: no map: no two of {len(records)} frames overlap enough and are taken far "
         f"enough apart (the best pair has {parallax:.1f} degrees of parallax, {MIN_PARALLAX:g} are "
