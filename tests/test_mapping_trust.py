@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -152,6 +153,28 @@ def test_a_pose_that_its_landmarks_leave_open_is_uncertain() -> None:
         found = is_uncertain(structure, frame, frame.pose, frame.observed, frame.seen)
         assert found == uncertain
     assert untrusted_frames(structure) == {0: UNCERTAIN}
+
+
+def test_a_pose_on_which_few_of_the_expected_matches_agree_is_none() -> None:
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=1000, window=20), PINHOLE)
+    for i, pose in enumerate(walk(8)):
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose)))
+    frame = mapper.structure.frames[4]
+    found = mapper.tracker.relocalize(frame)
+    assert found is not None
+    expected = mapper.memory.expected(mapper.memory.search(frame.codes)[1])
+    assert len(found.matches) > 0.5 * expected > 50
+    # As in a place that looks alike: most matches agree on nothing.
+    rng = np.random.default_rng(0)
+    moved = rng.permutation(len(frame.keypoints))[: int(0.85 * len(frame.keypoints))]
+    pixels = frame.keypoints.copy()
+    pixels[moved] = rng.uniform((0, 0), SIZE, (len(moved), 2))
+    alike = replace(frame, keypoints=pixels, rays=PINHOLE.rays(pixels))
+    tracker = mapper.tracker
+    tracker.min_inliers = 8
+    assert tracker.relocalize(alike) is None
+    pixels[moved[len(moved) // 2 :]] = frame.keypoints[moved[len(moved) // 2 :]]
+    assert tracker.relocalize(replace(alike, rays=PINHOLE.rays(pixels))) is not None
 
 
 def logo() -> np.ndarray:
