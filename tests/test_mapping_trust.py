@@ -26,6 +26,7 @@ from protomark.mapping.source import open_source
 from protomark.mapping.static_regions import outside, read_mask, static_regions
 from protomark.mapping.structure import Structure
 from protomark.mapping.survey import MatchedPair
+from protomark.mapping.tracking import LandmarkMatches
 from protomark.mapping.trust import THROWN, UNCERTAIN, is_uncertain, untrusted_frames
 from test_mapping import CAMERA, COUNT, error_of, run
 from test_tracks_command import fails
@@ -150,8 +151,8 @@ def test_a_pose_that_its_landmarks_leave_open_is_uncertain() -> None:
     for points, uncertain in ((far, False), (close, True)):
         structure = structure_of(walk(1), points)
         frame = structure.frames[0]
-        found = is_uncertain(structure, frame, frame.pose, frame.observed, frame.seen)
-        assert found == uncertain
+        matches = LandmarkMatches(frame.observed, frame.seen)
+        assert is_uncertain(structure, frame, frame.pose, matches) == uncertain
     assert untrusted_frames(structure) == {0: UNCERTAIN}
 
 

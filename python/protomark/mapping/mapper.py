@@ -133,9 +133,9 @@ class Mapper:
     def _register(self, frame: Frame, record: FrameRecord) -> None:
         """Track or relocalize a frame, and update the map with it."""
         found = self._track_or_relocalize(frame)
-        if found is None:
+        if found is None or trust.is_uncertain(self.structure, frame, found.pose, found.matches):
             self.lost_in_row += 1
-            record.outcome = "not found in the map: too few matches agree on a pose"
+            record.outcome = trust.NOT_FOUND if found is None else trust.UNCERTAIN
             return
         self.lost_in_row = 0
         self._insert_frame(frame, found)
@@ -196,11 +196,7 @@ class Mapper:
                 other = self.tracker.track_local_map(frame, rough.pose) if rough else None
                 if found is None or (other and len(other.matches) > len(found.matches)):
                     found = other
-            return found if found and self._is_certain(frame, found) else None
-
-    def _is_certain(self, frame: Frame, found: TrackedPose) -> bool:
-        matches = found.matches
-        return not trust.is_uncertain(self.structure, frame, found.pose, matches.rows, matches.ids)
+        return found
 
     def _observe(self, frame: Frame, found: TrackedPose) -> int:
         """Update the prototypes that a frame observes (Eq. 2); returns the frame's index."""

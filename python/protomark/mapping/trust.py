@@ -10,11 +10,12 @@ import numpy as np
 
 from protomark.geometry.absolute_pose import pose_covariance
 from protomark.geometry.pose import camera_centers, transform
-from protomark.mapping.frame import Array, Frame, Ids
+from protomark.mapping.frame import Array, Frame
 from protomark.mapping.history import REGISTERED
 from protomark.mapping.initialisation import MIN_PARALLAX
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.structure import Structure
+from protomark.mapping.tracking import LandmarkMatches
 
 if TYPE_CHECKING:
     from protomark.mapping.mapper import Mapper
@@ -32,15 +33,17 @@ _MIN_STEPS = 8
 # Maps with a smaller share of their frames are of something else than their input.
 _MIN_REGISTERED = 0.5
 
+NOT_FOUND = "not found in the map: too few matches agree on a pose"
 UNCERTAIN = "its pose is uncertain: what it sees has too little depth, or lies too close together"
 THROWN = "it was thrown far away from its neighbours"
 WAITING = "before the first pair of frames with enough parallax"
 TOO_FEW = "too few landmarks are left that it observes"
 
 
-def is_uncertain(structure: Structure, frame: Frame, pose: Array, rows: Ids, ids: Ids) -> bool:
-    """Whether these landmarks, seen by these keypoints, leave open where a frame was taken."""
-    pixels, positions = frame.keypoints[rows].astype(np.float64), structure.positions[ids]
+def is_uncertain(structure: Structure, frame: Frame, pose: Array, matches: LandmarkMatches) -> bool:
+    """Whether landmarks that match leave open where a frame was taken."""
+    pixels = frame.keypoints[matches.rows].astype(np.float64)
+    positions = structure.positions[matches.ids]
     covariance = pose_covariance(pose, pixels, positions, structure.cameras[frame.camera_id])
     if covariance is None:
         return True
@@ -54,7 +57,9 @@ def untrusted_frames(structure: Structure) -> dict[int, str]:
     for i, frame in enumerate(structure.frames):
         if len(frame.seen) < _MIN_LANDMARKS:
             failed[i] = TOO_FEW
-        elif is_uncertain(structure, frame, frame.pose, frame.observed, frame.seen):
+        elif is_uncertain(
+            structure, frame, frame.pose, LandmarkMatches(frame.observed, frame.seen)
+        ):
             failed[i] = UNCERTAIN
     for camera_id in {frame.camera_id for frame in structure.frames}:
         order = [
