@@ -39,6 +39,17 @@ def walk(count: int, step: float = 0.08) -> NDArray[np.float64]:
     return np.array(out)
 
 
+def turn_and_approach(count: int) -> NDArray[np.float64]:
+    """(count, 3, 4) cam_from_world of a motion that determines the focal length."""
+    out = []
+    for i in range(count):
+        center = np.array([0.1 * i - 0.8, 0.15 * np.sin(0.9 * i), 0.5 * np.sin(0.4 * i) - 0.3])
+        turn = np.array([0.15 * np.sin(0.7 * i), 0.2 * np.sin(0.5 * i), 0.05 * i])
+        rotation = cv2.Rodrigues(turn)[0]
+        out.append(np.column_stack([rotation, -rotation @ center]))
+    return np.array(out)
+
+
 def show(pose: NDArray[np.float64], camera: Camera = PINHOLE, seed: int = 0) -> NDArray[np.uint8]:
     """Renders the image of a camera; every seed gives another room."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

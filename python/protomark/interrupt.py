@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -14,6 +15,9 @@ class Interrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Seconds after a signal within which the step at hand may still end.
+_PATIENCE = 3.0
+_requested_at: float | None = None
 
 
 @contextmanager
@@ -32,14 +36,31 @@ def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Ca
         return
 
     def request(number: int, frame: FrameType | None) -> None:
+        global _requested_at
         if requested.is_set():
             raise KeyboardInterrupt
         requested.set()
+        _requested_at = time.monotonic()
         notify()
 
     before = [signal.signal(number, request) for number in _SIGNALS]
     try:
         yield requested.is_set
     finally:
+        _forget()
         for number, handler in zip(_SIGNALS, before, strict=True):
             signal.signal(number, handler)
+
+
+def raise_if_overdue() -> None:
+    """Raise KeyboardInterrupt if the step at hand goes on for long after a deferred signal.
+
+    Long steps call it between parts that leave nothing behind.
+    """
+    if _requested_at is not None and time.monotonic() - _requested_at > _PATIENCE:
+        raise KeyboardInterrupt
+
+
+def _forget() -> None:
+    global _requested_at
+    _requested_at = None

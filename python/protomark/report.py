@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from protomark.plot import INK, MUTED, MapPictures, map_figures, svg_text
+from protomark.plot import INK, MUTED, RED, MapPictures, map_figures, svg_text
 
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{title}</title>
@@ -15,9 +15,11 @@ _PAGE = """<!doctype html>
 body {{ font: 16px/1.5 system-ui, sans-serif; color: {ink}; max-width: 70rem; margin: 2rem auto;
   padding: 0 1rem }}
 table {{ border-collapse: collapse }} td {{ padding: .2rem 1.2rem .2rem 0; vertical-align: top }}
+p.warning {{ border-left: .3rem solid {red}; padding-left: 1rem }}
 td:first-child {{ color: {muted} }} svg {{ max-width: 100%; height: auto }}
 </style>
 <h1>{title}</h1>
+{warnings}
 <table>{rows}</table>
 {plots}
 <h2>Frames without a pose</h2>{unregistered}
@@ -63,12 +65,19 @@ def map_page(facts: Mapping[str, Any], pictures: MapPictures, title: str) -> str
     return _PAGE.format(
         title=escape(title),
         ink=INK,
+        red=RED,
         muted=MUTED,
+        warnings="".join(f"<p class=warning>{escape(w)}" for w in _map_warnings(facts)),
         rows="".join(f"<tr><td>{escape(k)}<td>{escape(v)}" for k, v in map_rows(facts)),
         plots="\n".join(svg_text(figure) for figure in map_figures(pictures)),
         unregistered=_unregistered(facts["not_registered"]),
         events=f"<ul>{events}</ul>" if events else "<p>None.",
     )
+
+
+def _map_warnings(facts: Mapping[str, Any]) -> list[str]:
+    stopped = "This map was stopped before all frames were added: --resume continues it."
+    return [*([] if facts["finished"] else [stopped]), *facts["warnings"]]
 
 
 def track_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -100,6 +109,7 @@ def map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         ),
         *([("sealed map", f"{sealed:,} bytes, with encoder and positions")] if sealed else []),
         ("camera", f"{camera['model']}, {camera['width']}x{camera['height']}: {params}"),
+        *([("left out", facts["left_out"])] if facts["left_out"] else []),
         (
             "time",
             f"{facts['seconds_total']:.1f} s, {facts['frames_per_second']:.1f} frames per second",

@@ -11,6 +11,7 @@ from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoint
 
 
 def map_(
+    ctx: typer.Context,
     images: Annotated[
         Path, typer.Argument(metavar="IMAGES_OR_VIDEO", help="Folder of images, or a video file.")
     ],
@@ -27,7 +28,7 @@ def map_(
         float | None,
         typer.Option(
             help="Focal length to start calibration with, pixels; by default that of EXIF data, "
-            "else 1.2 times the longer side of the image."
+            "else what most pairs of the first frames agree on."
         ),
     ] = None,
     poses: Annotated[
@@ -36,6 +37,10 @@ def map_(
             help="Known poses, which are not adjusted: a COLMAP model folder or images.txt, or a "
             "TUM trajectory."
         ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(help="Image that is black where the camera sees no scene, as in COLMAP."),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
     window: Annotated[
@@ -67,21 +72,23 @@ def map_(
 
     protomark localize kitchen new-images/
 
-    Ctrl-C writes the map so far, and the same command with --resume continues it.
+    Ctrl-C writes the map so far, and the same command with --resume continues it. The exit code is
+    1 if there is no map, or one that cannot be trusted: sentences say why.
     """
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.extras import optional
     from protomark.features.images import passed_over
     from protomark.files import check_outputs
     from protomark.mapping.options import MappingOptions
-    from protomark.mapping.session import MapRequest, make_map
+    from protomark.mapping.request import MapRequest
+    from protomark.mapping.session import make_map
 
     scene = output or into
     if scene is None or (output is not None and into is not None):
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
-    check_outputs(json_file, inputs=[images, camera, poses, encoder], folder=scene)
+    check_outputs(json_file, inputs=[images, camera, poses, mask, encoder], folder=scene)
     if line := passed_over(images):
         note(line)
     if view:
@@ -99,6 +106,7 @@ def map_(
         camera=camera,
         focal=focal,
         poses=poses,
+        mask=mask,
         every=every,
         resume=resume,
         extend=into is not None,
@@ -106,11 +114,19 @@ def map_(
         record=view,
         seal=not no_seal,
         threads=threads,
+        chosen=frozenset(name for name in ctx.params if _is_chosen(ctx, name)),
     )
     with progress_bar() as progress:
         figures = make_map(request, progress, note)
     write_json(json_file, figures)
     _show(figures, scene)
+    if figures["warnings"]:
+        raise typer.Exit(1)
+
+
+def _is_chosen(ctx: typer.Context, name: str) -> bool:
+    source = ctx.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"
 
 
 def _show(figures: dict[str, Any], scene: Path) -> None:
@@ -122,4 +138,7 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
     print_facts([("map", f"{scene}, see {scene / 'report.html'}"), *map_rows(figures)])
     for reason, names in figures["not_registered"].items():
         say(f"  [yellow]without a pose[/]: {escape(first_of(names))}: {escape(reason)}")
-    say(f"  next: protomark localize {escape(str(scene))} IMAGES")
+    for warning in figures["warnings"]:
+        say(f"  [red]cannot be trusted[/]: {escape(warning)}")
+    if not figures["warnings"]:
+        say(f"  next: protomark localize {escape(str(scene))} IMAGES")

@@ -11,6 +11,7 @@ import zlib  # noqa: F401  (must come before pycolmap, see above)
 
 # isort: split
 import contextlib
+import math
 import os
 import re
 import signal
@@ -31,6 +32,7 @@ from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 from protomark.geometry.pose_files import check_images_txt
+from protomark.interrupt import raise_if_overdue
 
 # pycolmap takes SIGTERM for itself, to print a stack trace.
 _on_sigterm = signal.getsignal(signal.SIGTERM)
@@ -39,6 +41,8 @@ if _on_sigterm is not None and threading.current_thread() is threading.main_thre
     signal.signal(signal.SIGTERM, _on_sigterm)
 
 _FILES = ("cameras", "images")
+# Steps of the solver in one call.
+_SLICE = 10
 
 
 @dataclass
@@ -259,6 +263,61 @@ def bundle_adjust(
         priors: (m, 3) camera centres that images 1 to m are likely to have.
         spread: standard deviation of the priors along each axis.
     """
+    images, usable = list(image_ids), False
+    # Python sees signals only between two calls of the solver.
+    for start in range(0, iterations, _SLICE):
+        raise_if_overdue()
+        limit = min(_SLICE, iterations - start)
+        adjuster = _adjuster(
+            reconstruction, images, fixed, limit, loss_scale, intrinsics, threads, priors, spread
+        )
+        with quiet():
+            summary = adjuster.solve()
+        usable = bool(summary.is_solution_usable())
+        if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
+            break
+    return usable
+
+
+def focal_deviations(reconstruction: Any, image_ids: Iterable[int]) -> dict[int, float]:
+    """Relative standard deviation of each camera's focal length after bundle adjustment.
+
+    Poses, points and distortion are free, and the residuals say how accurate a keypoint is. The
+    value is infinite where the images do not determine the focal length.
+
+    Args:
+        reconstruction: an adjusted `pycolmap.Reconstruction`.
+        image_ids: images that take part.
+    """
+    adjuster = _adjuster(reconstruction, image_ids, intrinsics=True)
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    with quiet():
+        covariance = pycolmap.estimate_ba_covariance(options, reconstruction, adjuster)
+    reconstruction.update_point_3d_errors()
+    # The mean length of an error with this deviation in x and in y is sqrt(pi / 2) times it.
+    noise = reconstruction.compute_mean_reprojection_error() / math.sqrt(math.pi / 2)
+    deviations = {}
+    for camera_id, camera in reconstruction.cameras.items():
+        block = None if covariance is None else covariance.get_other_params_cov(camera.params)
+        variance = float(block[0, 0]) if block is not None else math.inf
+        valid = math.isfinite(variance) and variance >= 0
+        deviation = noise * math.sqrt(variance) / camera.mean_focal_length() if valid else math.inf
+        deviations[int(camera_id)] = deviation
+    return deviations
+
+
+def _adjuster(
+    reconstruction: Any,
+    image_ids: Iterable[int],
+    fixed: Sequence[int] = (),
+    iterations: int = 30,
+    loss_scale: float = 1.0,
+    intrinsics: bool = False,
+    threads: int = 1,
+    priors: NDArray[np.float64] | None = None,
+    spread: float = 1.0,
+) -> Any:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = intrinsics
     options.refine_principal_point = False
@@ -277,18 +336,11 @@ def bundle_adjust(
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
     if priors is None:
-        adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    else:
-        known = [_prior(reconstruction.images[i], p, spread) for i, p in enumerate(priors, 1)]
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            options,
-            pycolmap.PosePriorBundleAdjustmentOptions(),
-            config,
-            known,
-            reconstruction,
-        )
-    with quiet():
-        return bool(adjuster.solve().is_solution_usable())
+        return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+    known = [_prior(reconstruction.images[i], p, spread) for i, p in enumerate(priors, 1)]
+    return pycolmap.create_pose_prior_bundle_adjuster(
+        options, pycolmap.PosePriorBundleAdjustmentOptions(), config, known, reconstruction
+    )
 
 
 def _prior(image: Any, position: NDArray[np.float64], spread: float) -> Any:

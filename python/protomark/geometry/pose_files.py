@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -235,14 +236,17 @@ def tum_trajectory(times: NDArray[np.float64], cam_from_world: NDArray[np.float6
     return "\n".join(lines) + "\n"
 
 
-def image_times(names: Sequence[str]) -> list[float]:
-    """Seconds if all names are ascending numbers like 1305031102.175304.png, else indices."""
+def image_times(names: Sequence[str]) -> tuple[list[float], bool]:
+    """Times of images by their names, and whether these are seconds.
+
+    They are seconds if all names are ascending numbers like 1305031102.175304.png, the numbers if
+    they are whole, else indices.
+    """
     stems = [Path(name).stem for name in names]
-    try:
-        if all("." in stem for stem in stems):
+    seconds = all("." in stem for stem in stems)
+    if seconds or all(stem.isdecimal() for stem in stems):
+        with suppress(ValueError):
             times = [float(stem) for stem in stems]
             if np.isfinite(times).all() and (np.diff(times) > 0).all():
-                return times
-    except ValueError:
-        pass
-    return [float(i) for i in range(len(names))]
+                return times, seconds
+    return [float(i) for i in range(len(names))], False

@@ -202,7 +202,7 @@ class LocalizationBatch:
         write_text(folder / POSES, images_txt(poses, camera_ids))
         write_text(folder / POINTS, "# The landmarks are in the map\n")
         write_text(folder / TABLE, self.table())
-        times = image_times([image.name for image in self.images])
+        times, _ = image_times([image.name for image in self.images])
         posed = [
             (time, poses[image.name])
             for time, image in zip(times, self.images, strict=True)

@@ -12,6 +12,7 @@ from protomark.geometry.pose import transform
 from protomark.geometry.triangulation import refine_points
 from protomark.mapping.frame import Array, Ids
 from protomark.mapping.reconstruction import to_reconstruction
+from protomark.mapping.self_calibration import Calibration
 from protomark.mapping.structure import Observations, Structure
 
 # Each frame's most observed landmarks take part in the adjustment; more cost time and do not lower
@@ -48,14 +49,23 @@ def adjust_global_bundle(
     structure: Structure,
     iterations: int = 30,
     loss_scale: float = 1.0,
-    intrinsics: bool = False,
+    calibration: Calibration | None = None,
     poses: bool = True,
     threads: int = 1,
 ) -> None:
-    """Adjust all keyframes and landmarks, with `intrinsics` the cameras, too."""
+    """Adjust all keyframes and landmarks.
+
+    Args:
+        structure: frames and landmarks; changed.
+        iterations: limit on the solver's steps.
+        loss_scale: pixels beyond which an error counts less.
+        calibration: calibrates the cameras as far as the map determines them; None: they stay.
+        poses: whether poses move, too.
+        threads: threads of the solver; their number changes the last digits.
+    """
     keyframes = structure.keyframes()
     moving, fixed = (keyframes, []) if poses else ([], keyframes)
-    adjust(structure, moving, fixed, iterations, loss_scale, intrinsics, threads)
+    adjust(structure, moving, fixed, iterations, loss_scale, calibration, threads)
     structure.recompute_views()
 
 
@@ -74,7 +84,7 @@ def adjust(
     fixed: list[int],
     iterations: int,
     loss_scale: float = 1.0,
-    intrinsics: bool = False,
+    calibration: Calibration | None = None,
     threads: int = 1,
 ) -> None:
     """Move frames and the landmarks they observe to the least (Cauchy) reprojection error.
@@ -85,7 +95,7 @@ def adjust(
         fixed: indices of keyframes that observe the same landmarks and are held fixed.
         iterations: limit on the solver's steps.
         loss_scale: pixels beyond which an error counts less.
-        intrinsics: whether focal length and distortion move, too.
+        calibration: calibrates the cameras as far as the map determines them; None: they stay.
         threads: threads of the solver; their number changes the last digits.
     """
     seen = structure.observations(sorted({*moving, *fixed}))
@@ -94,17 +104,21 @@ def adjust(
     if moving:
         used = seen.where(np.isin(seen.landmarks, _most_observed(seen, counts, set(moving))))
         before = {i: structure.frames[i].pose for i in moving}
-        present = set(np.unique(used.frames).tolist())
-        reconstruction = to_reconstruction(structure, sorted(present), used)
-        bundle_adjust(
-            reconstruction,
-            [i + 1 for i in present],
-            [i + 1 for i in fixed if i in present],
-            iterations=iterations,
-            loss_scale=loss_scale,
-            intrinsics=intrinsics,
-            threads=threads,
-        )
+        present = sorted(np.unique(used.frames).tolist())
+        for intrinsics in (True, False) if calibration is not None else (False,):
+            reconstruction = to_reconstruction(structure, present, used)
+            images = [i + 1 for i in present]
+            bundle_adjust(
+                reconstruction,
+                images,
+                [i + 1 for i in fixed if i in present],
+                iterations=iterations,
+                loss_scale=loss_scale,
+                intrinsics=intrinsics,
+                threads=threads,
+            )
+            if calibration is None or not intrinsics or calibration.accept(reconstruction, images):
+                break
         _read_back(structure, reconstruction, used, moving, intrinsics)
         _move_with_frames(structure, np.setdiff1d(seen.landmarks, used.landmarks), before)
     seen = structure.observations(sorted({*moving, *fixed}))
@@ -147,9 +161,8 @@ def _read_back(
     if cameras:
         for camera_id, camera in reconstruction.cameras.items():
             params = tuple(float(p) for p in camera.params)
-            if np.isfinite(params).all() and camera.mean_focal_length() > 0:
-                ours = structure.cameras[camera_id]
-                structure.set_camera(camera_id, Camera(ours.model, ours.width, ours.height, params))
+            ours = structure.cameras[camera_id]
+            structure.set_camera(camera_id, Camera(ours.model, ours.width, ours.height, params))
 
 
 def _move_with_frames(structure: Structure, ids: Ids, before: dict[int, Array]) -> None:

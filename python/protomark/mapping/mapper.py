@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 import protomark as pm
-from protomark.features.extractor import Extractor
+from protomark.features.extractor import Extractor, Features
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
-from protomark.mapping import adjustment, culling, loop
+from protomark.mapping import adjustment, culling, loop, trust
 from protomark.mapping.clock import Clock
 from protomark.mapping.frame import Array, Frame, InputImage
 from protomark.mapping.history import REGISTERED, FrameRecord, History
@@ -20,6 +20,8 @@ from protomark.mapping.memory import Memory, Prototypes, prototypes_for
 from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
+from protomark.mapping.self_calibration import Calibration
+from protomark.mapping.static_regions import Mask, outside
 from protomark.mapping.structure import Structure
 from protomark.mapping.tracking import LandmarkMatches, TrackedPose, Tracker
 from protomark.mapping.triangulation import triangulate, update_prototypes
@@ -43,11 +45,6 @@ _MAX_YOUNG_LOSSES = 3
 _MIN_TRACKED_SHARE = 0.3
 _LOOP_EVERY = 3
 _LOOP_LOSS_SCALE = 8.0
-# The map restarts if a guessed focal length proves to be off by more than this share, as its first
-# frames are bent. That is decided at this number of keyframes, or at the end: after the first
-# keyframes of `hololens` the estimate is 530 to 790 pixels, and 495 in the end.
-_MAX_FOCAL_OFFSET = 0.05
-_CALIBRATED_KEYFRAMES = 196
 
 
 class Mapper:
@@ -77,9 +74,10 @@ class Mapper:
         self.next_global = _FIRST_GLOBAL
         self.lost_in_row = 0
         self.retrying = False
-        # Focal length that the map was initialised with, 0 once it is confirmed.
-        self.guessed_focal = camera.focal_length if options.calibrate else 0.0
-        self.restarted = False
+        self.calibration = Calibration(camera.focal_length) if options.calibrate else None
+        # Features that are known already, and the part of the image that is left out.
+        self.features: dict[str, Features] = {}
+        self.mask: Mask | None = None
         self._extractor = Extractor(options.descriptor, options.max_keypoints)
         self._reset_initialiser()
 
@@ -135,9 +133,9 @@ class Mapper:
     def _register(self, frame: Frame, record: FrameRecord) -> None:
         """Track or relocalize a frame, and update the map with it."""
         found = self._track_or_relocalize(frame)
-        if found is None:
+        if found is None or trust.is_uncertain(self.structure, frame, found.pose, found.matches):
             self.lost_in_row += 1
-            record.outcome = "not found in the map: too few matches agree on a pose"
+            record.outcome = trust.NOT_FOUND if found is None else trust.UNCERTAIN
             return
         self.lost_in_row = 0
         self._insert_frame(frame, found)
@@ -167,7 +165,9 @@ class Mapper:
             )
             return None
         with self.clock.stage("detect"):
-            features = self._extractor(image.image)
+            features = self.features.get(image.name) or self._extractor(image.image)
+            if self.mask is not None and self.mask.shape == image.image.shape:
+                features = features.where(outside(self.mask, features.keypoints))
         record.keypoints = len(features)
         if len(features) < _MIN_KEYPOINTS:
             record.outcome = f"only {len(features)} keypoints: black, blurred or without texture"
@@ -273,16 +273,13 @@ class Mapper:
 
     def _adjust_global_bundle(self, rounds: int) -> None:
         """Adjust and cull the whole map, and the camera if it is being calibrated."""
-        structure, o = self.structure, self.options
-        # After a restart the first keyframes must not overrule the estimate from all frames.
-        fixed = self.restarted and self.guessed_focal
-        fixed = fixed and len(structure.keyframes()) < _CALIBRATED_KEYFRAMES
+        structure = self.structure
         with self.clock.stage("adjust"):
             for _ in range(rounds):
                 adjustment.adjust_global_bundle(
                     structure,
-                    intrinsics=o.calibrate and not fixed,
-                    poses=not o.fixed_poses,
+                    calibration=self.calibration,
+                    poses=not self.options.fixed_poses,
                     threads=self.threads,
                 )
                 self._cull(structure.keyframes())
@@ -332,7 +329,7 @@ class Mapper:
         with self.clock.stage("initialise"):
             pair = self.initialiser.push(frame)
         if pair is None:
-            record.outcome = "before the first pair of frames with enough parallax"
+            record.outcome = trust.WAITING
             return
         waiting = self.initialiser.waiting
         first, second = waiting[pair.first], waiting[pair.second]
@@ -400,27 +397,26 @@ class Mapper:
     # The camera.
 
     def needs_restart(self, at_end: bool = False) -> bool:
-        """Whether the camera proved so different from the guess that the map has to restart.
+        """Whether the camera proved so different from the start that the map has to restart.
 
         Args:
             at_end: whether no frame is left, so that the existing keyframes decide.
         """
-        if not self.guessed_focal or self.restarted:
+        if self.calibration is None:
             return False
-        keyframes = len(self.structure.keyframes())
-        if keyframes < (_FIRST_GLOBAL if at_end else _CALIBRATED_KEYFRAMES):
-            return False
-        if at_end:
+        if at_end and len(self.structure.keyframes()) >= _FIRST_GLOBAL:
             self._adjust_global_bundle(2)
-        return abs(self.camera.focal_length / self.guessed_focal - 1) > _MAX_FOCAL_OFFSET
+        return self.calibration.needs_restart(self.camera.focal_length)
 
     def restart(self) -> Mapper:
         """An empty map that starts with the camera which this one calibrated."""
+        assert self.calibration is not None
         new = Mapper(self.options, self.camera, self.threads, self._new_memory)
-        new.restarted = True
+        new.calibration = self.calibration.restarted(self.camera.focal_length)
+        new.features, new.mask = self.features, self.mask
         new.history.events.append(
-            f"the map restarts: focal length {new.guessed_focal:.0f}, not "
-            f"{self.guessed_focal:.0f} pixels"
+            f"the map restarts: focal length {new.calibration.start:.0f}, not "
+            f"{self.calibration.start:.0f} pixels"
         )
         return new
 
@@ -439,6 +435,7 @@ class Mapper:
         progress("adjust", 0, 0)
         if self.structure.frames:
             self._adjust_global_bundle(2)
+            self._remove_untrusted_frames()
         for frame in self.structure.frames:
             frame.descriptors = frame.encoded = None
         # With an empty window every landmark counts as old, and unconfirmed ones are culled.
@@ -451,6 +448,18 @@ class Mapper:
         for name, seconds in self.clock.lap().items():
             total = self.history.closing_seconds
             total[name] = total.get(name, 0.0) + seconds
+
+    def _remove_untrusted_frames(self) -> None:
+        """Remove frames whose poses fail the checks: they do not count as registered."""
+        structure = self.structure
+        failed = {} if self.options.fixed_poses else trust.untrusted_frames(structure)
+        culling.remove_observations(structure, self.memory, structure.observations(list(failed)))
+        for i, reason in failed.items():
+            record = self.history.records[structure.frames[i].name]
+            record.outcome, record.keyframe, record.inliers = reason, False, 0
+        structure.frames = [f for i, f in enumerate(structure.frames) if i not in failed]
+        if failed:
+            structure.recompute_views()
 
     def _retry_lost_frames(self, reread: Reread, progress: Progress) -> None:
         """Retry lost frames, backward first: most precede a registered frame that leads to them."""

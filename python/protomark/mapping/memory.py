@@ -93,6 +93,10 @@ class Memory(ABC):
             ratio = np.where(second > 0, nearest / second, 1.0)
         return clearest_rows(nearest, ratio, self.ratio)
 
+    def expected(self, distances: NDArray[np.int32]) -> float:
+        """How many of accepted matches with distances (q, 2) should be right; 0: unknown."""
+        return 0.0
+
 
 def clearest_rows(
     nearest: NDArray[np.int32], ambiguity: NDArray[np.floating], limit: float
@@ -164,6 +168,12 @@ class Prototypes(Memory):
             return super().accepted(distances)
         ambiguity = 1 - self.calibration.probability(distances)
         return clearest_rows(distances[:, 0], ambiguity, 1 - MIN_PROBABILITY)
+
+    def expected(self, distances: NDArray[np.int32]) -> float:
+        """See `Memory.expected`: the sum of their probabilities."""
+        if self.calibration is None or not len(distances):
+            return 0.0
+        return float(self.calibration.probability(distances).sum())
 
     def use(self, scene: pm.PrototypeMap) -> None:
         """Continue with a saved map.

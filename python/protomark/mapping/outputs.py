@@ -3,22 +3,48 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from protomark.files import write_text
+from protomark.files import replacing_folder, write_text
 from protomark.geometry.pose_files import tum_trajectory
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.reconstruction import write_model
+from protomark.mapping.state import CHECKPOINT
 from protomark.mapping.summary import map_pictures, summarise
 from protomark.maps import cameras
 from protomark.maps.open import SCENE_MAP, SEALED_MAP
 from protomark.maps.seal import seal_map
 from protomark.report import map_page
 
+# The map before it was extended.
+PREVIOUS = "previous"
 MODEL, TRAJECTORY, REPORT, FIGURES = "sparse", "trajectory.txt", "report.html", "report.json"
+
+
+def back_up(scene: Path) -> None:
+    """Keep the files of a map that is about to be replaced in its folder `previous`."""
+    kept = (PREVIOUS, CHECKPOINT)
+    with replacing_folder(scene / PREVIOUS) as folder:
+        shutil.copytree(
+            scene,
+            folder,
+            ignore=lambda path, names: [n for n in names if n in kept or n.startswith(".")],
+            copy_function=_link,
+            dirs_exist_ok=True,
+        )
+
+
+def _link(source: str, target: str) -> None:
+    """Files are replaced, never changed, so a link keeps the old one."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def write_outputs(

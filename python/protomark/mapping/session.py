@@ -5,60 +5,38 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
+from protomark.features.extractor import Extractor
+from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.pose_files import read_poses
 from protomark.interrupt import Interrupted, deferred_interrupt
-from protomark.mapping.initialisation import MIN_PARALLAX
+from protomark.mapping.given_poses import check_poses_fit, check_poses_given
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
-from protomark.mapping.outputs import write_outputs
+from protomark.mapping.outputs import back_up, write_outputs
 from protomark.mapping.recording import Recording
-from protomark.mapping.source import FrameSource, open_source
+from protomark.mapping.request import (
+    MapRequest,
+    check_output,
+    check_same_options,
+    check_same_request,
+    request_facts,
+)
+from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
+from protomark.mapping.source import EXIF, GIVEN, FrameSource, open_source
 from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
+from protomark.mapping.static_regions import describe, read_mask, static_regions
+from protomark.mapping.survey import Survey, survey
+from protomark.mapping.trust import no_map
 from protomark.progress import Progress, silent
 
 RECORDING = "recording.rrd"
 # Seconds between checkpoints, each of which takes about a tenth of a second.
 _CHECKPOINT_INTERVAL = 20.0
-
-
-@dataclass(frozen=True)
-class MapRequest:
-    """What to map, and how.
-
-    Attributes:
-        images: folder of images or video.
-        output: folder of the map.
-        options: how to make it; a map that is resumed or extended keeps its own.
-        camera: cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
-        focal: focal length to start calibration with, pixels.
-        poses: file or folder of known poses.
-        every: take every n-th frame only.
-        resume: whether to continue an interrupted map.
-        extend: whether to add the images to the existing map in `output`.
-        force: whether to replace an existing map.
-        record: whether to write a Rerun recording, too.
-        seal: whether to write a sealed map, too.
-        threads: threads to search and adjust on.
-    """
-
-    images: Path
-    output: Path
-    options: MappingOptions
-    camera: str | None = None
-    focal: float | None = None
-    poses: Path | None = None
-    every: int = 1
-    resume: bool = False
-    extend: bool = False
-    force: bool = False
-    record: bool = False
-    seal: bool = True
-    threads: int = 1
 
 
 def make_map(
@@ -81,28 +59,43 @@ def make_map(
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
-    _check_output(request)
+    check_output(request)
+    existed = request.output.exists()
+    try:
+        return _make_map(request, source, progress, note)
+    finally:
+        if not existed:
+            with suppress(OSError):  # it holds something
+                request.output.rmdir()
+
+
+def _make_map(
+    request: MapRequest, source: FrameSource, progress: Progress, note: Callable[[str], None]
+) -> dict[str, Any]:
     session = _Session(request, source, progress, note)
     finished = session.add_frames()
-    mapper = session.mapper
+    mapper, checkpoint = session.mapper, request.output / CHECKPOINT
+    resume = "the same command with --resume continues it"
     if finished:
-        mapper.finish(
-            lambda names, backward: source.images(only=names, backward=backward), progress
-        )
-        if not mapper.structure.frames:
-            shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
-            raise ValueError(_no_map(mapper, source))
+        try:
+            mapper.finish(
+                lambda names, backward: source.images(only=names, backward=backward), progress
+            )
+        except KeyboardInterrupt:
+            raise Interrupted(f"stopped before the last adjustment of the map: {resume}") from None
+        if not len(mapper.structure.ids) or len(mapper.structure.frames) <= session.known:
+            shutil.rmtree(checkpoint, ignore_errors=True)
+            raise ValueError(no_map(mapper, source, session.known))
     progress("write", 0, 0)
+    if finished and request.extend:
+        back_up(request.output)
     figures = write_outputs(mapper, request.output, source.path.name, finished, request.seal)
     if session.recording is not None:
         session.recording.close()
     if not finished:
-        raise Interrupted(
-            f"stopped: the map so far is in {request.output}; the same command with --resume "
-            "continues it"
-        )
+        raise Interrupted(f"stopped: the map so far is in {request.output}; {resume}")
     save_state(mapper, request.output / STATE, session.facts)
-    shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
+    shutil.rmtree(checkpoint, ignore_errors=True)
     return figures
 
 
@@ -111,8 +104,10 @@ class _Session:
 
     Attributes:
         mapper: the map in the making.
-        cursor: index of the next frame.
-        facts: the inputs so far with the prefixes of their frames' names, to continue the map.
+        cursor: number of frames that are done.
+        facts: what a later run needs to continue the map: the request, and the inputs so far with
+            the prefixes of their frames' names.
+        known: number of frames that the map had before this run.
     """
 
     def __init__(
@@ -124,9 +119,11 @@ class _Session:
     ) -> None:
         self.request, self.source = request, source
         self.progress, self.note = progress, note
-        self.cursor = 0
+        self.cursor = self.known = 0
+        self.facts: dict[str, Any] = {}
         if request.poses:
             source.poses = read_poses(request.poses).for_images(source.names())
+        check_poses_given(source)
         if request.resume:
             self._resume()
         elif request.extend:
@@ -136,13 +133,12 @@ class _Session:
         request.output.mkdir(parents=True, exist_ok=True)
         self.recording = Recording(request.output / RECORDING) if request.record else None
 
-    def _camera(self) -> Any:
+    def _camera(self) -> Camera | None:
         request = self.request
-        if request.camera:
-            return read_cameras(request.camera).find("", *self.source.size())
-        if request.poses is not None and request.poses.is_dir():
-            return read_cameras(str(request.poses)).find("", *self.source.size())
-        return None
+        text = request.camera
+        if text is None and request.poses is not None and request.poses.is_dir():
+            text = str(request.poses)
+        return self.source.find_camera(read_cameras(text)) if text else None
 
     def _start(self) -> None:
         request, options = self.request, self.request.options
@@ -151,112 +147,143 @@ class _Session:
             options = replace(options, fixed_poses=True)
             if camera is None:
                 raise ValueError("--poses needs the camera of the images: give it with --camera")
+        surveyed = self._survey(options)
+        origin = ""
         if camera is None:
-            camera, origin = self.source.guess_camera(request.focal)
+            camera, origin = self._guess_camera(surveyed)
             options = replace(options, calibrate=True)
             self.note(
                 f"camera: the focal length of {camera.params[0]:.0f} pixels is {origin} and is "
                 "refined while mapping (--camera gives a calibrated one)"
             )
+        elif self.source.poses is not None:
+            check_poses_fit(surveyed, camera)
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
-        self._set_input("", {})
+        if self.mapper.calibration is not None:
+            self.mapper.calibration.given = origin in (GIVEN, EXIF)
+        self._prepare(surveyed, "", {})
+
+    def _guess_camera(self, surveyed: Survey) -> tuple[Camera, str]:
+        """A camera to start calibration with, and the origin of its focal length."""
+        camera, origin = self.source.guess_camera(self.request.focal)
+        if origin in (GIVEN, EXIF):
+            return camera, origin
+        focal = elect_focal_length(surveyed.pairs, (camera.width, camera.height))
+        if focal is None:
+            return camera, origin
+        return replace(camera, params=(focal, *camera.params[1:])), "what the first frames agree on"
 
     def _resume(self) -> None:
-        scene = self.request.output
-        self.mapper, facts = load_state(scene / CHECKPOINT, self.request.threads)
-        if facts.get("input") != self.source.path.name:
-            raise ValueError(
-                f"{scene}: the interrupted map was of {facts.get('input')}, "
-                f"not of {self.source.path.name}"
-            )
-        self.cursor = int(facts["cursor"])
-        self._set_input(str(facts["prefix"]), facts["inputs"])
+        folder = self.request.output / CHECKPOINT
+        self.mapper, facts = load_state(folder, self.request.threads)
+        check_same_request(
+            self.request.output, request_facts(self.request, self.source), facts["request"]
+        )
+        self.cursor, self.known = int(facts["cursor"]), int(facts["known"])
+        self._prepare(self._survey(self.mapper.options), str(facts["prefix"]), facts["inputs"])
+        self.source.shift(*facts["shift"])
 
     def _extend(self) -> None:
-        self.mapper, facts = load_state(self.request.output, self.request.threads, self._camera())
+        request = self.request
+        self.mapper, facts = load_state(request.output, request.threads, self._camera())
+        check_same_options(request, self.mapper.options)
         inputs: dict[str, str] = facts.get("inputs", {})
-        self._set_input(_prefix(self.mapper, self.source, inputs), inputs)
+        prefix = _prefix(self.mapper, self.source, inputs)
+        self.known = len(self.mapper.structure.frames)
+        self._prepare(self._survey(self.mapper.options), prefix, inputs)
+        self.source.follow(self.mapper.structure, self.mapper.history.records)
 
-    def _set_input(self, prefix: str, inputs: dict[str, str]) -> None:
+    def _survey(self, options: MappingOptions) -> Survey:
+        """What the first frames show, and the region of the image to leave out."""
+        self.progress("look at the first frames", 0, 0)
+        size = self.source.size()
+        extractor = Extractor(options.descriptor, options.max_keypoints)
+        surveyed = survey(self.source.images(), extractor, size)
+        mask = static_regions(surveyed.pairs, size)
+        if mask.any():
+            self.note(f"left out, as it never moves while the rest does: {describe(mask)}")
+        if self.request.mask is not None:
+            mask |= read_mask(self.request.mask, size)
+        surveyed.mask = mask
+        return surveyed
+
+    def _prepare(self, surveyed: Survey, prefix: str, inputs: dict[str, str]) -> None:
+        """Tell mapper and source what is known of the input."""
         source = self.source
         source.prefix = prefix
-        inputs = {**inputs, str(source.path.resolve()): prefix}
-        self.facts: dict[str, Any] = {
-            "input": source.path.name,
+        self.mapper.features = {prefix + name: f for name, f in surveyed.features.items()}
+        self.mapper.mask = surveyed.mask
+        self.facts = {
+            "request": request_facts(self.request, source),
             "prefix": prefix,
-            "inputs": inputs,
+            "inputs": {**inputs, str(source.path.resolve()): prefix},
         }
 
     def add_frames(self) -> bool:
-        """Add all frames to the map; returns False if Ctrl-C stopped that."""
+        """Add all frames to the map; returns False if a signal stopped that."""
+        with deferred_interrupt(
+            lambda: self.note("stopping after this frame (again: at once)")
+        ) as interrupted:
+            try:
+                return self._add_frames(interrupted)
+            except KeyboardInterrupt:
+                # The frame at hand took too long: the map is as of the last checkpoint.
+                folder = self.request.output / CHECKPOINT
+                if not interrupted() or not folder.is_dir():
+                    raise
+                self.mapper, facts = load_state(folder, self.request.threads)
+                self.cursor = int(facts["cursor"])
+                return False
+
+    def _add_frames(self, interrupted: Callable[[], bool]) -> bool:
         saved = started = time.monotonic()
         first = self.cursor
-        with deferred_interrupt(lambda: self.note("stopping after this frame")) as interrupted:
-            images = self.source.images(self.cursor)
-            while True:
-                image = next(images, None)
-                if self.mapper.needs_restart(at_end=image is None):
-                    # The wrong focal length has bent the first part of the map.
-                    self.mapper = self.mapper.restart()
-                    self.note(self.mapper.history.events[-1])
-                    self.cursor, first, started = 0, 0, time.monotonic()
-                    images = self.source.images()
-                    continue
-                if image is None:
-                    break
-                if image.name not in self.mapper.history.records:
-                    self.mapper.add(image)
-                self.cursor = image.index + 1
-                if self.recording is not None:
-                    self.recording.show(self.mapper, image)
-                rate = (self.cursor - first) / max(time.monotonic() - started, 1e-9)
-                registered = len(self.mapper.structure.frames)
-                stage = f"map, {registered} registered, {rate:.1f} frames/s"
-                self.progress(stage, self.cursor, max(len(self.source), self.cursor))
-                if interrupted() or time.monotonic() - saved > _CHECKPOINT_INTERVAL:
-                    self._save()
-                    saved = time.monotonic()
-                if interrupted():
-                    return False
-        self.mapper.guessed_focal = 0.0
+        images = self.source.images(self.cursor)
+        while True:
+            image = next(images, None)
+            if self.mapper.needs_restart(at_end=image is None):
+                # The wrong focal length has bent the first part of the map.
+                self.mapper = self.mapper.restart()
+                self.note(self.mapper.history.events[-1])
+                self.cursor, first, started = 0, 0, time.monotonic()
+                images = self.source.images()
+                continue
+            if image is None:
+                break
+            if image.name not in self.mapper.history.records:
+                self.mapper.add(image)
+            self.cursor += 1
+            if self.recording is not None:
+                self.recording.show(self.mapper, image)
+            rate = (self.cursor - first) / max(time.monotonic() - started, 1e-9)
+            registered = len(self.mapper.structure.frames)
+            stage = f"{self._stage()}, {registered} registered, {rate:.1f} frames/s"
+            self.progress(stage, self.cursor, max(len(self.source), self.cursor))
+            if interrupted() or time.monotonic() - saved > _CHECKPOINT_INTERVAL:
+                self._save()
+                saved = time.monotonic()
+            if interrupted():
+                return False
+        if self.mapper.calibration is not None:
+            self.mapper.calibration.restarts = MAX_RESTARTS
         self._save()
         return True
 
+    def _stage(self) -> str:
+        """The name of the stage: a progress bar starts anew with each."""
+        restarts = self.mapper.calibration.restarts if self.mapper.calibration else 0
+        return "map" if not restarts else f"map (start {restarts + 1})"
+
     def _save(self) -> None:
-        save_checkpoint(self.mapper, self.request.output, {**self.facts, "cursor": self.cursor})
-
-
-def _check_output(request: MapRequest) -> None:
-    """Raise before any work if the output folder is not what the request needs."""
-    scene = request.output
-    if scene.exists() and not scene.is_dir():
-        raise NotADirectoryError(f"{scene} is not a folder: name one for the map with -o")
-    interrupted = (scene / CHECKPOINT).is_dir()
-    if request.resume:
-        if not interrupted:
-            raise FileNotFoundError(
-                f"{scene} holds no interrupted map: start a new one without --resume"
-            )
-        return
-    if request.extend:
-        if interrupted:
-            raise FileExistsError(
-                f"{scene} holds an interrupted map: finish it with --resume first"
-            )
-        return
-    if request.force or not scene.exists() or not any(scene.iterdir()):
-        return
-    if interrupted:
-        raise FileExistsError(
-            f"{scene} holds an interrupted map: --resume continues it, --force starts anew"
-        )
-    if (scene / STATE).exists():
-        raise FileExistsError(
-            f"{scene} holds a map already: --into {scene} extends it, --force makes it anew"
-        )
-    raise FileExistsError(f"{scene} holds other files: name another folder with -o")
+        facts = {
+            **self.facts,
+            "cursor": self.cursor,
+            "known": self.known,
+            "shift": [self.source.first_index, self.source.time_shift],
+        }
+        save_checkpoint(self.mapper, self.request.output, facts)
 
 
 def _prefix(mapper: Mapper, source: FrameSource, inputs: dict[str, str]) -> str:
@@ -277,16 +304,3 @@ def _prefix(mapper: Mapper, source: FrameSource, inputs: dict[str, str]) -> str:
         return inputs[here]
     names = [source.path.name, *(f"{source.path.name}-{i}" for i in range(2, 1000))]
     return next(f"{n}/" for n in names if not any(r.startswith(f"{n}/") for r in records))
-
-
-def _no_map(mapper: Mapper, source: FrameSource) -> str:
-    records = mapper.history.records.values()
-    outcomes = {record.outcome for record in records}
-    if len(outcomes) == 1 and not any(record.keypoints for record in records):
-        return f"{source.path}: no map: none of {len(records)} frames is usable: {outcomes.pop()}"
-    parallax = mapper.initialiser.best_parallax
-    return (
-        f"{source.path}: no map: no two of {len(records)} frames overlap enough and are taken far "
-        f"enough apart (the best pair has {parallax:.1f} degrees of parallax, {MIN_PARALLAX:g} are "
-        "needed): move the camera sideways, or check that frames overlap and --camera is right"
-    )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import replace
-from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,21 @@ import numpy as np
 from protomark.extras import optional
 from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray, to_gray
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
-from protomark.geometry.camera_files import camera_from_exif
+from protomark.geometry.camera_files import CameraSet, camera_from_exif
 from protomark.geometry.pose_files import PoseSet, image_times
 from protomark.mapping.frame import InputImage
+from protomark.mapping.prediction import MAX_STEP
+from protomark.mapping.structure import Structure
 
 # Number of a video's frames that are held in memory to read it backward.
 _CHUNK = 64
-# Number of images of a folder by which its images' size is told.
-_SAMPLE = 9
 _GUESSED_MODEL = "SIMPLE_RADIAL"
+# Of so many images, spread over a folder, most have the size of the map's images.
+_SIZE_SAMPLES = 15
+# Cameras whose parameters differ by this share of the focal length count as one.
+_SAME_CAMERA = 0.01
+# Origins of a focal length that is no guess.
+GIVEN, EXIF = "given", "from EXIF data"
 
 
 class FrameSource(ABC):
@@ -32,15 +40,19 @@ class FrameSource(ABC):
         path: the folder or video.
         prefix: prefix of the frames' names in the map.
         poses: known poses, or None.
+        timed: whether frames have times in seconds, not numbers.
+        first_index: index of the first frame in the map.
+        time_shift: what is added to the times of frames in the map.
     """
 
-    # Whether frames have times of their own; those of images are in their names, or none.
     timed = False
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.prefix = ""
         self.poses: PoseSet | None = None
+        self.first_index, self.time_shift = 0, 0.0
+        self._size: tuple[int, int] | None = None
 
     @abstractmethod
     def __len__(self) -> int:
@@ -50,8 +62,29 @@ class FrameSource(ABC):
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]: ...
 
     @abstractmethod
+    def listing(self) -> list[tuple[str, float]]:
+        """Names of all frames, without the prefix, and their times."""
+
     def names(self) -> list[str]:
         """Names of all frames, without the prefix."""
+        return [name for name, _ in self.listing()]
+
+    def shift(self, first_index: int, time_shift: float) -> None:
+        """Number and time the frames so that they come after those of a map."""
+        self.first_index, self.time_shift = first_index, time_shift
+
+    def follow(self, structure: Structure, records: Collection[str]) -> None:
+        """Number the frames after those of a map, and shift their times if these overlap.
+
+        Args:
+            structure: frames of the map.
+            records: names in the map; frames of these names are not new.
+        """
+        first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
+        old = [f.time for f in structure.frames]
+        new = [time for name, time in self.listing() if self.prefix + name not in records]
+        overlap = bool(old and new) and min(new) <= max(old) and min(old) <= max(new)
+        self.shift(first, math.ceil(1 + max(old) - min(new)) if overlap else 0.0)
 
     def images(
         self, start: int = 0, only: set[str] | None = None, backward: bool = False
@@ -68,26 +101,54 @@ class FrameSource(ABC):
             only = {name[size:] for name in only if name.startswith(self.prefix)}
         for image in self._read(start, only, backward):
             time = image.time if self.timed else None
-            pose = self.poses.find(image.name, time) if self.poses else None
-            yield replace(image, name=self.prefix + image.name, pose=pose)
+            yield replace(
+                image,
+                index=self.first_index + image.index,
+                name=self.prefix + image.name,
+                time=self.time_shift + image.time,
+                pose=self.poses.find(image.name, time) if self.poses else None,
+            )
 
-    @cached_property
-    def example(self) -> InputImage:
-        """The first image that can be read.
+    def size(self) -> tuple[int, int]:
+        """Width and height of most images.
 
         Raises:
             ValueError: none can be read.
         """
-        for image in self._read(0, None, False):
-            if image.image is not None:
-                return image
-        raise ValueError(f"{self.path}: none of its {len(self)} frames can be read, copy it anew")
+        if self._size is None:
+            images = (image.image for image in self._samples())
+            sizes = Counter(image.shape[::-1] for image in images if image is not None)
+            if not sizes:
+                raise ValueError(
+                    f"{self.path}: none of its {len(self)} frames can be read, copy it anew"
+                )
+            self._size = sizes.most_common(1)[0][0]
+        return self._size
 
-    def size(self) -> tuple[int, int]:
-        """Width and height of the images; raises ValueError if none can be read."""
-        image = self.example.image
-        assert image is not None
-        return image.shape[1], image.shape[0]
+    def _samples(self) -> Iterator[InputImage]:
+        """Images that show the size of most."""
+        return self._read(0, None, False)
+
+    def find_camera(self, cameras: CameraSet) -> Camera:
+        """The one camera of all images.
+
+        Raises:
+            ValueError: there is none of their size, or images have different ones.
+        """
+        size = self.size()
+        named = {cameras.by_image[n] for n, _ in self.listing() if n in cameras.by_image}
+        of_size = [c for c in named if (c.width, c.height) == size]
+        of_size.sort(key=lambda camera: (camera.model, camera.params))
+        params = [c.params for c in of_size]
+        if len({c.model for c in of_size}) > 1 or (
+            of_size and np.ptp(params, axis=0).max() > _SAME_CAMERA * params[0][0]
+        ):
+            raise ValueError(
+                f"the images have {len(of_size)} different cameras, and a map takes one: give the "
+                f"one to use with --camera, such as '{of_size[0]}'"
+            )
+        # COLMAP calibrates each image of one camera for itself, unless told otherwise.
+        return of_size[len(of_size) // 2] if of_size else cameras.find("", *size)
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length.
@@ -96,9 +157,9 @@ class FrameSource(ABC):
             focal: focal length in pixels; None: from EXIF data, else COLMAP's guess.
         """
         width, height = self.size()
-        origin = "given"
+        origin = GIVEN
         if focal is None:
-            focal, origin = self._exif_focal_length(), "from EXIF data"
+            focal, origin = self._exif_focal_length(), EXIF
         if focal is None:
             focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), "a guess"
         if not (np.isfinite(focal) and focal > 0):
@@ -112,7 +173,8 @@ class FrameSource(ABC):
 class ImageFolder(FrameSource):
     """A folder of images, in natural order of their names (img2 before img10).
 
-    Times are seconds if all names are decimal numbers such as 1305031102.175304.png, else indices.
+    Times are seconds if all names are decimal numbers such as 1305031102.175304.png, the numbers if
+    they are whole, else indices.
     """
 
     def __init__(self, path: Path, every: int = 1) -> None:
@@ -121,14 +183,20 @@ class ImageFolder(FrameSource):
         if not self._names:
             suffixes = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
             raise FileNotFoundError(f"{path}: no images in this folder ({suffixes})")
-        self._times = image_times(self._names)
+        self._times, self.timed = image_times(self._names)
 
     def __len__(self) -> int:
         return len(self._names)
 
-    def names(self) -> list[str]:
-        """See `FrameSource.names`."""
-        return self._names
+    def listing(self) -> list[tuple[str, float]]:
+        """See `FrameSource.listing`."""
+        return list(zip(self._names, self._times, strict=True))
+
+    def _samples(self) -> Iterator[InputImage]:
+        step = -(-len(self._names) // _SIZE_SAMPLES)
+        images = self._read(0, set(self._names[::step]), False)
+        found = [image for image in images if image.image is not None]
+        return iter(found or self._read(0, None, False))
 
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]:
         indices = range(start, len(self._names))
@@ -143,18 +211,10 @@ class ImageFolder(FrameSource):
                 problem = str(error)
             yield InputImage(index, name, self._times[index], image, problem=problem)
 
-    @cached_property
-    def example(self) -> InputImage:
-        """The first image of the most frequent size, of a sample that can be read."""
-        chosen = self._names[:: max(1, len(self._names) // _SAMPLE)]
-        sample = [image for image in self._read(0, {*chosen}, False) if image.image is not None]
-        if not sample:
-            return super().example
-        sizes = [image.image.shape for image in sample if image.image is not None]
-        return sample[sizes.index(max(sizes, key=sizes.count))]
-
     def _exif_focal_length(self) -> float | None:
-        camera = camera_from_exif(self.path / self.example.name)
+        size, images = self.size(), self._read(0, None, False)
+        shown = (i.name for i in images if i.image is not None and i.image.shape[::-1] == size)
+        camera = camera_from_exif(self.path / next(shown))
         return None if camera is None else camera.params[0]
 
 
@@ -178,9 +238,12 @@ class Video(FrameSource):
     def __len__(self) -> int:
         return self._count
 
-    def names(self) -> list[str]:
-        """See `FrameSource.names`."""
-        return [image.name for image in self._read_forward(0, None, decode=False)]
+    def listing(self) -> list[tuple[str, float]]:
+        """See `FrameSource.listing`."""
+        return [(f.name, f.time) for f in self._read_forward(0, None, decode=False)]
+
+    def _samples(self) -> Iterator[InputImage]:
+        return islice((i for i in self._read_forward(0, None) if i.image is not None), 1)
 
     def _read(self, start: int, only: set[str] | None, backward: bool) -> Iterator[InputImage]:
         if not backward:
@@ -210,13 +273,14 @@ class Video(FrameSource):
                     continue
                 if chunk is not None and index not in chunk:
                     continue
+                time = number / self._rate
                 if not decode:
-                    yield InputImage(index, name, 0.0, None)
+                    yield InputImage(index, name, time, None)
                     continue
                 decoded, image = video.retrieve()
                 gray = to_gray(np.asarray(image)) if decoded else None
                 problem = "" if decoded else "this frame does not decode"
-                yield InputImage(index, name, number / self._rate, gray, problem=problem)
+                yield InputImage(index, name, time, gray, problem=problem)
         finally:
             video.release()
 

@@ -22,6 +22,7 @@ from protomark.mapping.history import History
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.options import MappingOptions
+from protomark.mapping.self_calibration import Calibration
 from protomark.maps.merge import open_learning_map
 from protomark.maps.open import SCENE_MAP
 
@@ -71,8 +72,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         "best_parallax": mapper.initialiser.best_parallax,
         "next_global": mapper.next_global,
         "lost_in_row": mapper.lost_in_row,
-        "guessed_focal": mapper.guessed_focal,
-        "restarted": mapper.restarted,
+        "calibration": asdict(mapper.calibration) if mapper.calibration else None,
         "history": mapper.history.as_dict(),
         "facts": facts,
     }
@@ -111,8 +111,8 @@ def load_state(
         _restore_frames(mapper, arrays, state)
         mapper.initialiser.best_parallax = state["best_parallax"]
         mapper.next_global, mapper.lost_in_row = state["next_global"], state["lost_in_row"]
-        mapper.guessed_focal = float(state["guessed_focal"])
-        mapper.restarted = bool(state["restarted"])
+        if mapper.calibration is not None:
+            mapper.calibration = Calibration(**state["calibration"])
         mapper.history = History.from_dict(state["history"])
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
         raise FileError(

@@ -25,6 +25,8 @@ _SAME_PLACE = 3.0
 _SAMPLE = 997
 # This share of the keypoints, or of the landmarks in view if these are fewer, must match.
 _MIN_SEEN = 0.03
+# This share of the matches that should be right must agree with a pose found anywhere in the map.
+_MIN_EXPECTED = 0.2
 
 
 @dataclass
@@ -103,8 +105,15 @@ class Tracker:
         return bool(np.median(off) > self.structure.tolerance(frame.camera_id, _LARGE_OFFSET))
 
     def relocalize(self, frame: Frame, among: Ids | None = None) -> TrackedPose | None:
-        """The pose of a frame anywhere in the map, by search among landmarks; None: all of them."""
-        return self._solve(frame, self.search(frame, among))
+        """The pose of a frame anywhere in the map, by search among landmarks; None: all of them.
+
+        Returns None if far fewer matches agree on it than the match calibration expects.
+        """
+        ids, distances = self.memory.search(frame.codes, self.threads, among)
+        rows = self.memory.accepted(distances)
+        found = self._solve(frame, _unique_landmarks(rows, ids[rows, 0]))
+        expected = self.memory.expected(distances[rows])
+        return found if found and len(found.matches) >= _MIN_EXPECTED * expected else None
 
     def track_among(self, frame: Frame, predicted: Array, among: Ids) -> TrackedPose | None:
         """The pose of a frame near a predicted one, by these landmarks only."""
@@ -127,12 +136,6 @@ class Tracker:
         if inliers.sum() < self.min_inliers or share < _MIN_SEEN:
             return None
         return TrackedPose(pose, matches.where(inliers), share)
-
-    def search(self, frame: Frame, among: Ids | None = None) -> LandmarkMatches:
-        """Accepted matches of keypoints with their nearest landmark in the whole map."""
-        ids, distances = self.memory.search(frame.codes, self.threads, among)
-        rows = self.memory.accepted(distances)
-        return _unique_landmarks(rows, ids[rows, 0])
 
     def match_projected(
         self, frame: Frame, pose: Array, radius: float, among: Ids | None = None

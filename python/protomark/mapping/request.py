@@ -1,0 +1,135 @@
+"""What `protomark map` is asked to do, and whether that can be done."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from protomark.mapping.options import MappingOptions
+from protomark.mapping.source import FrameSource
+from protomark.mapping.state import CHECKPOINT, STATE
+
+
+@dataclass(frozen=True)
+class MapRequest:
+    """What to map, and how.
+
+    Attributes:
+        images: folder of images or video.
+        output: folder of the map.
+        options: how to make it; a map that is resumed or extended keeps its own.
+        camera: cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
+        focal: focal length to start calibration with, pixels.
+        poses: file or folder of known poses.
+        mask: image that is black where the scene must not be looked at.
+        every: take every n-th frame only.
+        resume: whether to continue an interrupted map.
+        extend: whether to add the images to the existing map in `output`.
+        force: whether to replace an existing map.
+        record: whether to write a Rerun recording, too.
+        seal: whether to write a sealed map, too.
+        threads: threads to search and adjust on.
+        chosen: names of the options that the user chose, not left at their defaults; extending a
+            map that was made with others is refused.
+    """
+
+    images: Path
+    output: Path
+    options: MappingOptions
+    camera: str | None = None
+    focal: float | None = None
+    poses: Path | None = None
+    mask: Path | None = None
+    every: int = 1
+    resume: bool = False
+    extend: bool = False
+    force: bool = False
+    record: bool = False
+    seal: bool = True
+    threads: int = 1
+    chosen: frozenset[str] = frozenset()
+
+
+def check_output(request: MapRequest) -> None:
+    """Raise before any work if the output folder is not what the request needs."""
+    scene = request.output
+    if scene.exists() and not scene.is_dir():
+        raise NotADirectoryError(f"{scene} is not a folder: name one for the map with -o")
+    interrupted = (scene / CHECKPOINT).is_dir()
+    if request.resume:
+        if not interrupted:
+            raise FileNotFoundError(
+                f"{scene} holds no interrupted map: start a new one without --resume"
+            )
+        return
+    if request.extend:
+        if interrupted:
+            raise FileExistsError(
+                f"{scene} holds an interrupted map: finish it with --resume first"
+            )
+        return
+    if request.force or not scene.exists() or not any(scene.iterdir()):
+        return
+    if interrupted:
+        raise FileExistsError(
+            f"{scene} holds an interrupted map: --resume continues it, --force starts anew"
+        )
+    if (scene / STATE).exists():
+        raise FileExistsError(
+            f"{scene} holds a map already: --into {scene} extends it, --force makes it anew"
+        )
+    raise FileExistsError(f"{scene} holds other files: name another folder with -o")
+
+
+def request_facts(request: MapRequest, source: FrameSource) -> dict[str, Any]:
+    """What must be the same when a map is resumed, as JSON values: the input, and the options."""
+    names = "\n".join(source.names())
+    return {
+        "the input": str(source.path.resolve()),
+        "--every": request.every,
+        "the images": hashlib.sha256(names.encode(errors="surrogateescape")).hexdigest()[:16],
+        "--camera": request.camera,
+        "--focal": request.focal,
+        "--poses": None if request.poses is None else str(request.poses.resolve()),
+        "--mask": None if request.mask is None else str(request.mask.resolve()),
+        **{_option(name): value for name, value in asdict(request.options).items()},
+    }
+
+
+def check_same_request(scene: Path, now: dict[str, Any], before: dict[str, Any]) -> None:
+    """Raise ValueError if an interrupted map was made from something else or otherwise."""
+    for name, value in now.items():
+        if value != before.get(name):
+            was = "other ones" if name == "the images" else before.get(name)
+            told = "these" if name == "the images" else value
+            raise ValueError(
+                f"{scene}: {name} of the interrupted map: {was}, now: {told}: resume it with the "
+                "same command, or make it anew with --force"
+            )
+
+
+def check_same_options(request: MapRequest, options: MappingOptions) -> None:
+    """Raise ValueError if a map is to be extended with other options than it was made with."""
+    if (request.poses is not None) != options.fixed_poses:
+        raise ValueError(
+            f"{request.output} was made {'with' if options.fixed_poses else 'without'} --poses: "
+            "extend it likewise, or make another map with -o"
+        )
+    if "focal" in request.chosen:
+        raise ValueError(
+            f"--focal is for a new map: {request.output} has its camera already, give the one of "
+            "these images with --camera"
+        )
+    for name, value in asdict(options).items():
+        asked = getattr(request.options, name)
+        if name in request.chosen and asked != value:
+            raise ValueError(
+                f"{_option(name)} {asked}: {request.output} was made with {value}, so leave the "
+                "option out, or make another map with -o"
+            )
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"

@@ -1,0 +1,101 @@
+"""Surveys the first frames before the map starts: which of them moved, and how they match."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protomark.features.extractor import Extractor, Features
+from protomark.mapping.frame import Array, InputImage
+from protomark.mapping.initialisation import RATIO
+from protomark.tracks.matching import mutual, nearest_matches
+
+# This many frames are surveyed, out of at most so many.
+_FRAMES = 24
+_MAX_READ = 150
+# A frame is taken once a fifth of its matches with the last one has moved by this share of the
+# image's longer side: an overlay or a bonnet that never moves may hold all others.
+_MIN_MOTION = 0.02
+_MOVED_SHARE = 0.2
+# Each frame is matched with those that come so many frames later.
+_STEPS = (1, 2, 4, 8)
+_MIN_MATCHES = 50
+
+
+@dataclass
+class Survey:
+    """What the first frames show.
+
+    Attributes:
+        pairs: matches of frames that moved.
+        features: features by image name, so that the map need not detect them again.
+        mask: (height, width) bool, the part of the image to leave out; None: nothing.
+    """
+
+    pairs: list[MatchedPair]
+    features: dict[str, Features]
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass
+class MatchedPair:
+    """Keypoints of two frames that match.
+
+    Attributes:
+        images: the two images.
+        first: (n, 2) float64, pixels in the earlier frame.
+        second: (n, 2) float64, pixels in the later one.
+    """
+
+    images: tuple[InputImage, InputImage]
+    first: Array
+    second: Array
+
+
+def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, int]) -> Survey:
+    """Match the first frames that moved with each other.
+
+    Args:
+        images: the input, from its start.
+        extractor: detects and describes keypoints.
+        size: width and height; other images are left out.
+    """
+    frames: list[tuple[InputImage, Features]] = []
+    for count, image in enumerate(images):
+        if len(frames) == _FRAMES or count == _MAX_READ:
+            break
+        if image.image is None or image.image.shape[::-1] != size:
+            continue
+        features = extractor(image.image)
+        new = replace(image, image=None), features
+        if len(features) < _MIN_MATCHES or (frames and not _moved(_pair(frames[-1], new), size)):
+            continue
+        frames.append(new)
+    pairs = [
+        _pair(frame, frames[i + step])
+        for i, frame in enumerate(frames)
+        for step in _STEPS
+        if i + step < len(frames)
+    ]
+    return Survey(
+        [pair for pair in pairs if len(pair.first) >= _MIN_MATCHES],
+        {image.name: features for image, features in frames},
+    )
+
+
+def _pair(one: tuple[InputImage, Features], other: tuple[InputImage, Features]) -> MatchedPair:
+    rows, target, _ = nearest_matches(one[1].descriptors, other[1].descriptors, RATIO)
+    both = mutual(one[1].descriptors, other[1].descriptors, rows, target)
+    first, second = one[1].keypoints[rows[both]], other[1].keypoints[target[both]]
+    images = one[0], other[0]
+    return MatchedPair(images, first.astype(np.float64), second.astype(np.float64))
+
+
+def _moved(pair: MatchedPair, size: tuple[int, int]) -> bool:
+    if len(pair.first) < _MIN_MATCHES:
+        return True
+    motion = np.linalg.norm(pair.second - pair.first, axis=1)
+    return float(np.quantile(motion, 1 - _MOVED_SHARE)) > _MIN_MOTION * max(size)

@@ -1,0 +1,167 @@
+"""Checks what a map counts as registered, and says what in it cannot be trusted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from protomark.geometry.absolute_pose import pose_covariance
+from protomark.geometry.pose import camera_centers, transform
+from protomark.mapping.frame import Array, Frame
+from protomark.mapping.history import REGISTERED
+from protomark.mapping.initialisation import MIN_PARALLAX
+from protomark.mapping.prediction import MAX_STEP
+from protomark.mapping.structure import Structure
+from protomark.mapping.tracking import LandmarkMatches
+
+if TYPE_CHECKING:
+    from protomark.mapping.mapper import Mapper
+    from protomark.mapping.source import FrameSource
+
+# The standard deviation of a camera's centre may be this share of the median depth that it sees.
+_MAX_DEVIATION = 0.03
+# A frame needs this many landmarks after all culling.
+_MIN_LANDMARKS = 10
+# A camera was thrown if it moves so many times as far from one frame to the next as in the median,
+# and so many times as far as what it sees is away.
+_MAX_STEP_RATIO = 20.0
+_MAX_STEP_DEPTHS = 3.0
+_MIN_STEPS = 8
+# Maps with a smaller share of their frames are of something else than their input.
+_MIN_REGISTERED = 0.5
+
+NOT_FOUND = "not found in the map: too few matches agree on a pose"
+UNCERTAIN = "its pose is uncertain: what it sees has too little depth, or lies too close together"
+THROWN = "it was thrown far away from its neighbours"
+WAITING = "before the first pair of frames with enough parallax"
+TOO_FEW = "too few landmarks are left that it observes"
+
+
+def is_uncertain(structure: Structure, frame: Frame, pose: Array, matches: LandmarkMatches) -> bool:
+    """Whether landmarks that match leave open where a frame was taken."""
+    pixels = frame.keypoints[matches.rows].astype(np.float64)
+    positions = structure.positions[matches.ids]
+    covariance = pose_covariance(pose, pixels, positions, structure.cameras[frame.camera_id])
+    if covariance is None:
+        return True
+    depth = float(np.median(transform(pose, positions)[:, 2]))
+    return bool(np.sqrt(np.trace(covariance[3:, 3:])) > _MAX_DEVIATION * depth)
+
+
+def untrusted_frames(structure: Structure) -> dict[int, str]:
+    """Indices of the frames whose poses fail the checks, and why."""
+    failed: dict[int, str] = {}
+    for i, frame in enumerate(structure.frames):
+        if len(frame.seen) < _MIN_LANDMARKS:
+            failed[i] = TOO_FEW
+        elif is_uncertain(
+            structure, frame, frame.pose, LandmarkMatches(frame.observed, frame.seen)
+        ):
+            failed[i] = UNCERTAIN
+    for camera_id in {frame.camera_id for frame in structure.frames}:
+        order = [
+            i
+            for i, frame in enumerate(structure.frames)
+            if frame.camera_id == camera_id and i not in failed
+        ]
+        order.sort(key=lambda i: structure.frames[i].index)
+        failed |= dict.fromkeys(_thrown(structure, order), THROWN)
+    return failed
+
+
+def _thrown(structure: Structure, order: Sequence[int]) -> list[int]:
+    """Frames of a sequence that lie too far from the longest part without a jump."""
+    frames = [structure.frames[i] for i in order]
+    if len(frames) <= _MIN_STEPS:
+        return []
+    centers = camera_centers(np.array([frame.pose for frame in frames]))
+    indices = np.array([frame.index for frame in frames])
+    depths = np.array(
+        [np.median(transform(f.pose, structure.positions[f.seen])[:, 2]) for f in frames]
+    )
+    gaps = np.minimum(np.diff(indices), MAX_STEP)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps
+    limit = _MAX_STEP_RATIO * float(np.median(steps))
+
+    def jumps(one: int, other: int) -> bool:
+        distance = float(np.linalg.norm(centers[one] - centers[other]))
+        steps = max(abs(int(indices[one] - indices[other])), 1)
+        return distance > limit * steps and distance > _MAX_STEP_DEPTHS * min(
+            depths[one], depths[other]
+        )
+
+    cuts = [k + 1 for k in range(len(frames) - 1) if jumps(k, k + 1)]
+    parts = list(zip([0, *cuts], [*cuts, len(frames)], strict=True))
+    start, end = max(parts, key=lambda part: part[1] - part[0])
+    thrown = []
+    for outward in (range(start - 1, -1, -1), range(end, len(frames))):
+        last = start if outward.step < 0 else end - 1
+        for k in outward:
+            if jumps(last, k):
+                thrown.append(order[k])
+            else:
+                last = k
+    return thrown
+
+
+def warnings(mapper: Mapper) -> list[str]:
+    """Sentences on what in a map cannot be trusted; none if it can."""
+    out = []
+    calibration, camera = mapper.calibration, mapper.camera
+    if calibration is not None and not calibration.determined and not calibration.given:
+        out.append(
+            f"the images do not determine the focal length, it stays at {camera.focal_length:.0f} "
+            "pixels: give the camera with --camera, or add images that turn and that come closer"
+        )
+    records = list(mapper.history.records.values())
+    registered = sum(record.outcome == REGISTERED for record in records)
+    if registered < _MIN_REGISTERED * len(records):
+        out.append(
+            f"only {registered} of {len(records)} frames are registered: check that the images "
+            "overlap and show one scene, and give the camera with --camera"
+        )
+    seen = len(mapper.structure.pairs()[0])
+    if mapper.options.fixed_poses and seen < mapper.options.min_inliers * registered:
+        out.append(
+            f"the frames observe {seen / max(registered, 1):.0f} landmarks each: the poses do not "
+            "fit the images, or --camera is wrong"
+        )
+    thrown = sum(record.outcome == THROWN for record in records)
+    if thrown:
+        out.append(
+            f"parts of the map flew away, and {thrown} frames were taken out with them: what "
+            "connects these parts has too little depth or overlap"
+        )
+    return out
+
+
+def no_map(mapper: Mapper, source: FrameSource, known: int = 0) -> str:
+    """Why there is no map, or why a map with `known` frames was not extended."""
+    records = [r for r in mapper.history.records.values() if r.outcome != REGISTERED]
+    common = Counter(r.outcome for r in records).most_common(1)
+    if known:
+        return (
+            f"{source.path}: none of its frames fits the map, which stays as it was: "
+            f"{common[0][0] if common else 'there is no new one'}"
+        )
+    if common and common[0][0] != WAITING:
+        return (
+            f"{source.path}: no map: of {len(mapper.history.records)} frames {common[0][1]} have "
+            f"this in common: {common[0][0]}"
+        )
+    if len(records) < 2:
+        return f"{source.path}: no map: one image shows no depth, give several"
+    parallax = mapper.initialiser.best_parallax
+    if parallax >= MIN_PARALLAX:
+        return (
+            f"{source.path}: no map: frames are taken far enough apart, but no pair of them fits "
+            "what the others see: check --camera, and that nothing but the camera moves"
+        )
+    return (
+        f"{source.path}: no map: no two of {len(records)} frames overlap enough and are taken far "
+        f"enough apart (the best pair has {parallax:.1f} degrees of parallax, {MIN_PARALLAX:g} are "
+        "needed): move the camera sideways, or check that frames overlap and --camera is right"
+    )

@@ -1,0 +1,134 @@
+"""Maps that are stopped, resumed and extended: what must agree, and what is never lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapping_scene import walk, write_images
+from protomark import interrupt
+from protomark.interrupt import Interrupted
+from protomark.mapping import session
+from protomark.mapping.frame import InputImage
+from protomark.mapping.mapper import Mapper
+from protomark.mapping.request import MapRequest
+from protomark.mapping.session import make_map
+from test_mapping import CAMERA, SETTINGS, run
+from test_tracks_command import fails
+
+FRAMES = 9
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_images(tmp_path_factory.mktemp("walk") / "images", walk(FRAMES))
+
+
+@pytest.fixture(scope="module")
+def finished(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = tmp_path_factory.mktemp("map") / "scene"
+    make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA))
+    return scene
+
+
+@pytest.fixture
+def extended(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "scene"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = (f for f in folder.rglob("*") if f.is_file())
+    return {str(f.relative_to(folder)): f.read_bytes() for f in files}
+
+
+def interrupted_at(
+    index: int, request: MapRequest, monkeypatch: pytest.MonkeyPatch, lines: list[str]
+) -> None:
+    """Send a signal just before the frame of this index is added."""
+    add = Mapper.add
+
+    def stop(self: Mapper, picture: InputImage) -> object:
+        if picture.index == index:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return add(self, picture)
+
+    monkeypatch.setattr(Mapper, "add", stop)
+    with pytest.raises(Interrupted):
+        make_map(request, note=lines.append)
+    monkeypatch.setattr(Mapper, "add", add)
+
+
+def test_a_long_step_is_given_up_and_nothing_is_lost(
+    images: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The solver ends between two of its calls; the map is as of the last checkpoint."""
+    scene, lines = tmp_path / "scene", list[str]()
+    monkeypatch.setattr(interrupt, "_PATIENCE", -1.0)
+    monkeypatch.setattr(session, "_CHECKPOINT_INTERVAL", 0.0)
+    request = MapRequest(images, scene, SETTINGS, camera=CAMERA)
+    interrupted_at(6, request, monkeypatch, lines)
+    assert "stopping after this frame (again: at once)" in lines
+    assert "This map was stopped" in (scene / "report.html").read_text()
+    assert '"frames": 6' in (scene / "report.json").read_text()
+    make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA, resume=True))
+    for name in ("scene.pmk", "trajectory.txt"):
+        assert (scene / name).read_bytes() == (finished / name).read_bytes()
+    assert "This map was stopped" not in (scene / "report.html").read_text()
+
+
+def test_resume_takes_the_same_command_only(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "scene"
+    interrupted_at(4, MapRequest(images, scene, SETTINGS, camera=CAMERA), monkeypatch, [])
+    other = write_images(tmp_path / "other" / "images", walk(FRAMES), seed=50)
+    resume = ("-o", scene, "--resume", "-d", "orb", "--max-keypoints", "500", "--window", "5")
+    given = ("--camera", CAMERA)
+    fails(run(other, *resume, *given), "the input", str(images.resolve()))
+    fails(run(images, *resume, "--camera", "PINHOLE:310,310,160,120"), "--camera", CAMERA)
+    fails(run(images, *resume, *given, "--every", "2"), "--every", "1, now: 2")
+    fails(run(images, *resume, *given, "--dim", "16"), "--dim", "32, now: 16")
+    cv2.imwrite(str(images / "img99.png"), np.zeros((240, 320), np.uint8))
+    try:
+        fails(run(images, *resume, *given), "the images")
+    finally:
+        (images / "img99.png").unlink()
+    done = run(images, *resume, *given)
+    assert f"{FRAMES} of {FRAMES} frames registered" in done.stdout, done.stderr
+
+
+def test_another_scene_leaves_the_map_as_it_was(extended: Path, tmp_path: Path) -> None:
+    before = contents(extended)
+    other = write_images(tmp_path / "other", walk(6), seed=50)
+    fails(run(other, "--into", extended), "none of its frames fits the map", "not found in the map")
+    assert contents(extended) == before
+
+
+def test_options_that_differ_from_the_map_are_refused(extended: Path, tmp_path: Path) -> None:
+    more = write_images(tmp_path / "more", walk(FRAMES + 4)[FRAMES:])
+    into = (more, "--into", extended)
+    fails(run(*into, "-d", "akaze"), "--descriptor akaze", "orb")
+    fails(run(*into, "--dim", "16"), "--dim 16", "32")
+    fails(run(*into, "--focal", "300"), "--focal")
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    fails(run(*into, "--poses", tmp_path / "poses.txt"), "without --poses")
+
+
+def test_times_stay_unique_and_the_old_map_is_kept(extended: Path, tmp_path: Path) -> None:
+    before = contents(extended)
+    more = write_images(tmp_path / "more", walk(FRAMES + 4)[FRAMES:])
+    done = run(more, "--into", extended, "-d", "orb")
+    assert done.returncode == 0, done.stderr
+    rows = np.loadtxt(extended / "trajectory.txt")
+    assert len(rows) == FRAMES + 4
+    assert (np.diff(rows[:, 0]) > 0).all()
+    # The camera walks on along x, so the frames are in the order in which they were taken.
+    along = rows[:, 1:4] @ np.linalg.svd(rows[:, 1:4] - rows[:, 1:4].mean(0))[2][0]
+    assert (np.diff(along) > 0).all() or (np.diff(along) < 0).all()
+    assert contents(extended / "previous") == before

@@ -1,0 +1,319 @@
+"""Whether maps know what they cannot know: cameras, uncertain poses, and what never moves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapping_scene import show, walk, write_images
+from protomark.geometry.camera import Camera
+from protomark.geometry.camera_files import read_cameras
+from protomark.geometry.pose import quaternion_from_rotation, transform
+from protomark.mapping.frame import Frame, InputImage
+from protomark.mapping.mapper import Mapper
+from protomark.mapping.options import MappingOptions
+from protomark.mapping.self_calibration import (
+    Calibration,
+    elect_focal_length,
+    is_plausible,
+)
+from protomark.mapping.source import open_source
+from protomark.mapping.static_regions import outside, read_mask, static_regions
+from protomark.mapping.structure import Structure
+from protomark.mapping.survey import MatchedPair
+from protomark.mapping.tracking import LandmarkMatches
+from protomark.mapping.trust import THROWN, UNCERTAIN, is_uncertain, untrusted_frames
+from test_mapping import CAMERA, COUNT, error_of, run
+from test_tracks_command import fails
+from tracks_scene import PINHOLE
+
+SIZE = PINHOLE.width, PINHOLE.height
+IMAGE = InputImage(0, "", 0.0, None)
+
+
+def turning_pairs(count: int, noise: float, planar: bool = False) -> list[MatchedPair]:
+    """Matches of a camera that turns around points while it looks at them."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (300, 3))
+    if planar:
+        points[:, 2] = 0
+    views = []
+    for i in range(count):
+        rotation = cv2.Rodrigues(np.array([0.2 * np.sin(i), 0.15 * i, 0.1 * np.cos(2 * i)]))[0]
+        shift = np.array([0.2 * np.sin(3 * i), 0.1 * np.cos(i), 3.5 + 0.3 * np.sin(2 * i)])
+        local = transform(np.column_stack([rotation, shift]), points)
+        views.append(PINHOLE.project(local) + noise * rng.normal(size=(len(points), 2)))
+    return [
+        MatchedPair((IMAGE, IMAGE), views[i], views[i + step])
+        for i in range(count)
+        for step in (1, 2, 4)
+        if i + step < count
+    ]
+
+
+def test_frames_elect_the_focal_length() -> None:
+    found = elect_focal_length(turning_pairs(14, 0.3), SIZE)
+    assert found == pytest.approx(300, rel=0.06)
+
+
+def test_frames_of_a_plane_elect_no_focal_length() -> None:
+    assert elect_focal_length(turning_pairs(14, 0.3, planar=True), SIZE) is None
+    assert elect_focal_length(turning_pairs(14, 0.3)[:5], SIZE) is None
+
+
+@pytest.mark.parametrize(
+    ("focal", "distortion", "plausible"),
+    [
+        (610, 0.0, True),
+        (520, 0.26, True),
+        (350, -0.2, True),
+        (12202, 192.8, False),
+        (3597, 14.5, False),
+        (150, 0.0, False),
+        (610, 3.0, False),
+        (320, -0.9, False),
+        (1340, 2.4, False),
+    ],
+)
+def test_what_a_lens_can_be(focal: float, distortion: float, plausible: bool) -> None:
+    camera = Camera("SIMPLE_RADIAL", 640, 480, (focal, 320, 240, distortion))
+    assert is_plausible(camera) == plausible
+
+
+def test_a_restart_needs_proof() -> None:
+    calibration = Calibration(700.0)
+    assert not calibration.needs_restart(900.0), "nothing is determined"
+    calibration.deviation = 0.004
+    assert not calibration.needs_restart(710.0)
+    assert calibration.needs_restart(900.0)
+    again = calibration.restarted(900.0)
+    assert again.start == 900
+    assert again.limit == pytest.approx(0.006)
+    for _ in range(2):
+        again = again.restarted(900.0)
+    assert not again.needs_restart(700.0), "it ends"
+
+
+def test_what_cannot_be_determined_is_said(tmp_path: Path) -> None:
+    """A camera that neither turns nor comes closer: every focal length fits."""
+    poses = walk(7)
+    poses[:, :, :3] = np.eye(3)
+    poses[:, 2, 3] = poses[:, 1, 3] = 0
+    images = write_images(tmp_path / "images", poses)
+    done = run(images, "-o", tmp_path / "scene", "-d", "orb")
+    assert done.returncode == 1
+    assert "do not determine the focal length" in done.stdout
+    report = json.loads((tmp_path / "scene/report.json").read_text())
+    assert "do not determine the focal length" in report["warnings"][0]
+    assert 0.3 * 320 <= report["camera"]["params"][0] <= 3 * 320
+    assert "do not determine" in (tmp_path / "scene/report.html").read_text()
+
+
+def structure_of(poses: np.ndarray, points: np.ndarray) -> Structure:
+    """Frames that all see the same points, exactly."""
+    rng = np.random.default_rng(0)
+    structure = Structure({1: PINHOLE})
+    ids = structure.create(points)
+    for i, pose in enumerate(poses):
+        pixels = PINHOLE.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
+        frame = Frame(i, str(i), float(i), 1, pixels.astype(np.float32), PINHOLE.rays(pixels))
+        frame = frame.at(pose)
+        structure.frames.append(frame)
+        structure.observe(frame, np.arange(len(ids)), ids)
+    return structure
+
+
+def test_a_frame_that_was_thrown_far_away_is_not_registered() -> None:
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-0.6, 0.5, (80, 2)), rng.uniform(2, 3, 80)])
+    structure = structure_of(walk(14), points)
+    assert not untrusted_frames(structure)
+    # As if nothing but distance were wrong: what the frame sees moves along.
+    structure.frames[9].pose[:, 3] *= 300
+    assert list(untrusted_frames(structure)) == [9]
+    structure.frames[9].pose = walk(14)[9]
+    for frame in structure.frames[:4]:
+        frame.landmarks[:] = structure.create(points * 300)
+        frame.pose[:, 3] = 300 * walk(14)[frame.index][:, 3]
+    structure.recompute_views()
+    assert untrusted_frames(structure) == dict.fromkeys(range(4), THROWN)
+
+
+def test_a_pose_that_its_landmarks_leave_open_is_uncertain() -> None:
+    rng = np.random.default_rng(1)
+    far = np.column_stack([rng.uniform(-0.6, 0.5, (60, 2)), rng.uniform(2, 3, 60)])
+    close = np.column_stack([rng.uniform(-0.01, 0.01, (60, 2)), rng.uniform(2, 2.01, 60)])
+    for points, uncertain in ((far, False), (close, True)):
+        structure = structure_of(walk(1), points)
+        frame = structure.frames[0]
+        matches = LandmarkMatches(frame.observed, frame.seen)
+        assert is_uncertain(structure, frame, frame.pose, matches) == uncertain
+    assert untrusted_frames(structure) == {0: UNCERTAIN}
+
+
+def test_a_pose_on_which_few_of_the_expected_matches_agree_is_none() -> None:
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=1000, window=20), PINHOLE)
+    for i, pose in enumerate(walk(8)):
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose)))
+    frame = mapper.structure.frames[4]
+    found = mapper.tracker.relocalize(frame)
+    assert found is not None
+    expected = mapper.memory.expected(mapper.memory.search(frame.codes)[1])
+    assert len(found.matches) > 0.5 * expected > 50
+    # As in a place that looks alike: most matches agree on nothing.
+    rng = np.random.default_rng(0)
+    moved = rng.permutation(len(frame.keypoints))[: int(0.85 * len(frame.keypoints))]
+    pixels = frame.keypoints.copy()
+    pixels[moved] = rng.uniform((0, 0), SIZE, (len(moved), 2))
+    alike = replace(frame, keypoints=pixels, rays=PINHOLE.rays(pixels))
+    tracker = mapper.tracker
+    tracker.min_inliers = 8
+    assert tracker.relocalize(alike) is None
+    pixels[moved[len(moved) // 2 :]] = frame.keypoints[moved[len(moved) // 2 :]]
+    assert tracker.relocalize(replace(alike, rays=PINHOLE.rays(pixels))) is not None
+
+
+def logo() -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return cv2.resize(rng.integers(0, 255, (30, 40), np.uint8), (120, 90), fx=0, fy=0)
+
+
+def with_logo(folder: Path, poses: np.ndarray) -> Path:
+    """Images with a logo in a corner."""
+    folder.mkdir()
+    for i, pose in enumerate(poses, 1):
+        picture = show(pose)
+        picture[140:230, 10:130] = logo()
+        cv2.imwrite(str(folder / f"img{i}.png"), picture)
+    return folder
+
+
+def test_what_never_moves_is_left_out_and_named(tmp_path: Path) -> None:
+    images = with_logo(tmp_path / "images", walk(COUNT))
+    done = run(images, "-o", tmp_path / "scene", "--camera", CAMERA, "-d", "orb")
+    assert done.returncode == 0, done.stderr
+    assert "never moves" in done.stderr
+    assert "of the image (x " in done.stdout
+    assert f"{COUNT} of {COUNT} frames" in done.stdout
+    assert error_of(tmp_path / "scene", walk(COUNT)) < 0.02
+
+
+def test_static_regions_need_a_scene_that_moves() -> None:
+    rng = np.random.default_rng(0)
+    still = rng.uniform((0, 0), (80, 60), (60, 2))
+    moving = rng.uniform((100, 80), SIZE, (200, 2))
+    both = np.concatenate((still, moving))
+    moved = np.concatenate((still, np.add(moving, (6.0, 2.0))))
+    pairs = [MatchedPair((IMAGE, IMAGE), both, moved)] * 10
+    mask = static_regions(pairs, SIZE)
+    assert outside(mask, moving.astype(np.float32)).all()
+    assert outside(mask, still.astype(np.float32)).mean() < 0.3
+    assert not static_regions([MatchedPair((IMAGE, IMAGE), both, both)] * 10, SIZE).any()
+
+
+def test_a_mask_leaves_its_black_part_out(tmp_path: Path) -> None:
+    white = np.full((240, 320), 255, np.uint8)
+    white[:, :100] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), white)
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=2000), PINHOLE)
+    mapper.mask = read_mask(tmp_path / "mask.png", SIZE)
+    for i, pose in enumerate(walk(9)):
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose)))
+    assert len(mapper.structure.frames) >= 2
+    assert all((frame.keypoints[:, 0] >= 100).all() for frame in mapper.structure.frames)
+    with pytest.raises(ValueError, match="320x240 pixels, the images have 640x480"):
+        read_mask(tmp_path / "mask.png", (640, 480))
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros_like(white))
+    with pytest.raises(ValueError, match="black"):
+        read_mask(tmp_path / "mask.png", SIZE)
+
+
+def images_txt(poses: np.ndarray, file: Path, order: list[int] | None = None) -> Path:
+    lines = []
+    for i, pose in enumerate(poses, 1):
+        numbers = [*quaternion_from_rotation(pose[:, :3]), *pose[:, 3]]
+        name = order[i - 1] + 1 if order else i
+        lines.append(f"{i} {' '.join(str(float(n)) for n in numbers)} 1 img{name}.png\n\n")
+    file.write_text("".join(lines))
+    return file
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    return np.column_stack([pose[:, :3].T, -pose[:, :3].T @ pose[:, 3]])
+
+
+@pytest.mark.parametrize("wrong", ["camera-to-world", "OpenGL", "shuffled"])
+def test_poses_that_do_not_fit_the_images(wrong: str, tmp_path: Path) -> None:
+    poses, order = walk(COUNT), None
+    if wrong == "camera-to-world":
+        poses = np.array([inverse(pose) for pose in poses])
+    elif wrong == "OpenGL":
+        poses = np.diag([1.0, -1, -1]) @ poses
+    else:
+        order = np.random.default_rng(0).permutation(COUNT).tolist()
+    images = write_images(tmp_path / "images", walk(COUNT))
+    given = images_txt(poses, tmp_path / "images.txt", order)
+    done = run(images, "-o", tmp_path / "x", "--camera", CAMERA, "--poses", given, "-d", "orb")
+    fails(done, "do not fit the images", "camera-to-world")
+    assert not (tmp_path / "x").exists()
+
+
+def tum(times: list[str], file: Path) -> Path:
+    file.write_text("".join(f"{t} {0.1 * i} 0 0 0 0 0 1\n" for i, t in enumerate(times)))
+    return file
+
+
+def test_seconds_are_no_image_numbers(tmp_path: Path) -> None:
+    images = write_images(tmp_path / "images", walk(12))
+    request = (images, "-o", tmp_path / "x", "--camera", CAMERA, "-d", "orb", "--poses")
+    fails(run(*request, tum([f"{0.1 * i:.1f}" for i in range(40)], tmp_path / "s")), "by seconds")
+    epoch = tum([str(1305031102 + i) for i in range(12)], tmp_path / "epoch")
+    fails(run(*request, epoch), "0 of the 12 images", "time 1.30503e+09")
+
+
+def test_the_size_of_most_images_counts(tmp_path: Path) -> None:
+    images = write_images(tmp_path / "images", walk(COUNT))
+    cv2.imwrite(str(images / "AlbumArt.png"), np.zeros((120, 160), np.uint8))
+    done = run(images, "-o", tmp_path / "scene", "--camera", CAMERA, "-d", "orb")
+    assert done.returncode == 0, done.stderr
+    assert "AlbumArt.png: 160x120 pixels, but the camera has 320x240" in done.stdout
+
+
+def test_a_map_takes_one_camera(tmp_path: Path) -> None:
+    images = write_images(tmp_path / "images", walk(4))
+    model = tmp_path / "model"
+    model.mkdir()
+    images_txt(walk(4), model / "images.txt")
+    text = (model / "images.txt").read_text().splitlines()
+    for camera in range(1, 5):
+        text[2 * camera - 2] = text[2 * camera - 2].replace(" 1 img", f" {camera} img")
+    (model / "images.txt").write_text("\n".join(text) + "\n")
+    lines = [f"{i} PINHOLE 320 240 {300 + 10 * i} 300 160 120" for i in range(1, 5)]
+    (model / "cameras.txt").write_text("\n".join(lines) + "\n")
+    done = run(images, "-o", tmp_path / "x", "--poses", model, "-d", "orb")
+    fails(done, "4 different cameras", "--camera", "PINHOLE 320 240 310 300 160 120")
+    # COLMAP gives each image its own camera, and these hardly differ.
+    lines = [f"{i} PINHOLE 320 240 {300 + i / 10} 300 160 120" for i in range(1, 5)]
+    (model / "cameras.txt").write_text("\n".join(lines) + "\n")
+    camera = open_source(images).find_camera(read_cameras(str(model)))
+    assert camera.params == (300.3, 300, 160, 120)
+
+
+def test_one_image_makes_no_map(tmp_path: Path) -> None:
+    one = write_images(tmp_path / "one", walk(1))
+    fails(run(one, "-o", tmp_path / "x", "--camera", CAMERA, "-d", "orb"), "give several")
+
+
+def test_black_images_are_named_as_the_reason(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{i}.png"), np.zeros((240, 320), np.uint8))
+    done = run(folder, "-o", tmp_path / "x", "--camera", CAMERA, "-d", "orb")
+    fails(done, "4 have this in common", "black, blurred")
+    assert not (tmp_path / "x").exists()
