@@ -49,7 +49,7 @@ def map_(
             help="Number of latest keyframes that keep their descriptors, to triangulate landmarks."
         ),
     ] = 8,
-    dim: Annotated[int, typer.Option(help="Numbers per prototype, one byte each.")] = 32,
+    dim: Annotated[int, typer.Option(help="Numbers per prototype.")] = 48,
     encoder: EncoderName = None,
     max_keypoints: MaxKeypoints = 2000,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted map.")] = False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protomark.features.descriptors import descriptor_kind
+from protomark.maps.build import APPEARANCE_BITS, DIM
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class MappingOptions:
     descriptor: str = "akaze"
     max_keypoints: int = 2000
     encoder: str = ""
-    dim: int = 32
-    appearance_bits: int = 0
+    dim: int = DIM
+    appearance_bits: int = APPEARANCE_BITS
     window: int = 8
     max_error: float = 0.005
     min_angle: float = 1.0
