@@ -232,6 +232,11 @@ def test_an_unknown_camera_is_calibrated_along_the_way(
     restarts = [event for event in figures["events"] if "restarts" in event]
     assert len(restarts) == (0 if elected else 1)
     assert elected or "not 384 pixels" in restarts[0]
+    frames = json.loads((tmp_path / "scene/report.json").read_text())["history"]
+    last = sum(frame["seconds"]["triangulate"] for frame in frames)
+    assert (figures["seconds"]["triangulate"] > 1.3 * last) != elected, (
+        "the first start counts, too"
+    )
     assert error_of(tmp_path / "scene", turn_and_approach(18)) < 0.02
 
 

@@ -300,8 +300,8 @@ def test_a_map_takes_one_camera(tmp_path: Path) -> None:
     # COLMAP gives each image its own camera, and these hardly differ.
     lines = [f"{i} PINHOLE 320 240 {300 + i / 10} 300 160 120" for i in range(1, 5)]
     (model / "cameras.txt").write_text("\n".join(lines) + "\n")
-    camera = open_source(images).find_camera(read_cameras(str(model)))
-    assert camera.params == (300.3, 300, 160, 120)
+    found = open_source(images).find_camera(read_cameras(str(model)))
+    assert found.params == (300.3, 300, 160, 120)
 
 
 def test_one_image_makes_no_map(tmp_path: Path) -> None:

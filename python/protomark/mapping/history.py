@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from protomark.mapping.clock import STAGES
+
 REGISTERED = "registered"
 
 
@@ -48,12 +50,21 @@ class History:
     Attributes:
         records: records by frame name.
         events: sentences such as "frame 31: a place seen before, 45 landmarks merged".
-        closing_seconds: seconds by stage after the last frame (retries, global adjustment).
+        closing_seconds: seconds by stage before the first frame and before a restart, and after
+            the last frame (retries, global adjustment).
     """
 
     records: dict[str, FrameRecord] = field(default_factory=dict)
     events: list[str] = field(default_factory=list)
     closing_seconds: dict[str, float] = field(default_factory=dict)
+
+    def total_seconds(self) -> dict[str, float]:
+        """Seconds by stage over all frames and after them."""
+        total: dict[str, float] = dict.fromkeys(STAGES, 0.0)
+        for parts in (*(r.seconds for r in self.records.values()), self.closing_seconds):
+            for name, value in parts.items():
+                total[name] += value
+        return total
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON values."""

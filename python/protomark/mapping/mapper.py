@@ -414,6 +414,7 @@ class Mapper:
         new = Mapper(self.options, self.camera, self.threads, self._new_memory)
         new.calibration = self.calibration.restarted(self.camera.focal_length)
         new.features, new.mask = self.features, self.mask
+        new.history.closing_seconds = self.history.total_seconds()
         new.history.events.append(
             f"the map restarts: focal length {new.calibration.start:.0f}, not "
             f"{self.calibration.start:.0f} pixels"

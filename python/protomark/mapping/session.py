@@ -198,6 +198,7 @@ class _Session:
     def _survey(self, options: MappingOptions) -> Survey:
         """What the first frames show, and the region of the image to leave out."""
         self.progress("look at the first frames", 0, 0)
+        started = time.perf_counter()
         size = self.source.size()
         extractor = Extractor(options.descriptor, options.max_keypoints)
         surveyed = survey(self.source.images(), extractor, size)
@@ -206,7 +207,7 @@ class _Session:
             self.note(f"left out, as it never moves while the rest does: {describe(mask)}")
         if self.request.mask is not None:
             mask |= read_mask(self.request.mask, size)
-        surveyed.mask = mask
+        surveyed.mask, surveyed.seconds = mask, time.perf_counter() - started
         return surveyed
 
     def _prepare(self, surveyed: Survey, prefix: str, inputs: dict[str, str]) -> None:
@@ -215,6 +216,7 @@ class _Session:
         source.prefix = prefix
         self.mapper.features = {prefix + name: f for name, f in surveyed.features.items()}
         self.mapper.mask = surveyed.mask
+        self.mapper.history.closing_seconds["initialise"] = surveyed.seconds
         self.facts = {
             "request": request_facts(self.request, source),
             "prefix": prefix,

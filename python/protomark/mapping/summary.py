@@ -25,10 +25,7 @@ def summarise(mapper: Mapper) -> dict[str, Any]:
     seen = structure.observations(range(len(structure.frames)))
     errors = structure.errors(seen)
     errors = errors[np.isfinite(errors)]
-    seconds = dict.fromkeys(STAGES, 0.0)
-    for parts in (*(r.seconds for r in records), mapper.history.closing_seconds):
-        for name, value in parts.items():
-            seconds[name] += value
+    seconds = mapper.history.total_seconds()
     unregistered: dict[str, list[str]] = {}
     for record in records:
         if record.outcome != REGISTERED:

@@ -33,11 +33,13 @@ class Survey:
         pairs: matches of frames that moved.
         features: features by image name, so that the map need not detect them again.
         mask: (height, width) bool, the part of the image to leave out; None: nothing.
+        seconds: how long the survey took.
     """
 
     pairs: list[MatchedPair]
     features: dict[str, Features]
     mask: NDArray[np.bool_] | None = None
+    seconds: float = 0.0
 
 
 @dataclass
