@@ -90,4 +90,3 @@ def test_the_most_frequent_size_is_that_of_the_folder(tmp_path: Path) -> None:
     (tmp_path / "00.png").write_bytes(b"")
     folder = ImageFolder(tmp_path)
     assert folder.size() == (40, 40)
-    assert folder.example.name == "2.png"

@@ -68,7 +68,8 @@ def frame(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Keypoints and descriptors of a frame that was taken at a place."""
     seen = np.sort(place * PLACE + rng.choice(PLACE, SEEN, replace=False))
-    others = rng.integers(0, len(scene), KEYPOINTS - SEEN)
+    elsewhere = int(rng.integers(0, len(scene) // PLACE))
+    others = elsewhere * PLACE + rng.choice(PLACE, KEYPOINTS - SEEN, replace=False)
     points = scene.positions(seen) - center(np.int64(place))
     pixels = CAMERA.project(points) + rng.normal(0, 0.5, (SEEN, 2))
     clutter = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (KEYPOINTS - SEEN, 2))

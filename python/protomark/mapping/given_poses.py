@@ -39,7 +39,7 @@ def check_poses_given(source: FrameSource) -> None:
     )
     if found < 2:
         name, time = listing[0]
-        first = f"time {time:g}" if len(poses.times) else name
+        first = f"time {time:g}" if source.timed else name
         raise ValueError(
             f"{found} of the {len(listing)} images have one of the {len(poses)} poses: the poses "
             f"start with {poses.example}, the images with {first}; give both the same names or "

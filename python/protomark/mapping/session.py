@@ -123,7 +123,6 @@ class _Session:
         self.facts: dict[str, Any] = {}
         if request.poses:
             source.poses = read_poses(request.poses).for_images(source.names())
-        check_poses_given(source)
         if request.resume:
             self._resume()
         elif request.extend:
@@ -142,6 +141,7 @@ class _Session:
 
     def _start(self) -> None:
         request, options = self.request, self.request.options
+        check_poses_given(self.source)
         camera = self._camera()
         if self.source.poses is not None:
             options = replace(options, fixed_poses=True)
