@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mapping_scene import show, walk, write_images
+from protomark.features.static_regions import describe, outside, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.pose import quaternion_from_rotation, transform
@@ -23,7 +24,6 @@ from protomark.mapping.self_calibration import (
     is_plausible,
 )
 from protomark.mapping.source import open_source
-from protomark.mapping.static_regions import outside, read_mask, static_regions
 from protomark.mapping.structure import Structure
 from protomark.mapping.survey import MatchedPair
 from protomark.mapping.tracking import LandmarkMatches
@@ -209,11 +209,10 @@ def test_static_regions_need_a_scene_that_moves() -> None:
     moving = rng.uniform((100, 80), SIZE, (200, 2))
     both = np.concatenate((still, moving))
     moved = np.concatenate((still, np.add(moving, (6.0, 2.0))))
-    pairs = [MatchedPair((IMAGE, IMAGE), both, moved)] * 10
-    mask = static_regions(pairs, SIZE)
+    mask = static_regions([(both, moved)] * 10, SIZE)
     assert outside(mask, moving.astype(np.float32)).all()
     assert outside(mask, still.astype(np.float32)).mean() < 0.3
-    assert not static_regions([MatchedPair((IMAGE, IMAGE), both, both)] * 10, SIZE).any()
+    assert describe(static_regions([(both, both)] * 10, SIZE)) == ""
 
 
 def test_a_mask_leaves_its_black_part_out(tmp_path: Path) -> None:
@@ -271,9 +270,13 @@ def tum(times: list[str], file: Path) -> Path:
 def test_seconds_are_no_image_numbers(tmp_path: Path) -> None:
     images = write_images(tmp_path / "images", walk(12))
     request = (images, "-o", tmp_path / "x", "--camera", CAMERA, "-d", "orb", "--poses")
-    fails(run(*request, tum([f"{0.1 * i:.1f}" for i in range(40)], tmp_path / "s")), "by seconds")
+    fails(
+        run(*request, tum([f"{0.1 * i:.1f}" for i in range(40)], tmp_path / "s")),
+        "0 of 12 images",
+        "seconds",
+    )
     epoch = tum([str(1305031102 + i) for i in range(12)], tmp_path / "epoch")
-    fails(run(*request, epoch), "0 of the 12 images", "time 1.30503e+09")
+    fails(run(*request, epoch), "0 of 12 images", "time 1305031102")
 
 
 def test_the_size_of_most_images_counts(tmp_path: Path) -> None:

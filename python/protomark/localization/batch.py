@@ -23,7 +23,7 @@ from protomark.geometry.pose_files import (
     PoseSet,
     image_times,
     images_txt,
-    read_poses,
+    poses_of_images,
     tum_trajectory,
 )
 from protomark.interrupt import deferred_interrupt
@@ -271,8 +271,10 @@ def localize_files(
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
     for camera in cameras.cameras if cameras else ():
         check_pose_model(camera)
-    true_poses = _poses_of(request.true_poses, names)
-    priors = _poses_of(request.priors, names)
+    true_poses, priors = (
+        poses_of_images(path, names) if path else PoseSet({})
+        for path in (request.true_poses, request.priors)
+    )
 
     def localize(image: tuple[str, Path]) -> ImageResult:
         name, path = image
@@ -328,20 +330,6 @@ def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
                 )
             found[name] = path
     return list(found.items())
-
-
-def _poses_of(source: Path | None, names: Sequence[str]) -> PoseSet:
-    """Poses from a file or folder, of which one must belong to an image."""
-    if source is None:
-        return PoseSet({})
-    given = read_poses(source)
-    poses = given.for_images(names)
-    if all(poses.find(name) is None for name in names):
-        raise ValueError(
-            f"{source}: none of its {len(given)} poses (such as that of {given.example}) belongs "
-            f"to an image (such as {names[0]}): give poses of these images"
-        )
-    return poses
 
 
 def _localize_file(

@@ -8,6 +8,7 @@ import numpy as np
 
 import protomark as pm
 from protomark.features.extractor import Extractor, Features
+from protomark.features.static_regions import Mask, outside
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
 from protomark.mapping import adjustment, culling, loop, trust
@@ -21,7 +22,6 @@ from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
 from protomark.mapping.self_calibration import Calibration
-from protomark.mapping.static_regions import Mask, outside
 from protomark.mapping.structure import Structure
 from protomark.mapping.tracking import LandmarkMatches, TrackedPose, Tracker
 from protomark.mapping.triangulation import triangulate, update_prototypes

@@ -10,11 +10,12 @@ from dataclasses import replace
 from typing import Any
 
 from protomark.features.extractor import Extractor
+from protomark.features.static_regions import describe, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
-from protomark.geometry.pose_files import read_poses
+from protomark.geometry.given_poses import misfit
+from protomark.geometry.pose_files import poses_of_images
 from protomark.interrupt import Interrupted, deferred_interrupt
-from protomark.mapping.given_poses import check_poses_fit, check_poses_given
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.outputs import back_up, write_outputs
@@ -29,7 +30,6 @@ from protomark.mapping.request import (
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
 from protomark.mapping.source import EXIF, GIVEN, FrameSource, open_source
 from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
-from protomark.mapping.static_regions import describe, read_mask, static_regions
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import no_map
 from protomark.progress import Progress, silent
@@ -122,8 +122,8 @@ class _Session:
         self.cursor = self.known = 0
         self.facts: dict[str, Any] = {}
         if request.poses:
-            source.poses = read_poses(request.poses).for_images(source.names())
-        check_poses_given(source)
+            names, times = zip(*source.listing(), strict=True)
+            source.poses = poses_of_images(request.poses, names, times if source.timed else None)
         if request.resume:
             self._resume()
         elif request.extend:
@@ -156,8 +156,8 @@ class _Session:
                 f"camera: the focal length of {camera.params[0]:.0f} pixels is {origin} and is "
                 "refined while mapping (--camera gives a calibrated one)"
             )
-        elif self.source.poses is not None:
-            check_poses_fit(surveyed, camera)
+        elif sentence := misfit(surveyed.pose_errors(camera)):
+            raise ValueError(f"{request.poses}: {sentence}")
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
@@ -202,9 +202,9 @@ class _Session:
         size = self.source.size()
         extractor = Extractor(options.descriptor, options.max_keypoints)
         surveyed = survey(self.source.images(), extractor, size)
-        mask = static_regions(surveyed.pairs, size)
-        if mask.any():
-            self.note(f"left out, as it never moves while the rest does: {describe(mask)}")
+        mask = static_regions([(pair.first, pair.second) for pair in surveyed.pairs], size)
+        if region := describe(mask):
+            self.note(f"left out, as it never moves while the rest does: {region}")
         if self.request.mask is not None:
             mask |= read_mask(self.request.mask, size)
         surveyed.mask, surveyed.seconds = mask, time.perf_counter() - started

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.features.extractor import Extractor, Features
+from protomark.geometry.camera import Camera
+from protomark.geometry.given_poses import agreeing, pose_errors
 from protomark.mapping.frame import Array, InputImage
 from protomark.mapping.initialisation import RATIO
-from protomark.tracks.matching import mutual, nearest_matches
+from protomark.tracks.matching import mutual_matches
 
 # This many frames are surveyed, out of at most so many.
 _FRAMES = 24
@@ -40,6 +42,20 @@ class Survey:
     features: dict[str, Features]
     mask: NDArray[np.bool_] | None = None
     seconds: float = 0.0
+
+    def pose_errors(self, camera: Camera) -> list[Array]:
+        """Errors of given poses for each pair whose matches can tell."""
+        errors = []
+        for pair in self.pairs:
+            one, other = (image.pose for image in pair.images)
+            if one is None or other is None:
+                continue
+            first, second = camera.rays(pair.first), camera.rays(pair.second)
+            agree = agreeing(first, second, camera.focal_length)
+            if agree.any():
+                seen = first[agree], second[agree]
+                errors.append(pose_errors(one, other, *seen, camera.focal_length))
+        return errors
 
 
 @dataclass
@@ -89,9 +105,8 @@ def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, 
 
 
 def _pair(one: tuple[InputImage, Features], other: tuple[InputImage, Features]) -> MatchedPair:
-    rows, target, _ = nearest_matches(one[1].descriptors, other[1].descriptors, RATIO)
-    both = mutual(one[1].descriptors, other[1].descriptors, rows, target)
-    first, second = one[1].keypoints[rows[both]], other[1].keypoints[target[both]]
+    rows = mutual_matches(one[1].descriptors, other[1].descriptors, RATIO)
+    first, second = one[1].keypoints[rows[:, 0]], other[1].keypoints[rows[:, 1]]
     images = one[0], other[0]
     return MatchedPair(images, first.astype(np.float64), second.astype(np.float64))
 
