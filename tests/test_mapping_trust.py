@@ -14,7 +14,8 @@ from mapping_scene import show, walk, write_images
 from protomark.features.static_regions import describe, outside, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
-from protomark.geometry.pose import quaternion_from_rotation, transform
+from protomark.geometry.given_poses import agreeing, misfit, pose_errors
+from protomark.geometry.pose import camera_centers, quaternion_from_rotation, transform
 from protomark.mapping.frame import Frame, InputImage
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
@@ -260,6 +261,22 @@ def test_poses_that_do_not_fit_the_images(wrong: str, tmp_path: Path) -> None:
     done = run(images, "-o", tmp_path / "x", "--camera", CAMERA, "--poses", given, "-d", "orb")
     fails(done, "do not fit the images", "camera-to-world")
     assert not (tmp_path / "x").exists()
+
+
+def test_poses_that_put_landmarks_behind_the_cameras_do_not_fit() -> None:
+    """Epipolar lines alone do not tell a translation from the opposite one."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.6, 0.5, (80, 2)), rng.uniform(2, 3, 80)])
+    one, other = walk(6)[[0, 5]]
+    first, second = (PINHOLE.rays(PINHOLE.project(transform(p, points))) for p in (one, other))
+    assert agreeing(first, second, 300.0).all()
+    right = pose_errors(one, other, first, second, 300.0)
+    assert right.max() < 1e-6
+    opposite = 2 * camera_centers(one) - camera_centers(other)
+    other = np.column_stack([other[:, :3], -other[:, :3] @ opposite])
+    wrong = pose_errors(one, other, first, second, 300.0)
+    assert not misfit([right, right, right, wrong])
+    assert "2 of 3 pairs" in misfit([right, wrong, wrong])
 
 
 def tum(times: list[str], file: Path) -> Path:

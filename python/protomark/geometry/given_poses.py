@@ -28,10 +28,7 @@ _CLEAR_ANGLE = 0.5
 def agreeing(first: Array, second: Array, focal: float) -> NDArray[np.bool_]:
     """Which matches (n,) agree on a relative pose (PoseLib's LO-RANSAC); none if too few do.
 
-    Args:
-        first: (n, 2) rays in one image, NaN where undistortion fails.
-        second: (n, 2) rays in the other one.
-        focal: focal length in pixels.
+    Rays (n, 2) are NaN where undistortion fails.
     """
     found = np.asarray(np.isfinite(np.hstack([first, second])).all(axis=1))
     if found.sum() < _MIN_MATCHES:
@@ -53,16 +50,9 @@ def agreeing(first: Array, second: Array, focal: float) -> NDArray[np.bool_]:
 
 
 def pose_errors(one: Array, other: Array, first: Array, second: Array, focal: float) -> Array:
-    """Epipolar errors (n,) of matches under given poses, pixels.
+    """Epipolar errors (n,) of matched rays (n, 2) under given poses, pixels.
 
     Matches that meet behind the cameras are off by the focal length at least.
-
-    Args:
-        one: (3, 4) pose of the first image.
-        other: (3, 4) pose of the second image.
-        first: (n, 2) rays in the first image.
-        second: (n, 2) rays in the second image.
-        focal: focal length in pixels.
     """
     relative = relative_pose(one, other)
     depth, angle = depth_of_first(*relative, first, second)
@@ -72,11 +62,7 @@ def pose_errors(one: Array, other: Array, first: Array, second: Array, focal: fl
 
 
 def misfit(errors: Sequence[Array]) -> str:
-    """A sentence if poses do not belong to the images, else "".
-
-    Args:
-        errors: errors of agreeing matches for each pair of images, see `pose_errors`.
-    """
+    """A sentence if the errors of each pair of images say that poses are of others, else ""."""
     fitting = sum(float(np.median(error)) <= _MAX_ERROR for error in errors)
     if fitting >= _MIN_FITTING * len(errors):
         return ""

@@ -42,17 +42,11 @@ _MAX_PARTNERS = 10
 
 @dataclass
 class TwoViewPose:
-    """The relative pose of two frames, the first one at the origin.
+    """The relative pose of two frames, the first one at the origin."""
 
-    Attributes:
-        first: index into `Initialiser.waiting`.
-        second: index into `Initialiser.waiting`.
-        pose: (3, 4) float64, of the second; the translation has length 1.
-    """
-
-    first: int
-    second: int
-    pose: Array
+    first: int  # index into `Initialiser.waiting`
+    second: int  # index into `Initialiser.waiting`
+    pose: Array  # (3, 4) float64, of the second; the translation has length 1
 
 
 class Initialiser:
@@ -60,10 +54,6 @@ class Initialiser:
 
     Two views of a plane fit two relative poses, and views of little depth nearly do. Other waiting
     frames, the witnesses, decide: landmarks of a wrong pose do not project where these see them.
-
-    Args:
-        camera: camera of all frames.
-        max_error: largest epipolar error in pixels.
     """
 
     def __init__(self, camera: Camera, max_error: float) -> None:

@@ -44,15 +44,7 @@ def make_map(
     progress: Progress = silent,
     note: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Make, resume or extend a map; write it and its report.
-
-    Args:
-        request: what to map, and how.
-        progress: called with each frame.
-        note: called with each message to the user.
-
-    Returns:
-        Its figures, see `protomark.mapping.summary.summarise`.
+    """Make, resume or extend a map; write it and its report; returns its figures.
 
     Raises:
         Interrupted: Ctrl-C was pressed; the map so far is written.

@@ -29,19 +29,14 @@ _MIN_MATCHES = 50
 
 @dataclass
 class Survey:
-    """What the first frames show.
+    """What the first frames show."""
 
-    Attributes:
-        pairs: matches of frames that moved.
-        features: features by image name, so that the map need not detect them again.
-        mask: (height, width) bool, the part of the image to leave out; None: nothing.
-        seconds: how long the survey took.
-    """
-
-    pairs: list[MatchedPair]
+    pairs: list[MatchedPair]  # matches of frames that moved
+    # Features by image name, so that the map need not detect them again.
     features: dict[str, Features]
+    # (height, width) bool, the part of the image to leave out; None: nothing.
     mask: NDArray[np.bool_] | None = None
-    seconds: float = 0.0
+    seconds: float = 0.0  # how long the survey took
 
     def pose_errors(self, camera: Camera) -> list[Array]:
         """Errors of given poses for each pair whose matches can tell."""
@@ -60,27 +55,15 @@ class Survey:
 
 @dataclass
 class MatchedPair:
-    """Keypoints of two frames that match.
+    """Keypoints of two frames that match."""
 
-    Attributes:
-        images: the two images.
-        first: (n, 2) float64, pixels in the earlier frame.
-        second: (n, 2) float64, pixels in the later one.
-    """
-
-    images: tuple[InputImage, InputImage]
-    first: Array
-    second: Array
+    images: tuple[InputImage, InputImage]  # the two images
+    first: Array  # (n, 2) float64, pixels in the earlier frame
+    second: Array  # (n, 2) float64, pixels in the later one
 
 
 def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, int]) -> Survey:
-    """Match the first frames that moved with each other.
-
-    Args:
-        images: the input, from its start.
-        extractor: detects and describes keypoints.
-        size: width and height; other images are left out.
-    """
+    """Match the first frames that moved with each other; images of another size do not count."""
     frames: list[tuple[InputImage, Features]] = []
     for count, image in enumerate(images):
         if len(frames) == _FRAMES or count == _MAX_READ:

@@ -51,30 +51,19 @@ _METHOD = 4
 
 @dataclass(frozen=True)
 class TracksOptions:
-    """How tracks are made.
+    """How tracks are made."""
 
-    Attributes:
-        descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
-        max_keypoints: limit on keypoints per image.
-        partners: about how many keyframes each keyframe is matched with.
-        ratio: limit on the ratio of the nearest to the second nearest Hamming distance.
-        max_error: largest epipolar and reprojection error, pixels.
-        min_angle: smallest triangulation angle of a landmark, degrees.
-        min_length: smallest number of observations of a landmark.
-        refine_poses: "yes", "no", or "auto": if the matches do not fit the poses.
-        max_unlabelled: limit on keypoints without a landmark per keyframe, the strongest; None: no
-            limit. A limit makes smaller files, but query frames that lack keypoints which match
-            nothing.
-    """
-
+    # Name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
     descriptor: str = "freak"
-    max_keypoints: int = 2000
-    partners: int = 24
-    ratio: float = 0.8
-    max_error: float = 3.0
-    min_angle: float = 1.0
-    min_length: int = 3
-    refine_poses: str = "auto"
+    max_keypoints: int = 2000  # limit on keypoints per image
+    partners: int = 24  # about how many keyframes each keyframe is matched with
+    ratio: float = 0.8  # limit on the ratio of the nearest to the second nearest Hamming distance
+    max_error: float = 3.0  # largest epipolar and reprojection error, pixels
+    min_angle: float = 1.0  # smallest triangulation angle of a landmark, degrees
+    min_length: int = 3  # smallest number of observations of a landmark
+    refine_poses: str = "auto"  # "yes", "no", or "auto": if the matches do not fit the poses
+    # Limit on keypoints without a landmark per keyframe, the strongest; None: no limit. A limit
+    # makes smaller files, but query frames that lack keypoints which match nothing.
     max_unlabelled: int | None = None
 
     def __post_init__(self) -> None:

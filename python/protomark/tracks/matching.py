@@ -43,11 +43,7 @@ class VerifiedMatches:
 def _nearest(
     first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Nearest neighbours in Hamming distance that pass the ratio test.
-
-    Returns:
-        Rows (k,) of the first descriptors, of the second ones, and distances (k,) in bits.
-    """
+    """Rows (k,) of nearest neighbours that pass the ratio test, and their Hamming distances."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int32)
     index, distance = hamming_search(first, second, k=2)
@@ -74,14 +70,7 @@ def mutual_matches(
 
 
 def match(first: View, second: View, ratio: float, max_error: float) -> VerifiedMatches:
-    """Mutual nearest neighbours that pass the ratio test and lie near the epipolar lines.
-
-    Args:
-        first: keyframe of the queries.
-        second: keyframe to search.
-        ratio: limit on the ratio of the nearest to the second nearest distance, in (0, 1].
-        max_error: largest epipolar error in pixels.
-    """
+    """Mutual nearest neighbours that pass the ratio test, within pixels of the epipolar lines."""
     rows, target, distance = _nearest(first.descriptors, second.descriptors, ratio)
     error = _epipolar_errors(first, second, rows, target)
     near = error <= max_error  # false for NaN
