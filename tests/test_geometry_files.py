@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, read_cameras
 from protomark.geometry.colmap import find_model, read_model
-from protomark.geometry.pose_files import read_poses
+from protomark.geometry.pose_files import poses_of_images, read_poses
 from tracks_scene import DISTORTED, PINHOLE, poses, write_model
 
 
@@ -111,7 +111,7 @@ def test_base_names_only_where_they_are_unique(tmp_path: Path) -> None:
         (["a.png", "y/b.png"], {"a.png": 0, "y/b.png": 1}),
         (["1/b.png", "2/b.png", "x/a.png"], {"x/a.png": 0}),
     ):
-        found = read_poses(tmp_path / "one").for_images(names)
+        found = poses_of_images(tmp_path / "one", names)
         assert {n: i for n in names for i in (0, 1) if _is(found.find(n), poses(2)[i])} == expected
         cameras = read_cameras(str(tmp_path / "one")).for_images(names)
         assert set(cameras.by_image) == set(expected)
@@ -131,8 +131,11 @@ def test_seconds_are_no_numbers_of_images(tmp_path: Path) -> None:
     assert seconds.find("00001.png") is None
     assert seconds.find("0.1.png") is not None
     assert seconds.find("00001.png", time=0.1) is not None  # a frame of a video
-    numbers = read_poses(trajectory([1.0, 2.0, 3.0]))
+    with pytest.raises(ValueError, match="0 of 9 images"):
+        poses_of_images(trajectory([0.0, 0.1, 0.2]), [f"{i}.png" for i in range(9)])
+    whole = trajectory([1.0, 2.0, 3.0])
+    numbers = read_poses(whole)
     assert numbers.find("00001.png") is not None
     names = [f"{i}.png" for i in range(3, 20)]
     with pytest.warns(UserWarning, match="1 of 17 images have one of 3 poses"):
-        numbers.for_images(names)
+        poses_of_images(whole, names)

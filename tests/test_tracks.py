@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -157,7 +158,7 @@ def test_poses_of_something_else_are_refused(kind: str, sequence: Path, tmp_path
         wrong = wrong[np.random.default_rng(0).permutation(8)]
     source = find_sequence(moved_sequence(tmp_path, sequence, wrong))
     for refine in ("auto", "no"):
-        with pytest.raises(ValueError, match="these poses do not fit these images"):
+        with pytest.raises(ValueError, match=r"do not fit the images.*camera-to-world"):
             extract(source, TracksOptions("orb", max_keypoints=500, refine_poses=refine))
 
 
@@ -213,9 +214,12 @@ def test_what_never_moves_is_left_out(sequence: Path, orb: Tracks, tmp_path: Pat
         image[180:] = still[:, :, None]
         cv2.imwrite(str(path), image)
     tracks = extract(find_sequence(tmp_path / "hood"), TracksOptions("orb", max_keypoints=500))
-    left, top, right, bottom = tracks.info["static_region"]
-    assert (left < 60, 160 < top < 200, right > 260, bottom > 200) == (True,) * 4
-    assert not orb.info["static_region"]
+    boxes = re.findall(r"x (\d+)-(\d+), y (\d+)-(\d+)", tracks.info["static_region"])
+    left, right, top, bottom = np.array(boxes, int).T
+    assert left.min() < 60
+    assert right.max() > 260
+    assert 160 < top.min() < 200 < bottom.max()
+    assert orb.info["static_region"] == ""
     assert not tracks.info["poses_refined"]
     observed = tracks.keypoints[tracks.observations]
     assert (observed[:, 1] > 195).mean() < 0.02

@@ -166,12 +166,8 @@ def _show(facts: dict[str, Any], info: dict[str, Any]) -> None:
             if share > _FAR:
                 note("warning: poses moved far; --refine-poses no keeps them as they are")
         rows.append(("given poses", f"epipolar error {info['epipolar_error']:.2f} pixels, {fate}"))
-    if info.get("static_region"):
-        box = ", ".join(map(str, info["static_region"]))
-        note(
-            f"left out: what never moves while the rest does, within left, top, right, bottom = "
-            f"{box} pixels (an overlay, the camera's own vehicle?)"
-        )
+    if region := info.get("static_region"):
+        note(f"left out, as it never moves while the rest does: {region}")
     if without := info.get("images_without_pose"):
         rows.append(("left out without a pose", first_of(without)))
     if unreadable := info.get("images_unreadable"):

@@ -44,17 +44,11 @@ _MAX_CONDITION = 1e12
 
 @dataclass(frozen=True)
 class AbsolutePose:
-    """A pose and the matches that agree with it.
+    """A pose and the matches that agree with it."""
 
-    Attributes:
-        cam_from_world: (3, 4) float64.
-        inliers: (n,) bool.
-        camera: the camera, with the estimated focal length if that was not known.
-    """
-
-    cam_from_world: Array
-    inliers: NDArray[np.bool_]
-    camera: Camera
+    cam_from_world: Array  # (3, 4) float64
+    inliers: NDArray[np.bool_]  # (n,) bool
+    camera: Camera  # the camera, with the estimated focal length if that was not known
 
 
 def check_pose_model(camera: Camera) -> None:
@@ -181,17 +175,12 @@ def refine_pose(
 
 @dataclass(frozen=True)
 class FreeLens:
-    """What changes if focal length and principal point may move together with the pose.
+    """What changes if focal length and principal point may move together with the pose."""
 
-    Attributes:
-        cam_from_world: (3, 4) float64, the pose that fits best.
-        gain: by how much the mean loss falls, log(1 + (error / s)^2) with half the largest error s.
-        spread: standard deviation of the camera centre in world units, infinite if it is open.
-    """
-
-    cam_from_world: Array
+    cam_from_world: Array  # (3, 4) float64, the pose that fits best
+    # By how much the mean loss falls, log(1 + (error / s)^2) with half the largest error s.
     gain: float
-    spread: float
+    spread: float  # standard deviation of the camera centre in world units, infinite if it is open
 
 
 def free_lens(
@@ -234,13 +223,10 @@ def free_lens(
                 _lens_jacobian(projected),
             ],
             axis=2,
-        ).reshape(2 * count, -1)
-        unit = np.linalg.norm(jacobian, axis=0)
-        normal = (jacobian / unit).T @ (jacobian / unit)
-        if np.linalg.cond(normal) < _MAX_CONDITION:
-            variance = after[inlier].sum() / (2 * count - len(unit))
-            diagonal = np.diag(np.linalg.inv(normal)) / unit**2
-            spread = float(np.sqrt(variance * diagonal[3:6].sum()))
+        )
+        covariance = _covariance(jacobian, float(after[inlier].sum()))
+        if covariance is not None:
+            spread = float(np.sqrt(np.trace(covariance[3:6, 3:6])))
     return FreeLens(pose, float(losses[0] - losses[1]), spread)
 
 
@@ -337,8 +323,13 @@ def pose_covariance(
         return None
     poses = np.broadcast_to(cam_from_world, (len(positions), 3, 4))
     residual, depth = reprojection_residuals(positions, poses, camera.rays(pixels))
-    jacobian = _jacobian(cam_from_world, positions, depth > 0).reshape(-1, 6)
-    variance = (residual**2).sum() / (2 * len(pixels) - 6)
+    return _covariance(_jacobian(cam_from_world, positions, depth > 0), float((residual**2).sum()))
+
+
+def _covariance(jacobian: Array, square: float) -> Array | None:
+    """s^2 (J^T J)^-1 of derivatives (n, 2, d) and the sum of squared residuals; None if open."""
+    jacobian = jacobian.reshape(-1, jacobian.shape[2])
+    variance = square / (len(jacobian) - jacobian.shape[1])
     # Rotations and translations differ in unit: without scales their condition means nothing.
     scale = np.linalg.norm(jacobian, axis=0)
     if not (np.isfinite(variance) and (scale > 0).all()):

@@ -12,14 +12,11 @@ from protomark.geometry.pose_files import match_names
 
 @dataclass(frozen=True)
 class CameraSet:
-    """Cameras, and the images that they took.
+    """Cameras, and the images that they took."""
 
-    Attributes:
-        cameras: all cameras; one without a size (0 x 0) fits images of any size.
-        by_image: cameras by image name, if the source names images.
-    """
-
+    # All cameras; one without a size (0 x 0) fits images of any size.
     cameras: tuple[Camera, ...] = ()
+    # Cameras by image name, if the source names images.
     by_image: Mapping[str, Camera] = field(default_factory=dict)
 
     def for_images(self, names: Iterable[str]) -> CameraSet:

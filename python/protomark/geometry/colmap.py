@@ -47,23 +47,14 @@ _SLICE = 10
 
 @dataclass
 class ColmapModel:
-    """Cameras of a sparse model, and its images that have a pose, in natural order of their names.
+    """Cameras of a sparse model, and its images with a pose, in natural order of their names."""
 
-    Attributes:
-        cameras: cameras by COLMAP's id.
-        names: m image names (img2 comes before img10).
-        image_ids: (m,) int64, COLMAP image ids.
-        camera_ids: (m,) int32, camera of each image.
-        cam_from_world: (m, 3, 4) float64.
-        unposed: names of the images without a pose.
-    """
-
-    cameras: dict[int, Camera]
-    names: list[str]
-    image_ids: NDArray[np.int64]
-    camera_ids: NDArray[np.int32]
-    cam_from_world: NDArray[np.float64]
-    unposed: list[str]
+    cameras: dict[int, Camera]  # cameras by COLMAP's id
+    names: list[str]  # m image names (img2 comes before img10)
+    image_ids: NDArray[np.int64]  # (m,) int64, COLMAP image ids
+    camera_ids: NDArray[np.int32]  # (m,) int32, camera of each image
+    cam_from_world: NDArray[np.float64]  # (m, 3, 4) float64
+    unposed: list[str]  # names of the images without a pose
 
     @property
     def centers(self) -> NDArray[np.float64]:
@@ -194,21 +185,22 @@ def read_observations(
         FileNotFoundError, ValueError: see `read_reconstruction`.
     """
     reconstruction = read_reconstruction(path)
-    ids, images, pixels, sizes = [], [], [], []
+    ids: list[int] = []
+    images: list[int] = []
+    pixels: list[list[float]] = []
+    sizes: list[tuple[int, int]] = []
     for number, image in enumerate(reconstruction.images.values()):
-        seen = [(p.point3D_id, *p.xy) for p in image.points2D if p.has_point3D()]
-        table = np.array(seen, np.float64).reshape(-1, 3)
+        seen = [p for p in image.points2D if p.has_point3D()]
         camera = reconstruction.cameras[image.camera_id]
-        ids.append(np.array([row[0] for row in seen], np.int64))
-        images.append(np.full(len(seen), number, np.int64))
-        pixels.append(table[:, 1:])
-        sizes.append(np.full((len(seen), 2), (camera.width, camera.height), np.float64))
-    empty = [np.zeros((0, 2))]
+        ids += [p.point3D_id for p in seen]
+        images += [number] * len(seen)
+        pixels += [p.xy.tolist() for p in seen]
+        sizes += [(camera.width, camera.height)] * len(seen)
     return (
-        np.concatenate([*ids, np.zeros(0, np.int64)]),
-        np.concatenate([*images, np.zeros(0, np.int64)]),
-        np.concatenate(pixels + empty),
-        np.concatenate(sizes + empty),
+        np.array(ids, np.int64),
+        np.array(images, np.int64),
+        np.array(pixels, np.float64).reshape(-1, 2),
+        np.array(sizes, np.float64).reshape(-1, 2),
     )
 
 
@@ -284,10 +276,6 @@ def focal_deviations(reconstruction: Any, image_ids: Iterable[int]) -> dict[int,
 
     Poses, points and distortion are free, and the residuals say how accurate a keypoint is. The
     value is infinite where the images do not determine the focal length.
-
-    Args:
-        reconstruction: an adjusted `pycolmap.Reconstruction`.
-        image_ids: images that take part.
     """
     adjuster = _adjuster(reconstruction, image_ids, intrinsics=True)
     options = pycolmap.BACovarianceOptions()
@@ -337,18 +325,17 @@ def _adjuster(
     # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
     if priors is None:
         return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
-    known = [_prior(reconstruction.images[i], p, spread) for i, p in enumerate(priors, 1)]
+    known = [
+        pycolmap.PosePrior(
+            corr_data_id=reconstruction.images[i].data_id,
+            position=position,
+            position_covariance=spread**2 * np.eye(3),
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for i, position in enumerate(priors, 1)
+    ]
     return pycolmap.create_pose_prior_bundle_adjuster(
         options, pycolmap.PosePriorBundleAdjustmentOptions(), config, known, reconstruction
-    )
-
-
-def _prior(image: Any, position: NDArray[np.float64], spread: float) -> Any:
-    return pycolmap.PosePrior(
-        corr_data_id=image.data_id,
-        position=position,
-        position_covariance=spread**2 * np.eye(3),
-        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
     )
 
 

@@ -50,28 +50,7 @@ class PoseSet:
     @property
     def example(self) -> str:
         """The image name or time of the first pose, for error messages."""
-        return next(iter(self.by_name), None) or f"time {self.times[0]:g}"
-
-    def for_images(self, names: Sequence[str]) -> PoseSet:
-        """The poses of these images, and a warning if few of them have one.
-
-        Args:
-            names: names of all images; one in another folder has the pose of its base name if that
-                is unique among them and among the poses.
-        """
-        poses = PoseSet(
-            {name: self.by_name[key] for name, key in match_names(names, self.by_name).items()},
-            self.times,
-            self.poses,
-        )
-        found = sum(poses.find(name) is not None for name in names)
-        if 0 < found < _FEW * min(len(names), len(self)):
-            warnings.warn(
-                f"{found} of {len(names)} images have one of {len(self)} poses (such as that of "
-                f"{self.example}): are these the poses of these images?",
-                stacklevel=2,
-            )
-        return poses
+        return next(iter(self.by_name), None) or f"time {self.times[0]:.12g}"
 
     def find(self, name: str, time: float | None = None) -> NDArray[np.float64] | None:
         """The pose of an image, None if the set has none for it.
@@ -131,6 +110,41 @@ def read_poses(path: Path) -> PoseSet:
     if filled and all(len(words) == 8 for _, words in filled):
         return _read_tum(path, filled)
     return _read_images_txt(path, rows)
+
+
+def poses_of_images(
+    path: Path, names: Sequence[str], times: Sequence[float] | None = None
+) -> PoseSet:
+    """Read the poses of these images, see `read_poses`, and warn if few of them have one.
+
+    Args:
+        path: a file or folder of poses.
+        names: names of all images; one in another folder has the pose of its base name if that is
+            unique among them and among the poses.
+        times: times of all images in seconds, see `PoseSet.find`.
+
+    Raises:
+        ValueError: none of the images has a pose; or see `read_poses`.
+    """
+    given = read_poses(path)
+    by_name = {name: given.by_name[key] for name, key in match_names(names, given.by_name).items()}
+    poses = PoseSet(by_name, given.times, given.poses)
+    when: Sequence[float | None] = times or [None] * len(names)
+    found = sum(poses.find(n, time) is not None for n, time in zip(names, when, strict=True))
+    told = f"{found} of {len(names)} images have one of {len(given)} poses"
+    if not found:
+        image = names[0] if when[0] is None else f"time {when[0]:g}"
+        raise ValueError(
+            f"{path}: {told}: the poses start with {given.example}, the images with {image}; give "
+            "both the same names, or times in seconds as in 1305031102.175304.png"
+        )
+    if found < _FEW * min(len(names), len(given)):
+        warnings.warn(
+            f"{path}: {told} (such as that of {given.example}): are these the poses of these "
+            "images?",
+            stacklevel=2,
+        )
+    return poses
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:

@@ -23,7 +23,7 @@ from protomark.geometry.pose_files import (
     PoseSet,
     image_times,
     images_txt,
-    read_poses,
+    poses_of_images,
     tum_trajectory,
 )
 from protomark.interrupt import deferred_interrupt
@@ -41,54 +41,35 @@ STAGES = ("features", "encode", "search", "pose", "total")
 
 @dataclass(frozen=True)
 class LocalizationRequest:
-    """What to localize, and how.
+    """What to localize, and how."""
 
-    Attributes:
-        scene: a map file, or the folder that `protomark map` wrote.
-        images: image files, and folders of them.
-        camera: a cameras.txt, a folder with a COLMAP model, or a camera written out. None: those
-            that the map was made with, for images of their size; "estimate", and for other images:
-            focal lengths come from EXIF data and matches.
-        refine_focal_length: whether focal lengths of given cameras are refined for each image.
-        true_poses: file or folder of poses to measure errors against.
-        priors: file or folder of rough poses; None: the whole map is searched.
-        prior_distance: largest error of a prior's position, in world units.
-        prior_degrees: largest error of a prior's orientation.
-        min_confidence: smallest probability of an accepted pose.
-        max_keypoints: limit on keypoints per image.
-        recall: see `Localizer`.
-        threads: number of images to localize at a time.
-    """
-
-    scene: Path
-    images: Sequence[Path]
+    scene: Path  # a map file, or the folder that `protomark map` wrote
+    images: Sequence[Path]  # image files, and folders of them
+    # A cameras.txt, a folder with a COLMAP model, or a camera written out. None: those that the map
+    # was made with, for images of their size; "estimate", and for other images: focal lengths come
+    # from EXIF data and matches.
     camera: str | None = None
+    # Whether focal lengths of given cameras are refined for each image.
     refine_focal_length: bool = False
-    true_poses: Path | None = None
-    priors: Path | None = None
-    prior_distance: float = 1.0
-    prior_degrees: float = 15.0
-    min_confidence: float = 0.9
-    max_keypoints: int = 2000
-    recall: float | None = None
-    threads: int = 1
+    true_poses: Path | None = None  # file or folder of poses to measure errors against
+    priors: Path | None = None  # file or folder of rough poses; None: the whole map is searched
+    prior_distance: float = 1.0  # largest error of a prior's position, in world units
+    prior_degrees: float = 15.0  # largest error of a prior's orientation
+    min_confidence: float = 0.9  # smallest probability of an accepted pose
+    max_keypoints: int = 2000  # limit on keypoints per image
+    recall: float | None = None  # see `Localizer`
+    threads: int = 1  # number of images to localize at a time
 
 
 @dataclass(frozen=True)
 class ImageResult:
-    """The result for one image.
+    """The result for one image."""
 
-    Attributes:
-        name: name of the image.
-        found: its localization, None if the image cannot be read or has no camera.
-        error: what is wrong with the image, else "".
-        true_error: distance and degrees from the true pose, infinite without a pose; None without
-            a true pose.
-    """
-
-    name: str
+    name: str  # name of the image
+    # Its localization, None if the image cannot be read or has no camera.
     found: Localization | None
-    error: str = ""
+    error: str = ""  # what is wrong with the image, else ""
+    # Distance and degrees from the true pose, infinite without a pose; None without a true pose.
     true_error: tuple[float, float] | None = None
 
     @property
@@ -116,17 +97,11 @@ class ImageResult:
 
 @dataclass(frozen=True)
 class LocalizationBatch:
-    """The results for several images.
+    """The results for several images."""
 
-    Attributes:
-        images: results in the order of the images.
-        min_confidence: smallest probability of an accepted pose.
-        interrupted: whether Ctrl-C ended the run early.
-    """
-
-    images: Sequence[ImageResult]
-    min_confidence: float
-    interrupted: bool = False
+    images: Sequence[ImageResult]  # results in the order of the images
+    min_confidence: float  # smallest probability of an accepted pose
+    interrupted: bool = False  # whether Ctrl-C ended the run early
 
     def pose(self, image: ImageResult) -> NDArray[np.float64] | None:
         """The pose of an image if it is accepted, else None."""
@@ -140,18 +115,17 @@ class LocalizationBatch:
 
     def recall(self) -> list[dict[str, float]]:
         """Share of the images with a true pose that are accepted and within each threshold."""
-        measured = [i for i in self.images if i.true_error is not None]
-        rows = []
-        for distance, degrees in THRESHOLDS if measured else ():
-            right = [
-                self.accepted(i)
-                and i.true_error is not None
-                and i.true_error[0] <= distance
-                and i.true_error[1] <= degrees
-                for i in measured
+        errors = np.array(
+            [
+                i.true_error if self.accepted(i) else (np.inf, np.inf)
+                for i in self.images
+                if i.true_error is not None
             ]
-            rows.append({"distance": distance, "degrees": degrees, "recall": float(np.mean(right))})
-        return rows
+        )
+        return [
+            {"distance": d, "degrees": a, "recall": float((errors <= (d, a)).all(1).mean())}
+            for d, a in (THRESHOLDS if len(errors) else ())
+        ]
 
     def summary(self) -> dict[str, Any]:
         """Figures over all images."""
@@ -271,8 +245,10 @@ def localize_files(
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
     for camera in cameras.cameras if cameras else ():
         check_pose_model(camera)
-    true_poses = _poses_of(request.true_poses, names)
-    priors = _poses_of(request.priors, names)
+    true_poses, priors = (
+        poses_of_images(path, names) if path else PoseSet({})
+        for path in (request.true_poses, request.priors)
+    )
 
     def localize(image: tuple[str, Path]) -> ImageResult:
         name, path = image
@@ -328,20 +304,6 @@ def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
                 )
             found[name] = path
     return list(found.items())
-
-
-def _poses_of(source: Path | None, names: Sequence[str]) -> PoseSet:
-    """Poses from a file or folder, of which one must belong to an image."""
-    if source is None:
-        return PoseSet({})
-    given = read_poses(source)
-    poses = given.for_images(names)
-    if all(poses.find(name) is None for name in names):
-        raise ValueError(
-            f"{source}: none of its {len(given)} poses (such as that of {given.example}) belongs "
-            f"to an image (such as {names[0]}): give poses of these images"
-        )
-    return poses
 
 
 def _localize_file(

@@ -35,25 +35,17 @@ LENS_WEIGHTS: dict[CameraOrigin, tuple[float, ...]] = {
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence for a pose.
+    """The evidence for a pose."""
 
-    Attributes:
-        inliers: number of matches that agree with the pose.
-        matches: number of accepted matches.
-        cells: number of cells, of `CELLS` x `CELLS` over the image, with an inlier.
-        origin: where the camera comes from.
-        shift: by how much the pose moves if the lens is set free, in units of `DEPTH_SHARE` of the
-            median depth or of `DEGREES`, whichever is more.
-        gain: by how much that lowers the mean (Cauchy) loss of the matches.
-        spread: standard deviation of the camera centre, as a share of the depth, with a free lens.
-    """
-
-    inliers: int
-    matches: int
-    cells: int
-    origin: CameraOrigin = "user"
+    inliers: int  # number of matches that agree with the pose
+    matches: int  # number of accepted matches
+    cells: int  # number of cells, of `CELLS` x `CELLS` over the image, with an inlier
+    origin: CameraOrigin = "user"  # where the camera comes from
+    # By how much the pose moves if the lens is set free, in units of `DEPTH_SHARE` of the median
+    # depth or of `DEGREES`, whichever is more.
     shift: float = np.inf
-    gain: float = 0.0
+    gain: float = 0.0  # by how much that lowers the mean (Cauchy) loss of the matches
+    # Standard deviation of the camera centre, as a share of the depth, with a free lens.
     spread: float = np.inf
 
     def place(self) -> NDArray[np.float64]:

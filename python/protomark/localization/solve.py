@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,18 +86,13 @@ class Localization:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The nearest landmarks of the keypoints of a frame.
+    """The nearest landmarks of the keypoints of a frame."""
 
-    Attributes:
-        keypoints: (n, 2) float64, pixels.
-        landmarks: (n, c) int64, ids of the nearest landmarks, -1 where there is none.
-        positions: (n, c, 3) float64, their positions, NaN where there is none.
-        probabilities: (n,) float64, the probability that the nearest landmark is right.
-    """
-
-    keypoints: NDArray[np.float64]
+    keypoints: NDArray[np.float64]  # (n, 2) float64, pixels
+    # (n, c) int64, ids of the nearest landmarks, -1 where there is none.
     landmarks: NDArray[np.int64]
-    positions: NDArray[np.float64]
+    positions: NDArray[np.float64]  # (n, c, 3) float64, their positions, NaN where there is none
+    # (n,) float64, the probability that the nearest landmark is right.
     probabilities: NDArray[np.float64]
 
 
@@ -118,45 +113,35 @@ def solve_pose(
         of_map: whether the map was made with this camera.
     """
     keypoints, positions = candidates.keypoints, candidates.positions
-    # Geographic coordinates are large; around their middle nothing is lost by rounding.
-    middle = np.nanmedian(positions.reshape(-1, 3), axis=0) if np.isfinite(positions).any() else 0.0
-    positions = positions - middle
-    landmarks = np.where(np.isfinite(positions).all(axis=2), candidates.landmarks, -1)
     if len(keypoints) < MIN_MATCHES:
         return Localization(
             camera, reason=f"only {len(keypoints)} keypoints: blurred, dark or empty"
         )
+    # Geographic coordinates are large; around their middle nothing is lost by rounding.
+    middle = np.nanmedian(positions.reshape(-1, 3), axis=0) if np.isfinite(positions).any() else 0.0
+    positions = positions - middle
+    landmarks = np.where(np.isfinite(positions).all(axis=2), candidates.landmarks, -1)
+    candidates = replace(candidates, positions=positions, landmarks=landmarks)
     matches = accept(landmarks[:, 0], candidates.probabilities, min_probability)
     evidence = Evidence(0, len(matches), 0)
     if len(matches) < MIN_MATCHES:
         reason = f"only {len(matches)} likely matches of {len(keypoints)} keypoints: another place?"
         return Localization(camera, evidence=evidence, reason=reason)
     max_error = MAX_ERROR * max(camera.width, camera.height)
-    found = estimate_pose(
-        keypoints[matches.keypoints],
-        positions[matches.keypoints, 0],
-        camera,
-        max_error,
-        focal_length,
-    )
+    pixels, nearest = keypoints[matches.keypoints], positions[matches.keypoints, 0]
+    found = estimate_pose(pixels, nearest, camera, max_error, focal_length)
     if found is None:
         reason = f"no pose agrees with {MIN_MATCHES} of {len(matches)} likely matches"
         return Localization(camera, evidence=evidence, reason=reason)
     agreeing = matches.keypoints[found.inliers]
-    pose, rows, columns = _complete(found, keypoints, landmarks, positions, max_error)
+    pose, rows, columns = _complete(found, candidates, max_error)
     origin: CameraOrigin = "estimate" if focal_length != "known" else "map" if of_map else "user"
     evidence = Evidence(
         len(agreeing),
         len(matches),
         occupied_cells(found.camera, keypoints[agreeing]),
         origin,
-        *_lens_evidence(
-            pose,
-            keypoints[matches.keypoints],
-            positions[matches.keypoints, 0],
-            found.camera,
-            max_error,
-        ),
+        *_lens_evidence(pose, pixels, nearest, found.camera, max_error),
     )
     cam_from_world = np.column_stack([pose[:, :3], pose[:, 3] - pose[:, :3] @ middle])
     return Localization(
@@ -191,11 +176,7 @@ def _lens_evidence(
 
 
 def _complete(
-    found: AbsolutePose,
-    keypoints: NDArray[np.float64],
-    landmarks: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    max_error: float,
+    found: AbsolutePose, candidates: Candidates, max_error: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Refine the pose on all keypoints to which one of their nearest landmarks projects.
 
@@ -203,26 +184,23 @@ def _complete(
         The pose, and the rows and columns of the agreeing candidates.
     """
     pose, camera = found.cam_from_world, found.camera
-    rows, columns = _agreeing(pose, camera, keypoints, landmarks, positions, max_error)
+    rows, columns = _agreeing(pose, camera, candidates, max_error)
     if len(rows) >= MIN_MATCHES:
-        pose, _ = refine_pose(pose, keypoints[rows], positions[rows, columns], camera, max_error)
-        rows, columns = _agreeing(pose, camera, keypoints, landmarks, positions, max_error)
+        pixels, positions = candidates.keypoints[rows], candidates.positions[rows, columns]
+        pose, _ = refine_pose(pose, pixels, positions, camera, max_error)
+        rows, columns = _agreeing(pose, camera, candidates, max_error)
     return pose, rows, columns
 
 
 def _agreeing(
-    pose: NDArray[np.float64],
-    camera: Camera,
-    keypoints: NDArray[np.float64],
-    landmarks: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    max_error: float,
+    pose: NDArray[np.float64], camera: Camera, candidates: Candidates, max_error: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of the candidates within the error, each landmark and keypoint once."""
+    landmarks = candidates.landmarks
     present = landmarks >= 0
     pixels = np.full((*landmarks.shape, 2), np.inf)
-    pixels[present] = camera.project(transform(pose, positions[present]))
-    error = np.linalg.norm(pixels - keypoints[:, None], axis=2)
+    pixels[present] = camera.project(transform(pose, candidates.positions[present]))
+    error = np.linalg.norm(pixels - candidates.keypoints[:, None], axis=2)
     inside = error <= max_error
     rows = np.flatnonzero(inside.any(axis=1))
     columns = inside[rows].argmax(axis=1)

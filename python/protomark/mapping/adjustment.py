@@ -23,17 +23,7 @@ _MAX_FIXED = 15
 
 
 def adjust_local_bundle(structure: Structure, newest: int, size: int, iterations: int) -> list[int]:
-    """Adjust the keyframes that share most landmarks with one, and their landmarks.
-
-    Args:
-        structure: frames and landmarks; changed.
-        newest: index of the new keyframe.
-        size: number of keyframes that move.
-        iterations: limit on the solver's steps.
-
-    Returns:
-        Indices of the keyframes that moved.
-    """
+    """Adjust `size` keyframes, those that share most landmarks with the newest; returns them."""
     shared = _shared(structure, np.unique(structure.frames[newest].seen))
     shared.pop(newest, None)
     near = sorted(shared, key=lambda i: (-shared[i], i))[: size - 1]
@@ -49,20 +39,11 @@ def adjust_global_bundle(
     structure: Structure,
     iterations: int = 30,
     loss_scale: float = 1.0,
-    calibration: Calibration | None = None,
-    poses: bool = True,
+    calibration: Calibration | None = None,  # None: cameras stay as they are
+    poses: bool = True,  # whether they move
     threads: int = 1,
 ) -> None:
-    """Adjust all keyframes and landmarks.
-
-    Args:
-        structure: frames and landmarks; changed.
-        iterations: limit on the solver's steps.
-        loss_scale: pixels beyond which an error counts less.
-        calibration: calibrates the cameras as far as the map determines them; None: they stay.
-        poses: whether poses move, too.
-        threads: threads of the solver; their number changes the last digits.
-    """
+    """Adjust all keyframes and landmarks."""
     keyframes = structure.keyframes()
     moving, fixed = (keyframes, []) if poses else ([], keyframes)
     adjust(structure, moving, fixed, iterations, loss_scale, calibration, threads)
@@ -81,23 +62,13 @@ def _shared(structure: Structure, ids: Ids) -> dict[int, int]:
 def adjust(
     structure: Structure,
     moving: list[int],
-    fixed: list[int],
+    fixed: list[int],  # keyframes that observe the same landmarks
     iterations: int,
     loss_scale: float = 1.0,
-    calibration: Calibration | None = None,
+    calibration: Calibration | None = None,  # None: cameras stay as they are
     threads: int = 1,
 ) -> None:
-    """Move frames and the landmarks they observe to the least (Cauchy) reprojection error.
-
-    Args:
-        structure: frames and landmarks; changed.
-        moving: indices of keyframes that move.
-        fixed: indices of keyframes that observe the same landmarks and are held fixed.
-        iterations: limit on the solver's steps.
-        loss_scale: pixels beyond which an error counts less.
-        calibration: calibrates the cameras as far as the map determines them; None: they stay.
-        threads: threads of the solver; their number changes the last digits.
-    """
+    """Move frames and the landmarks they observe to the least (Cauchy) reprojection error."""
     seen = structure.observations(sorted({*moving, *fixed}))
     counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
     seen = seen.where(counts[seen.landmarks] >= 2)
@@ -160,9 +131,7 @@ def _read_back(
             structure.positions[point] = xyz
     if cameras:
         for camera_id, camera in reconstruction.cameras.items():
-            params = tuple(float(p) for p in camera.params)
-            ours = structure.cameras[camera_id]
-            structure.set_camera(camera_id, Camera(ours.model, ours.width, ours.height, params))
+            structure.set_camera(camera_id, Camera.from_colmap(camera))
 
 
 def _move_with_frames(structure: Structure, ids: Ids, before: dict[int, Array]) -> None:

@@ -21,23 +21,15 @@ def cull(
     structure: Structure,
     memory: Memory,
     frames: list[int],
-    max_error: float,
-    min_angle: float,
+    max_error: float,  # as a share of the image's longer side
+    min_angle: float,  # of a new landmark, degrees
 ) -> int:
     """Remove observations with a large error, and landmarks with too few or too narrow rays.
 
+    Returns the number of removed landmarks.
+
     Observations of frames in the window are subtracted from the memory exactly. Descriptors of
     other frames no longer exist: their observations leave the geometry, but stay in the prototype.
-
-    Args:
-        structure: frames and landmarks.
-        memory: the landmarks' prototypes.
-        frames: indices of the frames to check, with their landmarks.
-        max_error: largest reprojection error, as a share of the image's longer side.
-        min_angle: smallest triangulation angle of a new landmark, degrees.
-
-    Returns:
-        Number of removed landmarks.
     """
     seen = structure.observations(frames)
     limit = np.array(

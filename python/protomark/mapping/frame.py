@@ -14,55 +14,35 @@ Ids = NDArray[np.int64]
 
 @dataclass
 class InputImage:
-    """One image of the input.
+    """One image of the input."""
 
-    Attributes:
-        index: index in its input, from 0.
-        name: name, unique in the map.
-        time: seconds, or the index if the input has no times.
-        image: (height, width) uint8, None if it cannot be read.
-        pose: (3, 4) given pose, or None.
-        problem: why there is no image, else "".
-    """
-
-    index: int
-    name: str
-    time: float
-    image: NDArray[np.uint8] | None
-    pose: Array | None = None
-    problem: str = ""
+    index: int  # index in its input, from 0
+    name: str  # name, unique in the map
+    time: float  # seconds, or the index if the input has no times
+    image: NDArray[np.uint8] | None  # (height, width) uint8, None if it cannot be read
+    pose: Array | None = None  # (3, 4) given pose, or None
+    problem: str = ""  # why there is no image, else ""
 
 
 @dataclass
 class Frame:
-    """Keypoints and descriptors of an image, and once it is registered its pose and landmarks.
+    """Keypoints and descriptors of an image, and once it is registered its pose and landmarks."""
 
-    Attributes:
-        index: index in its input, from 0.
-        name: image name, unique in the map.
-        time: seconds, or the index if the input has no times.
-        camera_id: its camera.
-        keypoints: (n, 2) float32, pixels; those without a landmark are dropped when the frame
-            leaves the window.
-        rays: (n, 2) float64, undistorted.
-        descriptors: (n, B) uint8, None outside of the window.
-        encoded: (n, width), the form that the memory compares; None outside of the window.
-        pose: (3, 4) float64, cam_from_world; NaN before the frame is registered.
-        landmarks: (n,) int64, the landmark that each keypoint observes, -1 for none.
-        keyframe: whether its observations take part in bundle adjustment.
-    """
-
-    index: int
-    name: str
-    time: float
-    camera_id: int
+    index: int  # index in its input, from 0
+    name: str  # image name, unique in the map
+    time: float  # seconds, or the index if the input has no times
+    camera_id: int  # its camera
+    # (n, 2) float32, pixels; those without a landmark are dropped when the frame leaves the window.
     keypoints: NDArray[np.float32]
-    rays: Array
-    descriptors: NDArray[np.uint8] | None = None
+    rays: Array  # (n, 2) float64, undistorted
+    descriptors: NDArray[np.uint8] | None = None  # (n, B) uint8, None outside of the window
+    # (n, width), the form that the memory compares; None outside of the window.
     encoded: NDArray[Any] | None = None
+    # (3, 4) float64, cam_from_world; NaN before the frame is registered.
     pose: Array = field(default_factory=lambda: np.full((3, 4), np.nan))
+    # (n,) int64, the landmark that each keypoint observes, -1 for none.
     landmarks: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
-    keyframe: bool = True
+    keyframe: bool = True  # whether its observations take part in bundle adjustment
 
     def at(self, pose: Array) -> Frame:
         """A copy with a pose and without landmarks, to register in a map."""

@@ -12,50 +12,31 @@ REGISTERED = "registered"
 
 @dataclass
 class FrameRecord:
-    """What became of one frame of the input.
+    """What became of one frame of the input."""
 
-    Attributes:
-        index: index in its input.
-        name: image name.
-        outcome: "registered", or why it is not.
-        keypoints: number of keypoints.
-        inliers: matches that agree with its pose, 0 without one.
-        keyframe: whether it is a keyframe.
-        landmarks: landmarks of the map after this frame.
-        observations: observations of the map after this frame.
-        memory_bytes: bytes that matching needs after this frame.
-        descriptor_bytes: bytes that all descriptors of these observations would take.
-        window_bytes: bytes of the descriptors in the window.
-        seconds: seconds by stage.
-    """
-
-    index: int
-    name: str
-    outcome: str
-    keypoints: int = 0
-    inliers: int = 0
-    keyframe: bool = False
-    landmarks: int = 0
-    observations: int = 0
-    memory_bytes: int = 0
-    descriptor_bytes: int = 0
-    window_bytes: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
+    index: int  # index in its input
+    name: str  # image name
+    outcome: str  # "registered", or why it is not
+    keypoints: int = 0  # number of keypoints
+    inliers: int = 0  # matches that agree with its pose, 0 without one
+    keyframe: bool = False  # whether it is a keyframe
+    landmarks: int = 0  # landmarks of the map after this frame
+    observations: int = 0  # observations of the map after this frame
+    memory_bytes: int = 0  # bytes that matching needs after this frame
+    descriptor_bytes: int = 0  # bytes that all descriptors of these observations would take
+    window_bytes: int = 0  # bytes of the descriptors in the window
+    seconds: dict[str, float] = field(default_factory=dict)  # seconds by stage
 
 
 @dataclass
 class History:
-    """Records of all frames in the order of the input, and events.
+    """Records of all frames in the order of the input, and events."""
 
-    Attributes:
-        records: records by frame name.
-        events: sentences such as "frame 31: a place seen before, 45 landmarks merged".
-        closing_seconds: seconds by stage before the first frame and before a restart, and after
-            the last frame (retries, global adjustment).
-    """
-
-    records: dict[str, FrameRecord] = field(default_factory=dict)
+    records: dict[str, FrameRecord] = field(default_factory=dict)  # records by frame name
+    # Sentences such as "frame 31: a place seen before, 45 landmarks merged".
     events: list[str] = field(default_factory=list)
+    # Seconds by stage before the first frame and before a restart, and after the last frame
+    # (retries, global adjustment).
     closing_seconds: dict[str, float] = field(default_factory=dict)
 
     def total_seconds(self) -> dict[str, float]:

@@ -17,7 +17,7 @@ from protomark.geometry.absolute_pose import (
 from protomark.geometry.camera import Camera
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 from protomark.mapping.frame import Array, Frame, Ids
-from protomark.tracks.matching import mutual, nearest_matches
+from protomark.tracks.matching import mutual_matches
 
 RATIO = 0.8
 # This many matches must agree with the relative pose.
@@ -42,17 +42,11 @@ _MAX_PARTNERS = 10
 
 @dataclass
 class TwoViewPose:
-    """The relative pose of two frames, the first one at the origin.
+    """The relative pose of two frames, the first one at the origin."""
 
-    Attributes:
-        first: index into `Initialiser.waiting`.
-        second: index into `Initialiser.waiting`.
-        pose: (3, 4) float64, of the second; the translation has length 1.
-    """
-
-    first: int
-    second: int
-    pose: Array
+    first: int  # index into `Initialiser.waiting`
+    second: int  # index into `Initialiser.waiting`
+    pose: Array  # (3, 4) float64, of the second; the translation has length 1
 
 
 class Initialiser:
@@ -60,10 +54,6 @@ class Initialiser:
 
     Two views of a plane fit two relative poses, and views of little depth nearly do. Other waiting
     frames, the witnesses, decide: landmarks of a wrong pose do not project where these see them.
-
-    Args:
-        camera: camera of all frames.
-        max_error: largest epipolar error in pixels.
     """
 
     def __init__(self, camera: Camera, max_error: float) -> None:
@@ -185,7 +175,9 @@ class Initialiser:
     def _match(self, one: Frame, other: Frame) -> Ids:
         key = one.name, other.name
         if key not in self._matches:
-            self._matches[key] = match(one, other)
+            assert one.descriptors is not None
+            assert other.descriptors is not None
+            self._matches[key] = mutual_matches(one.descriptors, other.descriptors, RATIO)
         return self._matches[key]
 
     def _support(
@@ -226,15 +218,6 @@ def _same_pose(first: Array, second: Array) -> bool:
     chord = np.linalg.norm(first[:, :3] - second[:, :3]) / np.sqrt(8)
     cosine = float(first[:, 3] @ second[:, 3])
     return bool(2 * np.degrees(np.arcsin(min(chord, 1.0))) < 1 and cosine > np.cos(np.radians(10)))
-
-
-def match(first: Frame, second: Frame) -> Ids:
-    """Mutual nearest neighbours (k, 2) that pass the ratio test."""
-    assert first.descriptors is not None
-    assert second.descriptors is not None
-    rows, target, _ = nearest_matches(first.descriptors, second.descriptors, RATIO)
-    pairs = np.column_stack([rows, target])
-    return pairs[mutual(first.descriptors, second.descriptors, rows, target)]
 
 
 def _rotated_share(rotation: Array, first: Array, second: Array, limit: float) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 import protomark as pm
 from protomark.features.extractor import Extractor, Features
+from protomark.features.static_regions import Mask, outside
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
 from protomark.mapping import adjustment, culling, loop, trust
@@ -21,7 +22,6 @@ from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
 from protomark.mapping.self_calibration import Calibration
-from protomark.mapping.static_regions import Mask, outside
 from protomark.mapping.structure import Structure
 from protomark.mapping.tracking import LandmarkMatches, TrackedPose, Tracker
 from protomark.mapping.triangulation import triangulate, update_prototypes
@@ -48,14 +48,7 @@ _LOOP_LOSS_SCALE = 8.0
 
 
 class Mapper:
-    """Makes a map from one frame after the other.
-
-    Args:
-        options: how to make the map.
-        camera: camera of the next frames.
-        threads: threads to search and adjust on.
-        new_memory: creates an empty memory; by default one of prototypes.
-    """
+    """Makes a map from one frame after the other."""
 
     def __init__(
         self,
@@ -399,8 +392,7 @@ class Mapper:
     def needs_restart(self, at_end: bool = False) -> bool:
         """Whether the camera proved so different from the start that the map has to restart.
 
-        Args:
-            at_end: whether no frame is left, so that the existing keyframes decide.
+        Once no frame is left, the existing keyframes decide.
         """
         if self.calibration is None:
             return False
@@ -424,12 +416,7 @@ class Mapper:
     # The end.
 
     def finish(self, reread: Reread | None = None, progress: Progress = silent) -> None:
-        """Retry frames that were not found, adjust everything, and drop the window's descriptors.
-
-        Args:
-            reread: yields lost frames again; None: they are not retried.
-            progress: called with each retried frame.
-        """
+        """Retry frames that were not found, adjust everything, and drop the descriptors."""
         self.clock.lap()
         if reread is not None and self.structure.frames and not self.options.fixed_poses:
             self._retry_lost_frames(reread, progress)

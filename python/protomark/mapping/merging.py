@@ -18,23 +18,15 @@ def merge_duplicates(
     structure: Structure,
     memory: Memory,
     pairs: list[tuple[int, int]],
-    max_error: float,
-    check: bool = True,
+    max_error: float,  # as a share of the image's longer side
+    check: bool = True,  # whether one position must fit; not before a loop is closed
 ) -> int:
     """Merge pairs of landmarks that no frame observes together and that one position fits.
 
+    Returns their number.
+
     The landmark with more observations stays, and its prototype is exactly that of all observations
     together.
-
-    Args:
-        structure: frames and landmarks.
-        memory: the landmarks' prototypes.
-        pairs: landmarks that may be duplicates.
-        max_error: largest reprojection error, as a share of the image's longer side.
-        check: whether one position must fit; False until a loop is closed.
-
-    Returns:
-        Number of merged pairs.
     """
     chosen = _disjoint(structure, pairs)
     if not len(chosen):

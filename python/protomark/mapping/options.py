@@ -10,33 +10,23 @@ from protomark.maps.build import APPEARANCE_BITS, DIM
 
 @dataclass(frozen=True)
 class MappingOptions:
-    """How a map is made.
+    """How a map is made."""
 
-    Attributes:
-        descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
-        max_keypoints: limit on keypoints per frame.
-        encoder: name or file of the encoder; empty: the one that ships for the descriptor.
-        dim: numbers per prototype.
-        appearance_bits: number of signs of a code that tell the appearances of a landmark apart.
-        window: number of latest keyframes that keep their descriptors, to triangulate landmarks.
-        max_error: largest reprojection error of an observation, as a share of the longer side.
-        min_angle: smallest triangulation angle of a landmark, degrees.
-        min_inliers: number of matches that must agree with a frame's pose.
-        calibrate: whether focal length and distortion are refined while mapping.
-        fixed_poses: whether poses are given and not adjusted.
-    """
-
+    # Name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
     descriptor: str = "akaze"
-    max_keypoints: int = 2000
-    encoder: str = ""
-    dim: int = DIM
+    max_keypoints: int = 2000  # limit on keypoints per frame
+    encoder: str = ""  # name or file of the encoder; empty: the one that ships for the descriptor
+    dim: int = DIM  # numbers per prototype
+    # Number of signs of a code that tell the appearances of a landmark apart.
     appearance_bits: int = APPEARANCE_BITS
+    # Number of latest keyframes that keep their descriptors, to triangulate landmarks.
     window: int = 8
+    # Largest reprojection error of an observation, as a share of the longer side.
     max_error: float = 0.005
-    min_angle: float = 1.0
-    min_inliers: int = 20
-    calibrate: bool = False
-    fixed_poses: bool = False
+    min_angle: float = 1.0  # smallest triangulation angle of a landmark, degrees
+    min_inliers: int = 20  # number of matches that must agree with a frame's pose
+    calibrate: bool = False  # whether focal length and distortion are refined while mapping
+    fixed_poses: bool = False  # whether poses are given and not adjusted
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)

@@ -50,15 +50,7 @@ def _link(source: str, target: str) -> None:
 def write_outputs(
     mapper: Mapper, scene: Path, source: str, finished: bool, seal: bool = True
 ) -> dict[str, Any]:
-    """Write all files of a map to the folder `scene`; returns its figures.
-
-    Args:
-        mapper: the map.
-        scene: folder to write to.
-        source: name of the input.
-        finished: whether all frames of the input were added.
-        seal: whether to write a sealed map, too.
-    """
+    """Write all files of a map to the folder `scene`; returns its figures."""
     structure = mapper.structure
     figures = {"input": source, "finished": finished, **summarise(mapper)}
     ids = mapper.scene.ids

@@ -17,13 +17,7 @@ MAX_STEP = 3
 def predict(frames: Iterable[Frame], index: int, camera_id: int) -> Array | None:
     """The pose of a camera that moves at constant velocity through the two nearest frames.
 
-    Args:
-        frames: frames with a pose.
-        index: index of the new frame in the input.
-        camera_id: its camera.
-
-    Returns:
-        (3, 4) cam_from_world; the pose of the nearest frame if only one is near, None if none is.
+    It is the pose of the nearest frame if only one is near, and None if none is.
     """
     by_index = {frame.index: frame.pose for frame in frames if frame.camera_id == camera_id}
     near = _nearest(by_index, index)

@@ -17,11 +17,6 @@ def to_reconstruction(structure: Structure, frames: Sequence[int], seen: Observa
     """A `pycolmap.Reconstruction` of frames and their observations.
 
     Image ids are frame indices plus one, and point ids are landmark ids.
-
-    Args:
-        structure: frames and landmarks.
-        frames: indices of the frames, ascending.
-        seen: observations of these frames; an image has no other keypoints.
     """
     cameras = {
         i: structure.cameras[i] for i in sorted({structure.frames[i].camera_id for i in frames})

@@ -14,41 +14,25 @@ from protomark.mapping.state import CHECKPOINT, STATE
 
 @dataclass(frozen=True)
 class MapRequest:
-    """What to map, and how.
+    """What to map, and how."""
 
-    Attributes:
-        images: folder of images or video.
-        output: folder of the map.
-        options: how to make it; a map that is resumed or extended keeps its own.
-        camera: cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
-        focal: focal length to start calibration with, pixels.
-        poses: file or folder of known poses.
-        mask: image that is black where the scene must not be looked at.
-        every: take every n-th frame only.
-        resume: whether to continue an interrupted map.
-        extend: whether to add the images to the existing map in `output`.
-        force: whether to replace an existing map.
-        record: whether to write a Rerun recording, too.
-        seal: whether to write a sealed map, too.
-        threads: threads to search and adjust on.
-        chosen: names of the options that the user chose, not left at their defaults; extending a
-            map that was made with others is refused.
-    """
-
-    images: Path
-    output: Path
-    options: MappingOptions
+    images: Path  # folder of images or video
+    output: Path  # folder of the map
+    options: MappingOptions  # how to make it; a map that is resumed or extended keeps its own
+    # A cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
     camera: str | None = None
-    focal: float | None = None
-    poses: Path | None = None
-    mask: Path | None = None
-    every: int = 1
-    resume: bool = False
-    extend: bool = False
-    force: bool = False
-    record: bool = False
-    seal: bool = True
-    threads: int = 1
+    focal: float | None = None  # focal length to start calibration with, pixels
+    poses: Path | None = None  # file or folder of known poses
+    mask: Path | None = None  # image that is black where the scene must not be looked at
+    every: int = 1  # take every n-th frame only
+    resume: bool = False  # whether to continue an interrupted map
+    extend: bool = False  # whether to add the images to the existing map in `output`
+    force: bool = False  # whether to replace an existing map
+    record: bool = False  # whether to write a Rerun recording, too
+    seal: bool = True  # whether to write a sealed map, too
+    threads: int = 1  # threads to search and adjust on
+    # Names of the options that the user chose, not left at their defaults; extending a map that was
+    # made with others is refused.
     chosen: frozenset[str] = frozenset()
 
 

@@ -31,8 +31,6 @@ _AGREEMENT = 1.2
 _MIN_AGREEING = 0.25
 _MIN_VOTES = 8
 _MIN_INLIERS = 50
-
-
 # The map restarts if its focal length proves to be off by more than this share, as its first frames
 # are bent. After a restart, later estimates are taken once they are about as certain.
 _MAX_OFFSET = 0.05
@@ -42,21 +40,15 @@ _RESTART_SLACK = 1.5
 
 @dataclass
 class Calibration:
-    """How far a map in the making has determined its camera.
+    """How far a map in the making has determined its camera."""
 
-    Attributes:
-        start: focal length that the map started with, pixels.
-        limit: relative deviation above which an estimate of the focal length is not taken.
-        deviation: relative deviation of the focal length, infinite while it is not determined.
-        restarts: number of times that the map has started again.
-        given: whether the start comes from the user or the camera and not from a guess.
-    """
-
-    start: float
+    start: float  # focal length that the map started with, pixels
+    # Relative deviation above which an estimate of the focal length is not taken.
     limit: float = MAX_DEVIATION
+    # Relative deviation of the focal length, infinite while it is not determined.
     deviation: float = math.inf
-    restarts: int = 0
-    given: bool = False
+    restarts: int = 0  # number of times that the map has started again
+    given: bool = False  # whether the start comes from the user or the camera and not from a guess
 
     @property
     def determined(self) -> bool:
@@ -65,10 +57,9 @@ class Calibration:
 
     def accept(self, reconstruction: Any, image_ids: Sequence[int]) -> bool:
         """Whether adjusted cameras are plausible, and the images determine them."""
-        for camera in reconstruction.cameras.values():
-            params = tuple(float(p) for p in camera.params)
-            ours = Camera(camera.model.name, camera.width, camera.height, params)
-            if not np.isfinite(params).all() or params[0] <= 0 or not is_plausible(ours):
+        for camera in map(Camera.from_colmap, reconstruction.cameras.values()):
+            params = camera.params
+            if not np.isfinite(params).all() or params[0] <= 0 or not is_plausible(camera):
                 return False
         deviation = max(focal_deviations(reconstruction, image_ids).values())
         if not deviation <= self.limit:
@@ -106,10 +97,6 @@ def elect_focal_length(pairs: Sequence[MatchedPair], size: tuple[int, int]) -> f
     A fundamental matrix F between two images of one camera K fixes its focal length: the essential
     matrix K^T F K has two equal singular values (Kruppa's equations). One pair is noisy, and
     planes and some motions leave it open, so many pairs vote.
-
-    Args:
-        pairs: matched keypoints of frames.
-        size: width and height of the images.
     """
     poselib = optional("poselib")
     longer_side = max(size)

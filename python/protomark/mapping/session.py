@@ -10,11 +10,12 @@ from dataclasses import replace
 from typing import Any
 
 from protomark.features.extractor import Extractor
+from protomark.features.static_regions import describe, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
-from protomark.geometry.pose_files import read_poses
+from protomark.geometry.given_poses import misfit
+from protomark.geometry.pose_files import poses_of_images
 from protomark.interrupt import Interrupted, deferred_interrupt
-from protomark.mapping.given_poses import check_poses_fit, check_poses_given
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.outputs import back_up, write_outputs
@@ -29,7 +30,6 @@ from protomark.mapping.request import (
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
 from protomark.mapping.source import EXIF, GIVEN, FrameSource, open_source
 from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
-from protomark.mapping.static_regions import describe, read_mask, static_regions
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import no_map
 from protomark.progress import Progress, silent
@@ -44,15 +44,7 @@ def make_map(
     progress: Progress = silent,
     note: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Make, resume or extend a map; write it and its report.
-
-    Args:
-        request: what to map, and how.
-        progress: called with each frame.
-        note: called with each message to the user.
-
-    Returns:
-        Its figures, see `protomark.mapping.summary.summarise`.
+    """Make, resume or extend a map; write it and its report; returns its figures.
 
     Raises:
         Interrupted: Ctrl-C was pressed; the map so far is written.
@@ -121,8 +113,6 @@ class _Session:
         self.progress, self.note = progress, note
         self.cursor = self.known = 0
         self.facts: dict[str, Any] = {}
-        if request.poses:
-            source.poses = read_poses(request.poses).for_images(source.names())
         if request.resume:
             self._resume()
         elif request.extend:
@@ -139,9 +129,16 @@ class _Session:
             text = str(request.poses)
         return self.source.find_camera(read_cameras(text)) if text else None
 
+    def _read_poses(self) -> None:
+        source = self.source
+        if self.request.poses:
+            names, times = zip(*source.listing(), strict=True)
+            seconds = times if source.timed else None
+            source.poses = poses_of_images(self.request.poses, names, seconds)
+
     def _start(self) -> None:
         request, options = self.request, self.request.options
-        check_poses_given(self.source)
+        self._read_poses()
         camera = self._camera()
         if self.source.poses is not None:
             options = replace(options, fixed_poses=True)
@@ -156,8 +153,8 @@ class _Session:
                 f"camera: the focal length of {camera.params[0]:.0f} pixels is {origin} and is "
                 "refined while mapping (--camera gives a calibrated one)"
             )
-        elif self.source.poses is not None:
-            check_poses_fit(surveyed, camera)
+        elif sentence := misfit(surveyed.pose_errors(camera)):
+            raise ValueError(f"{request.poses}: {sentence}")
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
@@ -181,6 +178,7 @@ class _Session:
         check_same_request(
             self.request.output, request_facts(self.request, self.source), facts["request"]
         )
+        self._read_poses()
         self.cursor, self.known = int(facts["cursor"]), int(facts["known"])
         self._prepare(self._survey(self.mapper.options), str(facts["prefix"]), facts["inputs"])
         self.source.shift(*facts["shift"])
@@ -189,6 +187,7 @@ class _Session:
         request = self.request
         self.mapper, facts = load_state(request.output, request.threads, self._camera())
         check_same_options(request, self.mapper.options)
+        self._read_poses()
         inputs: dict[str, str] = facts.get("inputs", {})
         prefix = _prefix(self.mapper, self.source, inputs)
         self.known = len(self.mapper.structure.frames)
@@ -202,9 +201,9 @@ class _Session:
         size = self.source.size()
         extractor = Extractor(options.descriptor, options.max_keypoints)
         surveyed = survey(self.source.images(), extractor, size)
-        mask = static_regions(surveyed.pairs, size)
-        if mask.any():
-            self.note(f"left out, as it never moves while the rest does: {describe(mask)}")
+        mask = static_regions([(pair.first, pair.second) for pair in surveyed.pairs], size)
+        if region := describe(mask):
+            self.note(f"left out, as it never moves while the rest does: {region}")
         if self.request.mask is not None:
             mask |= read_mask(self.request.mask, size)
         surveyed.mask, surveyed.seconds = mask, time.perf_counter() - started

@@ -76,9 +76,7 @@ class FrameSource(ABC):
     def follow(self, structure: Structure, records: Collection[str]) -> None:
         """Number the frames after those of a map, and shift their times if these overlap.
 
-        Args:
-            structure: frames of the map.
-            records: names in the map; frames of these names are not new.
+        Frames whose names are among the records are not new.
         """
         first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
         old = [f.time for f in structure.frames]
@@ -89,13 +87,7 @@ class FrameSource(ABC):
     def images(
         self, start: int = 0, only: set[str] | None = None, backward: bool = False
     ) -> Iterator[InputImage]:
-        """Yield images with their names in the map and their known poses.
-
-        Args:
-            start: index of the first image.
-            only: names in the map of the images to yield; None: all.
-            backward: whether to go from the last to the first.
-        """
+        """Yield all images, or those with these names in the map, with their known poses."""
         if only is not None:
             size = len(self.prefix)
             only = {name[size:] for name in only if name.startswith(self.prefix)}
@@ -151,11 +143,7 @@ class FrameSource(ABC):
         return of_size[len(of_size) // 2] if of_size else cameras.find("", *size)
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
-        """A camera to start calibration with, and the origin of its focal length.
-
-        Args:
-            focal: focal length in pixels; None: from EXIF data, else COLMAP's guess.
-        """
+        """A camera to start calibration with, and the origin of its focal length."""
         width, height = self.size()
         origin = GIVEN
         if focal is None:
@@ -286,11 +274,7 @@ class Video(FrameSource):
 
 
 def open_source(path: Path, every: int = 1) -> FrameSource:
-    """Open a folder of images or a video.
-
-    Args:
-        path: a folder of images, the folder of a sequence (with images/ in it), or a video.
-        every: take every n-th frame only.
+    """Open a folder of images, the folder of a sequence (with images/ in it), or a video.
 
     Raises:
         FileNotFoundError: there is no such folder or file, or no image in it.

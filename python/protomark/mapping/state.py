@@ -38,13 +38,7 @@ def save_checkpoint(mapper: Mapper, scene: Path, facts: dict[str, Any]) -> None:
 
 
 def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
-    """Write everything except the map file.
-
-    Args:
-        mapper: the map in the making, between two frames.
-        path: file to write.
-        facts: JSON values that `load_state` returns again.
-    """
+    """Write everything except the map file, and facts (JSON values) for `load_state`."""
     save = optional("safetensors.numpy").save
     structure, waiting = mapper.structure, mapper.initialiser.waiting
     frames = structure.frames
@@ -84,15 +78,9 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
 def load_state(
     folder: Path, threads: int = 1, camera: Camera | None = None
 ) -> tuple[Mapper, dict[str, Any]]:
-    """Load the state of a map, to resume or extend it.
+    """Load a map or a checkpoint, to continue it, and the facts that were saved with it.
 
-    Args:
-        folder: folder of a map, or of a checkpoint.
-        threads: threads to search and adjust on.
-        camera: camera of the next frames, if it differs from that of the last ones.
-
-    Returns:
-        The map in the making, and the facts given to `save_state`.
+    The camera is that of the next frames, if it is another one.
 
     Raises:
         FileError: the folder holds no state, or a broken one.

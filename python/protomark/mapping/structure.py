@@ -24,23 +24,14 @@ _MIN_TOLERANCE = 2.5
 
 @dataclass
 class Observations:
-    """n observations of landmarks.
+    """n observations of landmarks."""
 
-    Attributes:
-        frames: (n,) int64, index of the frame.
-        rows: (n,) int64, row of the keypoint in its frame.
-        landmarks: (n,) int64.
-        poses: (n, 3, 4) float64.
-        rays: (n, 2) float64, undistorted.
-        focal: (n,) float64, focal length in pixels.
-    """
-
-    frames: Ids
-    rows: Ids
-    landmarks: Ids
-    poses: Array
-    rays: Array
-    focal: Array
+    frames: Ids  # (n,) int64, index of the frame
+    rows: Ids  # (n,) int64, row of the keypoint in its frame
+    landmarks: Ids  # (n,) int64
+    poses: Array  # (n, 3, 4) float64
+    rays: Array  # (n, 2) float64, undistorted
+    focal: Array  # (n,) float64, focal length in pixels
 
     def where(self, keep: Any) -> Observations:
         """The observations for which `keep` (n,) is true."""
@@ -52,23 +43,19 @@ class Structure:
     """Frames in the order in which they were registered, and landmarks by id.
 
     Landmark ids count up from 1 and index the arrays; no id is used twice.
-
-    Attributes:
-        cameras: cameras by id.
-        frames: frames with a pose.
-        positions: (l, 3) float64, NaN for ids of removed landmarks and for id 0.
-        directions: (l, 3) float64, sum of unit vectors from the landmark to its cameras.
-        views: (l,) int64, number of these vectors.
-        distances: (l, 2) float64, smallest and largest distance of an observing camera.
-        born: (l,) int64, number of frames in the map when the landmark was created.
     """
 
-    cameras: dict[int, Camera] = field(default_factory=dict)
-    frames: list[Frame] = field(default_factory=list)
+    cameras: dict[int, Camera] = field(default_factory=dict)  # cameras by id
+    frames: list[Frame] = field(default_factory=list)  # frames with a pose
+    # (l, 3) float64, NaN for ids of removed landmarks and for id 0.
     positions: Array = field(default_factory=lambda: np.full((1, 3), np.nan))
+    # (l, 3) float64, sum of unit vectors from the landmark to its cameras.
     directions: Array = field(default_factory=lambda: np.zeros((1, 3)))
+    # (l,) int64, number of these vectors.
     views: Ids = field(default_factory=lambda: np.zeros(1, np.int64))
+    # (l, 2) float64, smallest and largest distance of an observing camera.
     distances: Array = field(default_factory=lambda: np.zeros((1, 2)))
+    # (l,) int64, number of frames in the map when the landmark was created.
     born: Ids = field(default_factory=lambda: np.zeros(1, np.int64))
 
     @property

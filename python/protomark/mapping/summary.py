@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from protomark.features.static_regions import describe
 from protomark.mapping.clock import STAGES
 from protomark.mapping.history import REGISTERED
 from protomark.mapping.mapper import Mapper
-from protomark.mapping.static_regions import describe
 from protomark.mapping.trust import warnings
 from protomark.plot import MapPictures
 from protomark.tracks.summary import track_figures
@@ -47,7 +47,7 @@ def summarise(mapper: Mapper) -> dict[str, Any]:
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "seconds_total": round(total, 3),
         "frames_per_second": len(records) / total if total else 0.0,
-        "left_out": describe(mapper.mask) if mapper.mask is not None and mapper.mask.any() else "",
+        "left_out": "" if mapper.mask is None else describe(mapper.mask),
         "warnings": warnings(mapper),
         "events": mapper.history.events,
         "not_registered": unregistered,

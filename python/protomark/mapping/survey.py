@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.features.extractor import Extractor, Features
+from protomark.geometry.camera import Camera
+from protomark.geometry.given_poses import agreeing, pose_errors
 from protomark.mapping.frame import Array, InputImage
 from protomark.mapping.initialisation import RATIO
-from protomark.tracks.matching import mutual, nearest_matches
+from protomark.tracks.matching import mutual_matches
 
 # This many frames are surveyed, out of at most so many.
 _FRAMES = 24
@@ -27,44 +29,41 @@ _MIN_MATCHES = 50
 
 @dataclass
 class Survey:
-    """What the first frames show.
+    """What the first frames show."""
 
-    Attributes:
-        pairs: matches of frames that moved.
-        features: features by image name, so that the map need not detect them again.
-        mask: (height, width) bool, the part of the image to leave out; None: nothing.
-        seconds: how long the survey took.
-    """
-
-    pairs: list[MatchedPair]
+    pairs: list[MatchedPair]  # matches of frames that moved
+    # Features by image name, so that the map need not detect them again.
     features: dict[str, Features]
+    # (height, width) bool, the part of the image to leave out; None: nothing.
     mask: NDArray[np.bool_] | None = None
-    seconds: float = 0.0
+    seconds: float = 0.0  # how long the survey took
+
+    def pose_errors(self, camera: Camera) -> list[Array]:
+        """Errors of given poses for each pair whose matches can tell."""
+        errors = []
+        for pair in self.pairs:
+            one, other = (image.pose for image in pair.images)
+            if one is None or other is None:
+                continue
+            first, second = camera.rays(pair.first), camera.rays(pair.second)
+            agree = agreeing(first, second, camera.focal_length)
+            if agree.any():
+                seen = first[agree], second[agree]
+                errors.append(pose_errors(one, other, *seen, camera.focal_length))
+        return errors
 
 
 @dataclass
 class MatchedPair:
-    """Keypoints of two frames that match.
+    """Keypoints of two frames that match."""
 
-    Attributes:
-        images: the two images.
-        first: (n, 2) float64, pixels in the earlier frame.
-        second: (n, 2) float64, pixels in the later one.
-    """
-
-    images: tuple[InputImage, InputImage]
-    first: Array
-    second: Array
+    images: tuple[InputImage, InputImage]  # the two images
+    first: Array  # (n, 2) float64, pixels in the earlier frame
+    second: Array  # (n, 2) float64, pixels in the later one
 
 
 def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, int]) -> Survey:
-    """Match the first frames that moved with each other.
-
-    Args:
-        images: the input, from its start.
-        extractor: detects and describes keypoints.
-        size: width and height; other images are left out.
-    """
+    """Match the first frames that moved with each other; images of another size do not count."""
     frames: list[tuple[InputImage, Features]] = []
     for count, image in enumerate(images):
         if len(frames) == _FRAMES or count == _MAX_READ:
@@ -89,9 +88,8 @@ def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, 
 
 
 def _pair(one: tuple[InputImage, Features], other: tuple[InputImage, Features]) -> MatchedPair:
-    rows, target, _ = nearest_matches(one[1].descriptors, other[1].descriptors, RATIO)
-    both = mutual(one[1].descriptors, other[1].descriptors, rows, target)
-    first, second = one[1].keypoints[rows[both]], other[1].keypoints[target[both]]
+    rows = mutual_matches(one[1].descriptors, other[1].descriptors, RATIO)
+    first, second = one[1].keypoints[rows[:, 0]], other[1].keypoints[rows[:, 1]]
     images = one[0], other[0]
     return MatchedPair(images, first.astype(np.float64), second.astype(np.float64))
 

@@ -31,15 +31,10 @@ _MIN_EXPECTED = 0.2
 
 @dataclass
 class LandmarkMatches:
-    """k matches of keypoints with landmarks, the clearest first; each occurs once.
+    """k matches of keypoints with landmarks, the clearest first; each occurs once."""
 
-    Attributes:
-        rows: (k,) int64, row of the keypoint in its frame.
-        ids: (k,) int64, landmark.
-    """
-
-    rows: Ids
-    ids: Ids
+    rows: Ids  # (k,) int64, row of the keypoint in its frame
+    ids: Ids  # (k,) int64, landmark
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -51,36 +46,23 @@ class LandmarkMatches:
 
 @dataclass
 class TrackedPose:
-    """The pose of a frame.
+    """The pose of a frame."""
 
-    Attributes:
-        pose: (3, 4) float64, cam_from_world.
-        matches: matches that agree with the pose.
-        share: their share of the landmarks in view, or of the keypoints if these are fewer.
-    """
-
-    pose: Array
-    matches: LandmarkMatches
+    pose: Array  # (3, 4) float64, cam_from_world
+    matches: LandmarkMatches  # matches that agree with the pose
+    # Their share of the landmarks in view, or of the keypoints if these are fewer.
     share: float = 1.0
 
 
 class Tracker:
-    """Finds frames in a map.
-
-    Args:
-        structure: frames and landmarks.
-        memory: the landmarks' prototypes.
-        max_error: largest reprojection error, as a share of the image's longer side.
-        min_inliers: number of matches that must agree with a pose.
-        threads: threads to search on; the result is the same.
-    """
+    """Finds frames in a map."""
 
     def __init__(
         self,
         structure: Structure,
         memory: Memory,
-        max_error: float,
-        min_inliers: int,
+        max_error: float,  # as a share of the image's longer side
+        min_inliers: int,  # matches that must agree with a pose
         threads: int = 1,
     ) -> None:
         self.structure, self.memory = structure, memory

@@ -28,16 +28,7 @@ def triangulate(
     wide enough and the landmark projects back to both. If one of them observes a landmark already,
     the other observes it, too, provided that it projects there.
 
-    Args:
-        structure: frames and landmarks.
-        memory: gets every new observation.
-        newest: index of the frame, which is in the window.
-        window: indices of the other frames of the window.
-        max_error: largest reprojection error, as a share of the image's longer side.
-        min_angle: smallest triangulation angle, degrees.
-
-    Returns:
-        Pairs of landmarks whose keypoints match, so that they may be duplicates.
+    Returns pairs of landmarks whose keypoints match, so that they may be duplicates.
     """
     frame = structure.frames[newest]
     duplicates: list[tuple[int, int]] = []

@@ -16,13 +16,15 @@ from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
 from protomark.features.extractor import Extractor, Features
 from protomark.features.images import image_names, read_gray
+from protomark.features.static_regions import Mask, describe, outside, static_regions
 from protomark.files import hash_files
 from protomark.geometry import colmap
+from protomark.geometry.given_poses import agreeing, misfit, pose_errors
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
-from protomark.tracks import completion, pairs, triangulation, verification
+from protomark.tracks import completion, pairs, triangulation
 from protomark.tracks.file import Tracks
-from protomark.tracks.matching import VerifiedMatches, View, match, with_errors
+from protomark.tracks.matching import VerifiedMatches, View, match, mutual_matches, with_errors
 from protomark.tracks.scene import Scene
 
 Pairs = dict[tuple[int, int], VerifiedMatches]
@@ -33,8 +35,6 @@ _ROUGH_ERROR = 16.0
 # `refine_poses="auto"` tries to refine poses. Structure from motion has 0.2 to 0.6, poses of other
 # sensors have 0.5 to 1.3.
 _ROUGH_POSES = 0.6
-# Poses are not of these images if a quarter of the pairs has a larger error.
-_FOREIGN_POSES = 4.0
 # Refined poses are kept if so many more of the verified matches fit them within a pixel. True poses
 # gain 1.1 to 1.2 by fitting noise, rough ones 1.9.
 _CLEARLY_MORE = 1.25
@@ -43,36 +43,27 @@ _REFINE_ERRORS = (12.0, 4.0)
 # error.
 _REFINE_KEYPOINTS = 700
 _COMPLETION_PASSES = 3
+# Neighbours of so many keyframes tell about all poses.
+_SAMPLE = 20
 # Increased whenever the same options yield other tracks, so that old files are made anew.
 _METHOD = 4
 
 
 @dataclass(frozen=True)
 class TracksOptions:
-    """How tracks are made.
+    """How tracks are made."""
 
-    Attributes:
-        descriptor: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
-        max_keypoints: limit on keypoints per image.
-        partners: about how many keyframes each keyframe is matched with.
-        ratio: limit on the ratio of the nearest to the second nearest Hamming distance.
-        max_error: largest epipolar and reprojection error, pixels.
-        min_angle: smallest triangulation angle of a landmark, degrees.
-        min_length: smallest number of observations of a landmark.
-        refine_poses: "yes", "no", or "auto": if the matches do not fit the poses.
-        max_unlabelled: limit on keypoints without a landmark per keyframe, the strongest; None: no
-            limit. A limit makes smaller files, but query frames that lack keypoints which match
-            nothing.
-    """
-
+    # Name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
     descriptor: str = "freak"
-    max_keypoints: int = 2000
-    partners: int = 24
-    ratio: float = 0.8
-    max_error: float = 3.0
-    min_angle: float = 1.0
-    min_length: int = 3
-    refine_poses: str = "auto"
+    max_keypoints: int = 2000  # limit on keypoints per image
+    partners: int = 24  # about how many keyframes each keyframe is matched with
+    ratio: float = 0.8  # limit on the ratio of the nearest to the second nearest Hamming distance
+    max_error: float = 3.0  # largest epipolar and reprojection error, pixels
+    min_angle: float = 1.0  # smallest triangulation angle of a landmark, degrees
+    min_length: int = 3  # smallest number of observations of a landmark
+    refine_poses: str = "auto"  # "yes", "no", or "auto": if the matches do not fit the poses
+    # Limit on keypoints without a landmark per keyframe, the strongest; None: no limit. A limit
+    # makes smaller files, but query frames that lack keypoints which match nothing.
     max_unlabelled: int | None = None
 
     def __post_init__(self) -> None:
@@ -184,13 +175,10 @@ def extract(
     made_from = provenance(sequence, options, given)
     given, features, unreadable = _detect(sequence, given, options, threads, progress)
     work = _Matching(given, features, options, threads, progress)
-    error, quartile, region = work.judge_poses()
-    if quartile > _FOREIGN_POSES and options.refine_poses != "yes":
-        raise ValueError(
-            f"{sequence.model}: these poses do not fit these images (a quarter of the pairs has "
-            f"epipolar errors above {quartile:.1f} pixels): camera-to-world? other axes? other "
-            "names? --refine-poses yes takes them nevertheless"
-        )
+    region, errors = work.look_at_neighbours()
+    if options.refine_poses != "yes" and (sentence := misfit(errors)):
+        raise ValueError(f"{sequence.model}: {sentence} --refine-poses yes takes them nevertheless")
+    error = float(np.median([float(np.median(e)) for e in errors] or [0.0]))
     overlap = work.match_covisible()
     if not any(len(m) for m in work.matches.values()):
         raise _nothing_triangulated(sequence)
@@ -221,7 +209,7 @@ def extract(
         "pose_shift_median": float(np.median(shift)),
         "pose_shift_max": float(shift.max()),
         "extent": float(np.linalg.norm(np.ptp(given.centers, axis=0))),
-        "static_region": region,
+        "static_region": describe(region),
         "images_without_pose": sorted(
             {*given.unposed, *image_names(sequence.images)} - {*given.names, *unreadable}
         ),
@@ -261,7 +249,8 @@ class _Matching:
         self.rays = [c.rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
         self.focal = np.array([camera.focal_length for camera in cameras])
         self.views = self._make_views()
-        self.verified: Pairs = {}
+        # Rows (k, 2) of the matches of neighbours that agree on a relative pose.
+        self.agreeing: dict[tuple[int, int], NDArray[np.int64]] = {}
 
     def _make_views(self) -> list[View]:
         parts = (self.features, self.rays, self.model.cam_from_world, self.focal)
@@ -275,28 +264,44 @@ class _Matching:
         found = parallel_map(one, chosen, self.threads, self.progress, stage)
         self.matches |= dict(zip(chosen, found, strict=True))
 
-    def judge_poses(self) -> tuple[float, float, list[int]]:
-        """Judges the given poses, and drops what never moves.
-
-        Returns:
-            Median and upper quartile over pairs of the epipolar error in pixels, 0 if no pair can
-            tell, and a box around what never moves, see `StaticRegion.box`.
+    def look_at_neighbours(self) -> tuple[Mask, list[NDArray[np.float64]]]:
+        """What never moves in the images, and errors of given poses, see `pose_errors`.
 
         Keypoints of what never moves get no rays, so that nothing matches them.
         """
-        sample = verification.sample_matches(
-            self.views, self.options.ratio, self.threads, self.progress
+        chosen = pairs.neighbour_pairs(len(self.views), _SAMPLE)
+        descriptors = [f.descriptors for f in self.features]
+        found = parallel_map(
+            lambda p: mutual_matches(descriptors[p[0]], descriptors[p[1]], self.options.ratio),
+            chosen,
+            self.threads,
+            self.progress,
+            "judge poses",
         )
-        keypoints = [f.keypoints for f in self.features]
+        matches = {(i, j): rows for (i, j), rows in zip(chosen, found, strict=True)}
+        at = [f.keypoints for f in self.features]
         cameras = self.model.cameras.values()
         size = max(c.width for c in cameras), max(c.height for c in cameras)
-        region = verification.StaticRegion(keypoints, sample, size)
-        for rays, at in zip(self.rays, keypoints, strict=True):
-            rays[region.contains(at)] = np.nan
-        self.verified = verification.verify(self.views, sample)
-        errors = verification.pose_errors(self.views, self.verified)
-        medians = [float(np.median(e)) for e in errors] or [0.0]
-        return float(np.median(medians)), float(np.percentile(medians, 75)), region.box()
+        region = static_regions(
+            [(at[i][r[:, 0]], at[j][r[:, 1]]) for (i, j), r in matches.items()], size
+        )
+        for rays, keypoints in zip(self.rays, at, strict=True):
+            rays[~outside(region, keypoints)] = np.nan
+        for (i, j), rows in matches.items():
+            agree = agreeing(self.rays[i][rows[:, 0]], self.rays[j][rows[:, 1]], self._focal(i, j))
+            if agree.any():
+                self.agreeing[i, j] = rows[agree]
+        return region, self._errors()
+
+    def _focal(self, i: int, j: int) -> float:
+        return float(0.5 * (self.focal[i] + self.focal[j]))
+
+    def _errors(self) -> list[NDArray[np.float64]]:
+        poses, rays = self.model.cam_from_world, self.rays
+        return [
+            pose_errors(poses[i], poses[j], rays[i][r[:, 0]], rays[j][r[:, 1]], self._focal(i, j))
+            for (i, j), r in self.agreeing.items()
+        ]
 
     def match_covisible(self) -> NDArray[np.float64]:
         """Match keyframes with overlapping views; returns the overlap (m, m)."""
@@ -341,9 +346,8 @@ class _Matching:
         }
 
     def _fitting(self) -> float:
-        """Number of verified matches within a pixel of their epipolar lines."""
-        errors = verification.pose_errors(self.views, self.verified)
-        return float(sum((e < 1).sum() for e in errors))
+        """Number of agreeing matches within a pixel of their epipolar lines."""
+        return float(sum((e < 1).sum() for e in self._errors()))
 
 
 def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.float64]) -> Scene:

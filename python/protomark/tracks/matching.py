@@ -40,14 +40,10 @@ class VerifiedMatches:
         return VerifiedMatches(self.rows[keep], self.distances[keep], self.errors[keep])
 
 
-def nearest_matches(
+def _nearest(
     first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Nearest neighbours in Hamming distance that pass the ratio test.
-
-    Returns:
-        Rows (k,) of the first descriptors, of the second ones, and distances (k,) in bits.
-    """
+    """Rows (k,) of nearest neighbours that pass the ratio test, and their Hamming distances."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int32)
     index, distance = hamming_search(first, second, k=2)
@@ -55,33 +51,31 @@ def nearest_matches(
     return rows, index[rows, 0], distance[rows, 0].astype(np.int32)
 
 
-def mutual(
-    first: NDArray[np.uint8],
-    second: NDArray[np.uint8],
-    rows: NDArray[np.int64],
-    target: NDArray[np.int64],
+def _mutual(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], rows: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Whether the nearest neighbour of each target (k,) is the row (k,) that it was found for."""
+    """Whether the nearest neighbour of each second row is the first of the pair (k, 2)."""
     if not len(rows):
         return np.zeros(0, bool)
-    back, _ = hamming_search(second[target], first, k=1)
-    return np.asarray(back[:, 0] == rows)
+    back, _ = hamming_search(second[rows[:, 1]], first, k=1)
+    return np.asarray(back[:, 0] == rows[:, 0])
+
+
+def mutual_matches(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float
+) -> NDArray[np.int64]:
+    """Rows (k, 2) of mutual nearest neighbours in Hamming distance that pass the ratio test."""
+    rows = np.column_stack(_nearest(first, second, ratio)[:2])
+    return rows[_mutual(first, second, rows)]
 
 
 def match(first: View, second: View, ratio: float, max_error: float) -> VerifiedMatches:
-    """Mutual nearest neighbours that pass the ratio test and lie near the epipolar lines.
-
-    Args:
-        first: keyframe of the queries.
-        second: keyframe to search.
-        ratio: limit on the ratio of the nearest to the second nearest distance, in (0, 1].
-        max_error: largest epipolar error in pixels.
-    """
-    rows, target, distance = nearest_matches(first.descriptors, second.descriptors, ratio)
+    """Mutual nearest neighbours that pass the ratio test, within pixels of the epipolar lines."""
+    rows, target, distance = _nearest(first.descriptors, second.descriptors, ratio)
     error = _epipolar_errors(first, second, rows, target)
     near = error <= max_error  # false for NaN
     matches = VerifiedMatches(np.column_stack([rows, target]), distance, error).where(near)
-    return matches.where(mutual(first.descriptors, second.descriptors, *matches.rows.T))
+    return matches.where(_mutual(first.descriptors, second.descriptors, matches.rows))
 
 
 def with_errors(matches: VerifiedMatches, first: View, second: View) -> VerifiedMatches:

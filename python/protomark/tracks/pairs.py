@@ -24,9 +24,13 @@ _GRID = 6
 _FAR = 1e6
 
 
-def neighbour_pairs(count: int) -> list[tuple[int, int]]:
-    """Pairs of keyframes that are 1, 2 or 4 apart, smaller index first, sorted."""
-    return sorted((i, i + step) for step in NEIGHBOURS for i in range(count - step))
+def neighbour_pairs(count: int, starts: int | None = None) -> list[tuple[int, int]]:
+    """Pairs of keyframes that are 1, 2 or 4 apart, smaller index first, sorted.
+
+    With `starts`, about so many keyframes, spread over the sequence, come first in a pair.
+    """
+    at = np.unique(np.linspace(0, count - 1, starts or count).astype(int)).tolist()
+    return sorted((i, i + step) for step in NEIGHBOURS for i in at if i + step < count)
 
 
 def depth_quartiles(

@@ -134,11 +134,6 @@ def refine_poses(given: ColmapModel, reconstruction: Any, error: float) -> Colma
     The given positions are priors, as uncertain as the error makes them, and the result stays in
     their world: its scale, rotation and origin bring the refined cameras closest to the given ones.
     Points that the poses do not need are deleted.
-
-    Args:
-        given: the given poses.
-        reconstruction: points, and poses to start from; changed.
-        error: epipolar error of the given poses, pixels.
     """
     _thin(reconstruction)
     images = [reconstruction.images[i + 1] for i in range(len(given.names))]

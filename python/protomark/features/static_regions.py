@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
 from protomark.features.images import read_gray
-from protomark.mapping.survey import MatchedPair
 
 Mask = NDArray[np.bool_]
 
@@ -24,25 +24,31 @@ _MIN_PAIRS = 6
 _MIN_MATCHES = 8
 # In pairs of frames of which less has moved, the camera may have stood still.
 _MIN_MOVED = 0.15
+# What a camera circles around never moves either, but fills fewer cells.
+_MIN_CELLS = 4
 _MAX_NAMED = 3
 
 
-def static_regions(pairs: Sequence[MatchedPair], size: tuple[int, int]) -> Mask:
+def static_regions(
+    pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]], size: tuple[int, int]
+) -> Mask:
     """A mask (height, width) that is true where the image does not move with the scene.
 
     Args:
-        pairs: matched keypoints of frames.
+        pairs: pixels (n, 2) of the matches of two frames, in each of them.
         size: width and height of the images.
     """
     width, height = size
     cell = max(8, round(_CELL * max(size)))
     shape = -(-height // cell), -(-width // cell)
     stationary, moving, frequency = (np.zeros(shape, np.int64) for _ in range(3))
-    for pair in pairs:
-        still = np.linalg.norm(pair.second - pair.first, axis=1) <= _MAX_MOTION
+    for first, second in pairs:
+        if not len(first):
+            continue
+        still = np.linalg.norm(second - first, axis=1) <= _MAX_MOTION
         if (~still).mean() < _MIN_MOVED:
             continue
-        column, row = np.minimum(pair.first // cell, [shape[1] - 1, shape[0] - 1]).astype(int).T
+        column, row = np.minimum(first // cell, [shape[1] - 1, shape[0] - 1]).astype(int).T
         here = np.zeros(shape, np.int64)
         np.add.at(here, (row[still], column[still]), 1)
         stationary += here
@@ -50,15 +56,21 @@ def static_regions(pairs: Sequence[MatchedPair], size: tuple[int, int]) -> Mask:
         np.add.at(moving, (row[~still], column[~still]), 1)
     static = (frequency >= _MIN_PAIRS) & (stationary >= _MIN_MATCHES)
     static &= stationary >= _MIN_STATIONARY * (stationary + moving)
-    # Beside a static cell, one without evidence of motion belongs to it.
+    # Beside a static cell, one without evidence of motion belongs to the same region.
     cv2 = optional("cv2")
-    beside = cv2.dilate(static.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    static |= beside & (moving <= stationary)
+    count, part = cv2.connectedComponents(cv2.dilate(static.astype(np.uint8), np.ones((3, 3))))
+    large = np.bincount(part[static], minlength=count) >= _MIN_CELLS
+    static = large[part] & (moving <= stationary)
     return np.kron(static, np.ones((cell, cell), bool))[:height, :width]
 
 
 def describe(static: Mask) -> str:
-    """The static regions as a share of the image and their outlines, the largest first."""
+    """The static regions as a share of the image and their outlines, the largest first.
+
+    Returns "" without any.
+    """
+    if not static.any():
+        return ""
     cv2 = optional("cv2")
     _, _, boxes, _ = cv2.connectedComponentsWithStats(static.astype(np.uint8), connectivity=8)
     boxes = sorted(boxes[1:].tolist(), key=lambda box: -box[4])
