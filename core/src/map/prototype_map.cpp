@@ -227,17 +227,24 @@ RecallTable measure_recall_of(const PrototypeStore& store,
   std::vector<std::int64_t> owners;
   for (const Row row : rows) owners.push_back(store.id(store.owner(row)));
   const std::vector<std::int8_t> codes = store.rounded(rows);
-  std::vector<std::int8_t> prototype(store.dim());
+  // Those of the landmark that was asked for last, which may be one of many appearances.
+  std::int64_t last = -1;
+  std::vector<Row> own_rows;
+  std::vector<std::int8_t> prototypes;
   const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
+    if (std::exchange(last, id) != id) {
+      own_rows = store.sorted_rows(store.at(id));
+      prototypes = store.rounded(own_rows);
+      std::ranges::transform(prototypes, prototypes.begin(), value);
+    }
     std::uint32_t list = 0;
     std::int32_t least = INT32_MAX;
-    for (const Row row : store.sorted_rows(store.at(id))) {
-      store.rounded(row, prototype.data());
-      std::ranges::transform(prototype, prototype.begin(), value);
-      const std::int32_t distance = squared_distance(query, prototype.data(), store.dim());
+    for (std::size_t i = 0; i < own_rows.size(); ++i) {
+      const std::int8_t* prototype = &prototypes[i * store.dim()];
+      const std::int32_t distance = squared_distance(query, prototype, store.dim());
       if (distance >= least) continue;
       least = distance;
-      list = store.lists().list_of(row);
+      list = store.lists().list_of(own_rows[i]);
     }
     return list;
   };

@@ -209,10 +209,16 @@ class PrototypeStore : public RowTable {
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
   // which keeps its position if it has one.
   void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
-    for (Row row = from.first_row(landmark); row != kNoRow; row = from.next_row(row)) {
-      merge(find_or_create_row(id, from.appearance(row)), from.sum(row), from.count(row));
+    LandmarkIndex into = find(id);
+    // Both by ascending appearance, as looking up each of many would take long.
+    const std::vector<Row> rows = into == kNoLandmark ? std::vector<Row>() : sorted_rows(into);
+    auto existing = rows.begin();
+    for (const Row row : from.sorted_rows(landmark)) {
+      const std::uint16_t wanted = from.appearance(row);
+      while (existing != rows.end() && appearance(*existing) < wanted) ++existing;
+      const bool found = existing != rows.end() && appearance(*existing) == wanted;
+      merge(found ? *existing : create_row(id, into, wanted), from.sum(row), from.count(row));
     }
-    const LandmarkIndex into = at(id);
     if (!has_position(position(into))) set_position(into, from.position(landmark));
   }
   // Puts rows that were created or set into their lists; ends every change.

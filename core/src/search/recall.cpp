@@ -1,5 +1,6 @@
 #include "search/recall.h"
 
+#include <algorithm>
 #include <cmath>
 
 #include "base/quantize.h"
@@ -33,11 +34,16 @@ RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& qu
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
   std::vector<std::int32_t> limits(n, INT32_MIN);
+  // If others are as near, the owner may be second, or not among the two. By landmark, as list_of
+  // keeps the prototypes of one.
+  std::vector<std::pair<std::int64_t, std::size_t>> nearest;
   for (std::size_t q = 0; q < n; ++q) {
-    // If others are as near, the owner may be second, or not among the two.
-    const std::int64_t nearest = ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0];
-    if (nearest < 0) continue;
-    lists[q] = list_of(nearest, queries.row(q));
+    nearest.emplace_back(ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0], q);
+  }
+  std::ranges::sort(nearest);
+  for (const auto& [landmark, q] : nearest) {
+    if (landmark < 0) continue;
+    lists[q] = list_of(landmark, queries.row(q));
     const std::int8_t* centroid = &quantizer.centroids()[lists[q] * dim];
     limits[q] = squared_distance(centroid, queries.row(q), dim) - prepared.norms()[q];
   }
