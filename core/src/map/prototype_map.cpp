@@ -222,7 +222,7 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
 
 RecallTable measure_recall_of(const PrototypeStore& store,
                               const std::function<std::int8_t(std::int8_t)>& value,
-                              const SearchTwo& search_two) {
+                              const ExactSearch& search) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
   std::vector<std::int64_t> owners;
   for (const Row row : rows) owners.push_back(store.id(store.owner(row)));
@@ -248,8 +248,8 @@ RecallTable measure_recall_of(const PrototypeStore& store,
     }
     return list;
   };
-  return measure_recall({codes.data(), rows.size(), store.dim()}, owners, store.quantizer(),
-                        search_two, list_of);
+  return measure_recall({codes.data(), rows.size(), store.dim()}, owners, store.quantizer(), search,
+                        list_of);
 }
 
 std::size_t MapState::nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads) {
@@ -288,8 +288,8 @@ void MapState::measure(int threads, bool wait) {
   }
   if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
   auto measured = std::make_shared<MeasuredRecall>();
-  measured->table = measure_recall_of(store, std::identity(), [&](Codes queries) {
-    return search_exact(store.view(), queries, 2, {.threads = threads});
+  measured->table = measure_recall_of(store, std::identity(), [&](Codes queries, std::size_t k) {
+    return search_exact(store.view(), queries, k, {.threads = threads});
   });
   measured->lists_version = store.lists_version();
   measured->changes = store.changes();

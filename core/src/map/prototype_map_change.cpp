@@ -220,7 +220,8 @@ void PrototypeMap::set_positions(std::span<const std::int64_t> ids,
   for (std::size_t i = 0; i < ids.size(); ++i) {
     store.at(ids[i]);
     const Position& p = positions[i];
-    if (!is_finite(p) && has_position(p)) invalid("position of landmark ", ids[i], " is not finite");
+    if (!is_finite(p) && has_position(p))
+      invalid("position of landmark ", ids[i], " is not finite");
   }
   if (std::ranges::any_of(positions, has_position)) {
     store.make_room_for_positions(state_->searching);

@@ -209,15 +209,21 @@ class PrototypeStore : public RowTable {
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
   // which keeps its position if it has one.
   void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
+    constexpr std::size_t kFew = 8;
     LandmarkIndex into = find(id);
+    const std::vector<Row> others = from.sorted_rows(landmark);
     // Both by ascending appearance, as looking up each of many would take long.
-    const std::vector<Row> rows = into == kNoLandmark ? std::vector<Row>() : sorted_rows(into);
+    const bool sorted = into != kNoLandmark && others.size() > kFew;
+    const std::vector<Row> rows = sorted ? sorted_rows(into) : std::vector<Row>();
     auto existing = rows.begin();
-    for (const Row row : from.sorted_rows(landmark)) {
-      const std::uint16_t wanted = from.appearance(row);
+    const bool look_up = into != kNoLandmark && !sorted;
+    for (const Row other : others) {
+      const std::uint16_t wanted = from.appearance(other);
       while (existing != rows.end() && appearance(*existing) < wanted) ++existing;
-      const bool found = existing != rows.end() && appearance(*existing) == wanted;
-      merge(found ? *existing : create_row(id, into, wanted), from.sum(row), from.count(row));
+      Row row = look_up ? find_row(into, wanted) : kNoRow;
+      if (existing != rows.end() && appearance(*existing) == wanted) row = *existing;
+      if (row == kNoRow) row = create_row(id, into, wanted);
+      merge(row, from.sum(other), from.count(other));
     }
     if (!has_position(position(into))) set_position(into, from.position(landmark));
   }

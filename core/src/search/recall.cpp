@@ -24,12 +24,12 @@ std::vector<std::int8_t> like_observations(Codes codes) {
   return result;
 }
 
-// owner(q) is the landmark that query q must not find.
+// owner(q) is the landmark that query q must not find, if k is 2.
 template <typename Owner>
 RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& quantizer,
-                    const SearchTwo& search_two, const ListOf& list_of) {
+                    const ExactSearch& search, std::size_t k, const ListOf& list_of) {
   const std::size_t n = queries.rows, dim = queries.columns;
-  const Matrix<std::int64_t> ids = search_two(queries).ids;
+  const Matrix<std::int64_t> ids = search(queries, k).ids;
   // The list of the landmark that a query searches for, and the distance of its centroid.
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
@@ -76,14 +76,14 @@ std::vector<std::size_t> test_rows(std::size_t rows) {
 }
 
 RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& owners,
-                           const CoarseQuantizer& quantizer, const SearchTwo& search_two,
+                           const CoarseQuantizer& quantizer, const ExactSearch& search,
                            const ListOf& list_of) {
   const RecallTable others =
-      measure(prototypes, [&](std::size_t q) { return owners[q]; }, quantizer, search_two, list_of);
+      measure(prototypes, [&](std::size_t q) { return owners[q]; }, quantizer, search, 2, list_of);
   const std::vector<std::int8_t> moved = like_observations(prototypes);
   RecallTable table = measure(
       {moved.data(), prototypes.rows, prototypes.columns}, [](std::size_t) { return -1; },
-      quantizer, search_two, list_of);
+      quantizer, search, 1, list_of);
   // A map with a single landmark has no others.
   for (std::size_t i = 0; i < others.size(); ++i) table[i] = std::max(table[i], others[i]);
   return table;
