@@ -5,6 +5,7 @@
 #include <nanobind/ndarray.h>
 
 #include <cstdint>
+#include <limits>
 #include <span>
 #include <stdexcept>
 #include <string>
@@ -38,6 +39,8 @@ inline std::string describe(nb::handle array) {
 // with `what`. Copies only memory that is not contiguous.
 template <typename Array>
 Array array_of(nb::handle object, const char* type, int dimensions, const char* what) {
+  // OpenCV's descriptors of an image without keypoints.
+  if (object.is_none()) type_error(std::string(what) + " array is needed, not None");
   nb::object array = numpy("asarray")(object);
   if (nb::cast<int>(array.attr("ndim")) != dimensions ||
       !array.attr("dtype").equal(numpy("dtype")(type))) {
@@ -70,6 +73,33 @@ inline Array1<std::int64_t> landmark_ids(nb::handle object) {
   }
   return nb::cast<Array1<std::int64_t>>(
       numpy("ascontiguousarray")(array, nb::arg("dtype") = numpy("int64")));
+}
+
+// Converts an integer. One beyond T becomes the nearest T, which the call then refuses.
+template <typename T>
+T integer(nb::handle object, const char* what) {
+  const auto number = nb::steal(PyNumber_Index(object.ptr()));
+  if (!number.is_valid()) {
+    PyErr_Clear();
+    type_error(std::string(what) + ": an integer is needed, not " + nb::repr(object).c_str());
+  }
+  int beyond = 0;
+  const long long value = PyLong_AsLongLongAndOverflow(number.ptr(), &beyond);
+  if (beyond > 0 || std::cmp_greater(value, std::numeric_limits<T>::max())) {
+    return std::numeric_limits<T>::max();
+  }
+  if (beyond < 0 || std::cmp_less(value, std::numeric_limits<T>::min())) {
+    return std::numeric_limits<T>::min();
+  }
+  return static_cast<T>(value);
+}
+
+// Converts a length of codes; None becomes 0, which the core takes for the full one.
+inline std::size_t code_length(nb::handle object) {
+  if (object.is_none()) return 0;
+  const auto dim = integer<std::size_t>(object, "dim");
+  if (dim == 0) throw nb::value_error("dim must be at least 1");
+  return dim;
 }
 
 inline std::vector<Position> positions(nb::handle object) {

@@ -25,12 +25,13 @@ Layer to_layer(nb::dict d, bool last) {
   layer.weights.assign(weights.data(), weights.data() + weights.size());
   layer.bias.assign(bias.data(), bias.data() + bias.size());
   layer.multipliers.assign(multipliers.data(), multipliers.data() + multipliers.size());
-  layer.shift = nb::cast<int>(nb::module_::import_("operator").attr("index")(d["shift"]));
+  layer.shift = integer<int>(d["shift"], "shift");
   const nb::object table = d["table"];
   if (table.is_none()) {
     if (!last) throw nb::value_error("a hidden layer needs a table, only the last one has None");
     return layer;
   }
+  if (last) throw nb::value_error("the last layer has no table");
   const auto bytes = array_of<Array1<std::uint8_t>>(table, "uint8", 1, "table: a (256,) uint8");
   if (bytes.size() != layer.table.size()) {
     throw nb::value_error("a layer's table must have 256 entries");
@@ -70,6 +71,7 @@ void bind_encoder(nb::module_& m) {
              std::map<std::string, std::string> notes) {
             std::vector<Layer> built;
             for (nb::handle layer : layers) {
+              if (!nb::isinstance<nb::dict>(layer)) type_error("layers: each must be a dict");
               built.push_back(
                   to_layer(nb::cast<nb::dict>(layer), built.size() + 1 == layers.size()));
             }
@@ -106,14 +108,13 @@ Raises:
            "Write the model file, whole or not at all. Raises FileError.")
       .def(
           "encode",
-          [](const Encoder& encoder, nb::object array, std::optional<std::size_t> dim,
-             int threads) {
+          [](const Encoder& encoder, nb::object array, nb::object dim, nb::object threads) {
             const auto d = descriptors(array);
-            if (dim == 0) throw nb::value_error("dim must be at least 1");
-            return to_numpy(
-                without_gil([&] { return encoder.encode(view(d), dim.value_or(0), threads); }));
+            const std::size_t length = code_length(dim);
+            const auto workers = integer<int>(threads, "threads");
+            return to_numpy(without_gil([&] { return encoder.encode(view(d), length, workers); }));
           },
-          "descriptors"_a, "dim"_a = nb::none(), "threads"_a = 1,
+          "descriptors"_a.none(), "dim"_a.none() = nb::none(), "threads"_a.none() = 1,
           nb::sig("def encode(self, descriptors: NDArray[numpy.uint8], dim: int | None = None, "
                   "threads: int = 1) -> NDArray[numpy.int8]"),
           R"(Encode descriptors.
@@ -132,10 +133,10 @@ Raises:
         below 1.)")
       .def(
           "match_calibration",
-          [](const Encoder& encoder, std::optional<std::size_t> dim) {
-            return MatchCalibration::of(encoder, dim.value_or(0));
+          [](const Encoder& encoder, nb::object dim) {
+            return MatchCalibration::of(encoder, code_length(dim));
           },
-          "dim"_a = nb::none(),
+          "dim"_a.none() = nb::none(),
           nb::sig("def match_calibration(self, dim: int | None = None) -> MatchCalibration"),
           "How likely a match is right, by the distances to the two nearest landmarks, for codes "
           "of `dim` numbers, one of `dims` (None: the full length). Raises ValueError if the "

@@ -7,17 +7,19 @@ namespace protomark::python {
 void bind_hamming(nb::module_& m) {
   m.def(
       "hamming_search",
-      [](nb::object queries, nb::object database, std::size_t k,
-         std::optional<nb::object> landmarks, std::optional<int> max_distance, int threads) {
+      [](nb::object queries, nb::object database, nb::object k, std::optional<nb::object> landmarks,
+         std::optional<int> max_distance, nb::object threads) {
         const auto q = descriptors(queries);
         const auto d = descriptors(database);
         std::optional<Array1<std::int64_t>> ids;
-        HammingOptions options{std::nullopt, max_distance, threads};
+        const auto count = integer<std::size_t>(k, "k");
+        HammingOptions options{std::nullopt, max_distance, integer<int>(threads, "threads")};
         if (landmarks) options.landmarks = view(ids.emplace(landmark_ids(*landmarks)));
-        return to_numpy(without_gil([&] { return hamming_search(view(q), view(d), k, options); }));
+        return to_numpy(
+            without_gil([&] { return hamming_search(view(q), view(d), count, options); }));
       },
-      "queries"_a, "database"_a, "k"_a = 2, "landmarks"_a = nb::none(),
-      "max_distance"_a = nb::none(), "threads"_a = 1,
+      "queries"_a.none(), "database"_a.none(), "k"_a.none() = 2, "landmarks"_a = nb::none(),
+      "max_distance"_a = nb::none(), "threads"_a.none() = 1,
       nb::sig("def hamming_search(queries: NDArray[numpy.uint8], database: NDArray[numpy.uint8], "
               "k: int = 2, landmarks: ArrayLike | None = None, max_distance: int | None = None, "
               "threads: int = 1) -> tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),

@@ -53,7 +53,7 @@ void bind_match(nb::module_& m, const std::string& type) {
         }
         return arrays_of(without_gil([&] { return match(map, view(d), options); }));
       },
-      "scene"_a, "descriptors"_a, "min_probability"_a, "threads"_a, "recall"_a.none(),
+      "scene"_a, "descriptors"_a.none(), "min_probability"_a, "threads"_a, "recall"_a.none(),
       "among"_a.none(), nb::sig(signature.c_str()),
       "See protomark.matching.match: keypoints, landmarks and probabilities.");
 }
@@ -77,10 +77,11 @@ keypoint's landmark is in the map at all. Where there is no second landmark, s i
           "Take the weights w0, w1, w2.")
       .def_static(
           "of",
-          [](const Encoder& encoder, std::optional<std::size_t> dim) {
-            return MatchCalibration::of(encoder, dim.value_or(0));
+          [](const Encoder& encoder, nb::object dim) {
+            return MatchCalibration::of(encoder, code_length(dim));
           },
-          "encoder"_a, "dim"_a = nb::none(),
+          "encoder"_a, "dim"_a.none() = nb::none(),
+          nb::sig("def of(encoder: Encoder, dim: int | None = None) -> MatchCalibration"),
           "The calibration that an encoder's model file has for codes of `dim` numbers (None: "
           "all). Raises ValueError if the encoder was never calibrated for codes of this length.")
       .def_prop_ro(

@@ -12,11 +12,12 @@ namespace {
 
 // Bind a function that takes ids and as many descriptors, or codes.
 auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Descriptors, int)) {
-  return [method](PrototypeMap& self, nb::object ids, nb::object array, int threads) {
+  return [method](PrototypeMap& self, nb::object ids, nb::object array, nb::object threads) {
     const auto l = landmark_ids(ids);
     const auto d = descriptors(array);
+    const auto workers = integer<int>(threads, "threads");
     const nb::gil_scoped_release release;
-    (self.*method)(view(l), view(d), threads);
+    (self.*method)(view(l), view(d), workers);
   };
 }
 auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Codes)) {
@@ -29,7 +30,8 @@ auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Codes)) 
 }
 
 void bind_changes(nb::class_<PrototypeMap>& map) {
-  map.def("add", change(&PrototypeMap::add), "landmark_ids"_a, "descriptors"_a, "threads"_a = 1,
+  map.def("add", change(&PrototypeMap::add), "landmark_ids"_a, "descriptors"_a.none(),
+          "threads"_a.none() = 1,
           nb::sig("def add(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
                   "threads: int = 1) -> None"),
           R"(Add observations (Komorowski and Trzcinski, Eq. 1 and Eq. 2).
@@ -45,8 +47,8 @@ Raises:
     TypeError: descriptors are not (n, bits / 8) uint8, or ids not integers.
     ValueError: descriptors are of another size than the encoder's, there are not as many ids, an id
         is negative, or threads is below 1. The map stays as it was.)")
-      .def("subtract", change(&PrototypeMap::subtract), "landmark_ids"_a, "descriptors"_a,
-           "threads"_a = 1,
+      .def("subtract", change(&PrototypeMap::subtract), "landmark_ids"_a, "descriptors"_a.none(),
+           "threads"_a.none() = 1,
            nb::sig("def subtract(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
                    "threads: int = 1) -> None"),
            R"(Undo `add`, exactly; a landmark without observations leaves the map.
@@ -54,11 +56,12 @@ Raises:
 Raises:
     KeyError: a landmark is not in the map.
     ValueError: these observations cannot have been added. Nothing is changed then.)")
-      .def("add_codes", change(&PrototypeMap::add_codes), "landmark_ids"_a, "codes"_a,
+      .def("add_codes", change(&PrototypeMap::add_codes), "landmark_ids"_a, "codes"_a.none(),
            nb::sig(
                "def add_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> None"),
            "Like add, for descriptors that are encoded already: (n, dim) int8.")
-      .def("subtract_codes", change(&PrototypeMap::subtract_codes), "landmark_ids"_a, "codes"_a,
+      .def("subtract_codes", change(&PrototypeMap::subtract_codes), "landmark_ids"_a,
+           "codes"_a.none(),
            nb::sig("def subtract_codes(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) "
                    "-> None"),
            "Like subtract, for descriptors that are encoded already: (n, dim) int8.")
@@ -168,7 +171,7 @@ void bind_parts(nb::class_<PrototypeMap>& map) {
         const auto c = codes(array);
         return to_numpy(without_gil([&] { return self.distances(view(l), view(c)); }));
       },
-      "landmark_ids"_a, "codes"_a,
+      "landmark_ids"_a, "codes"_a.none(),
       nb::sig("def distances(self, landmark_ids: ArrayLike, codes: NDArray[numpy.int8]) -> "
               "NDArray[numpy.int32]"),
       R"(Squared distance of each code to one landmark, as search measures it.
@@ -338,12 +341,11 @@ void bind_prototype_map(nb::module_& m) {
       "integer sum of codes, so that it follows every change without rounding.");
   map.def(
       "__init__",
-      [](PrototypeMap* self, std::shared_ptr<Encoder> encoder, std::optional<std::size_t> dim,
+      [](PrototypeMap* self, std::shared_ptr<Encoder> encoder, nb::object dim,
          std::size_t appearance_bits) {
-        if (dim == 0) throw nb::value_error("dim must be at least 1");
-        new (self) PrototypeMap(std::move(encoder), dim.value_or(0), appearance_bits);
+        new (self) PrototypeMap(std::move(encoder), code_length(dim), appearance_bits);
       },
-      "encoder"_a, "dim"_a = nb::none(), "appearance_bits"_a = 0,
+      "encoder"_a, "dim"_a.none() = nb::none(), "appearance_bits"_a = 0,
       nb::sig("def __init__(self, encoder: Encoder, dim: int | None = None, "
               "appearance_bits: int = 0) -> None"),
       R"(Make an empty map.

@@ -37,23 +37,27 @@ std::vector<std::int64_t> ids_or_mask(const Map& map, nb::handle among) {
 // Binds Map::search or Map::search_codes, whose queries are of type `Queries`.
 template <typename Map, typename Queries, typename Search>
 auto bind_search(Queries (*to_queries)(nb::handle), Search search) {
-  return [=](const Map& map, nb::object queries, std::size_t k,
-             std::optional<std::int64_t> max_distance, std::optional<double> ratio, int threads,
-             std::optional<double> recall, std::optional<std::size_t> nprobe,
-             std::optional<nb::object> among) {
-    const auto q = to_queries(queries);
-    SearchOptions options{recall, nprobe, std::nullopt, ratio, std::nullopt, threads};
-    std::vector<std::int64_t> searched;
-    if (among) {
-      searched = ids_or_mask(map, *among);
-      options.among = searched;
-    }
-    if (max_distance) {
-      options.max_distance =
-          static_cast<std::int32_t>(std::clamp<std::int64_t>(*max_distance, -1, INT32_MAX));
-    }
-    return to_numpy(without_gil([&] { return (map.*search)(view(q), k, options); }));
-  };
+  return
+      [=](const Map& map, nb::object queries, nb::object k, std::optional<nb::object> max_distance,
+          std::optional<double> ratio, nb::object threads, std::optional<double> recall,
+          std::optional<nb::object> nprobe, std::optional<nb::object> among) {
+        const auto q = to_queries(queries);
+        const auto count = integer<std::size_t>(k, "k");
+        SearchOptions options;
+        options.recall = recall;
+        options.ratio = ratio;
+        options.threads = integer<int>(threads, "threads");
+        if (nprobe) options.nprobe = integer<std::size_t>(*nprobe, "nprobe");
+        std::vector<std::int64_t> searched;
+        if (among) {
+          searched = ids_or_mask(map, *among);
+          options.among = searched;
+        }
+        if (max_distance) {
+          options.max_distance = integer<std::int32_t>(*max_distance, "max_distance");
+        }
+        return to_numpy(without_gil([&] { return (map.*search)(view(q), count, options); }));
+      };
 }
 
 // Bind a method that takes ids of landmarks, or one id.
@@ -66,8 +70,10 @@ auto bind_of_landmarks(Of of) {
 }
 template <typename Map, typename Of>
 auto bind_of_landmark(Of of) {
-  return [of](const Map& map, std::int64_t id) {
-    return to_numpy(without_gil([&] { return (map.*of)(id); }));
+  return [of](const Map& map, nb::object id) {
+    const auto ids = landmark_ids(id);
+    if (ids.size() != 1) type_error("one landmark id is needed, not " + std::to_string(ids.size()));
+    return to_numpy(without_gil([&] { return (map.*of)(ids(0)); }));
   };
 }
 
@@ -125,9 +131,10 @@ Returns:
         or more at the last index.
     landmarks_with_position: their number.
     extent: (2, 3) float64, the lowest and highest coordinates; None if no landmark has a position.)")
-      .def("search", bind_search<Map>(&descriptors, &Map::search), "descriptors"_a, "k"_a = 2,
-           "max_distance"_a = nb::none(), "ratio"_a = nb::none(), "threads"_a = 1,
-           "recall"_a = nb::none(), "nprobe"_a = nb::none(), "among"_a = nb::none(),
+      .def("search", bind_search<Map>(&descriptors, &Map::search), "descriptors"_a.none(),
+           "k"_a.none() = 2, "max_distance"_a = nb::none(), "ratio"_a = nb::none(),
+           "threads"_a.none() = 1, "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+           "among"_a = nb::none(),
            nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
                    "max_distance: int | None = None, ratio: float | None = None, "
                    "threads: int = 1, recall: float | None = None, nprobe: int | None = None, "
@@ -161,9 +168,10 @@ Raises:
         a mask is of another length than the map;
         max_distance is negative; ratio or recall is out of its range; recall and nprobe are both
         given, or one of them and the map has no index (PrototypeMap.build_index).)")
-      .def("search_codes", bind_search<Map>(&codes, &Map::search_codes), "codes"_a, "k"_a = 2,
-           "max_distance"_a = nb::none(), "ratio"_a = nb::none(), "threads"_a = 1,
-           "recall"_a = nb::none(), "nprobe"_a = nb::none(), "among"_a = nb::none(),
+      .def("search_codes", bind_search<Map>(&codes, &Map::search_codes), "codes"_a.none(),
+           "k"_a.none() = 2, "max_distance"_a = nb::none(), "ratio"_a = nb::none(),
+           "threads"_a.none() = 1, "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+           "among"_a = nb::none(),
            nb::sig("def search_codes(self, codes: NDArray[numpy.int8], k: int = 2, "
                    "max_distance: int | None = None, ratio: float | None = None, "
                    "threads: int = 1, recall: float | None = None, nprobe: int | None = None, "

@@ -6,6 +6,8 @@
 #include <filesystem>
 #include <fstream>
 #include <iterator>
+#include <limits>
+#include <numeric>
 #include <thread>
 
 #include "check.h"
@@ -140,6 +142,48 @@ void test_races(std::size_t appearance_bits) {
   std::printf("%d of 20 refused\n", refused);
 }
 
+// The same while landmarks are merged and get positions.
+void test_later_races(std::size_t appearance_bits) {
+  const auto encoder = test::random_encoder();
+  for (int round = 0; round < 10; ++round) {
+    PrototypeMap map(encoder, 0, appearance_bits);
+    std::vector<std::int64_t> into(kMany), source(kMany);
+    std::iota(into.begin(), into.end(), 0);
+    std::iota(source.begin(), source.end(), kMany);
+    const std::vector<std::int8_t> codes(kMany * encoder->dim(), 5);
+    const Codes all{codes.data(), kMany, encoder->dim()};
+    map.add_codes(into, all);
+    map.add_codes(source, all);
+    std::vector<Position> positions(kMany, Position{1, 2, 3});
+    map.set_positions(std::vector<std::int64_t>{0}, {positions.data(), 1});
+    {
+      const std::jthread merger([&] {
+        try {
+          map.merge_landmarks(into, source);
+        } catch (const std::out_of_range&) {
+        } catch (const std::invalid_argument&) {
+        }
+      });
+      while (map.size() == 2 * kMany) std::this_thread::yield();
+      __atomic_store_n(&into.back(), -5, __ATOMIC_RELAXED);
+    }
+    into.back() = kMany - 1;
+    {
+      const std::jthread setter([&] {
+        try {
+          map.set_positions(into, positions);
+        } catch (const std::invalid_argument&) {
+        }
+      });
+      const std::vector<std::int64_t> first{1};
+      while (!(map.positions(first)[0][0] == 1)) std::this_thread::yield();
+      const double infinite = std::numeric_limits<double>::infinity();
+      __atomic_store(&positions.back()[1], &infinite, __ATOMIC_RELAXED);
+    }
+    CHECK(!bytes_of(map).empty() && PrototypeMap::load(path).size() == map.size());
+  }
+}
+
 }  // namespace
 
 int main() {
@@ -150,6 +194,7 @@ int main() {
     }
 #ifndef __SANITIZE_THREAD__  // which is right to complain
     test_races(appearance_bits);
+    test_later_races(appearance_bits);
 #endif
   }
   fs::remove(path);

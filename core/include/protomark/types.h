@@ -45,7 +45,8 @@ struct Matrix {
   Matrix() = default;
   // All zeros. Throws std::bad_alloc.
   Matrix(std::size_t n, std::size_t m) : rows(n), columns(m) {
-    if (m > PTRDIFF_MAX || (m != 0 && n > PTRDIFF_MAX / sizeof(T) / m)) throw std::bad_alloc();
+    if (m > PTRDIFF_MAX / sizeof(T) || (m != 0 && n > PTRDIFF_MAX / sizeof(T) / m))
+      throw std::bad_alloc();
     data.resize(n * m);
   }
 

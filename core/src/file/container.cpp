@@ -99,6 +99,10 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   if (header.version != kVersion) {
     fail("format version ", header.version, ", this Protomark reads version ", kVersion);
   }
+  if (header.kind == static_cast<std::uint32_t>(FileKind::journal) &&
+      header.file_size < file_.size()) {
+    fail("it is the journal of a map: name the map file beside it");
+  }
   if (header.file_size != file_.size()) {
     fail("it should have ", header.file_size, " bytes and has ", file_.size(),
          file_.size() < header.file_size ? ": it is cut off" : "");

@@ -109,7 +109,8 @@ TemporaryFile::TemporaryFile(const std::filesystem::path& target)
   std::error_code error;
   const auto type = std::filesystem::status(target_, error).type();
   using enum std::filesystem::file_type;
-  if (type != not_found && type != none && type != regular) {
+  if (type == none) fail_file(name_, "cannot be written: ", error.message());
+  if (type != not_found && type != regular) {
     fail_file(name_, "cannot be written: it exists and is not a regular file");
   }
   // Only the owner may read the files of mkstemp.

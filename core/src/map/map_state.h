@@ -61,10 +61,10 @@ inline void check_pairs(std::size_t ids, std::size_t others, const char* what) {
 std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal);
 
 // Measures the recall table of a store whose rounded prototypes are searched with value(v) in place
-// of each number v, where search_two finds the two nearest landmarks of queries.
+// of each number v, where `search` finds the nearest landmarks of queries.
 RecallTable measure_recall_of(const PrototypeStore& store,
                               const std::function<std::int8_t(std::int8_t)>& value,
-                              const SearchTwo& search_two);
+                              const ExactSearch& search);
 
 // A change of a map: while it exists no other one begins, and all that read the map for long wait.
 // Searches go on between its pieces.

@@ -86,7 +86,7 @@ class PositionCodec {
         p[i] = number == kNone ? kNaN : p[i] + step_[i] * number;
       }
     }
-    return std::ranges::all_of(p, [](double x) { return std::isfinite(x); }) ? p : kNoPosition;
+    return is_finite(p) ? p : kNoPosition;
   }
 
  private:

@@ -222,27 +222,34 @@ Matches PrototypeMap::search_codes(Codes queries, std::size_t k,
 
 RecallTable measure_recall_of(const PrototypeStore& store,
                               const std::function<std::int8_t(std::int8_t)>& value,
-                              const SearchTwo& search_two) {
+                              const ExactSearch& search) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
   std::vector<std::int64_t> owners;
   for (const Row row : rows) owners.push_back(store.id(store.owner(row)));
   const std::vector<std::int8_t> codes = store.rounded(rows);
-  std::vector<std::int8_t> prototype(store.dim());
+  // Those of the landmark that was asked for last, which may be one of many appearances.
+  std::int64_t last = -1;
+  std::vector<Row> own_rows;
+  std::vector<std::int8_t> prototypes;
   const auto list_of = [&](std::int64_t id, const std::int8_t* query) {
+    if (std::exchange(last, id) != id) {
+      own_rows = store.sorted_rows(store.at(id));
+      prototypes = store.rounded(own_rows);
+      std::ranges::transform(prototypes, prototypes.begin(), value);
+    }
     std::uint32_t list = 0;
     std::int32_t least = INT32_MAX;
-    for (const Row row : store.sorted_rows(store.at(id))) {
-      store.rounded(row, prototype.data());
-      std::ranges::transform(prototype, prototype.begin(), value);
-      const std::int32_t distance = squared_distance(query, prototype.data(), store.dim());
+    for (std::size_t i = 0; i < own_rows.size(); ++i) {
+      const std::int8_t* prototype = &prototypes[i * store.dim()];
+      const std::int32_t distance = squared_distance(query, prototype, store.dim());
       if (distance >= least) continue;
       least = distance;
-      list = store.lists().list_of(row);
+      list = store.lists().list_of(own_rows[i]);
     }
     return list;
   };
-  return measure_recall({codes.data(), rows.size(), store.dim()}, owners, store.quantizer(),
-                        search_two, list_of);
+  return measure_recall({codes.data(), rows.size(), store.dim()}, owners, store.quantizer(), search,
+                        list_of);
 }
 
 std::size_t MapState::nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads) {
@@ -281,8 +288,8 @@ void MapState::measure(int threads, bool wait) {
   }
   if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
   auto measured = std::make_shared<MeasuredRecall>();
-  measured->table = measure_recall_of(store, std::identity(), [&](Codes queries) {
-    return search_exact(store.view(), queries, 2, {.threads = threads});
+  measured->table = measure_recall_of(store, std::identity(), [&](Codes queries, std::size_t k) {
+    return search_exact(store.view(), queries, k, {.threads = threads});
   });
   measured->lists_version = store.lists_version();
   measured->changes = store.changes();

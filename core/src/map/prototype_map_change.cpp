@@ -187,19 +187,23 @@ void PrototypeMap::merge_landmarks(std::span<const std::int64_t> into,
   MapChange change(*state_);
   PrototypeStore& store = state_->store;
   IdSet removed;
+  // A copy, as a caller may write over ids meanwhile.
+  std::vector<std::array<std::int64_t, 2>> pairs;
   for (std::size_t i = 0; i < into.size(); ++i) {
-    for (const std::int64_t id : {into[i], source[i]}) {
+    const auto [to, from] = pairs.emplace_back(std::array{into[i], source[i]});
+    for (const std::int64_t id : {to, from}) {
       store.at(id);
       if (removed.contains(id)) {
         invalid("landmark ", id, " was merged into another earlier in the same call");
       }
     }
-    if (into[i] == source[i]) invalid("landmark ", into[i], " cannot be merged into itself");
-    removed.insert(source[i]);
+    if (to == from) invalid("landmark ", to, " cannot be merged into itself");
+    removed.insert(from);
   }
-  change.in_pieces(into.size(), [&](std::size_t i) {
-    store.merge(into[i], store, store.at(source[i]));
-    store.erase(source[i]);
+  change.in_pieces(pairs.size(), [&](std::size_t i) {
+    const auto [to, from] = pairs[i];
+    store.merge(to, store, store.at(from));
+    store.erase(from);
   });
 }
 
@@ -216,8 +220,8 @@ void PrototypeMap::set_positions(std::span<const std::int64_t> ids,
   for (std::size_t i = 0; i < ids.size(); ++i) {
     store.at(ids[i]);
     const Position& p = positions[i];
-    const bool finite = std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
-    if (!finite && has_position(p)) invalid("position of landmark ", ids[i], " is not finite");
+    if (!is_finite(p) && has_position(p))
+      invalid("position of landmark ", ids[i], " is not finite");
   }
   if (std::ranges::any_of(positions, has_position)) {
     store.make_room_for_positions(state_->searching);

@@ -214,9 +214,7 @@ class Reading {
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);
-      const bool finite =
-          std::ranges::all_of(positions[i], [](double x) { return std::isfinite(x); });
-      if (!finite && has_position(positions[i])) {
+      if (!is_finite(positions[i]) && has_position(positions[i])) {
         file.fail("landmark ", ids[i], " has no finite position");
       }
     }

@@ -60,9 +60,10 @@ void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const std::int
   std::unordered_map<std::uint32_t, std::int64_t> renamed;
   renamed.reserve(source.size());
   for (std::size_t i = 0; i < source.size(); ++i) {
-    if (into[i] < 0) invalid("landmark id ", into[i], " is negative");
-    if (!renamed.emplace(from.at(source[i]).value, into[i]).second) {
-      invalid("landmark ", source[i], " of the other map is named twice");
+    const std::int64_t id = into[i], other_id = source[i];
+    if (id < 0) invalid("landmark id ", id, " is negative");
+    if (!renamed.emplace(from.at(other_id).value, id).second) {
+      invalid("landmark ", other_id, " of the other map is named twice");
     }
   }
   Metadata metadata = merged(state_->metadata, other.state_->metadata);

@@ -123,13 +123,14 @@ class RowWriter {
 
 // Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
 // piece.
-Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
+Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
+                      std::size_t k) {
   // A piece is small compared with the map.
   const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(2, {});
+  Neighbours nearest = prepared.neighbours(k, {});
   PackedPrototypes piece = store.view();
   piece.data = packed.data();
   piece.scale = packer.scale();
@@ -147,7 +148,7 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
       piece.landmarks.ids += piece.rows;
     }
   }
-  Matches matches{{queries.rows, 2}, {queries.rows, 2}};
+  Matches matches{{queries.rows, k}, {queries.rows, k}};
   write_answer(nearest, prepared.norms(), {}, 0, matches);
   return matches;
 }
@@ -191,7 +192,9 @@ class SealedContent {
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
           store_, [this](std::int8_t code) { return packer_.value(code); },
-          [this](Codes queries) { return search_packed(store_, packer_, queries); });
+          [this](Codes queries, std::size_t k) {
+            return search_packed(store_, packer_, queries, k);
+          });
       sink(std::as_bytes(std::span(table)));
     });
   }

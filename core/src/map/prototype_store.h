@@ -209,10 +209,22 @@ class PrototypeStore : public RowTable {
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
   // which keeps its position if it has one.
   void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
-    for (Row row = from.first_row(landmark); row != kNoRow; row = from.next_row(row)) {
-      merge(find_or_create_row(id, from.appearance(row)), from.sum(row), from.count(row));
+    constexpr std::size_t kFew = 8;
+    LandmarkIndex into = find(id);
+    const std::vector<Row> others = from.sorted_rows(landmark);
+    // Both by ascending appearance, as looking up each of many would take long.
+    const bool sorted = into != kNoLandmark && others.size() > kFew;
+    const std::vector<Row> rows = sorted ? sorted_rows(into) : std::vector<Row>();
+    auto existing = rows.begin();
+    const bool look_up = into != kNoLandmark && !sorted;
+    for (const Row other : others) {
+      const std::uint16_t wanted = from.appearance(other);
+      while (existing != rows.end() && appearance(*existing) < wanted) ++existing;
+      Row row = look_up ? find_row(into, wanted) : kNoRow;
+      if (existing != rows.end() && appearance(*existing) == wanted) row = *existing;
+      if (row == kNoRow) row = create_row(id, into, wanted);
+      merge(row, from.sum(other), from.count(other));
     }
-    const LandmarkIndex into = at(id);
     if (!has_position(position(into))) set_position(into, from.position(landmark));
   }
   // Puts rows that were created or set into their lists; ends every change.

@@ -17,6 +17,9 @@ inline constexpr Position kNoPosition = {kNaN, kNaN, kNaN};
 inline bool has_position(const Position& p) {
   return !(std::isnan(p[0]) && std::isnan(p[1]) && std::isnan(p[2]));
 }
+inline bool is_finite(const Position& p) {
+  return std::ranges::all_of(p, [](double x) { return std::isfinite(x); });
+}
 
 // Arrays grow as with push_back, but before a change, which therefore cannot fail half-way.
 template <typename Vector>
@@ -173,13 +176,14 @@ class RowTable {
       }
     }
   }
-  void set_position(LandmarkIndex landmark, const Position& position) {
+  // Takes a copy, as a caller may write over a position that was checked.
+  void set_position(LandmarkIndex landmark, Position position) {
     if (positions_.empty()) {
       if (!has_position(position)) return;
       positions_.assign(ids_.size(), kNoPosition);
     }
     // One NaN for all, so that equal maps give equal files.
-    positions_[landmark.value] = has_position(position) ? position : kNoPosition;
+    positions_[landmark.value] = is_finite(position) ? position : kNoPosition;
   }
 
   // Bytes per row as in a file, so that equal maps have the same.

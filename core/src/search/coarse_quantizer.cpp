@@ -3,6 +3,7 @@
 #include <bit>
 #include <cmath>
 #include <queue>
+#include <set>
 #include <utility>
 
 #include "base/quantize.h"
@@ -14,6 +15,8 @@ namespace {
 
 constexpr int kIterations = 8;
 constexpr std::size_t kGroupProbes = 4;
+// Centroids of a group at most, in terms of the mean.
+constexpr std::size_t kLargestGroup = 4;
 // Codes that are assigned at a time.
 constexpr std::size_t kAssignChunk = 1 << 14;
 
@@ -108,9 +111,19 @@ ListOrder::ListOrder(std::vector<Row> lists, std::size_t nlist)
 
 CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim)
     : dim_(dim), centroids_(std::move(centroids)) {
-  const std::size_t n = nlist();
-  const Codes all{centroids_.data(), n, dim_};
-  packed_ = pack_codes(all);
+  packed_ = pack_codes({centroids_.data(), nlist(), dim_});
+  // Of equal centroids only the first one gets codes.
+  std::vector<std::int8_t> distinct;
+  std::vector<LandmarkIndex> lists;
+  std::set<std::span<const std::int8_t>, decltype(std::ranges::lexicographical_compare)> seen;
+  for (LandmarkIndex list{0}; list.value < nlist(); ++list.value) {
+    const std::span<const std::int8_t> centroid(&centroids_[list.value * dim_], dim_);
+    if (!seen.insert(centroid).second) continue;
+    distinct.insert(distinct.end(), centroid.begin(), centroid.end());
+    lists.push_back(list);
+  }
+  const std::size_t n = lists.size();
+  const Codes all{distinct.data(), n, dim_};
 
   const auto groups =
       std::min(n, static_cast<std::size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
@@ -120,27 +133,32 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
         all, [&](Codes codes) { return search_exact(packed_view(packed, groups), codes, 1, {}); });
   };
   const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
-  std::vector<Row> group_of;
-  for (const std::uint32_t group : assign(group_centroids)) group_of.push_back({group});
-  const ListOrder order(std::move(group_of), groups);
-  // Leave out groups without centroids, which a broken file may bring about.
+  // Cuts large groups into parts, as k-means may leave nearly all centroids in one, with all of
+  // which each code would be compared. Groups without centroids are left out.
+  const std::size_t limit = kLargestGroup * ((n + groups - 1) / groups);
   std::vector<std::int8_t> used;
-  for (std::size_t g = 0; g < groups; ++g) {
-    if (order.sizes[g] == 0) continue;
-    used.insert(used.end(), &group_centroids[g * dim_], &group_centroids[g * dim_] + dim_);
-    group_sizes_.push_back(order.sizes[g]);
-    group_blocks_.push_back(order.first_blocks[g]);
+  std::vector<std::uint32_t> sizes(groups, 0), parts(groups);
+  std::vector<Row> group_of;
+  for (const std::uint32_t g : assign(group_centroids)) {
+    if (sizes[g]++ % limit == 0) {
+      parts[g] = static_cast<std::uint32_t>(used.size() / dim_);
+      used.insert(used.end(), &group_centroids[g * dim_], &group_centroids[g * dim_] + dim_);
+    }
+    group_of.push_back({parts[g]});
   }
-  group_blocks_.push_back(order.first_blocks.back());
-  group_centroids_ = pack_codes({used.data(), group_sizes_.size(), dim_});
+  ListOrder order(std::move(group_of), used.size() / dim_);
+  group_centroids_ = pack_codes({used.data(), order.sizes.size(), dim_});
   const std::size_t rows = order.first_blocks.back() * kPackedRows;
   std::vector<std::int8_t> grouped(rows * dim_, 0);
   list_of_.assign(rows, kNoLandmark);
-  for (std::uint32_t list = 0; list < n; ++list) {
-    std::copy_n(all.row(list), dim_, &grouped[order.new_rows[list].value * dim_]);
-    list_of_[order.new_rows[list].value] = {list};
+  for (std::size_t i = 0; i < n; ++i) {
+    const Row row = order.new_rows[i];
+    std::copy_n(all.row(i), dim_, &grouped[row.value * dim_]);
+    list_of_[row.value] = lists[i];
   }
   grouped_ = pack_codes({grouped.data(), rows, dim_});
+  group_sizes_ = std::move(order.sizes);
+  group_blocks_ = std::move(order.first_blocks);
 }
 
 CoarseQuantizer CoarseQuantizer::learn(Codes codes, std::size_t nlist, int threads) {

@@ -1,5 +1,6 @@
 #include "search/recall.h"
 
+#include <algorithm>
 #include <cmath>
 
 #include "base/quantize.h"
@@ -23,21 +24,26 @@ std::vector<std::int8_t> like_observations(Codes codes) {
   return result;
 }
 
-// owner(q) is the landmark that query q must not find.
+// owner(q) is the landmark that query q must not find, if k is 2.
 template <typename Owner>
 RecallTable measure(Codes queries, const Owner& owner, const CoarseQuantizer& quantizer,
-                    const SearchTwo& search_two, const ListOf& list_of) {
+                    const ExactSearch& search, std::size_t k, const ListOf& list_of) {
   const std::size_t n = queries.rows, dim = queries.columns;
-  const Matrix<std::int64_t> ids = search_two(queries).ids;
+  const Matrix<std::int64_t> ids = search(queries, k).ids;
   // The list of the landmark that a query searches for, and the distance of its centroid.
   const PreparedCodes prepared(queries);
   std::vector<std::uint32_t> lists(n);
   std::vector<std::int32_t> limits(n, INT32_MIN);
+  // If others are as near, the owner may be second, or not among the two. By landmark, as list_of
+  // keeps the prototypes of one.
+  std::vector<std::pair<std::int64_t, std::size_t>> nearest;
   for (std::size_t q = 0; q < n; ++q) {
-    // If others are as near, the owner may be second, or not among the two.
-    const std::int64_t nearest = ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0];
-    if (nearest < 0) continue;
-    lists[q] = list_of(nearest, queries.row(q));
+    nearest.emplace_back(ids.row(q)[ids.row(q)[0] == owner(q) ? 1 : 0], q);
+  }
+  std::ranges::sort(nearest);
+  for (const auto& [landmark, q] : nearest) {
+    if (landmark < 0) continue;
+    lists[q] = list_of(landmark, queries.row(q));
     const std::int8_t* centroid = &quantizer.centroids()[lists[q] * dim];
     limits[q] = squared_distance(centroid, queries.row(q), dim) - prepared.norms()[q];
   }
@@ -70,14 +76,14 @@ std::vector<std::size_t> test_rows(std::size_t rows) {
 }
 
 RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& owners,
-                           const CoarseQuantizer& quantizer, const SearchTwo& search_two,
+                           const CoarseQuantizer& quantizer, const ExactSearch& search,
                            const ListOf& list_of) {
   const RecallTable others =
-      measure(prototypes, [&](std::size_t q) { return owners[q]; }, quantizer, search_two, list_of);
+      measure(prototypes, [&](std::size_t q) { return owners[q]; }, quantizer, search, 2, list_of);
   const std::vector<std::int8_t> moved = like_observations(prototypes);
   RecallTable table = measure(
       {moved.data(), prototypes.rows, prototypes.columns}, [](std::size_t) { return -1; },
-      quantizer, search_two, list_of);
+      quantizer, search, 1, list_of);
   // A map with a single landmark has no others.
   for (std::size_t i = 0; i < others.size(); ++i) table[i] = std::max(table[i], others[i]);
   return table;

@@ -20,8 +20,8 @@ struct MeasuredRecall {
 inline constexpr std::size_t kTestQueries = 2048;
 std::vector<std::size_t> test_rows(std::size_t rows);
 
-// Finds the two nearest landmarks of each query exactly.
-using SearchTwo = std::function<Matches(Codes)>;
+// Finds the k nearest landmarks of each query exactly.
+using ExactSearch = std::function<Matches(Codes, std::size_t k)>;
 // The list of the prototype of a landmark that is nearest to a query.
 using ListOf = std::function<std::uint32_t(std::int64_t landmark, const std::int8_t* query)>;
 
@@ -30,7 +30,7 @@ using ListOf = std::function<std::uint32_t(std::int64_t landmark, const std::int
 // these as observations are search for any landmark, which is harder in a dense map. For each share
 // of the queries the larger number counts.
 RecallTable measure_recall(Codes prototypes, const std::vector<std::int64_t>& owners,
-                           const CoarseQuantizer& quantizer, const SearchTwo& search_two,
+                           const CoarseQuantizer& quantizer, const ExactSearch& search,
                            const ListOf& list_of);
 
 // Returns how many lists to search for a recall above 0 and at most 1; all of them for 1.
