@@ -93,7 +93,7 @@ def test_resume_takes_the_same_command_only(
     fails(run(other, *resume, *given), "the input", str(images.resolve()))
     fails(run(images, *resume, "--camera", "PINHOLE:310,310,160,120"), "--camera", CAMERA)
     fails(run(images, *resume, *given, "--every", "2"), "--every", "1, now: 2")
-    fails(run(images, *resume, *given, "--dim", "16"), "--dim", "32, now: 16")
+    fails(run(images, *resume, *given, "--dim", "16"), "--dim", "48, now: 16")
     cv2.imwrite(str(images / "img99.png"), np.zeros((240, 320), np.uint8))
     try:
         fails(run(images, *resume, *given), "the images")
@@ -114,7 +114,7 @@ def test_options_that_differ_from_the_map_are_refused(extended: Path, tmp_path: 
     more = write_images(tmp_path / "more", walk(FRAMES + 4)[FRAMES:])
     into = (more, "--into", extended)
     fails(run(*into, "-d", "akaze"), "--descriptor akaze", "orb")
-    fails(run(*into, "--dim", "16"), "--dim 16", "32")
+    fails(run(*into, "--dim", "16"), "--dim 16", "48")
     fails(run(*into, "--focal", "300"), "--focal")
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     fails(run(*into, "--poses", tmp_path / "poses.txt"), "without --poses")
