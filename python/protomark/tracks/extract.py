@@ -46,7 +46,7 @@ _COMPLETION_PASSES = 3
 # Neighbours of so many keyframes tell about all poses.
 _SAMPLE = 20
 # Increased whenever the same options yield other tracks, so that old files are made anew.
-_METHOD = 4
+_METHOD = 5
 
 
 @dataclass(frozen=True)
