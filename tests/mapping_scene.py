@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from protomark.geometry.camera import Camera
+from protomark.interrupt import Interrupted
+from protomark.mapping.frame import InputImage
+from protomark.mapping.mapper import Mapper
+from protomark.mapping.request import MapRequest
+from protomark.mapping.session import make_map
 from tracks_scene import PINHOLE
 
 # Depth of each wall (it stands parallel to the x axis and y axis), its extent in x, and its seed.
@@ -74,3 +82,25 @@ def write_images(folder: Path, poses: NDArray[np.float64], seed: int = 0, first:
     for i, pose in enumerate(poses, first):
         cv2.imwrite(str(folder / f"img{i}.png"), show(pose, seed=seed))
     return folder
+
+
+def interrupted_at(
+    index: int,
+    request: MapRequest,
+    monkeypatch: pytest.MonkeyPatch,
+    lines: list[str] | None = None,
+    number: int = signal.SIGTERM,
+) -> None:
+    """Send a signal just before the frame of this index is added; `lines` gets the notes."""
+
+    def stop(self: Mapper, picture: InputImage) -> object:
+        if picture.index == index:
+            os.kill(os.getpid(), number)
+        return add(self, picture)
+
+    add = Mapper.add
+    notes = [] if lines is None else lines
+    with monkeypatch.context() as patch:
+        patch.setattr(Mapper, "add", stop)
+        with pytest.raises(Interrupted):
+            make_map(request, note=notes.append)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from mapping_scene import show, turn_and_approach, walk, write_images
+from mapping_scene import interrupted_at, show, turn_and_approach, walk, write_images
 from protomark.geometry.colmap import pycolmap
 from protomark.geometry.pose import camera_centers, quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
@@ -148,17 +148,8 @@ def test_resumed_is_as_if_never_stopped(
     after: int, images: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = tmp_path / "scene"
-    add = Mapper.add
-
-    def stop_after(self: Mapper, picture: InputImage) -> object:
-        if picture.index == after:
-            os.kill(os.getpid(), signal.SIGINT)
-        return add(self, picture)
-
-    monkeypatch.setattr(Mapper, "add", stop_after)
-    with pytest.raises(Interrupted):
-        make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA))
-    monkeypatch.setattr(Mapper, "add", add)
+    request = MapRequest(images, scene, SETTINGS, camera=CAMERA)
+    interrupted_at(after, request, monkeypatch, number=signal.SIGINT)
     assert (scene / "scene.pmk").exists()
     with pytest.raises(FileExistsError, match="--resume continues it"):
         make_map(MapRequest(images, scene, SETTINGS, camera=CAMERA))

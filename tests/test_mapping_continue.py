@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from mapping_scene import walk, write_images
+from mapping_scene import interrupted_at, walk, write_images
 from protomark import interrupt
-from protomark.interrupt import Interrupted
 from protomark.mapping import session
-from protomark.mapping.frame import InputImage
-from protomark.mapping.mapper import Mapper
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from test_mapping import CAMERA, SETTINGS, run
@@ -45,23 +40,6 @@ def extended(finished: Path, tmp_path: Path) -> Path:
 def contents(folder: Path) -> dict[str, bytes]:
     files = (f for f in folder.rglob("*") if f.is_file())
     return {str(f.relative_to(folder)): f.read_bytes() for f in files}
-
-
-def interrupted_at(
-    index: int, request: MapRequest, monkeypatch: pytest.MonkeyPatch, lines: list[str]
-) -> None:
-    """Send a signal just before the frame of this index is added."""
-    add = Mapper.add
-
-    def stop(self: Mapper, picture: InputImage) -> object:
-        if picture.index == index:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return add(self, picture)
-
-    monkeypatch.setattr(Mapper, "add", stop)
-    with pytest.raises(Interrupted):
-        make_map(request, note=lines.append)
-    monkeypatch.setattr(Mapper, "add", add)
 
 
 def test_a_long_step_is_given_up_and_nothing_is_lost(
