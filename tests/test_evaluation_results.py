@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protomark.cli.evaluate import _table
+from protomark.cli.evaluate import results_table
 from protomark.evaluation.results import (
     MethodResult,
     SequenceResult,
@@ -105,7 +105,7 @@ def test_the_table_fits_a_terminal() -> None:
     rows = result().rows()
     rows[0].bytes_per_landmark = 12_345
     rows[0].search_ms = 1234
-    console.print(_table("title", rows))
+    console.print(results_table("title", rows))
     text = console.export_text()
     assert "…" not in text
     for shown in ("12,345", "0.800 ±0.141", "1,234"):

@@ -36,52 +36,23 @@ def demo(
     check_outputs(json_file, folder=output)
     with progress_bar() as progress:
         result = run_demo(output, tracks_path=tracks, encoder=encoder, progress=progress)
-    write_json(json_file, asdict(result))
+    table = [asdict(row) for row in result.comparison.rows()]
+    write_json(json_file, {**asdict(result), "table": table})
     _show(result)
 
 
 def _show(result: DemoResult) -> None:
-    from protomark.cli.terminal import console, readable_size, say, table_of
+    from protomark.cli.evaluate import results_table
+    from protomark.cli.terminal import console, readable_size, say
+    from protomark.evaluation.results import caption
 
-    say(
-        f"[bold]{result.sequence}[/]: {result.support_keyframes} keyframes build a map of "
-        f"{result.landmarks:,} landmarks from {result.observations:,} observations "
-        f"({result.descriptor.upper()}, {result.bits} bits), {result.rows[0].frames} are "
-        "localized in it."
-    )
-    table = table_of(
-        "method",
-        "bytes per\nlandmark",
-        "whole\nmap",
-        "precision",
-        "poses\nfound",
-        "median\nerror",
-        "ms per\nframe",
-    )
-    for row in result.rows:
-        table.add_row(
-            row.label,
-            f"{row.bytes_per_landmark:,.0f}",
-            readable_size(row.map_bytes),
-            f"{row.precision:.3f}",
-            f"{row.found} of {row.frames}",
-            f"{100 * row.median_error:.2f}%",
-            f"{row.ms_per_frame:.0f}",
-            style="bold green" if row.family.startswith("protomark") else "",
-        )
-    console.print(table)
-    console.print(
-        "Whole map: landmarks with position (12 bytes), without what exists once, such as the "
-        "encoder. Median error: of the camera position, as a share of the median scene depth. "
-        "Found: within 1 % of that depth and 2 degrees. ms: matching and RANSAC on one thread.",
-        style="dim",
-        highlight=False,
-    )
+    methods = result.comparison.rows()
+    console.print(results_table(caption(result.comparison), methods))
     folder = Path(result.folder)
     files = [f"{folder / name} ({readable_size(size)})" for name, size in result.files.items()]
     text = f"Wrote {', '.join(files)} in {result.seconds:.0f} s."
     console.print(text, markup=False, highlight=False, soft_wrap=True)
-    rows = {row.name: row for row in result.rows}
+    rows = {row.name: row for row in methods}
     raw, ours = rows["unaggregated"], rows[result.shown]
     say(
         f"[bold]What it means:[/] {ours.bytes_per_landmark:.0f} bytes per landmark in place of "

@@ -89,14 +89,14 @@ def evaluate(
     with progress_bar() as progress:
         for result in evaluate_files(tracks, options, progress):
             results.append(result)
-            console.print(_table(caption(result), result.rows()))
+            console.print(results_table(caption(result), result.rows()))
             if not any(method.family.startswith("protomark") for method in result.methods):
                 note(f"no encoder for {result.descriptor}: train one with `protomark train`")
     by_descriptor = group_by_descriptor(results)
     for descriptor, same in by_descriptor.items():
         if len(same) > 1:
             title = f"{descriptor.upper()}: mean of {len(same)} sequences"
-            console.print(_table(title, mean_rows(same)))
+            console.print(results_table(title, mean_rows(same)))
     if json_file:
         save_json(results, json_file)
     if markdown_file:
@@ -111,7 +111,7 @@ def evaluate(
             save_precision_plot(rows, path, f"{descriptor.upper()}: {names}")
 
 
-def _table(title: str, rows: Sequence[MethodSummary]) -> Table:
+def results_table(title: str, rows: Sequence[MethodSummary]) -> Table:
     """A table for a terminal of 80 columns, in which Protomark's rows stand out."""
     from protomark.cli.terminal import table_of
     from protomark.evaluation.results import table_row

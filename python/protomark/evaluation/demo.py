@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,27 +13,25 @@ import numpy as np
 import protomark as pm
 from protomark import sample
 from protomark.baselines.method import Method
-from protomark.baselines.support import Support
 from protomark.evaluation.frames import (
     QueryFrame,
     localize_frame,
-    scene_depth,
     select_matches,
 )
 from protomark.evaluation.methods import (
     APPEARANCE_BITS,
     APPEARANCE_DIMS,
-    MethodChoice,
     PrototypeMethod,
     choose_methods,
     method_choices,
 )
 from protomark.evaluation.protocol import SupportQuerySplit, split
-from protomark.evaluation.results import MethodSummary, precision_curves
+from protomark.evaluation.results import MethodSummary, SequenceResult, precision_curves
+from protomark.evaluation.run import EvaluationOptions, evaluate
 from protomark.maps.build import tracks_for
 from protomark.plot import ScenePicture, draw_curves, draw_scene, new_figure, save_figure
 from protomark.progress import Progress, silent
-from protomark.threads import one_blas_thread
+from protomark.report import percent
 from protomark.tracks.file import Tracks
 
 PICTURE, LEARNING_MAP, SEALED_MAP = "protomark_demo.png", "toy.pmk", "toy.sealed.pmk"
@@ -44,36 +43,15 @@ OURS = (
 )
 # Metadata of the picture, by which a later run recognises its own files.
 _MADE_BY = "protomark demo"
-# Bytes per position in a sealed map.
-_POSITION_BYTES = 12
 # Bytes per landmark in the sealed map.
 _SIZE = 33
-
-
-@dataclass
-class DemoRow(MethodSummary):
-    """Results of one method."""
-
-    map_bytes: int = 0  # bytes of all landmarks with positions
-    # Query keyframes whose pose is within 1 % of the median scene depth and 2 degrees.
-    found: int = 0
-    frames: int = 0  # query keyframes
-    # Median distance from the true camera centre, as a share of that depth.
-    median_error: float = 0.0
-    ms_per_frame: float = 0.0  # milliseconds to match and localize a frame on one thread
 
 
 @dataclass(frozen=True)
 class DemoResult:
     """The maps of the demo, and its comparison."""
 
-    sequence: str
-    descriptor: str
-    bits: int  # length of the descriptor in bits
-    support_keyframes: int  # keyframes that build the map
-    landmarks: int  # landmarks of the map
-    observations: int  # observations of the map
-    rows: list[DemoRow]  # one row per method
+    comparison: SequenceResult  # all methods on one split
     shown: str  # name of the method that the sealed map and the picture show
     folder: str  # folder of the files
     files: dict[str, int]  # sizes in bytes by file name
@@ -88,7 +66,7 @@ def run_demo(
     encoder: str | None = None,  # name or path of the encoder; None: the one for the descriptor
     progress: Progress = silent,
 ) -> DemoResult:
-    """Build, save and seal a map of the sample, localize query keyframes, compare and draw."""
+    """Build, save and seal a map of the sample, compare it with other ways, localize and draw."""
     began = time.perf_counter()
     tracks = Tracks.load(tracks_path or sample.path())
     loaded = pm.Encoder.load(encoder or tracks.descriptor)
@@ -96,34 +74,24 @@ def run_demo(
     _check_output(output)
     output.mkdir(parents=True, exist_ok=True)
     part = split(tracks, seed=0)
-    support = Support(
-        tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
-    )
     # The maps replace older ones only with the picture, by which a later run recognises them.
     with tempfile.TemporaryDirectory(dir=output, prefix=".protomark-") as folder:
         sealed, name = _write_maps(tracks, part, loaded, Path(folder))
+        method = PrototypeMethod(sealed)
         choices = method_choices([loaded])
         ours = [choice.name for choice in choices if choice.name in OURS]
-        chosen = choose_methods(choices, [*BASELINES, *ours, name])
-        rows, pictures = [], {}
-        with one_blas_thread():
-            for done, choice in enumerate(chosen):
-                progress(f"compare, {choice.label}", done, len(chosen))
-                shown = choice.name == name
-                method = PrototypeMethod(sealed) if shown else choice.build(support)
-                row, pictures[choice.name] = _measure(choice, method, tracks, part, support)
-                rows.append(row)
-        _draw(rows, name, pictures[name], output / PICTURE)
+        chosen = [
+            replace(choice, build=lambda _: method) if choice.name == name else choice
+            for choice in choose_methods(choices, [*BASELINES, *ours, name])
+        ]
+        options = EvaluationOptions(seeds=[0], pose_frames=len(part.query_keyframes))
+        sequence = str(tracks.info.get("sequence", "toy"))
+        comparison = evaluate(tracks, sequence, chosen, options, progress)
+        _draw(comparison.rows(), name, _scene(method, tracks, part), output / PICTURE)
         for file in (LEARNING_MAP, SEALED_MAP):
             (Path(folder) / file).replace(output / file)
     return DemoResult(
-        sequence=str(tracks.info.get("sequence", "toy")),
-        descriptor=tracks.descriptor,
-        bits=tracks.bits,
-        support_keyframes=len(part.support_keyframes),
-        landmarks=len(support.ids),
-        observations=len(support.landmarks),
-        rows=rows,
+        comparison,
         shown=name,
         folder=str(output),
         files={f: (output / f).stat().st_size for f in (LEARNING_MAP, SEALED_MAP, PICTURE)},
@@ -132,42 +100,23 @@ def run_demo(
     )
 
 
-def _measure(
-    choice: MethodChoice, method: Method, tracks: Tracks, part: SupportQuerySplit, support: Support
-) -> tuple[DemoRow, ScenePicture]:
-    """The results of a method, and the data of a picture of its localized frames."""
-    answers, _ = method.match(tracks.descriptors[part.query_rows])
-    right = answers[:, 0] == tracks.landmark_of_keypoint[part.query_rows]
-    frames = [QueryFrame.of(tracks, int(keyframe)) for keyframe in part.query_keyframes]
-    start = time.perf_counter()
+def _scene(method: Method, tracks: Tracks, part: SupportQuerySplit) -> ScenePicture:
+    """Localizes all query frames, for the picture."""
     located, matched = [], []
-    for frame in frames:
+    for keyframe in part.query_keyframes:
+        frame = QueryFrame.of(tracks, int(keyframe))
         matches = select_matches(*method.match(frame.descriptors))
         positions = tracks.positions_of(matches.landmarks)
         located.append(localize_frame(frame, matches, positions))
         matched.append(positions[located[-1].inliers])
-    seconds = time.perf_counter() - start
-    size, depth = method.bytes_per_landmark, scene_depth(tracks)
-    row = DemoRow(
-        name=choice.name,
-        label=choice.label,
-        family=choice.family,
-        bytes_per_landmark=size,
-        map_bytes=round(len(support.ids) * (size + _POSITION_BYTES)),
-        precision=float(right.mean()),
-        found=sum(one.found(depth) for one in located),
-        frames=len(frames),
-        median_error=float(np.median([one.position_error for one in located])) / depth,
-        ms_per_frame=1000 * seconds / len(frames),
-    )
-    picture = ScenePicture(
-        landmarks=tracks.positions_of(support.ids),
+    landmarks = np.unique(tracks.landmark_of_keypoint[part.support_rows])
+    return ScenePicture(
+        landmarks=tracks.positions_of(landmarks),
         matched=np.concatenate(matched),
         support=tracks.cam_from_world[part.support_keyframes],
         true=tracks.cam_from_world[part.query_keyframes],
         estimated=[one.cam_from_world for one in located],
     )
-    return row, picture
 
 
 def _write_maps(
@@ -191,14 +140,14 @@ def _write_maps(
     return sealed, f"appearances-{_SIZE}" if several else f"protomark-{encoder.dim}"
 
 
-def _draw(rows: list[DemoRow], name: str, scene: ScenePicture, path: Path) -> None:
+def _draw(rows: Sequence[MethodSummary], name: str, scene: ScenePicture, path: Path) -> None:
     shown = next(row for row in rows if row.name == name)
     figure = new_figure(13, 6.2, w_pad=0.12, h_pad=0.08, wspace=0.04)
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.2])
     draw_scene(
         left,
         scene,
-        f"From above: {shown.found} of {shown.frames} queries found, "
+        f"From above: {percent(shown.pose_recall)} of {len(scene.estimated)} queries found, "
         f"{shown.bytes_per_landmark:.0f} bytes per landmark",
     )
     title = "Is the nearest landmark the right one?"
