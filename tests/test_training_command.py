@@ -78,7 +78,6 @@ def test_one_command_from_tracks_to_an_encoder_and_its_card(files, tmp_path):
     # One binary descriptor a landmark is far above chance (1 in 1200) and below all of them.
     for one in ("medoid", "majority"):
         assert 0.02 < validation[one] < validation["unaggregated"]
-    assert 1 < figures["encode_ns"] < 1e6
     card = (tmp_path / "mine.md").read_text()
     assert (
         "protomark train a.synthetic.safetensors b.synthetic.safetensors --validation "

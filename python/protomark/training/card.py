@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -42,7 +41,6 @@ class EncoderCard:
     widths: list[int]  # units per layer, including input and output
     dims: list[int]  # prefixes that maps may use alone
     bytes: int  # size of the model file
-    encode_ns: float  # nanoseconds to encode one descriptor on one thread
     licence: str  # licence of the weights
     sources: list[TrainingSource]  # training sequences
     validation: list[TrainingSource]  # validation sequences
@@ -73,8 +71,6 @@ class EncoderCard:
             "",
             f"- network: {'-'.join(map(str, self.widths))}, SELU, int8 weights; "
             f"{self.multiply_adds:,} multiply-adds per descriptor",
-            f"- encode: {self.encode_ns:,.0f} ns per descriptor on one thread of "
-            f"{platform.machine()}",
             f"- file: {self.bytes:,} bytes",
             f"- licence: {self.licence or 'none stated'}",
             f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import shlex
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,8 +38,6 @@ from protomark.training.train import (
     keep_freed_memory,
 )
 from protomark.training.validation import Trial, mean_precision
-
-_TIMED_DESCRIPTORS, _TIMED_ROUNDS = 20_000, 5
 
 
 @dataclass(frozen=True)
@@ -175,7 +172,6 @@ def train_encoder(
         widths=[data.bits, *trainer.network.hidden, request.options.dims[-1]],
         dims=list(request.options.dims),
         bytes=request.output.stat().st_size,
-        encode_ns=encode_nanoseconds(encoder),
         licence=request.licence,
         sources=data.sources,
         validation=data.validation_sources,
@@ -291,18 +287,6 @@ def binary_precision(trial: Trial, threads: int = 1) -> list[float]:
         nearest, _ = method(support).match(trial.queries, threads=threads)
         shares.append(float((nearest[:, 0] == trial.targets).mean()))
     return shares
-
-
-def encode_nanoseconds(encoder: pm.Encoder) -> float:
-    """Nanoseconds of processor time to encode one descriptor on one thread, the best of rounds."""
-    rng = np.random.default_rng(0)
-    descriptors = rng.integers(0, 256, (_TIMED_DESCRIPTORS, encoder.bits // 8), np.uint8)
-    seconds = []
-    for _ in range(_TIMED_ROUNDS):
-        began = time.process_time()
-        encoder.encode(descriptors, threads=1)
-        seconds.append(time.process_time() - began)
-    return 1e9 * min(seconds) / _TIMED_DESCRIPTORS
 
 
 def _machine(device: str, threads: int, half: bool) -> str:
