@@ -161,6 +161,16 @@ class Camera:
         camera.check_lens()
         return camera
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same images at another size."""
+        if (width, height) == (self.width, self.height):
+            return self
+        from protomark.geometry.colmap import pycolmap
+
+        camera = pycolmap.Camera(self.as_dict())
+        camera.rescale(width, height)
+        return Camera.from_colmap(camera)
+
     def resembles(self, other: Camera) -> bool:
         """Whether both project alike: same size, and rays within 1 % of the image."""
         if (self.width, self.height) != (other.width, other.height):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
 from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength, check_pose_model
@@ -57,6 +58,7 @@ class LocalizationRequest:
     prior_degrees: float = 15.0  # largest error of a prior's orientation
     min_confidence: float = 0.9  # smallest probability of an accepted pose
     max_keypoints: int = 2000  # limit on keypoints per image
+    max_size: int = MAX_SIZE  # larger images are reduced to it before detection
     recall: float | None = None  # see `Localizer`
     threads: int = 1  # number of images to localize at a time
 
@@ -239,7 +241,12 @@ def localize_files(
             f"{output} holds a COLMAP model that `protomark localize` did not write: name another "
             "folder with -o"
         )
-    localizer = Localizer(request.scene, max_keypoints=request.max_keypoints, recall=request.recall)
+    localizer = Localizer(
+        request.scene,
+        max_keypoints=request.max_keypoints,
+        max_size=request.max_size,
+        recall=request.recall,
+    )
     given = request.camera is not None and request.camera != ESTIMATE
     names = [name for name, _ in images]
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None

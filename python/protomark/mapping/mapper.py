@@ -59,7 +59,7 @@ class Mapper:
     ) -> None:
         self.options, self.threads = options, threads
         self._new_memory = new_memory
-        self.structure = Structure({1: camera})
+        self.structure = Structure({1: camera}, options.max_size)
         self.memory = new_memory(options)
         self.history = History()
         self.clock = Clock()
@@ -71,7 +71,7 @@ class Mapper:
         # Features that are known already, and the part of the image that is left out.
         self.features: dict[str, Features] = {}
         self.mask: Mask | None = None
-        self._extractor = Extractor(options.descriptor, options.max_keypoints)
+        self._extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         self._reset_initialiser()
 
     @property
@@ -375,7 +375,7 @@ class Mapper:
             old.outcome, old.inliers, old.keyframe = f"initialised wrongly: {reason}", 0, False
         record.outcome = reason
         waiting = self.initialiser.waiting[-1:]
-        self.structure = Structure({self.camera_id: self.camera})
+        self.structure = Structure({self.camera_id: self.camera}, self.options.max_size)
         self.memory = self._new_memory(self.options)
         self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
         self._reset_initialiser()

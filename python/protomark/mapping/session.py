@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from protomark.features.extractor import Extractor
+from protomark.features.extractor import Extractor, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
@@ -153,8 +153,10 @@ class _Session:
                 f"camera: the focal length of {camera.params[0]:.0f} pixels is {origin} and is "
                 "refined while mapping (--camera gives a calibrated one)"
             )
-        elif sentence := misfit(surveyed.pose_errors(camera)):
-            raise ValueError(f"{request.poses}: {sentence}")
+        else:
+            pixel = pixel_size((camera.width, camera.height), options.max_size)
+            if sentence := misfit(surveyed.pose_errors(camera, pixel)):
+                raise ValueError(f"{request.poses}: {sentence}")
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
@@ -199,9 +201,10 @@ class _Session:
         self.progress("look at the first frames", 0, 0)
         started = time.perf_counter()
         size = self.source.size()
-        extractor = Extractor(options.descriptor, options.max_keypoints)
+        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         surveyed = survey(self.source.images(), extractor, size)
-        mask = static_regions([(pair.first, pair.second) for pair in surveyed.pairs], size)
+        matches = [(pair.first, pair.second) for pair in surveyed.pairs]
+        mask = static_regions(matches, size, pixel_size(size, options.max_size))
         if region := describe(mask):
             self.note(f"left out, as it never moves while the rest does: {region}")
         if self.request.mask is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.extractor import MAX_SIZE, pixel_size
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
 from protomark.geometry.triangulation import pixel_errors
@@ -46,6 +47,7 @@ class Structure:
     """
 
     cameras: dict[int, Camera] = field(default_factory=dict)  # cameras by id
+    max_size: int = MAX_SIZE  # see `MappingOptions`
     frames: list[Frame] = field(default_factory=list)  # frames with a pose
     # (l, 3) float64, NaN for ids of removed landmarks and for id 0.
     positions: Array = field(default_factory=lambda: np.full((1, 3), np.nan))
@@ -75,7 +77,13 @@ class Structure:
     def tolerance(self, camera_id: int, share: float) -> float:
         """A share of the longer side of a camera's images in pixels, at least `_MIN_TOLERANCE`."""
         camera = self.cameras[camera_id]
-        return max(share * max(camera.width, camera.height), _MIN_TOLERANCE)
+        least = _MIN_TOLERANCE * self.pixel(camera_id)
+        return max(share * max(camera.width, camera.height), least)
+
+    def pixel(self, camera_id: int) -> float:
+        """See `pixel_size`: keypoints of a camera are so accurate."""
+        camera = self.cameras[camera_id]
+        return pixel_size((camera.width, camera.height), self.max_size)
 
     def keyframes(self) -> list[int]:
         """Indices of the keyframes."""

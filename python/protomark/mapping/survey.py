@@ -38,18 +38,19 @@ class Survey:
     mask: NDArray[np.bool_] | None = None
     seconds: float = 0.0  # how long the survey took
 
-    def pose_errors(self, camera: Camera) -> list[Array]:
-        """Errors of given poses for each pair whose matches can tell."""
+    def pose_errors(self, camera: Camera, pixel: float) -> list[Array]:
+        """Errors of given poses for each pair whose matches can tell; `pixel`: see `pixel_size`."""
+        focal = camera.focal_length / pixel
         errors = []
         for pair in self.pairs:
             one, other = (image.pose for image in pair.images)
             if one is None or other is None:
                 continue
             first, second = camera.rays(pair.first), camera.rays(pair.second)
-            agree = agreeing(first, second, camera.focal_length)
+            agree = agreeing(first, second, focal)
             if agree.any():
                 seen = first[agree], second[agree]
-                errors.append(pose_errors(one, other, *seen, camera.focal_length))
+                errors.append(pose_errors(one, other, *seen, focal))
         return errors
 
 

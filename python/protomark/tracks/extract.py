@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import protomark
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import MAX_SIZE, Extractor, Features, reduced_size
 from protomark.features.images import image_names, read_gray
 from protomark.features.static_regions import Mask, describe, outside, static_regions
 from protomark.files import hash_files
@@ -56,6 +56,8 @@ class TracksOptions:
     # Name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
     descriptor: str = "freak"
     max_keypoints: int = 2000  # limit on keypoints per image
+    # Images with a longer side are reduced to it before detection; errors count in their pixels.
+    max_size: int = MAX_SIZE
     partners: int = 24  # about how many keyframes each keyframe is matched with
     ratio: float = 0.8  # limit on the ratio of the nearest to the second nearest Hamming distance
     max_error: float = 3.0  # largest epipolar and reprojection error, pixels
@@ -174,7 +176,7 @@ def extract(
     given = _read_posed_model(sequence.model)
     made_from = provenance(sequence, options, given)
     given, features, unreadable = _detect(sequence, given, options, threads, progress)
-    work = _Matching(given, features, options, threads, progress)
+    work = _Matching(*_reduced(given, features, options.max_size), options, threads, progress)
     region, errors = work.look_at_neighbours()
     if options.refine_poses != "yes" and (sentence := misfit(errors)):
         raise ValueError(f"{sequence.model}: {sentence} --refine-poses yes takes them nevertheless")
@@ -187,7 +189,7 @@ def extract(
     ) and work.refine_poses(error)
     matches = {p: m.where(m.errors <= options.max_error) for p, m in work.matches.items()}
     progress("triangulate", 0, 1)
-    keypoints = [f.keypoints for f in features]
+    keypoints = [f.keypoints for f in work.features]
     reconstruction = triangulation.triangulate(
         work.model, keypoints, matches, options.max_error, options.min_angle
     )
@@ -224,12 +226,25 @@ def extract(
             "pycolmap": colmap.pycolmap.__version__,
         },
     }
+    model = replace(work.model, cameras=given.cameras)
     tracks = Tracks.from_features(
-        options.descriptor, scene.model, features, scene.labels, scene.positions, info
+        options.descriptor, model, features, scene.labels, scene.positions, info
     )
     if options.max_unlabelled is not None:
         tracks = tracks.where(_labelled_or_strong(tracks, options.max_unlabelled))
     return tracks
+
+
+def _reduced(
+    model: colmap.ColmapModel, features: list[Features], max_size: int
+) -> tuple[colmap.ColmapModel, list[Features]]:
+    """Cameras and features in the pixels that these were detected at."""
+    full = model.cameras
+    sizes = {i: reduced_size((c.width, c.height), max_size) for i, c in full.items()}
+    scales = {i: (sizes[i][0] / c.width, sizes[i][1] / c.height) for i, c in full.items()}
+    cameras = {i: c.resized(*sizes[i]) for i, c in full.items()}
+    scaled = [f.scaled(scales[int(i)]) for f, i in zip(features, model.camera_ids, strict=True)]
+    return replace(model, cameras=cameras), scaled
 
 
 @dataclass
@@ -417,7 +432,7 @@ def _detect(
 
     def one(index: int) -> Features | str:
         if not hasattr(local, "extractor"):
-            local.extractor = Extractor(options.descriptor, options.max_keypoints)
+            local.extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         path = sequence.images / model.names[index]
         try:
             image = read_gray(path)
