@@ -209,8 +209,6 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     localizer = Localizer(scene)
     with pytest.raises(ValueError, match="320 x 240 pixels, but its camera 640 x 480"):
         localizer.localize(images[0], replace(PINHOLE, width=640, height=480))
-    with pytest.raises(ValueError, match="undistort"):
-        localizer.localize(images[0], replace(PINHOLE, model="FOV", params=(*PINHOLE.params, 1.0)))
     with pytest.raises(ValueError, match="PINHOLE has 4 parameters, not 3"):
         localizer.localize(images[0], replace(PINHOLE, params=(300.0, 160.0, 120.0)))
     with pytest.raises(ValueError, match="uint8"):

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -7,8 +8,12 @@ from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
+from protomark.mapping.history import FrameRecord
+from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
+from protomark.mapping.options import MappingOptions
 from protomark.mapping.source import ImageFolder, Video, open_source
+from protomark.mapping.trust import WAITING, no_map
 from tracks_scene import PINHOLE
 
 
@@ -194,3 +199,11 @@ def test_a_file_that_is_no_video(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="no images"):
         open_source(tmp_path / "empty")
+
+
+def test_a_parallax_that_is_too_small_is_not_rounded_up(tmp_path):
+    mapper = Mapper(MappingOptions(), PINHOLE)
+    mapper.initialiser.best_parallax = 1.98
+    mapper.history.records = {name: FrameRecord(0, name, WAITING) for name in "ab"}
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((240, 320), np.uint8))
+    assert "has 1.9 degrees of parallax, 2 are" in no_map(mapper, ImageFolder(tmp_path))

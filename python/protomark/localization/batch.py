@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
 from protomark.files import is_utf8, write_text
-from protomark.geometry.absolute_pose import FocalLength, check_pose_model
+from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras
 from protomark.geometry.pose import camera_centers, pose_error
@@ -250,8 +250,6 @@ def localize_files(
     given = request.camera is not None and request.camera != ESTIMATE
     names = [name for name, _ in images]
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
-    for camera in cameras.cameras if cameras else ():
-        check_pose_model(camera)
     true_poses, priors = (
         poses_of_images(path, names) if path else PoseSet({})
         for path in (request.true_poses, request.priors)

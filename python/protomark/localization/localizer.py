@@ -19,7 +19,7 @@ from protomark.features.descriptors import DESCRIPTORS
 from protomark.features.extractor import MAX_SIZE, Extractor, Features
 from protomark.features.images import read_gray, to_gray
 from protomark.features.upright import SUFFIX, upright_descriptors
-from protomark.geometry.absolute_pose import FocalLength, check_pose_model
+from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.localization.prior import PosePrior, visible
@@ -205,9 +205,9 @@ class Localizer:
 
         Raises:
             ValueError: the lengths differ, keypoints lie outside the image, the encoder takes other
-                descriptors, or poses cannot be estimated for this camera.
+                descriptors, or there is no such camera.
         """
-        check_pose_model(camera)
+        camera.check_params()
         camera.check_lens()
         if descriptors is None:  # what OpenCV computes for no keypoints
             descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)

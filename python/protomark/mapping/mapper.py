@@ -167,15 +167,17 @@ class Mapper:
             return None
         with self.clock.stage("encode"):
             encoded = self.memory.encode(features.descriptors)
+        rays, turns = camera.local_rays(features.keypoints)
         return Frame(
             image.index,
             image.name,
             image.time,
             self.camera_id,
             features.keypoints,
-            camera.rays(features.keypoints),
+            rays,
             features.descriptors,
             encoded,
+            turns=turns,
         )
 
     def _track_or_relocalize(self, frame: Frame) -> TrackedPose | None:
@@ -362,7 +364,7 @@ class Mapper:
         structure = self.structure
         pose = structure.frames[0].pose
         depth = structure.positions[structure.ids] @ pose[2, :3] + pose[2, 3]
-        scale = 1 / float(np.median(depth))
+        scale = 1 / float(np.median(np.abs(depth)))
         structure.positions *= scale
         for frame in structure.frames:
             frame.pose[:, 3] *= scale

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from protomark.features.extractor import Extractor, Features
 from protomark.geometry.camera import Camera
 from protomark.geometry.given_poses import agreeing, pose_errors
+from protomark.geometry.pose import turned
 from protomark.mapping.frame import Array, InputImage
 from protomark.mapping.initialisation import RATIO
 from protomark.tracks.matching import mutual_matches
@@ -46,11 +47,12 @@ class Survey:
             one, other = (image.pose for image in pair.images)
             if one is None or other is None:
                 continue
-            first, second = camera.rays(pair.first), camera.rays(pair.second)
-            agree = agreeing(first, second, focal)
+            agree = agreeing(camera.rays(pair.first), camera.rays(pair.second), focal)
             if agree.any():
-                seen = first[agree], second[agree]
-                errors.append(pose_errors(one, other, *seen, focal))
+                first, turns = camera.local_rays(pair.first[agree])
+                second, other_turns = camera.local_rays(pair.second[agree])
+                poses = turned(one, turns), turned(other, other_turns)
+                errors.append(pose_errors(*poses, first, second, focal))
         return errors
 
 

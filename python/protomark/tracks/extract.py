@@ -20,6 +20,7 @@ from protomark.features.static_regions import Mask, describe, outside, static_re
 from protomark.files import hash_files
 from protomark.geometry import colmap
 from protomark.geometry.given_poses import agreeing, misfit, pose_errors
+from protomark.geometry.pose import pose_at, turned
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
 from protomark.tracks import completion, pairs, triangulation
@@ -261,14 +262,17 @@ class _Matching:
     def __post_init__(self) -> None:
         cameras = [self.model.cameras[int(c)] for c in self.model.camera_ids]
         # Undistorted keypoints of each keyframe.
-        self.rays = [c.rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
+        local = [c.local_rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
+        self.rays, self.turns = [rays for rays, _ in local], [turns for _, turns in local]
+        self.cameras = cameras
         self.focal = np.array([camera.focal_length for camera in cameras])
         self.views = self._make_views()
         # Rows (k, 2) of the matches of neighbours that agree on a relative pose.
         self.agreeing: dict[tuple[int, int], NDArray[np.int64]] = {}
 
     def _make_views(self) -> list[View]:
-        parts = (self.features, self.rays, self.model.cam_from_world, self.focal)
+        poses = map(turned, self.model.cam_from_world, self.turns)
+        parts = (self.features, self.rays, poses, self.focal)
         return [View(f.descriptors, *rest) for f, *rest in zip(*parts, strict=True)]
 
     def _match(self, chosen: list[tuple[int, int]], stage: str) -> None:
@@ -303,20 +307,30 @@ class _Matching:
         for rays, keypoints in zip(self.rays, at, strict=True):
             rays[~outside(region, keypoints)] = np.nan
         for (i, j), rows in matches.items():
-            agree = agreeing(self.rays[i][rows[:, 0]], self.rays[j][rows[:, 1]], self._focal(i, j))
+            first, second = self._plane_rays(i, rows[:, 0]), self._plane_rays(j, rows[:, 1])
+            agree = agreeing(first, second, self._focal(i, j))
             if agree.any():
                 self.agreeing[i, j] = rows[agree]
         return region, self._errors()
+
+    def _plane_rays(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Rays (n, 2) of a camera that is not turned."""
+        rays = self.rays[i][rows]
+        if self.turns[i] is None:
+            return rays
+        return rays + self.cameras[i].rays(self.features[i].keypoints[rows])
 
     def _focal(self, i: int, j: int) -> float:
         return float(0.5 * (self.focal[i] + self.focal[j]))
 
     def _errors(self) -> list[NDArray[np.float64]]:
-        poses, rays = self.model.cam_from_world, self.rays
-        return [
-            pose_errors(poses[i], poses[j], rays[i][r[:, 0]], rays[j][r[:, 1]], self._focal(i, j))
-            for (i, j), r in self.agreeing.items()
-        ]
+        errors = []
+        for (i, j), rows in self.agreeing.items():
+            a, b = rows.T
+            poses = pose_at(self.views[i].pose, a), pose_at(self.views[j].pose, b)
+            rays = self.rays[i][a], self.rays[j][b]
+            errors.append(pose_errors(*poses, *rays, focal=self._focal(i, j)))
+        return errors
 
     def match_covisible(self) -> NDArray[np.float64]:
         """Match keyframes with overlapping views; returns the overlap (m, m)."""
@@ -378,6 +392,20 @@ def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.flo
         descriptors=np.concatenate([f.descriptors for f in work.features]),
         labels=labels,
         positions=positions,
+        turns=_all_turns(work.turns, counts),
+    )
+
+
+def _all_turns(
+    turns: list[NDArray[np.float64] | None], counts: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    if all(t is None for t in turns):
+        return None
+    return np.concatenate(
+        [
+            np.broadcast_to(np.eye(3), (n, 3, 3)) if t is None else t
+            for t, n in zip(turns, counts, strict=True)
+        ]
     )
 
 
