@@ -250,18 +250,20 @@ class Video(FrameSource):
         chunk: set[int] | None = None,
         decode: bool = True,
     ) -> Iterator[InputImage]:
-        video = _open_video(self.path)
+        video, position = _open_video(self.path), optional("cv2").CAP_PROP_POS_MSEC
         try:
-            number = -1
+            number, time = -1, -1 / self._rate
             while video.grab():
                 number += 1
+                # Frames need not follow each other at one rate; not every decoder knows when.
+                shown = video.get(position) / 1000
+                time = shown if shown > time else time + 1 / self._rate
                 index, rest = divmod(number, self._every)
                 name = f"{self.path.stem}-{number:06d}"
                 if rest or index < start or (only is not None and name not in only):
                     continue
                 if chunk is not None and index not in chunk:
                     continue
-                time = number / self._rate
                 if not decode:
                     yield InputImage(index, name, time, None)
                     continue
