@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.geometry.camera import Camera
 from protomark.geometry.pose import rotate, turned
 
 Array = NDArray[np.float64]
@@ -23,6 +24,7 @@ class InputImage:
     time: float  # seconds, or the index if the input has no times
     image: NDArray[np.uint8] | None  # (height, width) uint8, None if it cannot be read
     pose: Array | None = None  # (3, 4) given pose, or None
+    camera: Camera | None = None  # its camera, or None: that of the others
     problem: str = ""  # why there is no image, else ""
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.absolute_pose import estimate_pose, reprojection_error
-from protomark.geometry.camera import Camera
 from protomark.geometry.pose import relative_pose, transform
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 from protomark.geometry.two_views import (
@@ -17,6 +16,7 @@ from protomark.geometry.two_views import (
     refine_relative_pose,
 )
 from protomark.mapping.frame import Array, Frame, Ids
+from protomark.mapping.structure import Structure
 from protomark.tracks.matching import mutual_matches
 
 RATIO = 0.8
@@ -60,12 +60,18 @@ class Initialiser:
     frames, the witnesses, decide: landmarks of a wrong pose do not project where these see them.
     """
 
-    def __init__(self, camera: Camera, max_error: float) -> None:
-        self.camera, self.max_error = camera, max_error
+    def __init__(self, structure: Structure, max_error: float) -> None:
+        self._structure, self._max_error = structure, max_error
         self.waiting: list[Frame] = []
         self.best_parallax = 0.0
-        self._focal = camera.focal_length
+        self._use(next(iter(structure.cameras)))
         self._matches: dict[tuple[str, str], Ids] = {}
+
+    def _use(self, camera_id: int) -> None:
+        """Judge frames of this camera."""
+        self.camera = self._structure.cameras[camera_id]
+        self.max_error = self._structure.tolerance(camera_id, self._max_error)
+        self._focal = self.camera.focal_length
 
     def push(self, frame: Frame) -> TwoViewPose | None:
         """Pair a new frame with waiting ones, the oldest first; without success it waits, too."""
@@ -84,6 +90,9 @@ class Initialiser:
 
     def _relative_pose(self, first: int, second: int) -> Array | None:
         one, other = self.waiting[first], self.waiting[second]
+        if one.camera_id != other.camera_id:
+            return None
+        self._use(one.camera_id)
         rows = self._match(one, other)
         if len(rows) < _MIN_MATCHES:
             return None
@@ -163,11 +172,12 @@ class Initialiser:
 
     def _witnesses(self, first: int, second: int) -> list[tuple[Frame, Ids]]:
         """Further frames, preferably between the two, and their matches with the first one."""
-        between = list(range(first + 1, second))
-        near = sorted(set(range(second)) - {first, *between}, key=lambda i: abs(i - first))
+        one = self.waiting[first]
+        same = [i for i in range(second) if self.waiting[i].camera_id == one.camera_id]
+        between = [i for i in same if i > first]
+        near = sorted({*same} - {first, *between}, key=lambda i: abs(i - first))
         at = np.linspace(0, len(between) - 1, min(_MAX_WITNESSES, len(between))).round().astype(int)
         chosen = [between[k] for k in at] + near[: max(0, _MAX_WITNESSES - len(at))]
-        one = self.waiting[first]
         return [(self.waiting[i], self._match(one, self.waiting[i])) for i in chosen]
 
     def _match(self, one: Frame, other: Frame) -> Ids:

@@ -181,6 +181,7 @@ class _Session:
             self.request.output, request_facts(self.request, self.source), facts["request"]
         )
         self._read_poses()
+        self._camera()  # for the source to know those of its images
         self.cursor, self.known = int(facts["cursor"]), int(facts["known"])
         self._prepare(self._survey(self.mapper.options), str(facts["prefix"]), facts["inputs"])
         self.source.shift(*facts["shift"])

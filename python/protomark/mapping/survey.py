@@ -41,16 +41,17 @@ class Survey:
 
     def pose_errors(self, camera: Camera, pixel: float) -> list[Array]:
         """Errors of given poses for each pair whose matches can tell; `pixel`: see `pixel_size`."""
-        focal = camera.focal_length / pixel
         errors = []
         for pair in self.pairs:
             one, other = (image.pose for image in pair.images)
             if one is None or other is None:
                 continue
-            agree = agreeing(camera.rays(pair.first), camera.rays(pair.second), focal)
+            cameras = [image.camera or camera for image in pair.images]
+            focal = (cameras[0].focal_length + cameras[1].focal_length) / 2 / pixel
+            agree = agreeing(cameras[0].rays(pair.first), cameras[1].rays(pair.second), focal)
             if agree.any():
-                first, turns = camera.local_rays(pair.first[agree])
-                second, other_turns = camera.local_rays(pair.second[agree])
+                first, turns = cameras[0].local_rays(pair.first[agree])
+                second, other_turns = cameras[1].local_rays(pair.second[agree])
                 poses = turned(one, turns), turned(other, other_turns)
                 errors.append(pose_errors(*poses, first, second, focal))
         return errors
