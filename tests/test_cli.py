@@ -422,3 +422,20 @@ def test_sigterm_is_ctrl_c_even_after_pycolmap_was_imported() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("stopped\n", "")
+
+
+@pytest.mark.parametrize("module", ["protomark._core", "typer", "protomark.cli.train"])
+def test_ctrl_c_during_imports_ends_without_a_traceback(module: str) -> None:
+    program = f"""
+import os, signal, sys
+class Finder:
+    def find_spec(name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder)
+sys.argv = ["/usr/bin/protomark", "--help"]
+from protomark.__main__ import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

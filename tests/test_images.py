@@ -23,17 +23,20 @@ def encoded(suffix: str, image: np.ndarray) -> bytes:
 
 def test_links_are_followed_and_hidden_files_are_not_taken(tmp_path: Path) -> None:
     folder, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
-    for path in (folder / "@eaDir", folder / ".trash", elsewhere):
+    for path in (folder / "@eaDir", folder / ".trash", folder / "Depth_maps", elsewhere):
         path.mkdir(parents=True)
     for name in ("10.jpg", "9.jpg", "1²3.JPE", "._9.jpg", "@eaDir/a.jpg", ".trash/a.jpg", "a.heic"):
         (folder / name).touch()
     (elsewhere / "b.png").touch()
+    (folder / "Depth_maps" / "9.png").touch()
     (folder / "linked").symlink_to(elsewhere)
     (folder / "circle").symlink_to(folder)
     with open(os.fsencode(folder) + b"/caf\xe9.jpg", "wb"):
         pass
     assert image_names(folder) == ["1²3.JPE", "9.jpg", "10.jpg", "linked/b.png"]
     assert "1 heic" in passed_over(folder)
+    assert "1 folder Depth_maps/" in passed_over(folder)
+    assert image_names(folder / "Depth_maps") == ["9.png"]  # who names it wants it
     assert "1 whose name is not UTF-8 (caf" in passed_over(folder)
     assert passed_over(elsewhere) == ""
 

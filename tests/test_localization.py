@@ -28,6 +28,7 @@ from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose import camera_centers, pose_error
 from protomark.geometry.pose_files import read_poses
 from protomark.localization import Localization, Localizer, PosePrior
+from protomark.localization.batch import LocalizationRequest, localize_files
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
 from protomark.tracks.extract import TracksOptions, find_sequence
@@ -312,6 +313,25 @@ def query(folder: Path, scene: pm.PrototypeMap, images: list[Any], tmp_path: Pat
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["localize", *map(str, arguments)])
+
+
+@pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
+def test_what_was_localized_is_written_whatever_ends_the_run(
+    query: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    def until_the_third(self: Localizer, image: NDArray[np.uint8], *rest: Any, **how: Any) -> Any:
+        if np.array_equal(image, third):
+            raise error
+        return localize(self, image, *rest, **how)
+
+    localize, third = Localizer.localize, cv2.imread(str(query / "images" / "3.png"), 0)
+    monkeypatch.setattr(Localizer, "localize", until_the_third)
+    request = LocalizationRequest(query / "scene.pmk", [query / "images"])
+    with pytest.raises(error):
+        localize_files(request, query / "out")
+    rows = list(csv.DictReader((query / "out" / "poses.csv").open()))
+    assert [row["image"] for row in rows] == ["1.png", "2.png"]
+    assert all(row["accepted"] == "1" for row in rows)
 
 
 def test_command(query: Path) -> None:

@@ -98,7 +98,8 @@ def map_(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
     check_outputs(json_file, inputs=[images, camera, poses, mask, encoder], folder=scene)
-    if line := passed_over(images):
+    inner = images / "images"
+    if line := passed_over(inner if inner.is_dir() else images):
         note(line)
     if view:
         optional("rerun")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from protomark.features.extractor import Extractor, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
+from protomark.files import only_writer
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.given_poses import misfit
@@ -51,14 +51,9 @@ def make_map(
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
-    check_output(request)
-    existed = request.output.exists()
-    try:
+    with only_writer(request.output):
+        check_output(request)
         return _make_map(request, source, progress, note)
-    finally:
-        if not existed:
-            with suppress(OSError):  # it holds something
-                request.output.rmdir()
 
 
 def _make_map(
@@ -119,7 +114,6 @@ class _Session:
             self._extend()
         else:
             self._start()
-        request.output.mkdir(parents=True, exist_ok=True)
         self.recording = Recording(request.output / RECORDING) if request.record else None
 
     def _camera(self) -> Camera | None:
