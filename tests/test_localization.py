@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import pickle
 import re
 import shutil
@@ -34,6 +35,8 @@ from protomark.maps.cameras import KEY, cameras_text
 from protomark.tracks.extract import TracksOptions, find_sequence
 from protomark.tracks.file import Tracks
 from protomark.tracks.make import make_tracks
+from test_tracks_command import fails
+from test_tracks_command import run as run_command
 from tracks_scene import PINHOLE, poses, quaternion, render, texture, write_model, write_sequence
 
 KEYPOINTS = 600
@@ -313,6 +316,25 @@ def query(folder: Path, scene: pm.PrototypeMap, images: list[Any], tmp_path: Pat
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["localize", *map(str, arguments)])
+
+
+def test_what_is_no_image_of_the_scene_is_named(query: Path) -> None:
+    name = os.fsencode(query / "images") + b"/caf\xe9.png"
+    shutil.copy(query / "images" / "2.png", name)
+    (query / "images" / "masks").mkdir()
+    shutil.copy(query / "images" / "2.png", query / "images" / "masks")
+    for command, arguments in (
+        ("localize", [query / "scene.pmk", query / "images", "-o", query / "o"]),
+        ("map", [query / "images", "-o", query / "m", "--camera", PINHOLE, "-d", "orb"]),
+    ):
+        done = run_command(*arguments, command=command)
+        assert "1 whose name is not UTF-8 (caf\\udce9.png)" in done.stderr
+        assert "1 folder masks/" in done.stderr
+    assert len(list(csv.DictReader((query / "o" / "poses.csv").open()))) == 3
+    done = run_command(
+        query / "scene.pmk", os.fsdecode(name), "-o", query / "x", command="localize"
+    )
+    fails(done, "the name of this image is not UTF-8, rename it")
 
 
 @pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
