@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile, MaxKeypoints, Threads
+from protomark.cli.options import JsonFile, MaxKeypoints, MaxSize, Threads
 
 if TYPE_CHECKING:
     from protomark.localization.batch import LocalizationBatch
@@ -69,6 +69,7 @@ def localize(
         ),
     ] = 0.9,
     max_keypoints: MaxKeypoints = 2000,
+    max_size: MaxSize = 1600,
     recall: Annotated[
         float | None,
         typer.Option(
@@ -105,6 +106,7 @@ def localize(
         prior_degrees=prior_degrees,
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
+        max_size=max_size,
         recall=recall,
         threads=threads,
     )

@@ -69,6 +69,7 @@ def adjust(
     threads: int = 1,
 ) -> None:
     """Move frames and the landmarks they observe to the least (Cauchy) reprojection error."""
+    pixel = max(map(structure.pixel, structure.cameras))
     seen = structure.observations(sorted({*moving, *fixed}))
     counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
     seen = seen.where(counts[seen.landmarks] >= 2)
@@ -84,7 +85,7 @@ def adjust(
                 images,
                 [i + 1 for i in fixed if i in present],
                 iterations=iterations,
-                loss_scale=loss_scale,
+                loss_scale=loss_scale * pixel,
                 intrinsics=intrinsics,
                 threads=threads,
             )
@@ -95,7 +96,7 @@ def adjust(
     seen = structure.observations(sorted({*moving, *fixed}))
     seen = seen.where(counts[seen.landmarks] >= 2)
     structure.positions = refine_points(
-        structure.positions, seen.landmarks, seen.poses, seen.rays, seen.focal
+        structure.positions, seen.landmarks, seen.poses, seen.rays, seen.focal, huber=pixel
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.features.extractor import FEATURE_ARRAYS, Extractor, Features
+from protomark.features.extractor import FEATURE_ARRAYS, MAX_SIZE, Extractor, Features, pixel_size
 from protomark.features.images import read_gray
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
@@ -88,7 +88,11 @@ def add_augmentations(
 
     def copies(index: int) -> list[tuple[Features, NDArray[np.int64]]]:
         if not hasattr(local, "extractor"):
-            local.extractor = Extractor(tracks.descriptor, int(options.get("max_keypoints", 2000)))
+            local.extractor = Extractor(
+                tracks.descriptor,
+                int(options.get("max_keypoints", 2000)),
+                int(options.get("max_size", MAX_SIZE)),
+            )
         image = read_gray(images / tracks.keyframe_names[index])
         rows = plain.keypoints_of(index)
         seen = (plain.keypoints[rows], plain.sizes[rows], plain.landmark_of_keypoint[rows])
@@ -142,7 +146,8 @@ def _copy(
     xy = back[:, :2] / back[:, 2:] + 0.5
     nearest, gap = _nearest(xy, keypoints)
     ratio = features.sizes / scale / sizes[nearest]
-    fits = (gap < _MAX_DISTANCE**2) & (ratio < _MAX_SIZE_RATIO) & (ratio > 1 / _MAX_SIZE_RATIO)
+    limit = _MAX_DISTANCE * pixel_size(image.shape, extractor.max_size)
+    fits = (gap < limit**2) & (ratio < _MAX_SIZE_RATIO) & (ratio > 1 / _MAX_SIZE_RATIO)
     # A keypoint of the original keeps the closest one that fits.
     order = np.lexsort((gap, ~fits, nearest))
     first = np.zeros(len(xy), bool)
