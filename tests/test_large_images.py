@@ -21,7 +21,8 @@ from protomark.mapping.session import make_map
 from protomark.maps.build import build_map
 from protomark.tracks.extract import TracksOptions, extract, find_sequence
 from protomark.tracks.summary import reprojection_errors
-from tracks_scene import PINHOLE, poses, texture, write_model, write_sequence
+from test_wide_cameras import WIDE
+from tracks_scene import DISTORTED, PINHOLE, poses, texture, write_model, write_sequence
 
 LARGE = Camera("PINHOLE", 640, 480, (600.0, 600.0, 320.0, 240.0))
 
@@ -102,3 +103,12 @@ def test_a_map_of_doubled_images_is_that_of_the_originals(tmp_path: Path) -> Non
 def test_a_size_at_which_nothing_is_detected_is_refused(size: int) -> None:
     with pytest.raises(ValueError, match=f"max_size is {size}, but it must be at least 64"):
         Extractor("orb", max_size=size)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, DISTORTED, *WIDE], ids=lambda camera: camera.model)
+def test_a_resized_camera_sees_the_same(camera: Camera) -> None:
+    size = np.array([camera.width, camera.height])
+    half = camera.resized(camera.width // 2, camera.height // 2)
+    pixels = np.random.default_rng(0).uniform(0.2, 0.8, (20, 2)) * size
+    np.testing.assert_allclose(half.bearings(pixels / 2), camera.bearings(pixels), atol=1e-6)
+    assert camera.resized(*size.tolist()) is camera

@@ -89,7 +89,7 @@ def localize(
     """
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.features.images import passed_over
-    from protomark.files import check_outputs
+    from protomark.files import check_outputs, only_writer
     from protomark.localization.batch import LocalizationRequest, localize_files
 
     check_outputs(json_file, inputs=[scene, *images, camera, poses, priors], folder=output)
@@ -110,7 +110,7 @@ def localize(
         recall=recall,
         threads=threads,
     )
-    with progress_bar() as progress:
+    with only_writer(output), progress_bar() as progress:
         batch = localize_files(request, output, progress)
     write_json(json_file, batch.as_dict())
     _show(batch, output)

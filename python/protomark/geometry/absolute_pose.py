@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.geometry.camera import Camera
+from protomark.geometry.camera import MAX_PLANE_RAY, Camera
 from protomark.geometry.pose import transform, turned
 from protomark.geometry.triangulation import reprojection_residuals
 
@@ -25,8 +25,6 @@ FocalLength = Literal["known", "rough", "unknown"]
 _LOSS_SHARE = 0.5
 _MAX_LOSS = 20.0
 _REFINE_STEPS = 30
-# The lens of a wide camera is set free on rays at most this far from the axis (tangent of 60°).
-_MAX_FREE_RAY = 1.7
 # Matches that determine the nine numbers of a pose with a free lens.
 _MIN_FREE = 6
 # Normal equations of a larger condition do not determine a pose.
@@ -62,7 +60,6 @@ def estimate_pose(
         max_error: largest reprojection error of an inlier, pixels.
         focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
     """
-    camera.check_params()
     if len(positions) < 4:
         return None
     pixels = np.ascontiguousarray(pixels, np.float64)
@@ -175,7 +172,7 @@ def free_lens(
     rays = camera.rays(pixels)
     seen = np.isfinite(rays).all(1) & (transform(cam_from_world, positions)[:, 2] > 0)
     if camera.wide:
-        seen &= np.linalg.norm(rays, axis=1) < _MAX_FREE_RAY
+        seen &= (np.abs(rays) < MAX_PLANE_RAY).all(1)
     if seen.sum() < _MIN_FREE:
         return FreeLens(cam_from_world, 0.0, np.inf)
     rays, positions = rays[seen], positions[seen]

@@ -37,6 +37,8 @@ CAMERA_MODELS = {
 DEFAULT_FOCAL_RATIO = 1.2
 _WIDE_MODELS = ("FISHEYE", "FOV", "EUCM", "DIVISION", "EQUIRECTANGULAR")
 _MAX_ROUND_TRIP = 0.5  # pixels
+# Farther than 60 degrees from the axis (tangent), small angles are long ways in the image plane.
+MAX_PLANE_RAY = 1.7
 _MIN_VIEW, _MAX_VIEW = 1.0, 170.0  # degrees
 # Lenses do not bend rays to less than this share of their distance from the axis.
 _MIN_BENDING = 0.5

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
+from protomark.geometry.camera import MAX_PLANE_RAY
 from protomark.geometry.pose import relative_pose
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 
@@ -18,7 +19,6 @@ Array = NDArray[np.float64]
 _AGREEING_ERROR = 2.0
 _MIN_MATCHES = 30
 _MIN_SHARE = 0.5
-_MAX_RAY = 1.7  # tangent of 60 degrees
 # Given poses fit if, in this share of the pairs, the median error is at most so many pixels.
 _MAX_ERROR = 4.0
 _MIN_FITTING = 0.7
@@ -31,7 +31,7 @@ def agreeing(first: Array, second: Array, focal: float) -> NDArray[np.bool_]:
 
     Rays (n, 2) are NaN where undistortion fails. Those far from the axis do not count.
     """
-    found = np.asarray((np.abs(np.hstack([first, second])) < _MAX_RAY).all(axis=1))
+    found = np.asarray((np.abs(np.hstack([first, second])) < MAX_PLANE_RAY).all(axis=1))
     if found.sum() < _MIN_MATCHES:
         return np.zeros(len(first), bool)
     camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0, 0]}

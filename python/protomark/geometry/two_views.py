@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from protomark.extras import optional
 from protomark.geometry.absolute_pose import MAX_ITERATIONS, MIN_ITERATIONS
-from protomark.geometry.camera import Camera
+from protomark.geometry.camera import MAX_PLANE_RAY, Camera
 
 Array = NDArray[np.float64]
 
@@ -67,12 +67,14 @@ def refine_relative_pose(
 
 
 def planar_poses(
-    first: Array, second: Array, focal: float, max_error: float, min_inliers: int
+    first: Array, second: Array, camera: Camera, max_error: float, min_inliers: int
 ) -> list[Array]:
-    """Relative poses (3, 4) that matched rays (n, 2) of a planar scene admit, if it is one."""
-    poselib = optional("poselib")
+    """Relative poses (3, 4) that matched pixels (n, 2) of a planar scene admit, if it is one."""
+    poselib, focal = optional("poselib"), camera.focal_length
+    rays = focal * np.hstack([camera.rays(first), camera.rays(second)])
+    rays = rays[(np.abs(rays) < focal * MAX_PLANE_RAY).all(1)]
     options = {"max_reproj_error": max_error, **_SAMPLING}
-    plane, facts = poselib.estimate_homography(focal * first, focal * second, options, {})
+    plane, facts = poselib.estimate_homography(rays[:, :2], rays[:, 2:], options, {})
     if np.asarray(facts["inliers"], bool).sum() < min_inliers:
         return []
     scale = np.diag([focal, focal, 1.0])

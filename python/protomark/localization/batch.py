@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
-from protomark.files import is_utf8, only_writer, write_text
+from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras
@@ -163,6 +163,7 @@ class LocalizationBatch:
 
         Times of the trajectory are those of `image_times`.
         """
+        folder.mkdir(parents=True, exist_ok=True)
         camera_lines: dict[str, int] = {}
         poses, camera_ids = {}, {}
         for image in self.images:
@@ -234,13 +235,6 @@ def localize_files(
             fit, or no image can be localized.
         FileExistsError: the folder holds another COLMAP model.
     """
-    with only_writer(output):
-        return _localize_files(request, output, progress)
-
-
-def _localize_files(
-    request: LocalizationRequest, output: Path, progress: Progress
-) -> LocalizationBatch:
     images = list_images(request.images)
     if (output / POSES).exists() and not (output / TABLE).exists():
         raise FileExistsError(

@@ -207,7 +207,6 @@ class Localizer:
             ValueError: the lengths differ, keypoints lie outside the image, the encoder takes other
                 descriptors, or there is no such camera.
         """
-        camera.check_params()
         camera.check_lens()
         if descriptors is None:  # what OpenCV computes for no keypoints
             descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)

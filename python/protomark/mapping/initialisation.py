@@ -36,8 +36,6 @@ _MIN_LEAD = 1.05
 _MIN_LEAD_TWO_WITNESSES = 1.2
 _MAX_WITNESSES = 4
 _MIN_COMMON = 40
-# Homographies count rays at most this far from the axis (tangent of 60 degrees).
-_MAX_PLANE_RAY = 1.7
 # Of more waiting frames every second one is dropped; it is retried at the end as a lost frame.
 _MAX_WAITING = 40
 # A new frame is paired with at most so many waiting ones, from the oldest to the newest.
@@ -130,11 +128,8 @@ class Initialiser:
             return []
         if self._rotated_share(found[:, :3], one, other, rows[inliers]) > _MAX_ROTATED:
             return []
-        ray_a, ray_b = camera.rays(a), camera.rays(b)
-        front = (np.abs(np.hstack([ray_a, ray_b])) < _MAX_PLANE_RAY).all(1)
-        planar = planar_poses(ray_a[front], ray_b[front], self._focal, error, _MIN_COMMON)
         out = []
-        for start in (found, *planar):
+        for start in (found, *planar_poses(a, b, camera, error, _MIN_COMMON)):
             good = self._verify(start, one, other, rows)[0]
             pose = refine_relative_pose(start, a, b, camera, error, good)
             length = np.linalg.norm(pose[:, 3])

@@ -382,6 +382,10 @@ class _Matching:
 def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.float64]) -> Scene:
     counts = np.array([len(f) for f in work.features])
     keyframe = np.repeat(np.arange(len(counts)), counts)
+    turns = None
+    if any(t is not None for t in work.turns):
+        parts = zip(work.turns, counts, strict=True)
+        turns = np.concatenate([np.eye(3)[None].repeat(n, 0) if t is None else t for t, n in parts])
     return Scene(
         model=work.model,
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
@@ -392,20 +396,7 @@ def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.flo
         descriptors=np.concatenate([f.descriptors for f in work.features]),
         labels=labels,
         positions=positions,
-        turns=_all_turns(work.turns, counts),
-    )
-
-
-def _all_turns(
-    turns: list[NDArray[np.float64] | None], counts: NDArray[np.int64]
-) -> NDArray[np.float64] | None:
-    if all(t is None for t in turns):
-        return None
-    return np.concatenate(
-        [
-            np.broadcast_to(np.eye(3), (n, 3, 3)) if t is None else t
-            for t, n in zip(turns, counts, strict=True)
-        ]
+        turns=turns,
     )
 
 
