@@ -402,10 +402,17 @@ def test_command(query: Path) -> None:
         atol=1e-9,
     )
 
-    # What it wrote it may write again, but not over another's model.
+    # What it wrote it may write again, but no model, trajectory or table of others.
     assert run(query / "scene.pmk", query / "images" / "1.png", "-o", out).exit_code == 0
-    other = run(query / "scene.pmk", query / "images", "-o", query / "true")
-    assert "holds a COLMAP model" in str(other.exception)
+    (query / "map").mkdir()
+    (query / "map" / "trajectory.txt").write_text("mine")
+    (query / "mine").mkdir()
+    (query / "mine" / "poses.csv").write_text("mine")
+    for folder in ("true", "map", "mine"):
+        before = [path.read_bytes() for path in sorted((query / folder).iterdir())]
+        other = run(query / "scene.pmk", query / "images", "-o", query / folder)
+        assert "was not written by `protomark localize`" in str(other.exception)
+        assert before == [path.read_bytes() for path in sorted((query / folder).iterdir())]
 
 
 def test_cameras_and_poses_from_elsewhere(query: Path) -> None:

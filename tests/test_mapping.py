@@ -272,7 +272,7 @@ def test_black_blurred_and_broken_frames_are_named_and_cost_nothing_else(
     assert set(reasons) == {"img5.png", "img8.png", "img11.png", "img13.png"}
     assert "keypoints" in reasons["img5.png"]
     assert "keypoints" in reasons["img8.png"]
-    assert "truncated, or of an unknown format" in reasons["img11.png"]
+    assert "truncated, or its format is unknown" in reasons["img11.png"]
     assert "100x100 pixels" in reasons["img13.png"]
     assert error_of(tmp_path / "scene", walk(COUNT)) < 0.01
 

@@ -158,7 +158,7 @@ def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
     pictures = list(open_source(tmp_path).images())
     assert pictures[0].image is not None
     assert pictures[1].image is None
-    assert "truncated, or of an unknown format" in pictures[1].problem
+    assert "truncated, or its format is unknown" in pictures[1].problem
 
 
 def video_of(path, frames):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import signal
 import sys
 import warnings
@@ -83,6 +84,8 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     warnings.showwarning = _warn
+    # A sentence of ours names each image that cannot be read.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
     from protomark.interrupt import Interrupted
 
     if isinstance(sys.stdout, io.TextIOWrapper):

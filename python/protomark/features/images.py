@@ -96,7 +96,9 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
     except cv2.error as error:
         raise ValueError(f"{path}: OpenCV cannot decode this image ({error.err})") from None
     if image is None:
-        raise ValueError(f"{path}: the image is truncated, or of an unknown format: copy it anew")
+        raise ValueError(
+            f"{path}: the image is truncated, or its format is unknown: copy it anew, or convert it"
+        )
     if image.dtype == np.uint16:
         used = int(image.max()).bit_length()
         image = image >> next(bits - 8 for bits in (8, 10, 12, 14, 16) if used <= bits)

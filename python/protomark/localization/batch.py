@@ -35,6 +35,8 @@ from protomark.progress import Progress, silent, tracked
 
 POSES, CAMERAS, POINTS, TABLE = "images.txt", "cameras.txt", "points3D.txt", "poses.csv"
 TRAJECTORY = "trajectory.txt"
+# The table begins with it, by which a later run recognises its own files.
+_HEADER = "image,accepted,confidence,inliers,matches"
 # Distances in world units (metres if the map is metric) and angles in degrees, as in hloc.
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 STAGES = ("features", "encode", "search", "pose", "total")
@@ -196,7 +198,7 @@ class LocalizationBatch:
         """
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        header = ["image", "accepted", "confidence", "inliers", "matches"]
+        header = _HEADER.split(",")
         header += [f"center_{axis}" for axis in "xyz"]
         header += [f"cam_from_world_{i}{j}" for i in range(3) for j in range(3)]
         header += ["focal_length", "position_error", "angle_error"]
@@ -220,6 +222,21 @@ class LocalizationBatch:
         return out.getvalue()
 
 
+def _check_folder(output: Path) -> None:
+    """Raise FileExistsError if files would be replaced that no earlier run wrote."""
+    table = output / TABLE
+    if table.is_file():
+        with table.open("rb") as file:
+            if file.read(len(_HEADER)) == _HEADER.encode():
+                return
+    for name in (POSES, CAMERAS, POINTS, TRAJECTORY, TABLE):
+        if (output / name).exists():
+            raise FileExistsError(
+                f"{output / name} was not written by `protomark localize` and would be replaced: "
+                "name another folder with -o"
+            )
+
+
 def localize_files(
     request: LocalizationRequest, output: Path, progress: Progress = silent
 ) -> LocalizationBatch:
@@ -233,14 +250,10 @@ def localize_files(
     Raises:
         FileNotFoundError, ValueError: the map, a camera or the poses are missing, broken or do not
             fit, or no image can be localized.
-        FileExistsError: the folder holds another COLMAP model.
+        FileExistsError: the folder holds files that no earlier run wrote.
     """
     images = list_images(request.images)
-    if (output / POSES).exists() and not (output / TABLE).exists():
-        raise FileExistsError(
-            f"{output} holds a COLMAP model that `protomark localize` did not write: name another "
-            "folder with -o"
-        )
+    _check_folder(output)
     localizer = Localizer(
         request.scene,
         max_keypoints=request.max_keypoints,
