@@ -36,23 +36,7 @@ void bind_files(nb::module_& m) {
       },
       "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),
       "descriptor"_a = nb::none(),
-      R"(Open a map file: read a learning map, with what was committed to its journal, or map a
-sealed one.
-
-A map encodes descriptors itself, with the encoder that it was built with. If they are encoded
-elsewhere, or come from a detector that the map has not seen, say what you have:
-
-Args:
-    path: the map file.
-    journal: let the map commit to the journal beside the file, which is made if there is none. No
-        other map can be opened with it until this one is closed or destroyed.
-    encoder: the map must have been made with this encoder, or one of equal identity.
-    descriptor: the map must be one of this descriptor, for example "orb".
-
-Raises:
-    FileError: the file is not a map, or is broken; with journal also if it is sealed, or another
-        map has the journal.
-    ValueError: the map is of another encoder or descriptor.)");
+      "Open a map file: see `protomark.open`.");
   m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
         nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");

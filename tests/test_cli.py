@@ -353,6 +353,29 @@ def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     np.testing.assert_array_equal(joined.prototypes(np.arange(10, 20)), scene.prototypes(scene.ids))
 
 
+def test_a_folder_of_map_is_a_map(encoder: pm.Encoder, tmp_path: Path) -> None:
+    folder, empty = tmp_path / "kitchen", tmp_path / "empty"
+    folder.mkdir(), empty.mkdir()
+    scene = pm.PrototypeMap(encoder)
+    scene.add(np.arange(6), np.arange(6 * 8, dtype=np.uint8).reshape(6, 8))
+    scene.save(folder / "scene.pmk")
+    assert isinstance(pm.open(folder), pm.PrototypeMap)
+    assert protomark("info", "--verify", folder).stdout.count("learning map") == 1
+    assert protomark("split", folder, "--parts", 2, "-o", tmp_path).returncode == 0
+    assert len(pm.open(tmp_path / "scene.1.pmk")) == 3
+    part = tmp_path / "scene.0.pmk"
+    merged = protomark("merge", folder, part, "-o", tmp_path / "both.pmk")
+    assert merged.returncode == 0, merged.stderr
+    assert "input" in protomark("merge", folder, part, "-o", folder / "scene.pmk").stderr
+
+    # What ships comes first, but the map that learns takes observations.
+    scene.seal(folder / "scene.sealed.pmk")
+    assert isinstance(pm.open(folder), pm.SealedMap)
+    assert isinstance(pm.open(folder, journal=True), pm.PrototypeMap)
+    for command in (["info", empty], ["split", empty, "--parts", 2, "-o", tmp_path]):
+        assert "empty holds no scene.pmk" in protomark(*command).stderr
+
+
 def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path: Path) -> None:
     one, short, sealed = (tmp_path / name for name in ("one.pmk", "short.pmk", "sealed.pmk"))
     scene = pm.PrototypeMap(encoder)

@@ -23,10 +23,10 @@ from protomark._core import (
     file_sections,
     hamming_search,
     instruction_set,
-    open,
     verify_file,
 )
 from protomark.encoders import Encoder
+from protomark.maps.open import open_map as open
 
 if TYPE_CHECKING:
     from protomark.features.upright import upright_descriptors as upright_descriptors

@@ -14,7 +14,9 @@ _BARS = "▁▂▃▄▅▆▇█"
 
 
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A map, an encoder or tracks.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A map or its folder, an encoder or tracks.")
+    ],
     verify: Annotated[
         bool,
         typer.Option(
@@ -31,6 +33,7 @@ def info(
     from protomark.cli.terminal import error_console, write_json
     from protomark.files import check_outputs
     from protomark.maps.info import describe, is_tracks
+    from protomark.maps.open import map_path
 
     check_outputs(json_file, inputs=[file])
     with error_console.status(f"Reading {file.name}"):
@@ -38,7 +41,7 @@ def info(
         if verify and is_tracks(file):
             facts["checksums"] = "none in a tracks file, which is checked whole whenever it is read"
         elif verify:
-            verify_file(file)
+            verify_file(map_path(file))
             facts["checksums"] = "all right"
     write_json(json_file, facts)
     show(facts)

@@ -23,8 +23,7 @@ from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.self_calibration import Calibration
-from protomark.maps.merge import open_learning_map
-from protomark.maps.open import SCENE_MAP
+from protomark.maps.open import SCENE_MAP, open_learning_map
 
 STATE, CHECKPOINT = "state.safetensors", "checkpoint"
 _FORMAT, _VERSION = "protomark-mapping", "1"

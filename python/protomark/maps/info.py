@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import protomark as pm
+from protomark.maps.open import map_path
 from protomark.tracks.file import Tracks
 
 
@@ -17,13 +18,14 @@ def is_tracks(path: Path) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Facts about a file as JSON values, of which `kind` tells what it is.
+    """Facts about a file, or the map in a folder, as JSON; `kind` tells what it is.
 
     Raises:
         OSError, ValueError: the file cannot be read, or it is not one of Protomark's.
     """
     if is_tracks(path):
         return _describe_tracks(path)
+    path = map_path(path)
     kinds = dict(pm.file_sections(path))
     if "network" in kinds:
         return _describe_encoder(path)

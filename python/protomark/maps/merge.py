@@ -8,6 +8,7 @@ from typing import Any
 
 import protomark as pm
 from protomark.files import check_outputs
+from protomark.maps.open import map_path, open_learning_map
 from protomark.progress import Progress, silent, tracked
 
 MAX_ID = 2**63 - 1
@@ -21,10 +22,10 @@ def merge_files(
     With `renumber`, landmarks of different files differ, whatever their ids: those of each further
     file get new ids above all earlier ones.
     """
-    check_outputs(output, inputs=inputs)
+    check_outputs(output, inputs=[map_path(path, learning=True) for path in inputs])
     if len(inputs) < 2:
         raise ValueError("name at least two maps to merge")
-    resolved = [path.resolve() for path in inputs]
+    resolved = [map_path(path, learning=True).resolve() for path in inputs]
     for path, same in zip(inputs, resolved, strict=True):
         if resolved.count(same) > 1:
             raise ValueError(f"{path} is named twice, and its observations would count twice")
@@ -56,14 +57,6 @@ def merge_files(
         "appearance_bits": merged.appearance_bits or None,
         "bytes": output.stat().st_size,
     }
-
-
-def open_learning_map(path: Path) -> pm.PrototypeMap:
-    """Open a map that takes observations."""
-    scene = pm.open(path)
-    if not isinstance(scene, pm.PrototypeMap):
-        raise ValueError(f"{path} is a sealed map, which keeps no sums: give the learning map")
-    return scene
 
 
 def _merge_renumbered(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:

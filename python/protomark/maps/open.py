@@ -2,37 +2,85 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Literal, overload
 
-import protomark as pm
+from protomark import _core
+from protomark._core import PrototypeMap, SealedMap
 
 # The maps in the folder that `protomark map` writes: the one that learns, and the one that ships.
 SCENE_MAP = "scene.pmk"
 SEALED_MAP = "scene.sealed.pmk"
 
 
-def map_path(path: str | Path) -> Path:
+def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
     """The map file at a path: the path itself, or the map in a folder of `protomark map`.
 
     Of a folder it is the sealed map, which the mapper removes when the learning map has changed, or
-    else the learning map.
+    else the learning map. With `learning` only that counts.
 
     Raises:
-        FileNotFoundError: the folder holds no map.
+        FileNotFoundError: the folder holds no such map.
     """
     path = Path(path)
     if not path.is_dir():
         return path
-    for name in (SEALED_MAP, SCENE_MAP):
+    for name in (SCENE_MAP,) if learning else (SEALED_MAP, SCENE_MAP):
         if (path / name).is_file():
             return path / name
     raise FileNotFoundError(f"{path} holds no {SCENE_MAP}: name a map file")
 
 
-def open_map(path: str | Path) -> pm.PrototypeMap | pm.SealedMap:
-    """Open a map file, or the map in a folder of `protomark map`.
+@overload
+def open_map(  # what can commit is a learning map
+    path: str | os.PathLike[str],
+    *,
+    journal: Literal[True],
+    encoder: _core.Encoder | None = None,
+    descriptor: str | None = None,
+) -> PrototypeMap: ...
+@overload
+def open_map(
+    path: str | os.PathLike[str],
+    *,
+    journal: bool = False,
+    encoder: _core.Encoder | None = None,
+    descriptor: str | None = None,
+) -> PrototypeMap | SealedMap: ...
+def open_map(
+    path: str | os.PathLike[str],
+    *,
+    journal: bool = False,
+    encoder: _core.Encoder | None = None,
+    descriptor: str | None = None,
+) -> PrototypeMap | SealedMap:
+    """Open a map: read a learning map, with what was committed to its journal, or map a sealed one.
+
+    A map encodes descriptors itself, with the encoder that it was built with. If they are encoded
+    elsewhere, or come from a detector that the map has not seen, say what you have.
+
+    Args:
+        path: the map file, or the folder that `protomark map` wrote (see `map_path`).
+        journal: let the map commit to the journal beside the file, which is made if there is none.
+            No other map can be opened with it until this one is closed or destroyed.
+        encoder: the map must have been made with this encoder, or one of equal identity.
+        descriptor: the map must be one of this descriptor, for example "orb".
 
     Raises:
-        FileNotFoundError, FileError: there is no map at the path, or it is broken.
+        FileNotFoundError: the folder holds no map.
+        FileError: the file is not a map, or is broken; with journal also if it is sealed, or
+            another map has the journal.
+        ValueError: the map is of another encoder or descriptor.
     """
-    return pm.open(map_path(path))
+    file = map_path(path, learning=journal)
+    return _core.open(file, journal=journal, encoder=encoder, descriptor=descriptor)
+
+
+def open_learning_map(path: Path) -> PrototypeMap:
+    """Open a map that takes observations, by its file or the folder of `protomark map`."""
+    path = map_path(path, learning=True)
+    scene = open_map(path)
+    if not isinstance(scene, PrototypeMap):
+        raise ValueError(f"{path} is a sealed map, which keeps no sums: give the learning map")
+    return scene

@@ -15,8 +15,7 @@ import protomark as pm
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
 from protomark.maps.info import is_tracks
-from protomark.maps.merge import open_learning_map
-from protomark.maps.open import SCENE_MAP
+from protomark.maps.open import open_learning_map
 from protomark.maps.selection import Views, select_landmarks
 from protomark.progress import Progress, silent
 from protomark.tracks.file import Tracks
@@ -60,13 +59,7 @@ def seal(
         scene = build_map(tracks, pm.Encoder.load(tracks.descriptor), threads=request.threads)
         scene.metadata = {KEY: cameras_text(tracks.cameras.values())}
         return seal_map(scene, output, request, lambda: Views.of_tracks(tracks), progress)
-    if not source.is_dir():
-        return seal_map(open_learning_map(source), output, request, None, progress)
-    if not (source / SCENE_MAP).is_file():
-        raise FileNotFoundError(
-            f"{source}: no {SCENE_MAP} in this folder; name a learning map or tracks"
-        )
-    scene = open_learning_map(source / SCENE_MAP)
+    scene = open_learning_map(source)
     model = source / MODEL
     views = (lambda: Views.of_model(model)) if model.is_dir() else None
     return seal_map(scene, output, request, views, progress)

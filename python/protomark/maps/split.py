@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 import protomark as pm
-from protomark.maps.merge import open_learning_map
+from protomark.maps.open import map_path, open_learning_map
 from protomark.progress import Progress, silent, tracked
 
 
 def split_file(
-    path: Path,  # the map file, NAME.pmk
+    path: Path,  # the map file, NAME.pmk, or the folder of `protomark map`
     folder: Path,  # folder of the parts, created if it does not exist
     ids: list[int] | None = None,  # ascending ids, at each of which a part starts
     parts: int | None = None,  # number of parts by id, of equally many landmarks (give or take one)
@@ -29,6 +29,7 @@ def split_file(
     """
     if sum(option is not None for option in (ids, parts, cell_size)) != 1:
         raise ValueError("give one of --ids, --parts and --cell-size to split by")
+    path = map_path(path, learning=True)
     scene = open_learning_map(path)
     named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)
     ending = ".sealed.pmk" if sealed else ".pmk"
