@@ -14,6 +14,7 @@ import protomark as pm
 from mapping_scene import _paper, walk
 from protomark.geometry.absolute_pose import pose_covariance, refine_pose
 from protomark.geometry.camera import Camera
+from protomark.geometry.colmap import ColmapModel
 from protomark.geometry.given_poses import pose_errors
 from protomark.geometry.pose import camera_centers, pose_error, relative_pose, transform, turned
 from protomark.geometry.triangulation import depth_of_first, epipolar_error, pixel_errors
@@ -23,6 +24,7 @@ from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.maps.build import build_map
 from protomark.tracks.extract import TracksOptions, extract, find_sequence
+from protomark.tracks.pairs import overlaps
 from test_mapping import error_of
 from tracks_scene import write_model
 
@@ -176,3 +178,12 @@ def test_tracks_of_wide_images_lie_on_the_walls(camera: Camera, tmp_path: Path) 
     distance, degrees = pose_error(found.cam_from_world, POSES[5])
     assert distance < 0.02
     assert degrees < 0.5
+
+
+def test_spherical_views_overlap_whichever_way_they_turn() -> None:
+    back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), [0.1, 0.0, 0.0]])
+    for camera, share in ((WIDE[-1], 1.0), (FISHEYE, 0.0)):
+        poses, ids = np.stack([np.eye(3, 4), back]), np.ones(2, np.int32)
+        model = ColmapModel({1: camera}, ["a", "b"], np.arange(2), ids, poses, [])
+        found = overlaps(model, np.full((2, 3), 3.0))
+        np.testing.assert_allclose(found, share * (1 - np.eye(2)), atol=0.02)
