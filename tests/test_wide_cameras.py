@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from mapping_scene import _paper, walk
-from protomark.geometry.absolute_pose import pose_covariance, refine_pose
+from protomark.geometry.absolute_pose import estimate_pose, pose_covariance, refine_pose
 from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import ColmapModel
 from protomark.geometry.given_poses import pose_errors
@@ -127,6 +127,11 @@ def test_a_pose_is_refined_on_what_lies_in_any_direction(camera: Camera) -> None
     inside = np.isfinite(camera.bearings(pixels)).all(1)
     assert inside.sum() > 50
     pixels[~inside] = -5.0
+    for focal_length in ("known", "rough", "unknown"):
+        given = pixels[inside], points[inside], camera, 3.0
+        rough = estimate_pose(*given, focal_length)  # type: ignore[arg-type]
+        assert rough is not None
+        assert pose_error(rough.cam_from_world, POSES[3])[0] < 0.05
     start = POSES[3].copy()
     start[:, 3] += 0.05
     pose, inliers = refine_pose(start, pixels, points, camera, 3.0)
