@@ -450,20 +450,23 @@ def test_sigterm_is_ctrl_c_even_after_pycolmap_was_imported() -> None:
 
 
 @pytest.mark.parametrize("module", ["protomark._core", "typer", "protomark.cli.train"])
-def test_ctrl_c_during_imports_ends_without_a_traceback(module: str) -> None:
+@pytest.mark.parametrize("command", ["/usr/bin/protomark", "-m", "other"])
+def test_ctrl_c_during_imports_ends_without_a_traceback(module: str, command: str) -> None:
     program = f"""
-import os, signal, sys
+import os, runpy, signal, sys
 class Finder:
     def find_spec(name, path=None, target=None):
         if name == {module!r}:
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Finder)
-sys.argv = ["/usr/bin/protomark", "--help"]
-from protomark.__main__ import main
-main()
+sys.argv, sys.orig_argv = [{command!r}], ["python", {command!r}, "protomark"]
+runpy.run_module("protomark", run_name="__main__")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+    if command == "other":  # a program that imports the package handles Ctrl-C itself
+        assert "KeyboardInterrupt" in done.stderr
+    else:
+        assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 def test_progress_of_a_redirected_command_is_plain_lines(

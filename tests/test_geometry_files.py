@@ -26,6 +26,7 @@ from tracks_scene import DISTORTED, PINHOLE, poses, write_model
         ("OPENCV_FISHEYE 480 480 99999 99999 240 240 0 0 0 0", "field of view is 0.28 degrees"),
         ("OPENCV 540 360 495 495 270 180 1000 1000 0 0", "no lens distorts"),
         ("SIMPLE_RADIAL 540 360 495 270 180 -5", "no lens distorts"),
+        ("EQUIRECTANGULAR 800 400 1600 800", "not the size of the image"),
     ],
 )
 def test_a_camera_that_no_lens_has(text: str, message: str, tmp_path: Path) -> None:

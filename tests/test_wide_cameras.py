@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from mapping_scene import _paper, walk
-from protomark.geometry.absolute_pose import pose_covariance, refine_pose
+from protomark.geometry.absolute_pose import estimate_pose, pose_covariance, refine_pose
 from protomark.geometry.camera import Camera
+from protomark.geometry.colmap import ColmapModel
 from protomark.geometry.given_poses import pose_errors
 from protomark.geometry.pose import camera_centers, pose_error, relative_pose, transform, turned
 from protomark.geometry.triangulation import depth_of_first, epipolar_error, pixel_errors
@@ -23,6 +24,7 @@ from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.maps.build import build_map
 from protomark.tracks.extract import TracksOptions, extract, find_sequence
+from protomark.tracks.pairs import overlaps
 from test_mapping import error_of
 from tracks_scene import write_model
 
@@ -125,6 +127,11 @@ def test_a_pose_is_refined_on_what_lies_in_any_direction(camera: Camera) -> None
     inside = np.isfinite(camera.bearings(pixels)).all(1)
     assert inside.sum() > 50
     pixels[~inside] = -5.0
+    for focal_length in ("known", "rough", "unknown"):
+        given = pixels[inside], points[inside], camera, 3.0
+        rough = estimate_pose(*given, focal_length)  # type: ignore[arg-type]
+        assert rough is not None
+        assert pose_error(rough.cam_from_world, POSES[3])[0] < 0.05
     start = POSES[3].copy()
     start[:, 3] += 0.05
     pose, inliers = refine_pose(start, pixels, points, camera, 3.0)
@@ -176,3 +183,12 @@ def test_tracks_of_wide_images_lie_on_the_walls(camera: Camera, tmp_path: Path) 
     distance, degrees = pose_error(found.cam_from_world, POSES[5])
     assert distance < 0.02
     assert degrees < 0.5
+
+
+def test_spherical_views_overlap_whichever_way_they_turn() -> None:
+    back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), [0.1, 0.0, 0.0]])
+    for camera, share in ((WIDE[-1], 1.0), (FISHEYE, 0.0)):
+        poses, ids = np.stack([np.eye(3, 4), back]), np.ones(2, np.int32)
+        model = ColmapModel({1: camera}, ["a", "b"], np.arange(2), ids, poses, [])
+        found = overlaps(model, np.full((2, 3), 3.0))
+        np.testing.assert_allclose(found, share * (1 - np.eye(2)), atol=0.02)

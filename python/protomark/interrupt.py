@@ -23,9 +23,18 @@ def _exit(number: int, frame: FrameType | None) -> None:
     os._exit(130)
 
 
-# `python -m` has put "-m" in place of the script's name while it imports the package.
-if os.path.basename(sys.argv[0]) in ("protomark", "-m") and (
-    signal.getsignal(signal.SIGINT) is signal.default_int_handler
+def _is_command() -> bool:
+    """Whether this process is the command, as a script or by `python -m protomark`."""
+    script, words = (sys.argv or [""])[0], sys.orig_argv
+    if script == "-m" in words:  # while Python imports the package
+        return words[words.index("-m") + 1] == "protomark"
+    return os.path.basename(script) == "protomark"
+
+
+if (
+    _is_command()
+    and threading.current_thread() is threading.main_thread()
+    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 ):
     signal.signal(signal.SIGINT, _exit)
 

@@ -58,7 +58,8 @@ def estimate_pose(
         positions: (n, 3) float64, their landmarks in world coordinates.
         camera: the camera; if its focal length is unknown, only principal point and size count.
         max_error: largest reprojection error of an inlier, pixels.
-        focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
+        focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated; that
+            of a wide camera is never unknown.
     """
     if len(positions) < 4:
         return None
@@ -91,7 +92,7 @@ def _estimate_by_colmap(
     from protomark.geometry.colmap import pycolmap, quiet
 
     estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.estimate_focal_length = focal_length == "unknown"
+    estimation.estimate_focal_length = focal_length == "unknown" and not camera.wide
     estimation.ransac.max_error = max_error
     estimation.ransac.max_num_trials = MAX_ITERATIONS
     estimation.ransac.min_num_trials = MIN_ITERATIONS

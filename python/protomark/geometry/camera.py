@@ -282,7 +282,9 @@ def _pixels(word: str) -> int:
 def _check_lens(camera: Camera) -> None:
     size = np.array([camera.width, camera.height])
     middle = np.array(camera.colmap.params)[camera.colmap.principal_point_idxs()]
-    if not len(middle):  # equirectangular
+    if camera.model == "EQUIRECTANGULAR":
+        if camera.params != (camera.width, camera.height):
+            raise ValueError(f"camera {camera}: its parameters are not the size of the image")
         return
     if not ((middle > 0) & (middle < size)).all():
         raise ValueError(

@@ -59,24 +59,34 @@ def overlaps(model: ColmapModel, depths: NDArray[np.float64]) -> NDArray[np.floa
     for camera_id, camera in model.cameras.items():
         x = (np.arange(_GRID) + 0.5) / _GRID * camera.width
         y = (np.arange(_GRID) + 0.5) / _GRID * camera.height
-        grid = camera.rays(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
-        grids[camera_id] = grid[np.isfinite(grid).all(1)]
+        pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        rays = camera.rays(pixels)
+        rays = rays[np.isfinite(rays).all(1)]
+        grids[camera_id] = np.column_stack([rays, np.ones(len(rays))])
+        if camera.wide:
+            bearings = camera.bearings(pixels)
+            grids[camera_id] = bearings[np.isfinite(bearings).all(1)]
         # The outermost rays of the grid, extended to the image border.
-        middle, half = grids[camera_id].mean(0), np.ptp(grids[camera_id], axis=0) / 2
+        middle, half = rays.mean(0), np.ptp(rays, axis=0) / 2
         bounds[camera_id] = np.stack([middle, half * _GRID / (_GRID - 1)])
     rotation, translation = model.cam_from_world[:, :, :3], model.cam_from_world[:, :, 3]
-    centers = model.centers
+    centers, wide = model.centers, [i for i, c in model.cameras.items() if c.wide]
     limit = np.array([bounds[int(c)] for c in model.camera_ids])
     out = np.zeros((m, m))
     for i in range(m):
         grid = grids[int(model.camera_ids[i])]
-        local = np.concatenate([np.column_stack([grid, np.ones(len(grid))]) * d for d in depths[i]])
+        local = np.concatenate([grid * d for d in depths[i]])
         world = (local - translation[i]) @ rotation[i]
         there = np.einsum("mij,nj->mni", rotation, world) + translation[:, None]
         z = np.maximum(there[:, :, 2], 1e-12)
         inside = (there[:, :, 2] > 0) & (
             np.abs(there[:, :, :2] / z[:, :, None] - limit[:, None, 0]) <= limit[:, None, 1]
         ).all(2)
+        for camera_id in wide:
+            camera, frames = model.cameras[camera_id], model.camera_ids == camera_id
+            pixels = camera.project(there[frames].reshape(-1, 3))
+            seen = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
+            inside[frames] = seen.reshape(-1, there.shape[1])
         ours, theirs = world - centers[i], world[None] - centers[:, None]
         a, b = np.linalg.norm(ours, axis=1), np.linalg.norm(theirs, axis=2)
         b = np.maximum(b, 1e-12)
