@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstring>
+#include <functional>
 #include <memory>
 #include <utility>
 
@@ -21,10 +22,10 @@ constexpr std::size_t packed_bytes(std::size_t n, int bits) {
   return packed_words(n, bits) * sizeof(std::uint64_t);
 }
 
-// Returns the number whose lowest bit is bit `first` of words, which may begin anywhere in memory.
-inline std::uint64_t packed_number_at(const void* words, int bits, std::size_t first) {
+// Returns number i. The words may begin anywhere in memory.
+inline std::uint64_t packed_number(const void* words, int bits, std::size_t i) {
   if (bits == 0) return 0;
-  const auto width = static_cast<std::size_t>(bits), shift = first % 64;
+  const auto width = static_cast<std::size_t>(bits), first = i * width, shift = first % 64;
   std::uint64_t word[2];
   const char* from = static_cast<const char*>(words) + first / 64 * sizeof(word[0]);
   std::memcpy(word, from, sizeof(word[0]));
@@ -35,32 +36,47 @@ inline std::uint64_t packed_number_at(const void* words, int bits, std::size_t f
   }
   return value & ((std::uint64_t{1} << width) - 1);
 }
-inline std::uint64_t packed_number(const void* words, int bits, std::size_t i) {
-  return packed_number_at(words, bits, i * static_cast<std::size_t>(bits));
-}
 
-class BitPacker {
+// Hands packed numbers to a sink.
+class PackedWriter {
  public:
+  using Sink = std::function<void(std::span<const std::byte>)>;
+
+  explicit PackedWriter(Sink sink) : sink_(std::move(sink)) {}
+
   // A number of 64 bits begins at a whole word.
   void add(std::uint64_t value, int bits) {
     const auto width = static_cast<unsigned>(bits);
     word_ |= value << filled_;
     filled_ += width;
     if (filled_ < 64) return;
-    words_.push_back(word_);
     filled_ -= 64;
-    word_ = filled_ == 0 ? 0 : value >> (width - filled_);
+    put();
+    if (filled_ > 0) word_ = value >> (width - filled_);
   }
   // Pads the last word with zeros.
   void align() {
-    if (filled_ > 0) words_.push_back(word_);
-    word_ = 0;
+    if (filled_ > 0) put();
     filled_ = 0;
   }
-  // The full words, which the caller may remove.
-  std::vector<std::uint64_t>& words() { return words_; }
+  void finish() {
+    align();
+    flush();
+  }
 
  private:
+  static constexpr std::size_t kPiece = 1 << 12;  // words, a multiple of CheckedNumbers::kBlock
+
+  void put() {
+    words_.push_back(std::exchange(word_, 0));
+    if (words_.size() == kPiece) flush();
+  }
+  void flush() {
+    sink_(std::as_bytes(std::span(words_)));
+    words_.clear();
+  }
+
+  Sink sink_;
   std::vector<std::uint64_t> words_;
   std::uint64_t word_ = 0;
   unsigned filled_ = 0;  // bits of word_

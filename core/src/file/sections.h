@@ -24,6 +24,7 @@ inline constexpr char kIdGaps[] = "idgaps";
 inline constexpr char kAppearanceBits[] = "appbits";
 inline constexpr char kAppearances[] = "appear";
 inline constexpr char kSums[] = "sums";
+inline constexpr char kSpareBits[] = "spare";
 // Sealed maps.
 inline constexpr char kRows[] = "rows";
 inline constexpr char kPrototypes[] = "protos";
@@ -131,35 +132,7 @@ void add_value(ContainerWriter& file, const char* name, const T& value) {
   out.add_to(file, name);
 }
 
-// Writes packed numbers (base/packed_numbers.h) to a section.
-class PackedWriter {
- public:
-  explicit PackedWriter(ContainerWriter::Sink sink) : sink_(std::move(sink)) {}
-
-  void add(std::uint64_t value, int bits) {
-    packer_.add(value, bits);
-    if (packer_.words().size() >= kPiece) flush();
-  }
-  // Pads the last word with zeros.
-  void align() { packer_.align(); }
-  void finish() {
-    align();
-    flush();
-  }
-
- private:
-  static constexpr std::size_t kPiece = 8 * CheckedNumbers::kBlock;  // words
-
-  void flush() {
-    sink_(std::as_bytes(std::span(packer_.words())));
-    packer_.words().clear();
-  }
-
-  ContainerWriter::Sink sink_;
-  BitPacker packer_;
-};
-
-// Reads them one after the other.
+// Reads packed numbers of up to 57 bits one after the other.
 class PackedReader {
  public:
   // The section has `bits` bits, and padding up to a whole word.
@@ -170,8 +143,12 @@ class PackedReader {
 
   // Reading beyond the end is the caller's error.
   std::uint64_t next(int bits) {
-    const std::size_t first = std::exchange(at_, at_ + static_cast<std::size_t>(bits));
-    return packed_number_at(bytes_.data(), bits, first);
+    const std::size_t byte = std::min(at_ / 8, bytes_.size() - sizeof(std::uint64_t));
+    std::uint64_t word;
+    std::memcpy(&word, bytes_.data() + byte, sizeof(word));
+    word >>= at_ - 8 * byte;
+    at_ += static_cast<std::size_t>(bits);
+    return word & ((std::uint64_t{1} << bits) - 1);
   }
 
  private:

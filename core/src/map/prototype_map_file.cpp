@@ -6,42 +6,58 @@
 namespace protomark {
 namespace {
 
-// Bits per number of a sum of n codes: no such sum is beyond 127 n. n is 1 to 255.
+// In a file, each eight numbers of a sum have as few bits as they need, or up to three more.
+constexpr int kSpareBits = 2;
+
+// Bits that a number of a sum of n codes may need: none is beyond 127 n. n is 1 to 255.
 int sum_bits(int n) { return 8 + static_cast<int>(std::bit_width(static_cast<unsigned>(n - 1))); }
-// Bits per number of all rows with these counts.
-std::size_t sum_bits(std::span<const std::uint8_t> counts) {
-  std::size_t bits = 0;
-  for (const int n : counts) bits += static_cast<std::size_t>(sum_bits(n));
-  return bits;
+// Returns how many of these bits none of eight numbers needs.
+int spare_bits(const std::int16_t* eight, int bits) {
+  unsigned magnitudes = 0;
+  for (std::size_t i = 0; i < 8; ++i) {
+    magnitudes |= static_cast<std::uint16_t>(eight[i] ^ eight[i] >> 15);
+  }
+  return std::min(3, bits - 1 - static_cast<int>(std::bit_width(magnitudes)));
 }
 
 // Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
 // must not change until the file is written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
-  std::size_t n = 0, m = 0, bits = 0;
+  const std::size_t dim = store.dim();
+  std::size_t n = 0, m = 0, spares_size = 0, sums_size = 0;
   std::int64_t largest = -1;
   // A map whose positions were all removed equals one that never had any.
   bool positions = false;
-  const auto count = [&](LandmarkIndex landmark) {
+  const auto count_landmark = [&](LandmarkIndex landmark) {
     ++n;
     largest = std::max(largest, store.id(landmark));
-    store.each_row_of(landmark, [&](Row row) {
-      ++m;
-      bits += store.dim() * static_cast<std::size_t>(sum_bits(store.count(row)));
-    });
     positions = positions || has_position(store.position(landmark));
   };
+  const auto count_row = [&](Row row) {
+    ++m;
+    const Sum sum = store.sum(row);
+    const int width = sum_bits(store.count(row));
+    for (std::size_t d = 0; d < dim; d += 8) {
+      spares_size += kSpareBits;
+      sums_size += 8 * static_cast<std::size_t>(width - spare_bits(&sum[d], width));
+    }
+  };
   if (changed) {
-    std::ranges::for_each(*changed, count);
+    for (const LandmarkIndex landmark : *changed) {
+      count_landmark(landmark);
+      store.each_row_of(landmark, count_row);
+    }
   } else {
-    store.each_landmark(count);
+    store.each_landmark(count_landmark);
+    store.each_row(count_row);
   }
   const bool ids = IdBlockWriter::needed(n, largest), several = store.several();
   const auto appearance_bits = static_cast<int>(store.appearance_bits());
-  add_value(file, section::kShape, MapShape{n, store.dim(), {}});
+  add_value(file, section::kShape, MapShape{n, dim, {}});
   std::vector<ContainerWriter::Part> parts{{section::kCounts, m},
-                                           {section::kSums, packed_bytes(bits, 1)}};
+                                           {section::kSpareBits, packed_bytes(spares_size, 1)},
+                                           {section::kSums, packed_bytes(sums_size, 1)}};
   if (several) {
     add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(appearance_bits));
     parts.push_back({section::kAppearances, packed_bytes(m, appearance_bits + 1)});
@@ -52,7 +68,7 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   file.add_together(std::move(parts), [=, &store](auto sinks) {
     auto sink = sinks.begin();
     const auto& count_sink = *sink++;
-    PackedWriter sums(*sink++);
+    PackedWriter spares(*sink++), sums(*sink++);
     std::optional<PackedWriter> appearances;
     if (several) appearances.emplace(*sink++);
     const auto* position_sink = positions ? &*sink++ : nullptr;
@@ -68,9 +84,16 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
         if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
         const Sum sum = store.sum(rows[i]);
         const int width = sum_bits(store.count(rows[i]));
-        const std::uint64_t mask = (std::uint64_t{1} << width) - 1;
-        for (std::size_t d = 0; d < store.dim(); ++d) {
-          sums.add(static_cast<std::uint64_t>(sum[d]) & mask, width);
+        for (std::size_t d = 0; d < dim; d += 8) {
+          const int spare = spare_bits(&sum[d], width), bits = width - spare;
+          spares.add(static_cast<std::uint64_t>(spare), kSpareBits);
+          for (std::size_t half = d; half < d + 8; half += 4) {
+            std::uint64_t four = 0;
+            for (std::size_t j = half + 4; j-- > half;) {
+              four = four << bits | (static_cast<std::uint64_t>(sum[j]) & ((1u << bits) - 1));
+            }
+            sums.add(four, 4 * bits);
+          }
         }
         if (!several) continue;
         const bool last = i + 1 == rows.size() || store.owner(rows[i + 1]) != store.owner(rows[i]);
@@ -94,6 +117,7 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
       }
     };
     changed ? put(*changed) : store.visit_sorted_landmarks(put);
+    spares.finish();
     sums.finish();
     if (appearances) appearances->finish();
     if (id_writer) id_writer->finish();
@@ -167,7 +191,15 @@ class Reading {
     if (m < n) file.fail_size(section::kCounts);
     const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
     if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
-    PackedReader sums(file, section::kSums, dim * sum_bits(counts));
+    const std::size_t spares_size = m * ((dim + 7) / 8) * kSpareBits;
+    PackedReader spares(file, section::kSpareBits, spares_size);
+    std::size_t sums_size = 0;
+    for (PackedReader in = spares; const int count : counts) {
+      for (std::size_t d = 0; d < dim; d += 8) {
+        sums_size += 8 * (static_cast<std::size_t>(sum_bits(count)) - in.next(kSpareBits));
+      }
+    }
+    PackedReader sums(file, section::kSums, sums_size);
     std::optional<PackedReader> appearances;
     if (several) {
       appearances.emplace(file, section::kAppearances, m * static_cast<std::size_t>(bits + 1));
@@ -192,13 +224,17 @@ class Reading {
       std::int32_t before = -1;  // the appearance of the row before
       for (bool last = false; !last; ++row) {
         if (row == m) file.fail("it has a landmark without prototypes");
-        const int n_codes = counts[row], width = sum_bits(n_codes), sign = 1 << (width - 1);
+        const int count = counts[row];
         Sum sum{};
         bool possible = true;
-        for (std::size_t d = 0; d < dim; ++d) {
-          const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
-          possible = possible && std::abs(number) <= 127 * n_codes;
-          sum[d] = static_cast<std::int16_t>(number);
+        for (std::size_t d = 0; d < dim; d += 8) {
+          const int width = sum_bits(count) - static_cast<int>(spares.next(kSpareBits));
+          const int sign = 1 << (width - 1);
+          for (std::size_t j = d; j < d + 8; ++j) {
+            const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
+            possible = possible && std::abs(number) <= (j < dim ? 127 * count : 0);
+            sum[j] = static_cast<std::int16_t>(number);
+          }
         }
         if (!possible) file.fail("landmark ", ids[i], " has an impossible prototype");
         const auto marked = several ? static_cast<std::int32_t>(appearances->next(bits + 1)) : 1;
@@ -210,7 +246,7 @@ class Reading {
         before = appearance;
         if (!is_newest) continue;
         const Row to = store_.create_row(ids[i], landmark, static_cast<std::uint16_t>(appearance));
-        store_.set(to, sum, n_codes);
+        store_.set(to, sum, count);
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);
