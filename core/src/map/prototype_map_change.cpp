@@ -22,35 +22,36 @@ void check_codes(Codes codes, std::size_t dim) {
   }
 }
 
-void check_new_ids(std::span<const std::int64_t> ids) {
-  for (const std::int64_t id : ids) {
-    if (id < 0) invalid("landmark id ", id, " is negative");
-  }
+void check_new_id(std::int64_t id) {
+  if (id < 0) invalid("landmark id ", id, " is negative");
 }
 
 }  // namespace
 
 void MapChange::add(std::span<const std::int64_t> ids, Codes codes, int threads) {
   PrototypeStore& store = state_->store;
-  std::vector<std::int64_t> piece_ids;
+  std::vector<PrototypeStore::Key> keys;
   std::vector<Row> rows;
   for (std::size_t begin = 0; begin < codes.rows; begin += kPiece) {
     const std::size_t n = std::min(kPiece, codes.rows - begin);
     const Codes piece{codes.row(begin), n, codes.columns};
-    // A copy, checked once more, as a caller may write over ids meanwhile.
-    piece_ids.assign(&ids[begin], &ids[begin] + n);
-    check_new_ids(piece_ids);
+    // Copies of ids, checked once more, as a caller may write over them meanwhile.
+    keys.clear();
+    for (std::size_t i = 0; i < n; ++i) {
+      keys.push_back({ids[begin + i], store.appearance_of(piece.row(i))});
+      check_new_id(keys[i].id);
+    }
     rows.resize(n);
-    store.find_rows(piece_ids, piece, rows);
+    store.find_rows(keys, rows);
     std::size_t new_landmarks = 0, new_rows = 0;
     for (std::size_t i = 0; i < n; ++i) {
       if (rows[i] != kNoRow) continue;
       ++new_rows;
-      if (store.find(piece_ids[i]) == kNoLandmark) ++new_landmarks;
+      if (store.find(keys[i].id) == kNoLandmark) ++new_landmarks;
     }
     store.make_room(new_landmarks, new_rows, n, state_->searching);
     const auto lock = write();
-    store.add(piece_ids, piece, rows);
+    store.add(keys, piece, rows);
     store.reassign(threads);
   }
 }
@@ -65,7 +66,7 @@ void MapChange::set_metadata(Metadata metadata) {
 
 void PrototypeMap::add(std::span<const std::int64_t> ids, Descriptors descriptors, int threads) {
   check_pairs(ids.size(), descriptors.rows, "descriptors");
-  check_new_ids(ids);
+  std::ranges::for_each(ids, check_new_id);
   const std::size_t dim = this->dim();
   // One chunk is encoded while the chunk before it is added.
   std::vector<std::int8_t> buffer(std::min(descriptors.rows, 2 * kEncodeChunk) * dim);
@@ -108,7 +109,7 @@ void PrototypeMap::add(std::span<const std::int64_t> ids, Descriptors descriptor
 void PrototypeMap::add_codes(std::span<const std::int64_t> ids, Codes codes) {
   check_pairs(ids.size(), codes.rows, "codes");
   check_codes(codes, dim());
-  check_new_ids(ids);
+  std::ranges::for_each(ids, check_new_id);
   MapChange(*state_).add(ids, codes, 1);
 }
 

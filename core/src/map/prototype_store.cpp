@@ -116,21 +116,37 @@ std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const std::size_t> n) 
   return result;
 }
 
-void PrototypeStore::find_rows(std::span<const std::int64_t> ids, Codes codes,
-                               std::span<Row> rows) const {
-  const std::size_t n = rows.size();
-  for (std::size_t i = 0; i < n + 2 * kAhead; ++i) {
-    if (i < n) index_.prefetch_slot(ids[i]);
-    if (i >= kAhead && i < n + kAhead) index_.prefetch_ids(ids_, ids[i - kAhead]);
+void PrototypeStore::find_rows(std::span<const Key> keys, std::span<Row> rows) const {
+  constexpr std::size_t kMany = 64;
+  std::vector<std::size_t> left;  // keys of landmarks with many rows
+  for (std::size_t i = 0; i < keys.size() + 2 * kAhead; ++i) {
+    if (i < keys.size()) index_.prefetch_slot(keys[i].id);
+    if (i >= kAhead && i - kAhead < keys.size()) index_.prefetch_ids(ids_, keys[i - kAhead].id);
     if (i < 2 * kAhead) continue;
     const std::size_t at = i - 2 * kAhead;
-    const LandmarkIndex landmark = find(ids[at]);
-    rows[at] = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance_of(codes.row(at)));
+    const auto [id, wanted] = keys[at];
+    const LandmarkIndex landmark = find(id);
+    rows[at] = landmark == kNoLandmark ? kNoRow : walk(first_row(landmark), wanted, kMany);
+    if (rows[at] == kNoRow || appearance(rows[at]) == wanted) continue;
+    rows[at] = kNoRow;
+    left.push_back(at);
+  }
+  // All rows of a landmark once, not once per key.
+  std::ranges::sort(left, {}, [&](std::size_t i) { return keys[i]; });
+  for (std::span<const std::size_t> rest(left); !rest.empty();) {
+    const std::int64_t id = keys[rest[0]].id;
+    const auto of_id =
+        std::ranges::equal_range(rest, id, {}, [&](std::size_t i) { return keys[i].id; });
+    each_row_of(find(id), [&](Row row) {
+      const auto found = std::ranges::equal_range(
+          of_id, appearance(row), {}, [&](std::size_t i) { return keys[i].appearance; });
+      for (const std::size_t i : found) rows[i] = row;
+    });
+    rest = rest.subspan(of_id.size());
   }
 }
 
-void PrototypeStore::add(std::span<const std::int64_t> ids, Codes codes,
-                         std::span<const Row> rows) {
+void PrototypeStore::add(std::span<const Key> keys, Codes codes, std::span<const Row> rows) {
   const std::size_t n = rows.size();
   if (quantizer_.nlist() != 0) to_reassign_.reserve(to_reassign_.size() + n);
   // Neighbours of the same row are added at once.
@@ -145,12 +161,20 @@ void PrototypeStore::add(std::span<const std::int64_t> ids, Codes codes,
     add(rows[at], codes.row(at), end - at);
   }
   // If memory runs out, what was added so far stays, and answers.
+  std::size_t created = 0;
   for (std::size_t i = 0, end = 0; i < n; i = end) {
     end = i + 1;
     if (rows[i] != kNoRow) continue;
-    const std::uint16_t appearance = appearance_of(codes.row(i));
-    while (end < n && ids[end] == ids[i] && appearance_of(codes.row(end)) == appearance) ++end;
-    add(find_or_create_row(ids[i], appearance), codes.row(i), end - i);
+    while (end < n && keys[end] == keys[i]) ++end;
+    const auto [id, wanted] = keys[i];
+    LandmarkIndex landmark = find(id);
+    // New rows are the first of their landmark.
+    Row row = landmark == kNoLandmark ? kNoRow : walk(first_row(landmark), wanted, created);
+    if (row == kNoRow || appearance(row) != wanted) {
+      row = create_row(id, landmark, wanted);
+      ++created;
+    }
+    add(row, codes.row(i), end - i);
   }
 }
 
@@ -251,15 +275,16 @@ void PrototypeStore::reassign(int threads) {
   std::vector<Key> keys;
   std::vector<Row> rows;
   for (std::size_t first = 0; first < to_reassign_.size(); first += kReassignChunk) {
+    const std::size_t n = std::min(kReassignChunk, to_reassign_.size() - first);
+    rows.resize(n);
+    find_rows({&to_reassign_[first], n}, rows);
     keys.clear();
-    rows.clear();
-    const std::size_t end = std::min(first + kReassignChunk, to_reassign_.size());
-    for (std::size_t i = first; i < end; ++i) {
-      const Row row = find_row(to_reassign_[i].id, to_reassign_[i].appearance);
-      if (row == kNoRow) continue;
-      keys.push_back(to_reassign_[i]);
-      rows.push_back(row);
+    for (std::size_t i = 0; i < n; ++i) {
+      if (rows[i] == kNoRow) continue;
+      rows[keys.size()] = rows[i];
+      keys.push_back(to_reassign_[first + i]);
     }
+    rows.resize(keys.size());
     const std::vector<std::int8_t> codes = rounded(rows);
     auto lists = quantizer_.assign({codes.data(), rows.size(), dim_}, threads);
     std::size_t moving = 0;

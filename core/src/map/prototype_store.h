@@ -46,6 +46,14 @@ class Uncommitted {
 // that.
 class PrototypeStore : public RowTable {
  public:
+  // Names a row, whose index changes when others are removed.
+  struct Key {
+    std::int64_t id;
+    std::uint16_t appearance;
+
+    friend auto operator<=>(const Key&, const Key&) = default;
+  };
+
   PrototypeStore(std::size_t dim, std::size_t appearance_bits)
       : RowTable(appearance_bits != 0),
         dim_(dim),
@@ -199,11 +207,11 @@ class PrototypeStore : public RowTable {
   // Returns the rows that are n-th among all by id and then appearance.
   std::vector<Row> sorted_rows_at(std::span<const std::size_t> n) const;
 
-  // Finds the rows of these landmarks' codes, kNoRow for those that do not exist.
-  void find_rows(std::span<const std::int64_t> ids, Codes codes, std::span<Row> rows) const;
+  // Finds the rows of keys, kNoRow for those that do not exist.
+  void find_rows(std::span<const Key> keys, std::span<Row> rows) const;
   // Applies Eq. 2 for one code after the other, with new landmarks and rows where needed. `rows`
   // are those that find_rows found.
-  void add(std::span<const std::int64_t> ids, Codes codes, std::span<const Row> rows);
+  void add(std::span<const Key> keys, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const Sum& sum, int count);
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
@@ -271,12 +279,6 @@ class PrototypeStore : public RowTable {
   }
 
  private:
-  // Names a row, whose index changes when others are removed.
-  struct Key {
-    std::int64_t id;
-    std::uint16_t appearance;
-  };
-
   const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
   std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
   // The 4-bit numbers of a row: the low and high bits of byte d % 4 of each 4 bytes are numbers d

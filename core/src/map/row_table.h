@@ -82,11 +82,20 @@ class RowTable {
   void each_row_of(LandmarkIndex landmark, const Take& take) const {
     for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) take(row);
   }
-  // Returns the row of a landmark's appearance, or kNoRow.
-  Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
-    Row row = first_row(landmark);
-    while (several_ && row != kNoRow && appearances_[row.value] != appearance) row = next_row(row);
+  // Steps from a row of a landmark to that of an appearance, which may be kNoRow, but over at most
+  // `limit` others.
+  Row walk(Row row, std::uint16_t appearance, std::size_t limit) const {
+    if (!several_) return row;
+    std::size_t steps = 0;
+    for (; row != kNoRow && appearances_[row.value] != appearance && steps < limit; ++steps) {
+      row = next_row(row);
+    }
+    steps_ += steps;
     return row;
+  }
+  // Returns the row of a landmark's appearance, or kNoRow. Only changes may call this.
+  Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
+    return walk(first_row(landmark), appearance, SIZE_MAX);
   }
   Row find_row(std::int64_t id, std::uint16_t appearance) const {
     const LandmarkIndex landmark = find(id);
@@ -123,7 +132,7 @@ class RowTable {
   const std::vector<Position>& positions() const { return positions_; }
   bool any_position() const { return std::ranges::any_of(positions_, has_position); }
 
-  // Counts rows that were stepped over to remove or move others.
+  // Counts rows that changes stepped over to find, remove or move others.
   std::size_t steps() const { return steps_; }
 
  protected:
@@ -242,7 +251,7 @@ class RowTable {
     first_rows_.pop_back();
   }
 
-  std::size_t steps_ = 0;
+  mutable std::size_t steps_ = 0;
 };
 
 }  // namespace protomark
