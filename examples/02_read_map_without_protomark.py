@@ -43,18 +43,21 @@ def bit_numbers(content: Any, count: int, width: int) -> Any:
     return (bits.astype(np.int64) << np.arange(width)).sum(1)
 
 
-def learning_sums(content: bytes, counts: Any, k: int) -> Any:
-    """Unpack the sums of rows of k numbers, (m, k): 8 + ceil(log2(count)) bits each."""
-    bits = np.unpackbits(np.frombuffer(content, np.uint8), bitorder="little")
-    widths = 8 + np.ceil(np.log2(counts)).astype(int)
-    starts, sums = k * (np.cumsum(widths) - widths), np.empty((len(counts), k), np.int64)
-    for width in np.unique(widths):  # all rows of this width together
-        rows = np.flatnonzero(widths == width)
+def learning_sums(parts: dict[str, bytes], k: int) -> Any:
+    """Unpack the sums of rows of k numbers, (m, k): each eight numbers of w bits take w bytes."""
+    counts, content = (np.frombuffer(parts[name], "u1") for name in ("counts", "sums"))
+    eights = -(-k // 8)
+    spare = bit_numbers(np.frombuffer(parts["spare"], "u1"), len(counts) * eights, 2)
+    widths = np.repeat(8 + np.ceil(np.log2(counts)).astype(int), eights) - spare
+    starts, sums = np.cumsum(widths) - widths, np.empty((len(widths), 8), np.int64)
+    for width in np.unique(widths):  # all of this width together
+        same = np.flatnonzero(widths == width)
+        packed = content[starts[same, None] + np.arange(width)]
         values = 1 << np.arange(width)
         values[-1] *= -1  # two's complement
-        packed = bits[starts[rows, None] + np.arange(k * width)]
-        sums[rows] = packed.reshape(-1, k, width) @ values
-    return sums
+        bits = np.unpackbits(packed, axis=1, bitorder="little").reshape(-1, 8, width)
+        sums[same] = bits @ values
+    return sums.reshape(len(counts), 8 * eights)[:, :k]
 
 
 def learning_rows(parts: dict[str, bytes], n: int) -> tuple[Any, Any]:
@@ -138,7 +141,7 @@ class Map:
         self.landmarks = np.repeat(self.ids, rows)
         self.counts = np.frombuffer(parts["counts"], "u1")
         if learning:
-            sums = learning_sums(parts["sums"], self.counts, k)
+            sums = learning_sums(parts, k)
             count = self.counts[:, None].astype(np.int64)
             self.prototypes = np.sign(sums) * ((2 * abs(sums) + count) // (2 * count))
         else:

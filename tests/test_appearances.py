@@ -199,7 +199,7 @@ def test_maps_without_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene.add(ids, descriptors)
     data = file_bytes(scene, tmp_path)
     assert data[8:12] == (1).to_bytes(4, "little")
-    assert {name for name, _ in sections(data)} == {"encoder", "shape", "counts", "sums"}
+    assert {name for name, _ in sections(data)} == {"encoder", "shape", "counts", "spare", "sums"}
     assert scene.counts([0]).dtype == np.uint32
     assert scene.prototype_count == len(scene) == 40
     assert scene.appearance_bits == 0
@@ -293,6 +293,8 @@ def marked(*appearances: int) -> bytes:
         ("counts", bytes([1, 1, 0]), "it has an impossible prototype"),
         ("counts", bytes([1]), "section 'counts' has the wrong size"),
         ("counts", bytes([1, 1]), "section 'sums' has the wrong size"),
+        ("spare", bytes(8), "section 'sums' has the wrong size"),
+        ("spare", None, "it lacks the section 'spare'"),
         ("idblocks", struct.pack("<qQ", -1, 2), "negative landmark id"),
         ("idgaps", (1).to_bytes(8, "little"), "landmark ids do not ascend"),
     ],

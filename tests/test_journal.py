@@ -403,7 +403,7 @@ def landmarks_in(parts: dict[str, bytes], appearance_bits: int) -> dict[int, Any
     rows, appearances = READER["learning_rows"](parts, n)
     ends = np.cumsum(rows)[:-1]
     counts = np.frombuffer(parts["counts"], np.uint8)
-    sums = READER["learning_sums"](parts["sums"], counts, dim)
+    sums = READER["learning_sums"](parts, dim)
     positions = np.full((n, 3), np.nan)
     if "position" in parts:
         positions = np.frombuffer(parts["position"], "<f8").reshape(n, 3)

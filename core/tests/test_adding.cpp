@@ -12,6 +12,7 @@
 
 #include "check.h"
 #include "counted_memory.h"
+#include "map/map_state.h"
 #include "protomark/protomark.h"
 #include "random.h"
 
@@ -184,6 +185,26 @@ void test_later_races(std::size_t appearance_bits) {
   }
 }
 
+// A landmark with as many appearances as there are. The test counts rows, not time.
+void test_all_appearances() {
+  constexpr std::size_t kDim = 16, kRows = 1 << kDim;
+  std::vector<std::int8_t> codes;
+  for (std::size_t i = 0; i < kRows * kDim; ++i) {
+    codes.push_back((i / kDim >> i % kDim & 1) != 0 ? 5 : -5);
+  }
+  MapState state(test::random_encoder(64, kDim), kDim, kDim);
+  const PrototypeStore& store = state.store;
+  const std::vector<std::int64_t> ids(kRows, 7);
+  for (const std::uint32_t times : {1, 2}) {
+    MapChange(state).add(ids, {codes.data(), kRows, kDim}, 1);
+    CHECK(store.prototype_count() == kRows && store.observations(store.at(7)) == times * kRows);
+  }
+  CHECK(store.steps() < 2 * kRows * MapChange::kPiece);
+  PrototypeStore merged(kDim, kDim);
+  for (int times = 0; times < 2; ++times) merged.merge(3, store, store.at(7));
+  CHECK(merged.prototype_count() == kRows && merged.steps() < kRows);
+}
+
 }  // namespace
 
 int main() {
@@ -198,5 +219,6 @@ int main() {
 #endif
   }
   fs::remove(path);
+  test_all_appearances();
   return check::result();
 }

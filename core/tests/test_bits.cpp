@@ -8,23 +8,21 @@
 using namespace protomark;
 
 int main() {
+  constexpr std::size_t kNumbers = 9001;  // several pieces of 4096 words
   test::Random random(4);
   for (int bits = 0; bits < 64; ++bits) {
     const auto limit = static_cast<std::int64_t>((std::uint64_t{1} << bits) - 1);
-    const auto values = random.integers<std::uint64_t>(1001, 0, limit);
-    BitPacker packer;
+    const auto values = random.integers<std::uint64_t>(kNumbers, 0, limit);
     std::vector<std::uint64_t> words;
-    for (std::size_t i = 0; i < values.size(); ++i) {
-      packer.add(values[i], bits);
-      if (i % 100 != 0) continue;
-      // Full words may be taken at any time.
-      words.insert(words.end(), packer.words().begin(), packer.words().end());
-      packer.words().clear();
-    }
-    packer.align();
-    words.insert(words.end(), packer.words().begin(), packer.words().end());
-    CHECK(words.size() == packed_words(values.size(), bits));
-    CHECK(words.size() == (1001u * static_cast<unsigned>(bits) + 63) / 64);
+    PackedWriter writer([&](std::span<const std::byte> bytes) {
+      const std::size_t before = words.size();
+      words.resize(before + bytes.size() / 8);
+      if (!bytes.empty()) std::memcpy(&words[before], bytes.data(), bytes.size());
+    });
+    for (const std::uint64_t value : values) writer.add(value, bits);
+    writer.finish();
+    CHECK(words.size() == packed_words(kNumbers, bits));
+    CHECK(words.size() == (kNumbers * static_cast<unsigned>(bits) + 63) / 64);
     bool equal = true;
     for (std::size_t i = 0; i < values.size(); ++i) {
       equal = equal && packed_number(words.data(), bits, i) == values[i];

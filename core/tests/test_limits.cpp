@@ -424,7 +424,10 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(endless, "landmark without prototypes"));
   CHECK(says(File(learning).set("counts", 0, std::uint8_t{0}), "impossible prototype"));
   CHECK(says(File(learning).set("sums", 0, std::int16_t{0x80}), "impossible prototype"));
+  CHECK(says(File(learning).set("sums", 15, std::uint8_t{1}), "impossible prototype"));  // padding
   CHECK(says(File(learning).resize("sums", 100), "'sums' has the wrong size"));
+  CHECK(says(File(learning).set("spare", 0, UINT64_MAX), "'sums' has the wrong size"));
+  CHECK(says(File(learning).resize("spare", 9), "'spare' has the wrong size"));
   CHECK(says(File(learning).set("position", 0, kNaN), "no finite position"));
   CHECK(says(File(learning).set("position", 8, kInfinity), "no finite position"));
   CHECK(says(File(sealed).set("rows", 0, std::uint8_t{0}), "landmark without prototypes"));

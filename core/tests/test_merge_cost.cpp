@@ -6,6 +6,7 @@
 #include "check.h"
 #include "map/sealed_store.h"
 #include "random.h"
+#include "store_rows.h"
 
 using namespace protomark;
 
@@ -103,7 +104,7 @@ void merged_stores_equal_plain_ones() {
       for (std::size_t d = 0; d < dim; ++d) {
         sum[d] = static_cast<std::int16_t>(n * random.integer(-limit, limit));
       }
-      store.merge(store.find_or_create_row(random.integer(0, 9) * 7, appearance), sum, n);
+      store.merge(test::find_or_create_row(store, random.integer(0, 9) * 7, appearance), sum, n);
     }
     for (const std::size_t wanted : {0, 10, 20, 35, 50}) {
       const auto merged = merge_appearances(store, wanted);

@@ -142,7 +142,7 @@ Metadata parsed(const std::vector<std::byte>& section) {
   file.add(section::kEncoder, tiny->serialize());
   add_value(file, section::kShape, MapShape{0, 12, {}});
   file.add(section::kMetadata, section);
-  for (const char* name : {section::kCounts, section::kSums}) {
+  for (const char* name : {section::kCounts, section::kSpareBits, section::kSums}) {
     file.add(name, std::vector<std::byte>());
   }
   return PrototypeMap::parse(file.serialize(), "input").metadata();

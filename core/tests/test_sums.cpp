@@ -8,6 +8,7 @@
 #include "counted_memory.h"
 #include "map/prototype_store.h"
 #include "random.h"
+#include "store_rows.h"
 
 using namespace protomark;
 
@@ -38,7 +39,7 @@ void test_counts(std::size_t dim) {
       // Up and down between counts, or in order.
       const int count = round % 2 == 0 ? n : static_cast<int>(random.integer(1, 255));
       const Sum sum = random_sum(random, count, dim);
-      const Row row = store.find_or_create_row(random.integer(0, 40), 0);
+      const Row row = test::find_or_create_row(store, random.integer(0, 40), 0);
       store.set(row, sum, count);
       kept = kept && store.count(row) == count && equal(store.sum(row), sum, dim);
       store.rounded(row, means.data());
@@ -78,7 +79,7 @@ void test_changes(std::size_t appearance_bits) {
         std::erase_if(plain, [&](const auto& row) { return row.first.first == id; });
       } else {
         const Sum sum = random_sum(random, n, kDim);
-        store.set(store.find_or_create_row(id, appearance), sum, n);
+        store.set(test::find_or_create_row(store, id, appearance), sum, n);
         plain[{id, appearance}] = {sum, n};
       }
     }
@@ -88,7 +89,7 @@ void test_changes(std::size_t appearance_bits) {
     PrototypeStore copy = store;
     copy.erase(copy.id(copy.sorted_landmarks()[0]));
     for (std::int64_t id = 1000; id < 1300; ++id) {
-      copy.set(copy.find_or_create_row(id, 0), random_sum(random, 99, kDim), 99);
+      copy.set(test::find_or_create_row(copy, id, 0), random_sum(random, 99, kDim), 99);
     }
     CHECK(equals_plain(store));
     // Rows move into other lists.
@@ -112,7 +113,7 @@ void test_no_memory() {
   for (std::int64_t id = 0; id < 3000; id += 3) {
     const Sum few = random_sum(random, 15, kDim), many = random_sum(random, 16, kDim);
     std::vector<Row> rows;
-    for (int i = 0; i < 3; ++i) rows.push_back(store.find_or_create_row(id + i, 0));
+    for (int i = 0; i < 3; ++i) rows.push_back(test::find_or_create_row(store, id + i, 0));
     test::left = 0;
     store.set(rows[0], many, 16);
     for (const Row row : {rows[1], rows[2]}) {
@@ -131,7 +132,7 @@ void test_no_memory() {
   CHECK(kept && failed > 0);
   // What was given back is taken again.
   for (std::int64_t id = 0; id < 3000; ++id) {
-    const Row row = store.find_or_create_row(id, 0);
+    const Row row = test::find_or_create_row(store, id, 0);
     store.set(row, random_sum(random, 16, kDim), 16);
     store.set(row, random_sum(random, 1, kDim), 1);
     test::left = 0;

@@ -38,7 +38,7 @@ std::vector<Position> to_positions(const Eigen::MatrixBase<Points>& points) {
                 "points must be of a type with 3 rows (one point per column) or 3 columns (one per "
                 "row), such as Eigen::Matrix3Xd or Eigen::MatrixX3d");
   const Eigen::Index n = columns ? points.cols() : points.rows();
-  std::vector<Position> result(static_cast<std::size_t>(n));
+  std::vector<Position> result(static_cast<size_t>(n));
   Eigen::Map<Eigen::Matrix3Xd> copy(n == 0 ? nullptr : result.front().data(), 3, n);
   if constexpr (columns) {
     copy = points.template cast<double>();

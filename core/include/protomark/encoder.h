@@ -17,13 +17,13 @@ namespace protomark {
 // x are the bits of the descriptor, 0 or 1, in the first layer, and the bytes that the layer before
 // gave in later ones.
 struct Layer {
-  std::size_t inputs = 0;
-  std::size_t outputs = 0;
-  std::vector<std::int8_t> weights;  // outputs x inputs
-  std::vector<std::int32_t> bias;
-  std::vector<std::int32_t> multipliers;  // positive
-  int shift = 1;                          // 1 to 62
-  std::array<std::uint8_t, 256> table{};
+  size_t inputs = 0;
+  size_t outputs = 0;
+  std::vector<int8_t> weights;  // outputs x inputs
+  std::vector<int32_t> bias;
+  std::vector<int32_t> multipliers;  // positive
+  int shift = 1;                     // 1 to 62
+  std::array<uint8_t, 256> table{};
 };
 
 struct EncoderInfo {
@@ -39,7 +39,7 @@ class PROTOMARK_API Encoder {
   // `dims` are the lengths at which a code may be cut, ascending, the last one the number of
   // outputs; a code times `scale` is the real value. Throws std::invalid_argument if layers do not
   // fit together, a sum could exceed 32 bits, or a note is named like a field of EncoderInfo.
-  Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims, float scale);
+  Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale);
 
   // Reads and checks a model file. Throws FileError.
   static Encoder load(const std::filesystem::path& path);
@@ -52,21 +52,21 @@ class PROTOMARK_API Encoder {
 
   const EncoderInfo& info() const { return info_; }
   const std::vector<Layer>& layers() const { return layers_; }
-  std::size_t bits() const { return layers_.front().inputs; }  // of a descriptor
-  std::size_t bytes() const { return bits() / 8; }
-  std::size_t dim() const { return dims_.back(); }
-  const std::vector<std::size_t>& dims() const { return dims_; }
+  size_t bits() const { return layers_.front().inputs; }  // of a descriptor
+  size_t bytes() const { return bits() / 8; }
+  size_t dim() const { return dims_.back(); }
+  const std::vector<size_t>& dims() const { return dims_; }
   float scale() const { return scale_; }
   // The SHA-256 of the network, in hexadecimal; encoders of equal identity give equal codes.
   const std::string& identity() const { return identity_; }
   // Multiply-adds per descriptor.
-  std::size_t multiply_adds() const;
+  size_t multiply_adds() const;
 
   // Encodes descriptors (n x bytes) to codes (n x dim), where dim is one of dims(), or 0 for the
   // full length. Throws std::invalid_argument if shapes do not fit.
-  Matrix<std::int8_t> encode(Descriptors descriptors, std::size_t dim = 0, int threads = 1) const;
+  Matrix<int8_t> encode(Descriptors descriptors, size_t dim = 0, int threads = 1) const;
   // Encodes into memory of the caller; dim is codes.columns.
-  void encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads = 1) const;
+  void encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads = 1) const;
 
  private:
   struct Packed;  // the layers as the kernels take them
@@ -75,7 +75,7 @@ class PROTOMARK_API Encoder {
 
   EncoderInfo info_;
   std::vector<Layer> layers_;
-  std::vector<std::size_t> dims_;
+  std::vector<size_t> dims_;
   float scale_;
   std::string identity_;
   std::shared_ptr<const Packed> packed_;

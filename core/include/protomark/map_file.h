@@ -26,16 +26,16 @@ PROTOMARK_API void expect_descriptor(const Encoder& encoder, const std::string& 
                                      const std::string& map);
 
 // Returns the names and sizes in bytes of a file's sections. Throws FileError.
-PROTOMARK_API std::vector<std::pair<std::string, std::size_t>> file_sections(
+PROTOMARK_API std::vector<std::pair<std::string, size_t>> file_sections(
     const std::filesystem::path& path);
 
 // Checks every checksum of a model or map file, and of the journal beside it. Throws FileError.
 PROTOMARK_API void verify_file(const std::filesystem::path& path);
 
 struct FileJournal {
-  std::size_t commits;     // since the map file was written
-  std::size_t bytes;       // of the whole journal
-  std::size_t torn_bytes;  // at its end, of a commit that was interrupted
+  size_t commits;     // since the map file was written
+  size_t bytes;       // of the whole journal
+  size_t torn_bytes;  // at its end, of a commit that was interrupted
 };
 
 // Describes the journal beside a map file (PrototypeMap::commit). Throws FileError.

@@ -17,7 +17,7 @@ struct PROTOMARK_API MatchCalibration {
 
   // Reads the calibration for codes of `dim` numbers, 0 for the full length, from the encoder's
   // notes. Throws std::invalid_argument if there is none, or a note that cannot be read.
-  static MatchCalibration of(const Encoder& encoder, std::size_t dim = 0);
+  static MatchCalibration of(const Encoder& encoder, size_t dim = 0);
   // Takes squared distances as a search gives them. Returns 0 where there is no nearest landmark.
   double probability(double nearest, double second) const;
   bool operator==(const MatchCalibration&) const = default;
@@ -25,10 +25,10 @@ struct PROTOMARK_API MatchCalibration {
 
 // Match i is of keypoints[i] and landmarks[i]; the likeliest is first.
 struct MatchList {
-  std::vector<std::size_t> keypoints;   // rows of the descriptors, each at most once
-  std::vector<std::int64_t> landmarks;  // ids, each at most once
-  std::vector<double> probabilities;    // that the match is right
-  std::size_t size() const { return keypoints.size(); }
+  std::vector<size_t> keypoints;      // rows of the descriptors, each at most once
+  std::vector<int64_t> landmarks;     // ids, each at most once
+  std::vector<double> probabilities;  // that the match is right
+  size_t size() const { return keypoints.size(); }
   bool operator==(const MatchList&) const = default;
 };
 
@@ -37,7 +37,7 @@ struct MatchOptions {
   double min_probability = 0.2;
   // As in SearchOptions.
   std::optional<double> recall = std::nullopt;
-  std::optional<std::span<const std::int64_t>> among = std::nullopt;
+  std::optional<std::span<const int64_t>> among = std::nullopt;
   int threads = 1;
 };
 
@@ -52,7 +52,7 @@ PROTOMARK_API MatchList match(const SealedMap& map, Descriptors descriptors,
 // Returns the matches that are likely enough: landmark nearest[i], -1 for none, is right for
 // keypoint i with probabilities[i]. A landmark keeps its likeliest keypoint, ties to the smaller
 // row. Throws std::invalid_argument if sizes differ.
-PROTOMARK_API MatchList accept(std::span<const std::int64_t> nearest,
+PROTOMARK_API MatchList accept(std::span<const int64_t> nearest,
                                std::span<const double> probabilities, double min_probability);
 
 }  // namespace protomark

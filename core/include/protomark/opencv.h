@@ -14,7 +14,7 @@ namespace protomark {
 class MatDescriptors {
  public:
   // Throws std::invalid_argument unless the Mat is empty or of two dimensions and CV_8UC1.
-  explicit MatDescriptors(const cv::Mat& mat, std::size_t bytes = 0) : bytes_(bytes) {
+  explicit MatDescriptors(const cv::Mat& mat, size_t bytes = 0) : bytes_(bytes) {
     if (mat.empty()) return;
     if (mat.dims != 2 || mat.type() != CV_8UC1) {
       throw std::invalid_argument(
@@ -22,15 +22,15 @@ class MatDescriptors {
           cv::typeToString(mat.type()) + " with " + std::to_string(mat.dims));
     }
     mat_ = mat.isContinuous() ? mat : mat.clone();
-    bytes_ = static_cast<std::size_t>(mat.cols);
+    bytes_ = static_cast<size_t>(mat.cols);
   }
   operator Descriptors() const {  // NOLINT: a view costs nothing
-    return {mat_.data, static_cast<std::size_t>(mat_.rows), bytes_};
+    return {mat_.data, static_cast<size_t>(mat_.rows), bytes_};
   }
 
  private:
   cv::Mat mat_;
-  std::size_t bytes_;
+  size_t bytes_;
 };
 
 // Positions as cv::solvePnP takes them; those of landmarks without one are NaN.

@@ -16,7 +16,7 @@ struct MapState;
 struct IndexOptions {
   // Number of inverted lists, 1 to 65536 and at most one per prototype; by default a number that
   // fits the map.
-  std::optional<std::size_t> nlist = std::nullopt;
+  std::optional<size_t> nlist = std::nullopt;
   // Moves prototypes within the map instead of copying it.
   bool in_place = false;
 };
@@ -54,39 +54,39 @@ struct SealOptions {
 class PROTOMARK_API PrototypeMap {
  public:
   static constexpr int kMaxCount = 255;
-  static constexpr std::size_t kMaxAppearanceBits = 16;
+  static constexpr size_t kMaxAppearanceBits = 16;
 
   // Makes an empty map. `dim` is one of the encoder's dims(), or 0 for the full length;
   // `appearance_bits` is 0 (one prototype per landmark) to 16, and at most dim.
-  explicit PrototypeMap(std::shared_ptr<const Encoder> encoder, std::size_t dim = 0,
-                        std::size_t appearance_bits = 0);
+  explicit PrototypeMap(std::shared_ptr<const Encoder> encoder, size_t dim = 0,
+                        size_t appearance_bits = 0);
   PrototypeMap(PrototypeMap&& other) noexcept;
   ~PrototypeMap();
 
   const std::shared_ptr<const Encoder>& encoder() const;
-  std::size_t dim() const;
-  std::size_t appearance_bits() const;
-  std::size_t size() const;             // number of landmarks
-  std::size_t prototype_count() const;  // one per appearance of each landmark
+  size_t dim() const;
+  size_t appearance_bits() const;
+  size_t size() const;             // number of landmarks
+  size_t prototype_count() const;  // one per appearance of each landmark
   // Returns the ids of all landmarks in ascending order.
-  std::vector<std::int64_t> ids() const;
+  std::vector<int64_t> ids() const;
 
   // Adds observations: descriptor i (n x bytes) is of landmark ids[i], which is new if the map does
   // not hold it. Ids are not negative.
-  void add(std::span<const std::int64_t> ids, Descriptors descriptors, int threads = 1);
+  void add(std::span<const int64_t> ids, Descriptors descriptors, int threads = 1);
   // Undoes `add`. A landmark without observations leaves the map. Throws UnknownLandmark, and
   // std::invalid_argument if these observations cannot have been added.
-  void subtract(std::span<const std::int64_t> ids, Descriptors descriptors, int threads = 1);
+  void subtract(std::span<const int64_t> ids, Descriptors descriptors, int threads = 1);
   // The same for descriptors that are encoded already (n x dim).
-  void add_codes(std::span<const std::int64_t> ids, Codes codes);
-  void subtract_codes(std::span<const std::int64_t> ids, Codes codes);
+  void add_codes(std::span<const int64_t> ids, Codes codes);
+  void subtract_codes(std::span<const int64_t> ids, Codes codes);
   // Removes landmarks. Throws UnknownLandmark.
-  void remove(std::span<const std::int64_t> ids);
+  void remove(std::span<const int64_t> ids);
 
   // Merges landmark source[i] into landmark into[i], appearance by appearance, in this order; the
   // sources leave the map. A landmark keeps its position, or takes the source's if it has none.
   // Throws UnknownLandmark, and std::invalid_argument for a landmark that was merged before.
-  void merge_landmarks(std::span<const std::int64_t> into, std::span<const std::int64_t> source);
+  void merge_landmarks(std::span<const int64_t> into, std::span<const int64_t> source);
   // Merges another map of the same encoder, dim and appearance_bits into this one, as if its
   // observations had been added here. Landmark source[i] of the other map becomes landmark into[i]
   // of this one, existing or new; all others keep their ids. If several become one, they are merged
@@ -94,37 +94,37 @@ class PROTOMARK_API PrototypeMap {
   // under names that it lacks, and the earlier "created". Throws UnknownLandmark for a source that
   // the other map does not hold, and std::invalid_argument if maps differ, a source is named twice
   // or an id is negative.
-  void merge_map(const PrototypeMap& other, std::span<const std::int64_t> into = {},
-                 std::span<const std::int64_t> source = {});
+  void merge_map(const PrototypeMap& other, std::span<const int64_t> into = {},
+                 std::span<const int64_t> source = {});
 
   // Return parts of this map, without an index. All parts merged into an empty map, in any order,
   // equal this map without its index.
   //
   // Some landmarks, in any order. Throws UnknownLandmark.
-  PrototypeMap part(std::span<const std::int64_t> ids) const;
+  PrototypeMap part(std::span<const int64_t> ids) const;
   // By id: the landmarks below boundaries[0], those from there to below boundaries[1] and so on.
   // Throws std::invalid_argument unless boundaries ascend.
-  std::vector<PrototypeMap> split_by_id(std::span<const std::int64_t> boundaries) const;
+  std::vector<PrototypeMap> split_by_id(std::span<const int64_t> boundaries) const;
   // By space: a part per cube of this edge that holds landmarks, by ascending cell, then one of the
   // landmarks without a position if there are any. Throws std::invalid_argument if `cell_size` is
   // not above 0 or is too small for the extent of the map.
   std::vector<MapPart> split_by_space(double cell_size) const;
 
   // Sets world coordinates, which are finite; NaN in all three removes the position.
-  void set_positions(std::span<const std::int64_t> ids, std::span<const Position> positions);
+  void set_positions(std::span<const int64_t> ids, std::span<const Position> positions);
   // Replaces the metadata, of which a new map has none. Throws as check_metadata.
   void set_metadata(Metadata metadata);
   Metadata metadata() const;
 
   // Return positions, numbers of observations over all appearances, and means over all appearances
   // (n x dim, in code units). Throw UnknownLandmark.
-  std::vector<Position> positions(std::span<const std::int64_t> ids) const;
-  std::vector<std::uint32_t> counts(std::span<const std::int64_t> ids) const;
-  Matrix<float> prototypes(std::span<const std::int64_t> ids) const;
+  std::vector<Position> positions(std::span<const int64_t> ids) const;
+  std::vector<uint32_t> counts(std::span<const int64_t> ids) const;
+  Matrix<float> prototypes(std::span<const int64_t> ids) const;
   // Return the prototypes of a landmark (appearances x dim, in code units) and the number of
   // observations of each, by ascending sign bits of the appearance. Throw UnknownLandmark.
-  Matrix<float> appearances(std::int64_t id) const;
-  std::vector<std::uint32_t> appearance_counts(std::int64_t id) const;
+  Matrix<float> appearances(int64_t id) const;
+  std::vector<uint32_t> appearance_counts(int64_t id) const;
   MapSummary summary() const;
 
   // Learns the centroids of inverted lists from the map's prototypes, anew if there is an index,
@@ -138,20 +138,20 @@ class PROTOMARK_API PrototypeMap {
   void build_index(const IndexOptions& options = {}, int threads = 1);
   void drop_index();
   // Number of inverted lists; 0 means no index.
-  std::size_t nlist() const;
+  size_t nlist() const;
   // Returns how many lists a search with this recall, above 0 and at most 1, visits, as measured on
   // the map (docs/large-maps.md), and again when a tenth of it has changed. Throws
   // std::invalid_argument for another recall, and without an index.
-  std::size_t nprobe(double recall, int threads = 1) const;
+  size_t nprobe(double recall, int threads = 1) const;
 
   // Returns the squared distance of each code to one landmark, as a search measures it: what guided
   // matching needs, which knows near which landmarks a keypoint is. Throws UnknownLandmark, and
   // std::invalid_argument unless there is a code of `dim()` numbers per id.
-  std::vector<std::int32_t> distances(std::span<const std::int64_t> ids, Codes codes) const;
+  std::vector<int32_t> distances(std::span<const int64_t> ids, Codes codes) const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).
-  Matches search(Descriptors queries, std::size_t k = 2, const SearchOptions& options = {}) const;
-  Matches search_codes(Codes queries, std::size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search(Descriptors queries, size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search_codes(Codes queries, size_t k = 2, const SearchOptions& options = {}) const;
 
   // Writes the map, whole or not at all; equal maps (with equal centroids) give equal files.
   // Compacts if `path` is the file that the map was loaded from with a journal. Throws FileError,
@@ -170,7 +170,7 @@ class PROTOMARK_API PrototypeMap {
   // changed: once it has returned, the map file and its journal give this map, whatever happens.
   // Returns the number of bytes written, 0 if nothing changed. Throws FileError, after which one
   // may commit again, and std::invalid_argument without a journal.
-  std::size_t commit();
+  size_t commit();
   // Writes the map file anew and empties the journal. Whatever happens, the two of them give this
   // map or what was committed last. Throws FileError if the map file cannot be written, and
   // std::invalid_argument without a journal. If only the journal cannot be emptied it returns: its
@@ -196,7 +196,7 @@ class PROTOMARK_API PrototypeMap {
 struct MapPart {
   // Coordinate i of each position is in [cell[i], cell[i] + 1) * cell_size. nullopt: no landmark
   // has a position.
-  std::optional<std::array<std::int64_t, 3>> cell;
+  std::optional<std::array<int64_t, 3>> cell;
   PrototypeMap map;
 };
 

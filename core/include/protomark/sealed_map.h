@@ -26,9 +26,9 @@ class PROTOMARK_API SealedMap {
 
   const std::shared_ptr<const Encoder>& encoder() const;
   const Metadata& metadata() const;
-  std::size_t dim() const;
-  std::size_t size() const;  // number of landmarks
-  std::size_t prototype_count() const;
+  size_t dim() const;
+  size_t size() const;  // number of landmarks
+  size_t prototype_count() const;
   // Bits per number of a prototype: 8 or 4.
   int code_bits() const;
   // Bytes that a landmark takes on average for its prototypes, their number and its count, as
@@ -41,27 +41,27 @@ class PROTOMARK_API SealedMap {
   std::optional<Position> position_error() const;
   // Returns the ids of all landmarks in ascending order. Throws FileError if those of a broken file
   // do not ascend, which only this call checks.
-  std::vector<std::int64_t> ids() const;
+  std::vector<int64_t> ids() const;
 
   // Number of inverted lists; 0 means no index.
-  std::size_t nlist() const;
+  size_t nlist() const;
   // Returns how many lists a search with this recall, above 0 and at most 1, visits, as measured
   // when the map was sealed. Throws std::invalid_argument for another recall, and without an index.
-  std::size_t nprobe(double recall) const;
+  size_t nprobe(double recall) const;
 
   // Return positions; numbers of observations, at most 255; and prototypes as stored (n x dim, in
   // code units), of a landmark with several their plain mean. Throw UnknownLandmark.
-  std::vector<Position> positions(std::span<const std::int64_t> ids) const;
-  std::vector<std::uint32_t> counts(std::span<const std::int64_t> ids) const;
-  Matrix<float> prototypes(std::span<const std::int64_t> ids) const;
+  std::vector<Position> positions(std::span<const int64_t> ids) const;
+  std::vector<uint32_t> counts(std::span<const int64_t> ids) const;
+  Matrix<float> prototypes(std::span<const int64_t> ids) const;
   // Returns the prototypes of a landmark (appearances x dim, in code units), with an index in no
   // particular order. Throws UnknownLandmark.
-  Matrix<float> appearances(std::int64_t id) const;
+  Matrix<float> appearances(int64_t id) const;
   MapSummary summary() const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).
-  Matches search(Descriptors queries, std::size_t k = 2, const SearchOptions& options = {}) const;
-  Matches search_codes(Codes queries, std::size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search(Descriptors queries, size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search_codes(Codes queries, size_t k = 2, const SearchOptions& options = {}) const;
 
  private:
   struct Content;

@@ -24,14 +24,17 @@
 
 namespace protomark {
 
+using std::int16_t, std::int32_t, std::int64_t, std::int8_t, std::size_t;
+using std::uint16_t, std::uint32_t, std::uint64_t, std::uint8_t;
+
 // A row-major matrix in memory of the caller.
 template <typename T>
 struct MatrixView {
   T* data = nullptr;
-  std::size_t rows = 0;
-  std::size_t columns = 0;
+  size_t rows = 0;
+  size_t columns = 0;
 
-  T* row(std::size_t i) const { return data + i * columns; }
+  T* row(size_t i) const { return data + i * columns; }
   operator MatrixView<const T>() const  // NOLINT: as T* converts to const T*
     requires(!std::is_const_v<T>)
   {
@@ -44,37 +47,37 @@ template <typename T>
 struct Matrix {
   Matrix() = default;
   // All zeros. Throws std::bad_alloc.
-  Matrix(std::size_t n, std::size_t m) : rows(n), columns(m) {
+  Matrix(size_t n, size_t m) : rows(n), columns(m) {
     if (m > PTRDIFF_MAX / sizeof(T) || (m != 0 && n > PTRDIFF_MAX / sizeof(T) / m))
       throw std::bad_alloc();
     data.resize(n * m);
   }
 
-  T* row(std::size_t i) { return data.data() + i * columns; }
-  const T* row(std::size_t i) const { return data.data() + i * columns; }
+  T* row(size_t i) { return data.data() + i * columns; }
+  const T* row(size_t i) const { return data.data() + i * columns; }
   MatrixView<T> view() { return {data.data(), rows, columns}; }
   MatrixView<const T> view() const { return {data.data(), rows, columns}; }
   operator MatrixView<const T>() const { return view(); }  // NOLINT: a view costs nothing
   bool operator==(const Matrix&) const = default;
 
-  std::size_t rows = 0;
-  std::size_t columns = 0;
+  size_t rows = 0;
+  size_t columns = 0;
   std::vector<T> data;
 };
 
 // One descriptor per row, as OpenCV gives them: bit i of a descriptor is bit i % 8 (least
 // significant first) of byte i / 8.
-using Descriptors = MatrixView<const std::uint8_t>;
+using Descriptors = MatrixView<const uint8_t>;
 // One code per row, each number -127 to 127.
-using Codes = MatrixView<const std::int8_t>;
+using Codes = MatrixView<const int8_t>;
 
 // World coordinates of a landmark; NaN in all three if it has none.
 using Position = std::array<double, 3>;
 
 // The k nearest neighbours of each query, nearest first.
 struct Matches {
-  Matrix<std::int64_t> ids;        // (queries x k); -1 where there is no neighbour
-  Matrix<std::int32_t> distances;  // (queries x k); INT32_MAX where there is none
+  Matrix<int64_t> ids;        // (queries x k); -1 where there is no neighbour
+  Matrix<int32_t> distances;  // (queries x k); INT32_MAX where there is none
   bool operator==(const Matches&) const = default;
 };
 
@@ -84,19 +87,19 @@ struct Matches {
 // The library itself writes none, so that equal maps are equal files.
 using Metadata = std::map<std::string, std::string>;
 
-inline constexpr std::size_t kMaxMetadata = 256;          // names
-inline constexpr std::size_t kMaxMetadataName = 128;      // bytes, at least 1
-inline constexpr std::size_t kMaxMetadataText = 1 << 16;  // bytes
+inline constexpr size_t kMaxMetadata = 256;          // names
+inline constexpr size_t kMaxMetadataName = 128;      // bytes, at least 1
+inline constexpr size_t kMaxMetadataText = 1 << 16;  // bytes
 
 // Throws std::invalid_argument if metadata exceed these limits or are not UTF-8, or if "created" is
 // not such a time.
 PROTOMARK_API void check_metadata(const Metadata& metadata);
 
 struct MapSummary {
-  std::uint64_t observations = 0;  // a sealed map counts at most 255 per landmark
+  uint64_t observations = 0;  // a sealed map counts at most 255 per landmark
   // Number of landmarks with i observations, at index i; with 255 or more at the last index.
-  std::array<std::int64_t, 256> count_histogram{};
-  std::size_t landmarks_with_position = 0;
+  std::array<int64_t, 256> count_histogram{};
+  size_t landmarks_with_position = 0;
   // Lowest and highest coordinates; nullopt if no landmark has a position.
   std::optional<std::array<Position, 2>> extent;
 };
@@ -109,10 +112,10 @@ struct PROTOMARK_API FileError : std::runtime_error {
 
 // Thrown for a landmark id that the map does not hold.
 struct PROTOMARK_API UnknownLandmark : std::out_of_range {
-  explicit UnknownLandmark(std::int64_t unknown)
+  explicit UnknownLandmark(int64_t unknown)
       : std::out_of_range("landmark " + std::to_string(unknown) + " is not in the map"),
         id(unknown) {}
-  std::int64_t id;
+  int64_t id;
 };
 
 // Returns the instruction set of the kernels, such as "avx512", "avx2", "neon" or "portable": the

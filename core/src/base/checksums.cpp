@@ -8,20 +8,20 @@
 namespace protomark {
 namespace {
 
-constexpr std::size_t kSlices = 8;
-using Tables = std::array<std::array<std::uint32_t, 256>, kSlices>;
+constexpr size_t kSlices = 8;
+using Tables = std::array<std::array<uint32_t, 256>, kSlices>;
 
 // Table t holds the CRC of each byte when t zero bytes follow it ("slicing by 8", Kounavis and
 // Berry 2008).
 constexpr Tables make_tables() {
   Tables tables{};
-  for (std::uint32_t i = 0; i < 256; ++i) {
-    std::uint32_t crc = i;
+  for (uint32_t i = 0; i < 256; ++i) {
+    uint32_t crc = i;
     for (int bit = 0; bit < 8; ++bit) crc = (crc >> 1) ^ ((crc & 1) != 0 ? 0xedb88320u : 0u);
     tables[0][i] = crc;
   }
-  for (std::size_t t = 1; t < kSlices; ++t) {
-    for (std::size_t i = 0; i < 256; ++i) {
+  for (size_t t = 1; t < kSlices; ++t) {
+    for (size_t i = 0; i < 256; ++i) {
       tables[t][i] = (tables[t - 1][i] >> 8) ^ tables[0][tables[t - 1][i] & 0xff];
     }
   }
@@ -31,7 +31,7 @@ constexpr Tables make_tables() {
 constexpr Tables kTables = make_tables();
 
 // FIPS 180-4, 4.2.2: the first 32 bits of the fractional parts of the cube roots of 64 primes.
-constexpr std::array<std::uint32_t, 64> kRound = {
+constexpr std::array<uint32_t, 64> kRound = {
     0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
     0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
     0xe49b69c1, 0xefbe4786, 0x0fc19dc6, 0x240ca1cc, 0x2de92c6f, 0x4a7484aa, 0x5cb0a9dc, 0x76f988da,
@@ -41,39 +41,39 @@ constexpr std::array<std::uint32_t, 64> kRound = {
     0x19a4c116, 0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
     0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2};
 
-using State = std::array<std::uint32_t, 8>;
+using State = std::array<uint32_t, 8>;
 
-void compress(State& state, const std::uint8_t* block) {
-  std::array<std::uint32_t, 64> w;
-  for (std::size_t t = 0; t < 16; ++t) {
-    w[t] = std::uint32_t{block[4 * t]} << 24 | std::uint32_t{block[4 * t + 1]} << 16 |
-           std::uint32_t{block[4 * t + 2]} << 8 | std::uint32_t{block[4 * t + 3]};
+void compress(State& state, const uint8_t* block) {
+  std::array<uint32_t, 64> w;
+  for (size_t t = 0; t < 16; ++t) {
+    w[t] = uint32_t{block[4 * t]} << 24 | uint32_t{block[4 * t + 1]} << 16 |
+           uint32_t{block[4 * t + 2]} << 8 | uint32_t{block[4 * t + 3]};
   }
-  for (std::size_t t = 16; t < 64; ++t) {
-    const std::uint32_t a = w[t - 15], b = w[t - 2];
+  for (size_t t = 16; t < 64; ++t) {
+    const uint32_t a = w[t - 15], b = w[t - 2];
     w[t] = w[t - 16] + (std::rotr(a, 7) ^ std::rotr(a, 18) ^ a >> 3) + w[t - 7] +
            (std::rotr(b, 17) ^ std::rotr(b, 19) ^ b >> 10);
   }
   auto [a, b, c, d, e, f, g, h] = state;
-  for (std::size_t t = 0; t < 64; ++t) {
-    const std::uint32_t t1 = h + (std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25)) +
-                             ((e & f) ^ (~e & g)) + kRound[t] + w[t];
-    const std::uint32_t t2 =
+  for (size_t t = 0; t < 64; ++t) {
+    const uint32_t t1 = h + (std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25)) +
+                        ((e & f) ^ (~e & g)) + kRound[t] + w[t];
+    const uint32_t t2 =
         (std::rotr(a, 2) ^ std::rotr(a, 13) ^ std::rotr(a, 22)) + ((a & b) ^ (a & c) ^ (b & c));
     h = g, g = f, f = e, e = d + t1, d = c, c = b, b = a, a = t1 + t2;
   }
   const State add = {a, b, c, d, e, f, g, h};
-  for (std::size_t i = 0; i < 8; ++i) state[i] += add[i];
+  for (size_t i = 0; i < 8; ++i) state[i] += add[i];
 }
 
 }  // namespace
 
-std::uint32_t crc32(std::span<const std::byte> bytes, std::uint32_t crc) {
+uint32_t crc32(std::span<const std::byte> bytes, uint32_t crc) {
   crc = ~crc;
   const std::byte* p = bytes.data();
-  std::size_t n = bytes.size();
+  size_t n = bytes.size();
   for (; n >= 8; n -= 8, p += 8) {
-    std::uint32_t low, high;
+    uint32_t low, high;
     std::memcpy(&low, p, 4);
     std::memcpy(&high, p + 4, 4);
     low ^= crc;
@@ -82,26 +82,26 @@ std::uint32_t crc32(std::span<const std::byte> bytes, std::uint32_t crc) {
           kTables[1][high >> 16 & 0xff] ^ kTables[0][high >> 24];
   }
   for (; n > 0; --n, ++p) {
-    crc = (crc >> 8) ^ kTables[0][(crc ^ static_cast<std::uint32_t>(*p)) & 0xff];
+    crc = (crc >> 8) ^ kTables[0][(crc ^ static_cast<uint32_t>(*p)) & 0xff];
   }
   return ~crc;
 }
 
 std::string sha256(std::span<const std::byte> bytes) {
-  std::vector<std::uint8_t> message;
+  std::vector<uint8_t> message;
   message.reserve(bytes.size() + 72);
-  for (const std::byte b : bytes) message.push_back(static_cast<std::uint8_t>(b));
+  for (const std::byte b : bytes) message.push_back(static_cast<uint8_t>(b));
   message.push_back(0x80);
   while (message.size() % 64 != 56) message.push_back(0);
-  const std::uint64_t length = 8 * static_cast<std::uint64_t>(bytes.size());
+  const uint64_t length = 8 * static_cast<uint64_t>(bytes.size());
   for (int shift = 56; shift >= 0; shift -= 8) {
-    message.push_back(static_cast<std::uint8_t>(length >> shift));
+    message.push_back(static_cast<uint8_t>(length >> shift));
   }
   State state = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
                  0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
-  for (std::size_t i = 0; i < message.size(); i += 64) compress(state, &message[i]);
+  for (size_t i = 0; i < message.size(); i += 64) compress(state, &message[i]);
   std::string hex;
-  for (const std::uint32_t word : state) {
+  for (const uint32_t word : state) {
     for (int shift = 28; shift >= 0; shift -= 4) hex += "0123456789abcdef"[word >> shift & 15];
   }
   return hex;

@@ -23,7 +23,7 @@ class FairSharedMutex {
   }
   // Fails if any thread is waiting.
   bool try_lock_shared() {
-    std::uint32_t ticket = serving_.load();
+    uint32_t ticket = serving_.load();
     if (!next_.compare_exchange_strong(ticket, ticket + 1)) return false;
     const bool locked = mutex_.try_lock_shared();
     leave();
@@ -35,8 +35,8 @@ class FairSharedMutex {
  private:
   // One thread at a time waits at the mutex, the others wait for their ticket.
   void enter() {
-    const std::uint32_t ticket = next_.fetch_add(1);
-    for (std::uint32_t now = serving_.load(); now != ticket; now = serving_.load()) {
+    const uint32_t ticket = next_.fetch_add(1);
+    for (uint32_t now = serving_.load(); now != ticket; now = serving_.load()) {
       serving_.wait(now);
     }
   }
@@ -46,8 +46,8 @@ class FairSharedMutex {
   }
 
   std::shared_mutex mutex_;
-  std::atomic<std::uint32_t> next_ = 0;
-  std::atomic<std::uint32_t> serving_ = 0;
+  std::atomic<uint32_t> next_ = 0;
+  std::atomic<uint32_t> serving_ = 0;
 };
 
 }  // namespace protomark

@@ -10,10 +10,10 @@
 namespace protomark {
 
 // Each process draws its own seed, so that nobody can write a file whose ids all hash to one slot.
-inline std::uint64_t hash_seed() {
-  static const std::uint64_t seed = [] {
+inline uint64_t hash_seed() {
+  static const uint64_t seed = [] {
     std::random_device random;
-    return std::uint64_t{random()} << 32 | random();
+    return uint64_t{random()} << 32 | random();
   }();
   return seed;
 }
@@ -22,34 +22,34 @@ inline std::uint64_t hash_seed() {
 // differs from process to process, so no result may depend on it.
 class IdIndex {
  public:
-  using Ids = LargeVector<std::int64_t>;  // the array that indices point into
+  using Ids = LargeVector<int64_t>;  // the array that indices point into
 
   // Returns the index of `id`, or kNoLandmark.
-  LandmarkIndex find(const Ids& ids, std::int64_t id) const {
+  LandmarkIndex find(const Ids& ids, int64_t id) const {
     return slots_.empty() ? kNoLandmark : slots_[slot_of(ids, id)];
   }
   // Returns how many slots `find` reads.
-  std::size_t probe_length(const Ids& ids, std::int64_t id) const {
+  size_t probe_length(const Ids& ids, int64_t id) const {
     return slots_.empty() ? 0 : ((slot_of(ids, id) - home(id)) & mask()) + 1;
   }
 
   // Prefetch what `find` will read: first the slot and, once that has come, the ids to compare.
-  void prefetch_slot(std::int64_t id) const {
+  void prefetch_slot(int64_t id) const {
     if (!slots_.empty()) __builtin_prefetch(&slots_[home(id)]);
   }
-  void prefetch_ids(const Ids& ids, std::int64_t id) const {
+  void prefetch_ids(const Ids& ids, int64_t id) const {
     if (slots_.empty()) return;
-    for (std::size_t s = home(id); slots_[s] != kNoLandmark; s = next(s)) {
+    for (size_t s = home(id); slots_[s] != kNoLandmark; s = next(s)) {
       __builtin_prefetch(&ids[slots_[s].value]);
     }
   }
 
-  bool has_room(std::size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }
+  bool has_room(size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }
   // Returns a copy with room for `more` further ids.
-  IdIndex with_room(const Ids& ids, std::size_t more) const {
+  IdIndex with_room(const Ids& ids, size_t more) const {
     IdIndex result;
     result.used_ = used_;
-    std::size_t size = std::max<std::size_t>(16, slots_.size());
+    size_t size = std::max<size_t>(16, slots_.size());
     while (3 * (used_ + more) > 2 * size) size *= 2;
     result.slots_.assign(size, kNoLandmark);
     for (const LandmarkIndex index : slots_) {
@@ -58,7 +58,7 @@ class IdIndex {
     return result;
   }
 
-  void make_room(const Ids& ids, std::size_t more) {
+  void make_room(const Ids& ids, size_t more) {
     if (!has_room(more)) *this = with_room(ids, more);
   }
 
@@ -69,7 +69,7 @@ class IdIndex {
     ++used_;
   }
   // Changes the index of an id that is in the table.
-  void move(const Ids& ids, std::int64_t id, LandmarkIndex to) { slots_[slot_of(ids, id)] = to; }
+  void move(const Ids& ids, int64_t id, LandmarkIndex to) { slots_[slot_of(ids, id)] = to; }
   // Gives every index i the new value to[i].
   void renumber(std::span<const Row> to) {
     for (LandmarkIndex& index : slots_) {
@@ -77,12 +77,12 @@ class IdIndex {
     }
   }
   // Removes an id that is in the table and still in `ids`.
-  void erase(const Ids& ids, std::int64_t id) {
-    std::size_t hole = slot_of(ids, id);
+  void erase(const Ids& ids, int64_t id) {
+    size_t hole = slot_of(ids, id);
     // Each entry that follows without a break moves back if the hole is no further from its home
     // than the slot that it is in.
-    for (std::size_t s = next(hole); slots_[s] != kNoLandmark; s = next(s)) {
-      const std::size_t from = home(ids[slots_[s].value]);
+    for (size_t s = next(hole); slots_[s] != kNoLandmark; s = next(s)) {
+      const size_t from = home(ids[slots_[s].value]);
       if (((s - from) & mask()) >= ((s - hole) & mask())) {
         slots_[hole] = slots_[s];
         hole = s;
@@ -93,43 +93,43 @@ class IdIndex {
   }
 
  private:
-  std::size_t mask() const { return slots_.size() - 1; }
-  std::size_t next(std::size_t s) const { return (s + 1) & mask(); }
+  size_t mask() const { return slots_.size() - 1; }
+  size_t next(size_t s) const { return (s + 1) & mask(); }
 
   // SplitMix64 (Steele et al. 2014): neighbouring ids end far apart.
-  std::size_t home(std::int64_t id) const {
-    auto x = static_cast<std::uint64_t>(id) + seed_;
+  size_t home(int64_t id) const {
+    auto x = static_cast<uint64_t>(id) + seed_;
     x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
     x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
-    return static_cast<std::size_t>(x ^ (x >> 31)) & mask();
+    return static_cast<size_t>(x ^ (x >> 31)) & mask();
   }
 
   // Returns the slot of the id, or the free one at which the search for it ends.
-  std::size_t slot_of(const Ids& ids, std::int64_t id) const {
-    std::size_t s = home(id);
+  size_t slot_of(const Ids& ids, int64_t id) const {
+    size_t s = home(id);
     while (slots_[s] != kNoLandmark && ids[slots_[s].value] != id) s = next(s);
     return s;
   }
 
   void put(const Ids& ids, LandmarkIndex index) {
-    std::size_t s = home(ids[index.value]);
+    size_t s = home(ids[index.value]);
     while (slots_[s] != kNoLandmark) s = next(s);
     slots_[s] = index;
   }
 
   LargeVector<LandmarkIndex> slots_;
-  std::size_t used_ = 0;
-  std::uint64_t seed_ = hash_seed();
+  size_t used_ = 0;
+  uint64_t seed_ = hash_seed();
 };
 
 class IdSet {
  public:
   bool empty() const { return ids_.empty(); }
-  bool contains(std::int64_t id) const { return index_.find(ids_, id) != kNoLandmark; }
-  const LargeVector<std::int64_t>& ids() const { return ids_; }
+  bool contains(int64_t id) const { return index_.find(ids_, id) != kNoLandmark; }
+  const LargeVector<int64_t>& ids() const { return ids_; }
 
   // Leaves the set as it was if memory runs out.
-  void insert(std::int64_t id) {
+  void insert(int64_t id) {
     if (contains(id)) return;
     index_.make_room(ids_, 1);
     ids_.push_back(id);
@@ -137,7 +137,7 @@ class IdSet {
   }
 
  private:
-  LargeVector<std::int64_t> ids_;
+  LargeVector<int64_t> ids_;
   IdIndex index_;
 };
 

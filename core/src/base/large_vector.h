@@ -20,9 +20,9 @@ struct LargePageAllocator {
   template <typename U>
   LargePageAllocator(const LargePageAllocator<U>&) {}  // NOLINT: allocators convert
 
-  T* allocate(std::size_t n) {
+  T* allocate(size_t n) {
     if (n > SIZE_MAX / sizeof(T)) throw std::bad_array_new_length();
-    const std::size_t size = n * sizeof(T);
+    const size_t size = n * sizeof(T);
     void* memory = ::operator new(size, alignment(size));
 #ifdef __linux__
     // Memory that was in use before keeps its small pages unless they are dropped.
@@ -33,15 +33,15 @@ struct LargePageAllocator {
 #endif
     return static_cast<T*>(memory);
   }
-  void deallocate(T* memory, std::size_t n) { ::operator delete(memory, alignment(n * sizeof(T))); }
+  void deallocate(T* memory, size_t n) { ::operator delete(memory, alignment(n * sizeof(T))); }
 
   bool operator==(const LargePageAllocator&) const = default;
 
  private:
-  static constexpr std::size_t kPage = std::size_t{1} << 21, kLarge = 4 * kPage;
-  static constexpr std::size_t kCacheLine = 64;
+  static constexpr size_t kPage = size_t{1} << 21, kLarge = 4 * kPage;
+  static constexpr size_t kCacheLine = 64;
 
-  static std::align_val_t alignment(std::size_t size) {
+  static std::align_val_t alignment(size_t size) {
     return std::align_val_t{size >= kLarge ? kPage : kCacheLine};
   }
 };

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstring>
+#include <functional>
 #include <memory>
 #include <utility>
 
@@ -14,55 +15,70 @@
 
 namespace protomark {
 
-constexpr std::size_t packed_words(std::size_t n, int bits) {
-  return (n * static_cast<std::size_t>(bits) + 63) / 64;
+constexpr size_t packed_words(size_t n, int bits) {
+  return (n * static_cast<size_t>(bits) + 63) / 64;
 }
-constexpr std::size_t packed_bytes(std::size_t n, int bits) {
-  return packed_words(n, bits) * sizeof(std::uint64_t);
+constexpr size_t packed_bytes(size_t n, int bits) {
+  return packed_words(n, bits) * sizeof(uint64_t);
 }
 
-// Returns the number whose lowest bit is bit `first` of words, which may begin anywhere in memory.
-inline std::uint64_t packed_number_at(const void* words, int bits, std::size_t first) {
+// Returns number i. The words may begin anywhere in memory.
+inline uint64_t packed_number(const void* words, int bits, size_t i) {
   if (bits == 0) return 0;
-  const auto width = static_cast<std::size_t>(bits), shift = first % 64;
-  std::uint64_t word[2];
+  const auto width = static_cast<size_t>(bits), first = i * width, shift = first % 64;
+  uint64_t word[2];
   const char* from = static_cast<const char*>(words) + first / 64 * sizeof(word[0]);
   std::memcpy(word, from, sizeof(word[0]));
-  std::uint64_t value = word[0] >> shift;
+  uint64_t value = word[0] >> shift;
   if (shift + width > 64) {
     std::memcpy(word + 1, from + sizeof(word[0]), sizeof(word[1]));
     value |= word[1] << (64 - shift);
   }
-  return value & ((std::uint64_t{1} << width) - 1);
-}
-inline std::uint64_t packed_number(const void* words, int bits, std::size_t i) {
-  return packed_number_at(words, bits, i * static_cast<std::size_t>(bits));
+  return value & ((uint64_t{1} << width) - 1);
 }
 
-class BitPacker {
+// Hands packed numbers to a sink.
+class PackedWriter {
  public:
+  using Sink = std::function<void(std::span<const std::byte>)>;
+
+  explicit PackedWriter(Sink sink) : sink_(std::move(sink)) {}
+
   // A number of 64 bits begins at a whole word.
-  void add(std::uint64_t value, int bits) {
+  void add(uint64_t value, int bits) {
     const auto width = static_cast<unsigned>(bits);
     word_ |= value << filled_;
     filled_ += width;
     if (filled_ < 64) return;
-    words_.push_back(word_);
     filled_ -= 64;
-    word_ = filled_ == 0 ? 0 : value >> (width - filled_);
+    put();
+    if (filled_ > 0) word_ = value >> (width - filled_);
   }
   // Pads the last word with zeros.
   void align() {
-    if (filled_ > 0) words_.push_back(word_);
-    word_ = 0;
+    if (filled_ > 0) put();
     filled_ = 0;
   }
-  // The full words, which the caller may remove.
-  std::vector<std::uint64_t>& words() { return words_; }
+  void finish() {
+    align();
+    flush();
+  }
 
  private:
-  std::vector<std::uint64_t> words_;
-  std::uint64_t word_ = 0;
+  static constexpr size_t kPiece = 1 << 12;  // words, a multiple of CheckedNumbers::kBlock
+
+  void put() {
+    words_.push_back(std::exchange(word_, 0));
+    if (words_.size() == kPiece) flush();
+  }
+  void flush() {
+    sink_(std::as_bytes(std::span(words_)));
+    words_.clear();
+  }
+
+  Sink sink_;
+  std::vector<uint64_t> words_;
+  uint64_t word_ = 0;
   unsigned filled_ = 0;  // bits of word_
 };
 
@@ -71,13 +87,13 @@ class BitPacker {
 // threads may read.
 class CheckedNumbers {
  public:
-  static constexpr std::size_t kBlock = 512;  // words per CRC-32
+  static constexpr size_t kBlock = 512;  // words per CRC-32
 
-  static constexpr std::size_t blocks(std::size_t words) { return (words + kBlock - 1) / kBlock; }
+  static constexpr size_t blocks(size_t words) { return (words + kBlock - 1) / kBlock; }
 
   // `checksums` has one per block. Errors begin with `name`.
-  CheckedNumbers(std::span<const std::uint64_t> words, int bits,
-                 std::span<const std::uint32_t> checksums, std::string name)
+  CheckedNumbers(std::span<const uint64_t> words, int bits, std::span<const uint32_t> checksums,
+                 std::string name)
       : words_(words),
         bits_(bits),
         checksums_(checksums),
@@ -85,19 +101,19 @@ class CheckedNumbers {
         checked_(std::make_unique<std::atomic<bool>[]>(checksums.size())) {}
 
   // Throws FileError if the number's block is broken.
-  std::uint64_t operator[](std::size_t i) const {
-    const std::size_t first = i * static_cast<std::size_t>(bits_);
+  uint64_t operator[](size_t i) const {
+    const size_t first = i * static_cast<size_t>(bits_);
     check(first / 64 / kBlock);
-    check((first + static_cast<std::size_t>(bits_) - 1) / 64 / kBlock);
+    check((first + static_cast<size_t>(bits_) - 1) / 64 / kBlock);
     return packed_number(words_.data(), bits_, i);
   }
 
  private:
-  void check(std::size_t block) const {
+  void check(size_t block) const {
     if (!checked_[block].load(std::memory_order_relaxed)) check_now(block);
   }
-  void check_now(std::size_t block) const {
-    const std::size_t first = block * kBlock;
+  void check_now(size_t block) const {
+    const size_t first = block * kBlock;
     const auto words = words_.subspan(first, std::min(kBlock, words_.size() - first));
     if (crc32(std::as_bytes(words)) != checksums_[block]) {
       throw FileError(text(name_, " does not match its checksum, in the block at byte ",
@@ -106,9 +122,9 @@ class CheckedNumbers {
     checked_[block].store(true, std::memory_order_relaxed);
   }
 
-  std::span<const std::uint64_t> words_;
+  std::span<const uint64_t> words_;
   int bits_;
-  std::span<const std::uint32_t> checksums_;
+  std::span<const uint32_t> checksums_;
   std::string name_;
   std::unique_ptr<std::atomic<bool>[]> checked_;
 };

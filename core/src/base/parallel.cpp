@@ -14,17 +14,17 @@ namespace protomark {
 namespace {
 
 // Threads stay once started; a mistyped number must not start thousands.
-constexpr std::size_t kMaxThreads = 256;
+constexpr size_t kMaxThreads = 256;
 
 thread_local bool inside_task = false;
 
 struct Job {
-  const std::function<void(std::size_t)>& task;
-  std::size_t n;
-  std::size_t helpers_wanted;
-  std::atomic<std::size_t> next = 0;
+  const std::function<void(size_t)>& task;
+  size_t n;
+  size_t helpers_wanted;
+  std::atomic<size_t> next = 0;
   // Guarded by the pool's mutex.
-  std::size_t helpers_at_work = 0;
+  size_t helpers_at_work = 0;
   std::exception_ptr error = nullptr;
 };
 
@@ -46,7 +46,7 @@ class Pool {
   }
 
  private:
-  void start_threads(std::size_t n) {
+  void start_threads(size_t n) {
     try {
       for (; threads_ < n; ++threads_) std::thread([this] { help(); }).detach();
     } catch (const std::system_error&) {
@@ -70,7 +70,7 @@ class Pool {
 
   void work_on(Job& job) {
     inside_task = true;
-    for (std::size_t i; (i = job.next.fetch_add(1)) < job.n;) {
+    for (size_t i; (i = job.next.fetch_add(1)) < job.n;) {
       try {
         job.task(i);
       } catch (...) {
@@ -85,7 +85,7 @@ class Pool {
   std::mutex mutex_;
   std::condition_variable wake_, done_;
   std::deque<Job*> jobs_;  // those that still want helpers
-  std::size_t threads_ = 0;
+  size_t threads_ = 0;
 };
 
 // The pool is never destroyed, as its detached threads sleep in it at exit. A child of fork() makes
@@ -103,11 +103,11 @@ Pool& pool() {
 
 }  // namespace
 
-void run_tasks(int threads, std::size_t n, const std::function<void(std::size_t)>& task) {
+void run_tasks(int threads, size_t n, const std::function<void(size_t)>& task) {
   if (threads < 1) throw std::invalid_argument("threads must be at least 1");
-  const std::size_t workers = std::min({static_cast<std::size_t>(threads), n, kMaxThreads});
+  const size_t workers = std::min({static_cast<size_t>(threads), n, kMaxThreads});
   if (workers <= 1 || inside_task) {
-    for (std::size_t i = 0; i < n; ++i) task(i);
+    for (size_t i = 0; i < n; ++i) task(i);
     return;
   }
   Job job{task, n, workers - 1};

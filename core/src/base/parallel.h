@@ -11,34 +11,34 @@ namespace protomark {
 // Calls task(0) to task(n - 1) on up to `threads` threads, the caller's among them. A task that
 // calls this runs the inner tasks by itself. After an exception no further task begins, and the
 // first exception is rethrown. Several threads may call this at once, and so may a child of fork().
-void run_tasks(int threads, std::size_t n, const std::function<void(std::size_t)>& task);
+void run_tasks(int threads, size_t n, const std::function<void(size_t)>& task);
 
 struct Range {
-  std::size_t begin;
-  std::size_t end;
-  std::size_t size() const { return end - begin; }
+  size_t begin;
+  size_t end;
+  size_t size() const { return end - begin; }
 };
 
 // Returns the i-th of n elements' `ranges` ranges, all but the last with a multiple of `grain`.
-inline Range range_of(std::size_t n, std::size_t ranges, std::size_t i, std::size_t grain) {
-  const std::size_t grains = (n + grain - 1) / grain;
+inline Range range_of(size_t n, size_t ranges, size_t i, size_t grain) {
+  const size_t grains = (n + grain - 1) / grain;
   return {std::min(n, grains * i / ranges * grain), std::min(n, grains * (i + 1) / ranges * grain)};
 }
 
 // Calls body(begin, end) for ranges that cover [0, n), on up to `threads` threads. All ranges but
 // the last have a multiple of `grain` elements.
 template <typename Body>
-void parallel_for(int threads, std::size_t n, std::size_t grain, const Body& body) {
+void parallel_for(int threads, size_t n, size_t grain, const Body& body) {
   if (threads < 1) throw std::invalid_argument("threads must be at least 1");
   if (n == 0) return;
-  const std::size_t grains = (n + grain - 1) / grain;
+  const size_t grains = (n + grain - 1) / grain;
   if (threads == 1 || grains == 1) {
-    body(std::size_t{0}, n);
+    body(size_t{0}, n);
     return;
   }
   // With several ranges per thread, others take over from a thread that is held up.
-  const std::size_t ranges = std::min(grains, 4 * static_cast<std::size_t>(threads));
-  run_tasks(threads, ranges, [&](std::size_t i) {
+  const size_t ranges = std::min(grains, 4 * static_cast<size_t>(threads));
+  run_tasks(threads, ranges, [&](size_t i) {
     const Range range = range_of(n, ranges, i, grain);
     body(range.begin, range.end);
   });

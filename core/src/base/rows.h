@@ -11,18 +11,18 @@ namespace protomark {
 
 // The index of a prototype among the packed prototypes of a map.
 struct Row {
-  std::uint32_t value = 0;
+  uint32_t value = 0;
   friend constexpr auto operator<=>(Row, Row) = default;
 };
 
 // The index of a landmark in a map; its id is the user's.
 struct LandmarkIndex {
-  std::uint32_t value = 0;
+  uint32_t value = 0;
   friend constexpr auto operator<=>(LandmarkIndex, LandmarkIndex) = default;
 };
 
-constexpr Row row_at(std::size_t i) { return {static_cast<std::uint32_t>(i)}; }
-constexpr LandmarkIndex landmark_at(std::size_t i) { return {static_cast<std::uint32_t>(i)}; }
+constexpr Row row_at(size_t i) { return {static_cast<uint32_t>(i)}; }
+constexpr LandmarkIndex landmark_at(size_t i) { return {static_cast<uint32_t>(i)}; }
 
 inline constexpr Row kNoRow{UINT32_MAX};
 inline constexpr LandmarkIndex kNoLandmark{UINT32_MAX};

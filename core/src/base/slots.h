@@ -13,26 +13,24 @@ namespace protomark {
 class Slots {
  public:
   // `size` is at least 4.
-  explicit Slots(std::size_t size) : size_(size) {}
+  explicit Slots(size_t size) : size_(size) {}
 
-  const std::int8_t* operator[](std::uint32_t slot) const {
+  const int8_t* operator[](uint32_t slot) const {
     const auto [chunk, at] = place(slot);
     return chunks_[chunk].data() + at * size_;
   }
-  std::int8_t* operator[](std::uint32_t slot) {
-    return const_cast<std::int8_t*>(std::as_const(*this)[slot]);
-  }
+  int8_t* operator[](uint32_t slot) { return const_cast<int8_t*>(std::as_const(*this)[slot]); }
 
   // Makes sure that the next `take` does not throw for want of memory.
   void make_room() {
     if (free_ != kNone) return;
-    const std::size_t chunk = place(used_).first;
+    const size_t chunk = place(used_).first;
     if (chunk == chunks_.size()) chunks_.emplace_back();
     chunks_[chunk].reserve((kFirst << chunk) * size_);
   }
-  std::uint32_t take() {
+  uint32_t take() {
     make_room();
-    const std::uint32_t slot = free_ != kNone ? free_ : used_;
+    const uint32_t slot = free_ != kNone ? free_ : used_;
     if (slot == used_) {
       auto& chunk = chunks_[place(used_++).first];
       chunk.resize(chunk.size() + size_);
@@ -41,26 +39,26 @@ class Slots {
     }
     return slot;
   }
-  void give_back(std::uint32_t slot) {
+  void give_back(uint32_t slot) {
     std::memcpy((*this)[slot], &free_, sizeof(free_));
     free_ = slot;
   }
 
  private:
-  static constexpr std::size_t kFirst = 256;
-  static constexpr std::uint32_t kNone = UINT32_MAX;
+  static constexpr size_t kFirst = 256;
+  static constexpr uint32_t kNone = UINT32_MAX;
 
   // The chunk that a slot is in, each of which has twice as many as the one before, and where.
-  static std::pair<std::size_t, std::size_t> place(std::size_t slot) {
-    const auto chunk = static_cast<std::size_t>(std::bit_width(slot / kFirst + 1) - 1);
+  static std::pair<size_t, size_t> place(size_t slot) {
+    const auto chunk = static_cast<size_t>(std::bit_width(slot / kFirst + 1) - 1);
     return {chunk, slot + kFirst - (kFirst << chunk)};
   }
 
-  std::size_t size_;
-  std::vector<LargeVector<std::int8_t>> chunks_;
+  size_t size_;
+  std::vector<LargeVector<int8_t>> chunks_;
   // The first of the slots that were given back, each of which begins with the next one; and how
   // many were ever taken.
-  std::uint32_t free_ = kNone, used_ = 0;
+  uint32_t free_ = kNone, used_ = 0;
 };
 
 }  // namespace protomark

@@ -13,14 +13,14 @@ namespace protomark {
 // hold all of them by ascending key(index), which differs between them. `each(take)` calls
 // take(index) for all indices. Takes 5 bits per index, and calls `each` about eight times.
 template <typename Index, typename Each, typename Key, typename Visit>
-void visit_sorted(std::size_t n, const Each& each, const Key& key, const Visit& visit) {
-  constexpr std::size_t kPieces = 8, kMinPiece = 1 << 13;
+void visit_sorted(size_t n, const Each& each, const Key& key, const Visit& visit) {
+  constexpr size_t kPieces = 8, kMinPiece = 1 << 13;
   const auto less = [&](Index a, Index b) { return key(a) < key(b); };
-  const std::size_t piece = std::max(kMinPiece, (n + kPieces - 1) / kPieces);
-  const std::size_t limit = piece + piece / 4;
+  const size_t piece = std::max(kMinPiece, (n + kPieces - 1) / kPieces);
+  const size_t limit = piece + piece / 4;
   std::vector<Index> indices;
   indices.reserve(std::min(n, limit));
-  for (std::size_t seen = 0; seen < n; seen += indices.size()) {
+  for (size_t seen = 0; seen < n; seen += indices.size()) {
     // Takes the least keys above the last one of the piece before, which are below `end` once there
     // were too many.
     std::optional<decltype(key(Index{}))> last, end;

@@ -26,18 +26,18 @@ template <typename... Parts>
 
 // Whether a text is well-formed UTF-8 (Unicode 15, table 3-7).
 inline bool is_utf8(std::string_view text) {
-  const auto byte = [&](std::size_t i) {
-    return i < text.size() ? static_cast<std::uint8_t>(text[i]) : std::uint8_t{0};
+  const auto byte = [&](size_t i) {
+    return i < text.size() ? static_cast<uint8_t>(text[i]) : uint8_t{0};
   };
-  for (std::size_t i = 0; i < text.size();) {
-    const std::uint8_t lead = byte(i);
+  for (size_t i = 0; i < text.size();) {
+    const uint8_t lead = byte(i);
     const bool leads = lead < 0x80 || (lead >= 0xc2 && lead <= 0xf4);
     if (!leads) return false;
-    const std::size_t size = lead < 0x80 ? 1 : lead < 0xe0 ? 2 : lead < 0xf0 ? 3 : 4;
+    const size_t size = lead < 0x80 ? 1 : lead < 0xe0 ? 2 : lead < 0xf0 ? 3 : 4;
     // The range of the second byte excludes overlong forms, surrogates and what is beyond U+10FFFF.
-    std::uint8_t low = lead == 0xe0 ? 0xa0 : lead == 0xf0 ? 0x90 : 0x80;
-    std::uint8_t high = lead == 0xed ? 0x9f : lead == 0xf4 ? 0x8f : 0xbf;
-    for (std::size_t j = 1; j < size; ++j) {
+    uint8_t low = lead == 0xe0 ? 0xa0 : lead == 0xf0 ? 0x90 : 0x80;
+    uint8_t high = lead == 0xed ? 0x9f : lead == 0xf4 ? 0x8f : 0xbf;
+    for (size_t j = 1; j < size; ++j) {
       if (byte(i + j) < low || byte(i + j) > high) return false;
       low = 0x80;
       high = 0xbf;

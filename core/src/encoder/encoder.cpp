@@ -10,16 +10,16 @@
 namespace protomark {
 namespace {
 
-constexpr std::size_t kMinBits = 64;
-constexpr std::size_t kMaxBits = 1024;
-constexpr std::size_t kMaxDim = 256;
-constexpr std::size_t kMaxWidth = 4096;
-constexpr std::size_t kMaxLayers = 16;
+constexpr size_t kMinBits = 64;
+constexpr size_t kMaxBits = 1024;
+constexpr size_t kMaxDim = 256;
+constexpr size_t kMaxWidth = 4096;
+constexpr size_t kMaxLayers = 16;
 
 // Descriptors that go through the network together, at most: activations stay in the L2 cache.
-constexpr std::size_t kBatch = 512;
+constexpr size_t kBatch = 512;
 // Threads take multiples of this many descriptors.
-constexpr std::size_t kGrain = 64;
+constexpr size_t kGrain = 64;
 
 struct Field {
   std::string_view key;
@@ -30,7 +30,7 @@ constexpr Field kFields[] = {{"name", &EncoderInfo::name},
                              {"data", &EncoderInfo::data},
                              {"licence", &EncoderInfo::licence}};
 
-void check_layer(const Layer& layer, std::size_t inputs, std::size_t index) {
+void check_layer(const Layer& layer, size_t inputs, size_t index) {
   const std::string where = text("encoder: layer ", index);
   if (layer.inputs != inputs) {
     invalid(where, " has ", layer.inputs, " inputs, ", inputs, " are needed");
@@ -43,11 +43,11 @@ void check_layer(const Layer& layer, std::size_t inputs, std::size_t index) {
     invalid(where, ": weights, bias and multipliers do not match its size");
   }
   if (layer.shift < 1 || layer.shift > 62) invalid(where, ": shift must be 1 to 62");
-  if (std::ranges::any_of(layer.multipliers, [](std::int32_t m) { return m <= 0; })) {
+  if (std::ranges::any_of(layer.multipliers, [](int32_t m) { return m <= 0; })) {
     invalid(where, ": multipliers must be positive");
   }
-  const std::int64_t largest = index == 0 ? 1 : 255;
-  for (std::size_t o = 0; o < layer.outputs; ++o) {
+  const int64_t largest = index == 0 ? 1 : 255;
+  for (size_t o = 0; o < layer.outputs; ++o) {
     const auto [low, high] = sum_range(layer, o);
     if (layer.bias[o] + largest * low < INT32_MIN || layer.bias[o] + largest * high > INT32_MAX) {
       invalid(where, ": sums of output ", o, " could leave 32 bits");
@@ -79,19 +79,18 @@ ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network)
 struct Encoder::Packed {
   BitLayer first;
   std::vector<DenseLayer> later;
-  std::size_t widest;
+  size_t widest;
 
   explicit Packed(const std::vector<Layer>& layers)
       : first(layers.front(), layers.size() == 1), widest(first.outputs()) {
-    for (std::size_t l = 1; l < layers.size(); ++l) {
+    for (size_t l = 1; l < layers.size(); ++l) {
       later.emplace_back(layers[l], l + 1 == layers.size());
       widest = std::max(widest, later.back().outputs());
     }
   }
 };
 
-Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::size_t> dims,
-                 float scale)
+Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale)
     : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
   const auto check = [](bool ok, const auto&... what) {
     if (!ok) invalid("encoder: ", what...);
@@ -106,10 +105,10 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::s
   }
   check(!layers_.empty() && layers_.size() <= kMaxLayers, "it has ", layers_.size(),
         " layers, 1 to ", kMaxLayers, " are allowed");
-  const std::size_t bits = layers_.front().inputs;
+  const size_t bits = layers_.front().inputs;
   check(bits >= kMinBits && bits <= kMaxBits && bits % 8 == 0,
         "a descriptor has 64 to 1024 bits, a multiple of 8, not ", bits);
-  for (std::size_t l = 0; l < layers_.size(); ++l) {
+  for (size_t l = 0; l < layers_.size(); ++l) {
     check_layer(layers_[l], l == 0 ? bits : layers_[l - 1].outputs, l);
   }
   check(!dims_.empty() && dims_.front() != 0 && dims_.back() == layers_.back().outputs &&
@@ -121,20 +120,19 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<std::s
   packed_ = std::make_shared<const Packed>(layers_);
 }
 
-std::size_t Encoder::multiply_adds() const {
-  std::size_t sum = 0;
+size_t Encoder::multiply_adds() const {
+  size_t sum = 0;
   for (const Layer& layer : layers_) sum += layer.inputs * layer.outputs;
   return sum;
 }
 
-Matrix<std::int8_t> Encoder::encode(Descriptors descriptors, std::size_t dimensions,
-                                    int threads) const {
-  Matrix<std::int8_t> codes(descriptors.rows, dimensions == 0 ? dim() : dimensions);
+Matrix<int8_t> Encoder::encode(Descriptors descriptors, size_t dimensions, int threads) const {
+  Matrix<int8_t> codes(descriptors.rows, dimensions == 0 ? dim() : dimensions);
   encode(descriptors, codes.view(), threads);
   return codes;
 }
 
-void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int threads) const {
+void Encoder::encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads) const {
   // OpenCV's descriptors of an image without keypoints have neither rows nor columns.
   const bool empty = descriptors.rows == 0 && descriptors.columns == 0;
   if (descriptors.columns != bytes() && !empty) {
@@ -144,31 +142,31 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
   if (codes.rows != descriptors.rows) invalid("codes must have as many rows as descriptors");
   if (std::ranges::find(dims_, codes.columns) == dims_.end()) {
     std::string allowed;
-    for (const std::size_t d : dims_) allowed += (allowed.empty() ? "" : ", ") + std::to_string(d);
+    for (const size_t d : dims_) allowed += (allowed.empty() ? "" : ", ") + std::to_string(d);
     invalid("encoder '", info_.name, "' gives ", allowed, " dimensions, not ", codes.columns);
   }
   const kernels::Kernels& kernel = kernels::active();
   const Packed& network = *packed_;
-  const std::size_t depth = layers_.size(), width = network.widest;
+  const size_t depth = layers_.size(), width = network.widest;
 
-  parallel_for(threads, descriptors.rows, kGrain, [&](std::size_t first, std::size_t last) {
+  parallel_for(threads, descriptors.rows, kGrain, [&](size_t first, size_t last) {
     // Batches of equal size, as a small last one would cost as much as a large one.
-    const std::size_t batches = (last - first + kBatch - 1) / kBatch;
-    const std::size_t limit = std::min(kBatch, last - first);
-    const auto room = std::make_unique_for_overwrite<std::uint8_t[]>(2 * limit * width);
-    for (std::size_t b = 0; b < batches; ++b) {
-      const std::size_t begin = first + (last - first) * b / batches;
-      const std::size_t n = first + (last - first) * (b + 1) / batches - begin;
-      MatrixView<std::uint8_t> x{room.get(), n, width}, next{room.get() + limit * width, n, width};
-      const auto outputs = [&](std::size_t l) {
+    const size_t batches = (last - first + kBatch - 1) / kBatch;
+    const size_t limit = std::min(kBatch, last - first);
+    const auto room = std::make_unique_for_overwrite<uint8_t[]>(2 * limit * width);
+    for (size_t b = 0; b < batches; ++b) {
+      const size_t begin = first + (last - first) * b / batches;
+      const size_t n = first + (last - first) * (b + 1) / batches - begin;
+      MatrixView<uint8_t> x{room.get(), n, width}, next{room.get() + limit * width, n, width};
+      const auto outputs = [&](size_t l) {
         return l + 1 < depth ? layers_[l].outputs : codes.columns;
       };
       network.first.run(kernel, {descriptors.row(begin), n, bytes()}, outputs(0), x);
-      for (std::size_t l = 1; l < depth; ++l) {
+      for (size_t l = 1; l < depth; ++l) {
         network.later[l - 1].run(kernel, x, outputs(l), next);
         std::swap(x, next);
       }
-      for (std::size_t i = 0; i < n; ++i) {
+      for (size_t i = 0; i < n; ++i) {
         std::memcpy(codes.row(begin + i), x.row(i), codes.columns);
       }
     }
@@ -179,13 +177,13 @@ void Encoder::encode(Descriptors descriptors, MatrixView<std::int8_t> codes, int
 std::vector<std::byte> Encoder::network_bytes() const {
   SectionWriter out;
   out.value(scale_);
-  out.value(static_cast<std::uint32_t>(dims_.size()));
-  for (const std::size_t d : dims_) out.value(static_cast<std::uint32_t>(d));
-  out.value(static_cast<std::uint32_t>(layers_.size()));
+  out.value(static_cast<uint32_t>(dims_.size()));
+  for (const size_t d : dims_) out.value(static_cast<uint32_t>(d));
+  out.value(static_cast<uint32_t>(layers_.size()));
   for (const Layer& layer : layers_) {
-    out.value(static_cast<std::uint32_t>(layer.inputs));
-    out.value(static_cast<std::uint32_t>(layer.outputs));
-    out.value(static_cast<std::uint32_t>(layer.shift));
+    out.value(static_cast<uint32_t>(layer.inputs));
+    out.value(static_cast<uint32_t>(layer.outputs));
+    out.value(static_cast<uint32_t>(layer.shift));
     out.values(layer.bias.data(), layer.bias.size());
     out.values(layer.multipliers.data(), layer.multipliers.size());
     out.values(layer.table.data(), layer.table.size());
@@ -223,23 +221,23 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
 
   SectionReader in(file, section::kNetwork);
   const auto scale = in.value<float>();
-  const auto count = in.value<std::uint32_t>();
+  const auto count = in.value<uint32_t>();
   if (count > kMaxDim) file.fail("it has too many dims");
-  std::vector<std::size_t> dims;
-  for (const std::uint32_t d : in.values<std::uint32_t>(count)) dims.push_back(d);
-  const auto depth = in.value<std::uint32_t>();
+  std::vector<size_t> dims;
+  for (const uint32_t d : in.values<uint32_t>(count)) dims.push_back(d);
+  const auto depth = in.value<uint32_t>();
   if (depth > kMaxLayers) file.fail("it has too many layers");
   std::vector<Layer> layers(depth);
   for (Layer& layer : layers) {
-    layer.inputs = in.value<std::uint32_t>();
-    layer.outputs = in.value<std::uint32_t>();
+    layer.inputs = in.value<uint32_t>();
+    layer.outputs = in.value<uint32_t>();
     if (layer.inputs > kMaxWidth || layer.outputs > kMaxWidth) file.fail("a layer is too wide");
-    const auto shift = in.value<std::uint32_t>();
-    layer.shift = static_cast<int>(std::min<std::uint32_t>(shift, 63));
-    layer.bias = in.values<std::int32_t>(layer.outputs);
-    layer.multipliers = in.values<std::int32_t>(layer.outputs);
+    const auto shift = in.value<uint32_t>();
+    layer.shift = static_cast<int>(std::min<uint32_t>(shift, 63));
+    layer.bias = in.values<int32_t>(layer.outputs);
+    layer.multipliers = in.values<int32_t>(layer.outputs);
     in.copy(layer.table.data(), layer.table.size());
-    layer.weights = in.values<std::int8_t>(layer.inputs * layer.outputs);
+    layer.weights = in.values<int8_t>(layer.inputs * layer.outputs);
   }
   in.finish();
   try {

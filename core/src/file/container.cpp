@@ -5,16 +5,16 @@
 namespace protomark {
 namespace {
 
-static_assert(std::endian::native == std::endian::little && sizeof(std::size_t) == 8);
+static_assert(std::endian::native == std::endian::little && sizeof(size_t) == 8);
 
 constexpr char kMagic[8] = {'P', 'R', 'O', 'T', 'O', 'M', 'R', 'K'};
-constexpr std::uint32_t kVersion = 1;
+constexpr uint32_t kVersion = 1;
 
-constexpr std::uint64_t align(std::uint64_t n) {
+constexpr uint64_t align(uint64_t n) {
   return (n + kSectionAlignment - 1) / kSectionAlignment * kSectionAlignment;
 }
 
-std::uint32_t head_checksum(ContainerHeader header, Bytes table) {
+uint32_t head_checksum(ContainerHeader header, Bytes table) {
   header.crc = 0;
   return crc32(table, crc32(std::as_bytes(std::span(&header, 1))));
 }
@@ -24,12 +24,12 @@ std::uint32_t head_checksum(ContainerHeader header, Bytes table) {
 const char* describe(FileKind kind) {
   constexpr const char* kKinds[] = {"an encoder", "a learning map",        "a sealed map",
                                     "a journal",  "a record of a journal", "a record of a journal"};
-  return kKinds[static_cast<std::uint32_t>(kind) - 1];
+  return kKinds[static_cast<uint32_t>(kind) - 1];
 }
 
 bool has_magic(Bytes bytes) {
   const Bytes magic = std::as_bytes(std::span(kMagic));
-  const std::size_t n = std::min(bytes.size(), magic.size());
+  const size_t n = std::min(bytes.size(), magic.size());
   return std::ranges::equal(bytes.first(n), magic.first(n));
 }
 
@@ -37,8 +37,8 @@ bool ContainerHead::has_right_checksum() const {
   return head_checksum(header, bytes.subspan(sizeof(header))) == header.crc;
 }
 
-std::size_t ContainerWriter::head_size() const {
-  std::size_t sections = 0;
+size_t ContainerWriter::head_size() const {
+  size_t sections = 0;
   for (const Group& group : groups_) sections += group.parts.size();
   return align(sizeof(ContainerHeader) + sections * sizeof(SectionEntry));
 }
@@ -46,9 +46,9 @@ std::size_t ContainerWriter::head_size() const {
 std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
   constexpr std::array<std::byte, kSectionAlignment> zeros{};
   std::vector<SectionEntry> table;
-  std::uint64_t offset = head_size();
+  uint64_t offset = head_size();
   for (const Group& group : groups_) {
-    const std::size_t first = table.size();
+    const size_t first = table.size();
     for (const auto& [name, size] : group.parts) {
       SectionEntry entry{};
       std::memcpy(entry.padded_name, name.data(), std::min(sizeof(entry.padded_name), name.size()));
@@ -57,7 +57,7 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
       if (size != kUnknownSize) offset = align(offset + size);
     }
     std::vector<Sink> sinks;
-    for (std::size_t i = first; i < table.size(); ++i) {
+    for (size_t i = first; i < table.size(); ++i) {
       sinks.emplace_back([&put, &entry = table[i]](Bytes bytes) {
         entry.crc = crc32(bytes, entry.crc);
         put(entry.offset + entry.size, bytes);
@@ -65,13 +65,13 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
       });
     }
     group.produce(sinks);
-    for (std::size_t i = 0; i < group.parts.size(); ++i) {
+    for (size_t i = 0; i < group.parts.size(); ++i) {
       const auto& [name, size] = group.parts[i];
       const SectionEntry& entry = table[first + i];
       if (size != kUnknownSize && entry.size != size) {
         throw std::logic_error(text("section '", name, "' has ", entry.size, " bytes, not ", size));
       }
-      const std::uint64_t end = entry.offset + entry.size;
+      const uint64_t end = entry.offset + entry.size;
       offset = align(end);
       put(end, Bytes(zeros).first(offset - end));
     }
@@ -80,9 +80,9 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
   ContainerHeader header{};
   std::memcpy(header.magic, kMagic, sizeof(kMagic));
   header.version = kVersion;
-  header.kind = static_cast<std::uint32_t>(kind_);
+  header.kind = static_cast<uint32_t>(kind_);
   header.file_size = offset;
-  header.sections = static_cast<std::uint32_t>(table.size());
+  header.sections = static_cast<uint32_t>(table.size());
   header.crc = head_checksum(header, table_bytes);
 
   std::vector<std::byte> head(head_size());
@@ -99,8 +99,7 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   if (header.version != kVersion) {
     fail("format version ", header.version, ", this Protomark reads version ", kVersion);
   }
-  if (header.kind == static_cast<std::uint32_t>(FileKind::journal) &&
-      header.file_size < file_.size()) {
+  if (header.kind == static_cast<uint32_t>(FileKind::journal) && header.file_size < file_.size()) {
     fail("it is the journal of a map: name the map file beside it");
   }
   if (header.file_size != file_.size()) {
@@ -110,14 +109,14 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   const auto head = ContainerHead::parse(file_);
   if (!head) fail("its header is broken");
   if (!head->has_right_checksum()) fail("its header does not match its checksum");
-  if (header.kind < 1 || header.kind > static_cast<std::uint32_t>(FileKind::fold)) {
+  if (header.kind < 1 || header.kind > static_cast<uint32_t>(FileKind::fold)) {
     fail("it is of a kind that this Protomark does not know");
   }
   head_ = *head;
   kind_ = static_cast<FileKind>(header.kind);
 
-  std::uint64_t end = head_.bytes.size();
-  for (std::size_t at = sizeof(header); at < head_.bytes.size(); at += sizeof(SectionEntry)) {
+  uint64_t end = head_.bytes.size();
+  for (size_t at = sizeof(header); at < head_.bytes.size(); at += sizeof(SectionEntry)) {
     SectionEntry entry;
     std::memcpy(&entry, head_.bytes.data() + at, sizeof(entry));
     if (entry.offset % kSectionAlignment != 0 || entry.offset < end ||

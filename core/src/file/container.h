@@ -11,7 +11,7 @@
 
 namespace protomark {
 
-enum class FileKind : std::uint32_t {
+enum class FileKind : uint32_t {
   encoder = 1,
   learning_map = 2,
   sealed_map = 3,
@@ -26,21 +26,21 @@ const char* describe(FileKind kind);
 
 struct ContainerHeader {
   char magic[8];  // "PROTOMRK"
-  std::uint32_t version;
-  std::uint32_t kind;
-  std::uint64_t file_size;
-  std::uint32_t sections;
-  std::uint32_t crc;  // CRC-32 of the header, with zero here, and of the section table
-  std::uint8_t reserved[32];
+  uint32_t version;
+  uint32_t kind;
+  uint64_t file_size;
+  uint32_t sections;
+  uint32_t crc;  // CRC-32 of the header, with zero here, and of the section table
+  uint8_t reserved[32];
 };
 static_assert(sizeof(ContainerHeader) == 64);
 
 struct SectionEntry {
-  char padded_name[8];   // padded with zeros
-  std::uint64_t offset;  // a multiple of kSectionAlignment
-  std::uint64_t size;
-  std::uint32_t crc;
-  std::uint32_t reserved;
+  char padded_name[8];  // padded with zeros
+  uint64_t offset;      // a multiple of kSectionAlignment
+  uint64_t size;
+  uint32_t crc;
+  uint32_t reserved;
 
   std::string_view name() const {
     return {padded_name, ::strnlen(padded_name, sizeof(padded_name))};
@@ -48,10 +48,9 @@ struct SectionEntry {
 };
 static_assert(sizeof(SectionEntry) == 32);
 
-inline constexpr std::size_t kSectionAlignment = 64;
-inline constexpr std::uint32_t kMaxSections = 64;
-inline constexpr std::size_t kMaxHead =
-    sizeof(ContainerHeader) + kMaxSections * sizeof(SectionEntry);
+inline constexpr size_t kSectionAlignment = 64;
+inline constexpr uint32_t kMaxSections = 64;
+inline constexpr size_t kMaxHead = sizeof(ContainerHeader) + kMaxSections * sizeof(SectionEntry);
 
 // Whether bytes begin as every container does, as far as there are any.
 bool has_magic(Bytes bytes);
@@ -63,8 +62,7 @@ struct ContainerHead {
     ContainerHead head;
     if (bytes.size() < sizeof(head.header) || !has_magic(bytes)) return std::nullopt;
     std::memcpy(&head.header, bytes.data(), sizeof(head.header));
-    const std::size_t size =
-        sizeof(head.header) + std::size_t{head.header.sections} * sizeof(SectionEntry);
+    const size_t size = sizeof(head.header) + size_t{head.header.sections} * sizeof(SectionEntry);
     if (head.header.sections > kMaxSections || size > bytes.size()) return std::nullopt;
     head.bytes = bytes.first(size);
     return head;
@@ -92,11 +90,11 @@ class ContainerWriter {
     add(std::move(name), bytes.size(), [bytes](const Sink& sink) { sink(bytes); });
   }
   void add(std::string name, std::vector<std::byte> bytes) {
-    const std::size_t size = bytes.size();
+    const size_t size = bytes.size();
     add(std::move(name), size, [owned = std::move(bytes)](const Sink& sink) { sink(owned); });
   }
   // `produce` hands `size` bytes to the sink in order, each time that the file is written.
-  void add(std::string name, std::size_t size, Produce produce) {
+  void add(std::string name, size_t size, Produce produce) {
     add_together(
         {{std::move(name), size}},
         [produce = std::move(produce)](std::span<const Sink> sinks) { produce(sinks[0]); });
@@ -104,9 +102,9 @@ class ContainerWriter {
 
   struct Part {
     std::string name;
-    std::size_t size;  // in bytes
+    size_t size;  // in bytes
   };
-  static constexpr std::size_t kUnknownSize = SIZE_MAX;
+  static constexpr size_t kUnknownSize = SIZE_MAX;
   using ProduceAll = std::function<void(std::span<const Sink>)>;
   // Sections that are produced side by side: `produce` gets a sink for each. Only the size of the
   // last one may be unknown.
@@ -116,7 +114,7 @@ class ContainerWriter {
 
   std::vector<std::byte> serialize() const {
     std::vector<std::byte> result(head_size());
-    const auto head = emit([&](std::size_t offset, Bytes bytes) {
+    const auto head = emit([&](size_t offset, Bytes bytes) {
       result.resize(std::max(result.size(), offset + bytes.size()));
       std::copy(bytes.begin(), bytes.end(), result.begin() + static_cast<std::ptrdiff_t>(offset));
     });
@@ -131,7 +129,7 @@ class ContainerWriter {
   void write(const std::filesystem::path& path,
              const std::function<void(const std::string&)>& before = {}) const {
     TemporaryFile file(path);
-    const auto head = emit([&](std::size_t offset, Bytes bytes) { file.write(offset, bytes); });
+    const auto head = emit([&](size_t offset, Bytes bytes) { file.write(offset, bytes); });
     file.write(0, head);
     file.sync();
     if (before) before(ContainerHead::parse(head)->identity());
@@ -143,8 +141,8 @@ class ContainerWriter {
     std::vector<Part> parts;
     ProduceAll produce;
   };
-  using Put = std::function<void(std::size_t offset, Bytes)>;
-  std::size_t head_size() const;
+  using Put = std::function<void(size_t offset, Bytes)>;
+  size_t head_size() const;
   // Puts the sections to their offsets and returns header and table, which have their checksums.
   std::vector<std::byte> emit(const Put& put) const;
 
@@ -161,9 +159,9 @@ class ContainerReader {
   FileKind kind() const { return kind_; }
   const std::string& name() const { return name_; }
   // Of header and table, and thereby of everything.
-  std::uint32_t checksum() const { return head_.header.crc; }
+  uint32_t checksum() const { return head_.header.crc; }
   std::string identity() const { return head_.identity(); }
-  std::size_t size() const { return file_.size(); }
+  size_t size() const { return file_.size(); }
   // Throws if the file is of another kind.
   void expect(FileKind kind) const {
     if (kind_ != kind) fail("it holds ", describe(kind_), ", not ", describe(kind));
@@ -180,16 +178,16 @@ class ContainerReader {
   }
   // The same as n values of a type, for which the file's bytes must be aligned.
   template <typename T>
-  std::span<const T> read(std::string_view section, std::size_t n) const {
+  std::span<const T> read(std::string_view section, size_t n) const {
     return as<T>(section, read(section), n);
   }
   template <typename T>
-  std::span<const T> map(std::string_view section, std::size_t n) const {
+  std::span<const T> map(std::string_view section, size_t n) const {
     return as<T>(section, map(section), n);
   }
   // In bytes, in file order.
-  std::vector<std::pair<std::string, std::size_t>> sections() const {
-    std::vector<std::pair<std::string, std::size_t>> result;
+  std::vector<std::pair<std::string, size_t>> sections() const {
+    std::vector<std::pair<std::string, size_t>> result;
     for (const SectionEntry& entry : sections_) result.emplace_back(entry.name(), entry.size);
     return result;
   }
@@ -207,7 +205,7 @@ class ContainerReader {
 
  private:
   template <typename T>
-  std::span<const T> as(std::string_view section, Bytes bytes, std::size_t n) const {
+  std::span<const T> as(std::string_view section, Bytes bytes, size_t n) const {
     if (bytes.size() % sizeof(T) != 0 || bytes.size() / sizeof(T) != n) fail_size(section);
     return {reinterpret_cast<const T*>(bytes.data()), n};
   }

@@ -16,7 +16,7 @@ namespace {
 
 // Returns the path of a temporary file beside `target`.
 std::filesystem::path beside(const std::filesystem::path& target) {
-  constexpr std::size_t kMaxName = 255;  // bytes
+  constexpr size_t kMaxName = 255;  // bytes
   std::random_device random;
   const std::string suffix = "." + std::to_string(random());
   const std::string name = target.filename().string().substr(0, kMaxName - suffix.size());
@@ -39,19 +39,19 @@ FileDescriptor::~FileDescriptor() {
 }
 
 std::optional<std::span<std::byte>> FileDescriptor::read(std::span<std::byte> to) const {
-  std::size_t done = 0;
+  size_t done = 0;
   while (done < to.size()) {
     const ssize_t n =
         ::pread(descriptor_, to.data() + done, to.size() - done, static_cast<off_t>(done));
     if (n < 0 && errno == EINTR) continue;
     if (n < 0) return std::nullopt;
     if (n == 0) break;
-    done += static_cast<std::size_t>(n);
+    done += static_cast<size_t>(n);
   }
   return to.first(done);
 }
 
-bool FileDescriptor::write(std::size_t offset, Bytes bytes) const {
+bool FileDescriptor::write(size_t offset, Bytes bytes) const {
   // At a limit on file sizes SIGXFSZ would end the program; while it is blocked, the write fails.
   sigset_t size_signal, before;
   ::sigemptyset(&size_signal);
@@ -62,8 +62,8 @@ bool FileDescriptor::write(std::size_t offset, Bytes bytes) const {
     written = ::pwrite(descriptor_, bytes.data(), bytes.size(), static_cast<off_t>(offset));
     if (written < 0 && errno == EINTR) continue;
     if (written < 0) break;
-    bytes = bytes.subspan(static_cast<std::size_t>(written));
-    offset += static_cast<std::size_t>(written);
+    bytes = bytes.subspan(static_cast<size_t>(written));
+    offset += static_cast<size_t>(written);
   }
   const int error = errno;
   const timespec now{};
@@ -132,7 +132,7 @@ TemporaryFile::~TemporaryFile() {
   if (!path_.empty()) ::unlink(path_.c_str());
 }
 
-void TemporaryFile::write(std::size_t offset, Bytes bytes) {
+void TemporaryFile::write(size_t offset, Bytes bytes) {
   if (!file_.write(offset, bytes)) fail();
 }
 
@@ -157,7 +157,7 @@ MappedFile::MappedFile(const FileDescriptor& file, const std::filesystem::path& 
   struct stat status;
   if (!file) fail_file(path, "cannot be read: ", system_error());
   if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail_file(path, "not a file");
-  const auto size = static_cast<std::size_t>(status.st_size);
+  const auto size = static_cast<size_t>(status.st_size);
   if (size == 0) return;
   // The mapping and this descriptor are of one file, whatever becomes of its name.
   file_ = FileDescriptor(::fcntl(file.get(), F_DUPFD_CLOEXEC, 0));

@@ -42,7 +42,7 @@ class FileDescriptor {
   std::optional<std::span<std::byte>> read(std::span<std::byte> to) const;
   // Writes all bytes from an offset on. Returns false, with errno set, on failure, also at a limit
   // on file sizes, which raises no signal.
-  bool write(std::size_t offset, Bytes bytes) const;
+  bool write(size_t offset, Bytes bytes) const;
   // Whether the file still has this name.
   bool is_at(const std::filesystem::path& path) const;
 
@@ -71,7 +71,7 @@ class TemporaryFile {
   TemporaryFile(const TemporaryFile&) = delete;
   TemporaryFile& operator=(const TemporaryFile&) = delete;
 
-  void write(std::size_t offset, Bytes bytes);
+  void write(size_t offset, Bytes bytes);
   void sync();
   // Renames the synced file to its target, and syncs the folder.
   void replace_target();
@@ -102,7 +102,7 @@ class MappedFile {
  private:
   struct Stamp {
     off_t size = 0;
-    std::int64_t seconds = 0, nanoseconds = 0;
+    int64_t seconds = 0, nanoseconds = 0;
     bool operator==(const Stamp&) const = default;
   };
   static std::optional<Stamp> stamp_of(const FileDescriptor& file);

@@ -11,13 +11,13 @@ namespace protomark {
 // Landmark j of a block has the id first_id + j + gap j, where gap j counts the ids missing up to
 // there. Ids without gaps take no bits.
 struct IdBlock {
-  std::int64_t first_id;
-  std::uint64_t gaps;  // 64 * their first word + bits per gap, 0 to 63
+  int64_t first_id;
+  uint64_t gaps;  // 64 * their first word + bits per gap, 0 to 63
 
   int bits() const { return static_cast<int>(gaps % 64); }
-  std::size_t first_word() const { return gaps / 64; }
+  size_t first_word() const { return gaps / 64; }
 };
-inline constexpr std::size_t kIdBlock = 128;  // landmarks; the last block may have fewer
+inline constexpr size_t kIdBlock = 128;  // landmarks; the last block may have fewer
 
 // Writes the sections `idblocks` and `idgaps` from ascending ids.
 class IdBlockWriter {
@@ -25,7 +25,7 @@ class IdBlockWriter {
   IdBlockWriter(ContainerWriter::Sink blocks, ContainerWriter::Sink gaps)
       : blocks_(std::move(blocks)), gaps_(std::move(gaps)) {}
 
-  void add(std::int64_t id) {
+  void add(int64_t id) {
     ids_.push_back(id);
     if (ids_.size() == kIdBlock) end_block();
   }
@@ -36,32 +36,28 @@ class IdBlockWriter {
   }
 
   // Whether ids have to be stored: 0 to n - 1 have not.
-  static bool needed(std::size_t n, std::int64_t largest) {
-    return largest + 1 != static_cast<std::int64_t>(n);
-  }
+  static bool needed(size_t n, int64_t largest) { return largest + 1 != static_cast<int64_t>(n); }
   // Adds the two sections as the last of several that are produced side by side.
-  static void add_to(std::vector<ContainerWriter::Part>& parts, std::size_t n) {
+  static void add_to(std::vector<ContainerWriter::Part>& parts, size_t n) {
     parts.push_back({section::kIdBlocks, (n + kIdBlock - 1) / kIdBlock * sizeof(IdBlock)});
     parts.push_back({section::kIdGaps, ContainerWriter::kUnknownSize});
   }
 
  private:
   void end_block() {
-    const auto gap = [&](std::size_t j) {
-      return static_cast<std::uint64_t>(ids_[j] - ids_.front()) - j;
-    };
+    const auto gap = [&](size_t j) { return static_cast<uint64_t>(ids_[j] - ids_.front()) - j; };
     const auto bits = static_cast<int>(std::bit_width(gap(ids_.size() - 1)));
-    blocks_.add(static_cast<std::uint64_t>(ids_.front()), 64);
-    blocks_.add(words_ * 64 + static_cast<std::uint64_t>(bits), 64);
-    for (std::size_t j = 0; j < ids_.size(); ++j) gaps_.add(gap(j), bits);
+    blocks_.add(static_cast<uint64_t>(ids_.front()), 64);
+    blocks_.add(words_ * 64 + static_cast<uint64_t>(bits), 64);
+    for (size_t j = 0; j < ids_.size(); ++j) gaps_.add(gap(j), bits);
     gaps_.align();
     words_ += packed_words(ids_.size(), bits);
     ids_.clear();
   }
 
   PackedWriter blocks_, gaps_;
-  std::vector<std::int64_t> ids_;  // of the block
-  std::size_t words_ = 0;          // of all gaps
+  std::vector<int64_t> ids_;  // of the block
+  size_t words_ = 0;          // of all gaps
 };
 
 class LandmarkIds {
@@ -69,9 +65,9 @@ class LandmarkIds {
   LandmarkIds() = default;
   // Checks everything but the gaps, which are mapped, and checked as they are read. `file` must
   // outlive this. Throws FileError.
-  LandmarkIds(const ContainerReader& file, std::size_t n) : file_(&file), n_(n) {
+  LandmarkIds(const ContainerReader& file, size_t n) : file_(&file), n_(n) {
     if (!file.has(section::kIdBlocks)) return;
-    const std::size_t blocks = (n + kIdBlock - 1) / kIdBlock;
+    const size_t blocks = (n + kIdBlock - 1) / kIdBlock;
     if (file.map(section::kIdBlocks).size() != blocks * sizeof(IdBlock)) {
       file.fail_size(section::kIdBlocks);
     }
@@ -83,35 +79,35 @@ class LandmarkIds {
   // Whether each landmark's id is its index.
   bool are_indices() const { return blocks_.empty(); }
   // Throws FileError if the id is not below those of the next block.
-  std::int64_t operator[](LandmarkIndex landmark) const {
+  int64_t operator[](LandmarkIndex landmark) const {
     if (are_indices()) return landmark.value;
-    const std::size_t b = landmark.value / kIdBlock, j = landmark.value % kIdBlock;
+    const size_t b = landmark.value / kIdBlock, j = landmark.value % kIdBlock;
     const IdBlock& block = blocks_[b];
-    const std::uint64_t id = static_cast<std::uint64_t>(block.first_id) + j +
-                             packed_number(gaps_.data() + 8 * block.first_word(), block.bits(), j);
+    const uint64_t id = static_cast<uint64_t>(block.first_id) + j +
+                        packed_number(gaps_.data() + 8 * block.first_word(), block.bits(), j);
     if (id >= end_of(b)) file_->fail(kNoOrder);
-    return static_cast<std::int64_t>(id);
+    return static_cast<int64_t>(id);
   }
   // Throws UnknownLandmark.
-  LandmarkIndex find(std::int64_t id) const {
+  LandmarkIndex find(int64_t id) const {
     if (are_indices()) {
-      if (id < 0 || static_cast<std::uint64_t>(id) >= n_) throw UnknownLandmark(id);
-      return landmark_at(static_cast<std::size_t>(id));
+      if (id < 0 || static_cast<uint64_t>(id) >= n_) throw UnknownLandmark(id);
+      return landmark_at(static_cast<size_t>(id));
     }
     const auto next = std::ranges::upper_bound(blocks_, id, {}, &IdBlock::first_id);
     if (next == blocks_.begin()) throw UnknownLandmark(id);
-    std::size_t first = static_cast<std::size_t>(next - blocks_.begin() - 1) * kIdBlock;
-    for (std::size_t end = std::min(n_, first + kIdBlock); first < end;) {
-      const std::size_t half = first + (end - first) / 2;
+    size_t first = static_cast<size_t>(next - blocks_.begin() - 1) * kIdBlock;
+    for (size_t end = std::min(n_, first + kIdBlock); first < end;) {
+      const size_t half = first + (end - first) / 2;
       (*this)[landmark_at(half)] < id ? first = half + 1 : end = half;
     }
     if (first == n_ || (*this)[landmark_at(first)] != id) throw UnknownLandmark(id);
     return landmark_at(first);
   }
   // Returns all ids. Throws FileError unless they ascend.
-  std::vector<std::int64_t> all() const {
-    std::vector<std::int64_t> result(n_);
-    for (std::size_t i = 0; i < n_; ++i) {
+  std::vector<int64_t> all() const {
+    std::vector<int64_t> result(n_);
+    for (size_t i = 0; i < n_; ++i) {
       result[i] = (*this)[landmark_at(i)];
       if (i > 0 && result[i] <= result[i - 1]) file_->fail(kNoOrder);
     }
@@ -121,22 +117,22 @@ class LandmarkIds {
  private:
   static constexpr char kNoOrder[] = "its landmark ids do not ascend";
 
-  std::size_t block_size(std::size_t b) const { return std::min(kIdBlock, n_ - b * kIdBlock); }
+  size_t block_size(size_t b) const { return std::min(kIdBlock, n_ - b * kIdBlock); }
   // Returns a number that all ids of a block are below.
-  std::uint64_t end_of(std::size_t b) const {
-    return b + 1 < blocks_.size() ? static_cast<std::uint64_t>(blocks_[b + 1].first_id)
-                                  : std::uint64_t{1} << 63;
+  uint64_t end_of(size_t b) const {
+    return b + 1 < blocks_.size() ? static_cast<uint64_t>(blocks_[b + 1].first_id)
+                                  : uint64_t{1} << 63;
   }
   // Checks that blocks of gaps follow each other, and that ids can ascend.
   void check_blocks() const {
-    std::size_t words = 0;
-    for (std::size_t b = 0; b < blocks_.size(); ++b) {
+    size_t words = 0;
+    for (size_t b = 0; b < blocks_.size(); ++b) {
       if (blocks_[b].first_word() != words)
         file_->fail("its blocks of ids do not follow each other");
       words += packed_words(block_size(b), blocks_[b].bits());
       if (blocks_[b].first_id < 0) file_->fail("it has a negative landmark id");
       // The last id of a block is at least this.
-      if (static_cast<std::uint64_t>(blocks_[b].first_id) + block_size(b) > end_of(b)) {
+      if (static_cast<uint64_t>(blocks_[b].first_id) + block_size(b) > end_of(b)) {
         file_->fail(kNoOrder);
       }
     }
@@ -144,7 +140,7 @@ class LandmarkIds {
   }
 
   const ContainerReader* file_ = nullptr;
-  std::size_t n_ = 0;
+  size_t n_ = 0;
   std::vector<IdBlock> blocks_;
   Bytes gaps_;
 };

@@ -13,9 +13,9 @@
 namespace protomark {
 namespace {
 
-constexpr std::size_t kIdentitySize = 64;  // hexadecimal digits
+constexpr size_t kIdentitySize = 64;  // hexadecimal digits
 // Size of a journal's first container: header, table and the section `base`.
-constexpr std::size_t kFirstSize = 128 + kIdentitySize;
+constexpr size_t kFirstSize = 128 + kIdentitySize;
 
 // Returns the header and table that bytes begin with, if their checksum is right.
 std::optional<ContainerHead> intact_head(Bytes bytes) {
@@ -45,7 +45,7 @@ std::optional<ContainerReader> whole_container(Bytes bytes, const std::string& n
 bool is_record(FileKind kind) { return kind == FileKind::commit || kind == FileKind::fold; }
 
 // Returns the number of the record that bytes begin with; 0 if they begin with none.
-std::uint64_t record_number(Bytes bytes) try {
+uint64_t record_number(Bytes bytes) try {
   const auto file = container_at(bytes, "");
   // The size first, as reading the sections of many nested containers would take long.
   if (!file || !is_record(file->kind()) || file->map(section::kChain).size() != sizeof(ChainLink)) {
@@ -60,13 +60,12 @@ std::uint64_t record_number(Bytes bytes) try {
 // size of the bytes if there is none. As that record may itself contain anything, even a container,
 // the search begins behind it; if its header does not tell where that is, only a record with a
 // number above those of the whole records counts.
-std::size_t find_later(Bytes bytes, std::size_t broken, std::uint64_t records) {
+size_t find_later(Bytes bytes, size_t broken, uint64_t records) {
   const auto head = intact_head(bytes.subspan(broken));
-  const std::uint64_t size = head ? head->header.file_size : kSectionAlignment;
+  const uint64_t size = head ? head->header.file_size : kSectionAlignment;
   if (size > bytes.size() - broken) return bytes.size();
-  const std::uint64_t aligned =
-      (size + kSectionAlignment - 1) / kSectionAlignment * kSectionAlignment;
-  for (std::size_t at = broken + aligned; at < bytes.size(); at += kSectionAlignment) {
+  const uint64_t aligned = (size + kSectionAlignment - 1) / kSectionAlignment * kSectionAlignment;
+  for (size_t at = broken + aligned; at < bytes.size(); at += kSectionAlignment) {
     const Bytes rest = bytes.subspan(at);
     if (head ? intact_head(rest).has_value() : record_number(rest) > records) return at;
   }
@@ -121,7 +120,7 @@ void add_base(ContainerWriter& file, const std::string& identity) {
   file.add(section::kBase, std::vector(bytes.begin(), bytes.end()));
 }
 
-std::uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
+uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
 
 // Returns the bytes of an open journal, which its writer may cut off meanwhile. Throws FileError if
 // it is not a journal.
@@ -130,7 +129,7 @@ std::vector<std::byte> read_journal(const FileDescriptor& file, const std::files
   struct stat status;
   if (::fstat(file.get(), &status) != 0) fail(system_error());
   if (!S_ISREG(status.st_mode)) fail_file(path, "not a file");
-  const auto size = static_cast<std::size_t>(status.st_size);
+  const auto size = static_cast<size_t>(status.st_size);
   const auto read = [&](std::span<std::byte> to) {
     const auto bytes = file.read(to);
     if (!bytes) fail(system_error());
@@ -225,7 +224,7 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
     const auto record = whole_container(bytes.subspan(end_), where);
     if (!record) {
       container_at(bytes.subspan(end_), where);
-      const std::size_t next = find_later(bytes, end_, last_.record);
+      const size_t next = find_later(bytes, end_, last_.record);
       if (next == size_) return;
       throw FileError(text(where, " is broken, and another one follows at byte ", next,
                            ", which no power cut leaves; to keep the commits before it, cut the "
@@ -252,7 +251,7 @@ std::span<const JournalContent::Commit> JournalContent::commits(const std::strin
   for (auto base = bases_.rbegin(); base != bases_.rend(); ++base) {
     if (base->identity == identity) return std::span(commits_).subspan(base->commits);
   }
-  const std::size_t folded = bases_.empty() ? 0 : bases_.back().commits;
+  const size_t folded = bases_.empty() ? 0 : bases_.back().commits;
   if (commits_.size() == folded) return {};
   const std::string maybe =
       folded == 0 ? "" : text(", of which the first ", folded, " may be in that file already");
@@ -302,7 +301,7 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   }
 }
 
-bool Journal::cut(std::size_t size) {
+bool Journal::cut(size_t size) {
   if (tail_ && ::ftruncate(file_.get(), static_cast<off_t>(size)) != 0) return false;
   tail_ = false;
   return true;

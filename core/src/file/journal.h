@@ -11,9 +11,9 @@ namespace protomark {
 
 // The section `chain` of a record.
 struct ChainLink {
-  std::uint64_t record;    // counted from 1
-  std::uint32_t previous;  // checksum of the container before it
-  std::uint32_t reserved;
+  uint64_t record;    // counted from 1
+  uint32_t previous;  // checksum of the container before it
+  uint32_t reserved;
 };
 
 // Returns the path of the journal beside a map file, or beside the file that it links to.
@@ -23,8 +23,8 @@ std::filesystem::path journal_path(const std::filesystem::path& map);
 class JournalContent {
  public:
   struct Commit {
-    Bytes bytes;         // a container
-    std::size_t offset;  // in the journal
+    Bytes bytes;    // a container
+    size_t offset;  // in the journal
   };
 
   JournalContent() = default;
@@ -39,8 +39,8 @@ class JournalContent {
 
   const std::string& name() const { return name_; }
   // Returns where the last whole record ends; 0 if there is not even a header.
-  std::size_t end() const { return end_; }
-  std::size_t size() const { return size_; }
+  size_t end() const { return end_; }
+  size_t size() const { return size_; }
   // Returns the number of records, and the checksum of the last one or of the header.
   ChainLink last() const { return last_; }
   // Whether the journal has no records and was begun for a map file of this identity.
@@ -52,12 +52,12 @@ class JournalContent {
   // A map file that has the first `commits` commits.
   struct Base {
     std::string identity;
-    std::size_t commits;
+    size_t commits;
   };
 
   std::string name_;
-  std::size_t size_ = 0;
-  std::size_t end_ = 0;
+  size_t size_ = 0;
+  size_t end_ = 0;
   ChainLink last_{};
   std::vector<Commit> commits_;
   std::vector<Base> bases_;
@@ -110,7 +110,7 @@ class Journal {
  private:
   void check_owner() const;
   void begin();
-  bool cut(std::size_t size);
+  bool cut(size_t size);
   [[noreturn]] void fail_write() const { fail_file(path_, "cannot be written: ", system_error()); }
 
   std::filesystem::path map_, path_;
@@ -119,7 +119,7 @@ class Journal {
   pid_t process_;
   std::string base_;    // identity of the map file
   std::string folded_;  // and of the one that may have replaced it
-  std::size_t end_ = 0;
+  size_t end_ = 0;
   ChainLink last_{};
   bool tail_ = false;  // bytes may follow the end
 };

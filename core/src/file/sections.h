@@ -24,6 +24,7 @@ inline constexpr char kIdGaps[] = "idgaps";
 inline constexpr char kAppearanceBits[] = "appbits";
 inline constexpr char kAppearances[] = "appear";
 inline constexpr char kSums[] = "sums";
+inline constexpr char kSpareBits[] = "spare";
 // Sealed maps.
 inline constexpr char kRows[] = "rows";
 inline constexpr char kPrototypes[] = "protos";
@@ -52,21 +53,21 @@ class SectionReader {
     return v;
   }
   template <typename T>
-  std::vector<T> values(std::size_t n) {
+  std::vector<T> values(size_t n) {
     check(n, sizeof(T));
     std::vector<T> v(n);
     copy(v.data(), n);
     return v;
   }
   template <typename T>
-  void copy(T* to, std::size_t n) {
+  void copy(T* to, size_t n) {
     check(n, sizeof(T));
     if (n > 0) std::memcpy(to, rest_.data(), n * sizeof(T));
     rest_ = rest_.subspan(n * sizeof(T));
   }
   // Reads a u32 length and that many bytes of UTF-8.
   std::string text() {
-    const std::vector<char> bytes = values<char>(value<std::uint32_t>());
+    const std::vector<char> bytes = values<char>(value<uint32_t>());
     std::string result(bytes.begin(), bytes.end());
     if (!is_utf8(result)) file_->fail("its section '", section_, "' has a text that is not UTF-8");
     return result;
@@ -78,7 +79,7 @@ class SectionReader {
   }
 
  private:
-  void check(std::size_t n, std::size_t size) const {
+  void check(size_t n, size_t size) const {
     if (n <= rest_.size() / size) return;
     file_->fail("its section '", section_, "' is shorter than it should be");
   }
@@ -90,7 +91,7 @@ class SectionReader {
 
 // Reads a section of exactly n values.
 template <typename T>
-std::vector<T> read_section(const ContainerReader& file, const char* name, std::size_t n) {
+std::vector<T> read_section(const ContainerReader& file, const char* name, size_t n) {
   SectionReader in(file, name);
   std::vector<T> result = in.values<T>(n);
   in.finish();
@@ -109,12 +110,12 @@ class SectionWriter {
     values(&v, 1);
   }
   template <typename T>
-  void values(const T* v, std::size_t n) {
+  void values(const T* v, size_t n) {
     const Bytes bytes = std::as_bytes(std::span(v, n));
     bytes_.insert(bytes_.end(), bytes.begin(), bytes.end());
   }
   void text(const std::string& v) {
-    value(static_cast<std::uint32_t>(v.size()));
+    value(static_cast<uint32_t>(v.size()));
     values(v.data(), v.size());
   }
   void add_to(ContainerWriter& file, const char* name) { file.add(name, std::move(bytes_)); }
@@ -131,65 +132,40 @@ void add_value(ContainerWriter& file, const char* name, const T& value) {
   out.add_to(file, name);
 }
 
-// Writes packed numbers (base/packed_numbers.h) to a section.
-class PackedWriter {
- public:
-  explicit PackedWriter(ContainerWriter::Sink sink) : sink_(std::move(sink)) {}
-
-  void add(std::uint64_t value, int bits) {
-    packer_.add(value, bits);
-    if (packer_.words().size() >= kPiece) flush();
-  }
-  // Pads the last word with zeros.
-  void align() { packer_.align(); }
-  void finish() {
-    align();
-    flush();
-  }
-
- private:
-  static constexpr std::size_t kPiece = 8 * CheckedNumbers::kBlock;  // words
-
-  void flush() {
-    sink_(std::as_bytes(std::span(packer_.words())));
-    packer_.words().clear();
-  }
-
-  ContainerWriter::Sink sink_;
-  BitPacker packer_;
-};
-
-// Reads them one after the other.
+// Reads packed numbers of up to 57 bits one after the other.
 class PackedReader {
  public:
   // The section has `bits` bits, and padding up to a whole word.
-  PackedReader(const ContainerReader& file, const char* section, std::size_t bits)
+  PackedReader(const ContainerReader& file, const char* section, size_t bits)
       : bytes_(file.read(section)) {
     if (bytes_.size() != packed_bytes(bits, 1)) file.fail_size(section);
   }
 
   // Reading beyond the end is the caller's error.
-  std::uint64_t next(int bits) {
-    const std::size_t first = std::exchange(at_, at_ + static_cast<std::size_t>(bits));
-    return packed_number_at(bytes_.data(), bits, first);
+  uint64_t next(int bits) {
+    const size_t byte = std::min(at_ / 8, bytes_.size() - sizeof(uint64_t));
+    uint64_t word;
+    std::memcpy(&word, bytes_.data() + byte, sizeof(word));
+    word >>= at_ - 8 * byte;
+    at_ += static_cast<size_t>(bits);
+    return word & ((uint64_t{1} << bits) - 1);
   }
 
  private:
   Bytes bytes_;
-  std::size_t at_ = 0;  // bits
+  size_t at_ = 0;  // bits
 };
 
 // Hands n elements of `width` values each to a sink; fill(i, to) writes the values of element i.
 template <typename T, typename Fill>
-void put_values(const ContainerWriter::Sink& sink, std::size_t n, std::size_t width,
-                const Fill& fill) {
-  constexpr std::size_t kPiece = 1 << 16;  // bytes
-  const std::size_t element = width * sizeof(T);
-  const std::size_t piece = std::min(n, std::max<std::size_t>(1, kPiece / element));
+void put_values(const ContainerWriter::Sink& sink, size_t n, size_t width, const Fill& fill) {
+  constexpr size_t kPiece = 1 << 16;  // bytes
+  const size_t element = width * sizeof(T);
+  const size_t piece = std::min(n, std::max<size_t>(1, kPiece / element));
   std::vector<T> values(piece * width);
-  for (std::size_t first = 0; first < n; first += piece) {
-    const std::size_t end = std::min(n, first + piece);
-    for (std::size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
+  for (size_t first = 0; first < n; first += piece) {
+    const size_t end = std::min(n, first + piece);
+    for (size_t i = first; i < end; ++i) fill(i, &values[(i - first) * width]);
     sink(std::as_bytes(std::span(values)).first((end - first) * element));
   }
 }
@@ -198,7 +174,7 @@ void put_values(const ContainerWriter::Sink& sink, std::size_t n, std::size_t wi
 template <typename T, typename Element, typename Value>
 void put_each(const ContainerWriter::Sink& sink, std::span<const Element> elements,
               const Value& value) {
-  put_values<T>(sink, elements.size(), 1, [&](std::size_t i, T* to) { *to = value(elements[i]); });
+  put_values<T>(sink, elements.size(), 1, [&](size_t i, T* to) { *to = value(elements[i]); });
 }
 
 }  // namespace protomark

@@ -7,18 +7,18 @@ namespace protomark::kernels {
 namespace {
 
 struct Avx512 {
-  using Ints = Vector<std::int32_t, 64>;
-  using Sums16 = Pack<Vector<std::int16_t, 64>, 1>;
+  using Ints = Vector<int32_t, 64>;
+  using Sums16 = Pack<Vector<int16_t, 64>, 1>;
   using Sums = Pack<Ints, 1>;
 
-  static Sums16 widen(const std::int8_t* weights) {
-    return {(Vector<std::int16_t, 64>)_mm512_cvtepi8_epi16(load<__m256i>(weights))};
+  static Sums16 widen(const int8_t* weights) {
+    return {(Vector<int16_t, 64>)_mm512_cvtepi8_epi16(load<__m256i>(weights))};
   }
 
   using Codes = Ints;
-  static Codes load_codes(const std::int8_t* codes) { return load<Codes>(codes); }
-  using Step = std::uint8_t[4];
-  static Ints query(const std::uint8_t* codes) { return Ints{} + load<std::int32_t>(codes); }
+  static Codes load_codes(const int8_t* codes) { return load<Codes>(codes); }
+  using Step = uint8_t[4];
+  static Ints query(const uint8_t* codes) { return Ints{} + load<int32_t>(codes); }
   // GCC copies every accumulator of _mm512_dpbusd_epi32 twice per step.
   static void dot(Sums& sums, Ints u, Codes s) {
     __asm__("vpdpbusd %2, %1, %0" : "+v"(sums.v[0]) : "v"(u), "v"(s));
@@ -26,14 +26,14 @@ struct Avx512 {
   static constexpr int kDenseBatch = 8;
   static constexpr int kDenseGroups = 2;
 
-  static Ints load_ints(const std::int32_t* sums) { return load<Ints>(sums); }
-  static Ints load_ints(const std::int16_t* sums) {
+  static Ints load_ints(const int32_t* sums) { return load<Ints>(sums); }
+  static Ints load_ints(const int16_t* sums) {
     return (Ints)_mm512_cvtepi16_epi32(load<__m256i>(sums));
   }
   // The upper halves of 64-bit products.
   static Ints scaled(Ints sums, Ints bias, Ints multipliers, int shift) {
     const auto s = (__m512i)(sums + bias), m = (__m512i)multipliers;
-    const __m512i half = _mm512_set1_epi64(std::int64_t{1} << (shift - 1));
+    const __m512i half = _mm512_set1_epi64(int64_t{1} << (shift - 1));
     const __m512i even = _mm512_add_epi64(_mm512_mul_epi32(s, m), half);
     const __m512i odd = _mm512_add_epi64(
         _mm512_mul_epi32(_mm512_srli_epi64(s, 32), _mm512_srli_epi64(m, 32)), half);
@@ -42,7 +42,7 @@ struct Avx512 {
   }
   class Table {
    public:
-    explicit Table(const std::uint8_t* bytes) {
+    explicit Table(const uint8_t* bytes) {
       for (int q = 0; q < 4; ++q) table_[q] = load<__m512i>(bytes + 64 * q);
     }
     __m512i operator()(Ints a, Ints b, Ints c, Ints d) const {
@@ -61,7 +61,7 @@ struct Avx512 {
     __m512i table_[4];
   };
 
-  static constexpr std::size_t kBlocks = 4;
+  static constexpr size_t kBlocks = 4;
   // The biases are -|p|^2 - 256 sum(p), as queries come as q + 128.
   class Norms {
    public:
@@ -79,21 +79,19 @@ struct Avx512 {
     return {(Ints)_mm512_max_epi32((__m512i)a.v[0], (__m512i)b.v[0])};
   }
   using Flags = unsigned;
-  static unsigned near_rows(const Sums& sums, std::int32_t threshold) {
+  static unsigned near_rows(const Sums& sums, int32_t threshold) {
     return _mm512_cmpgt_epi32_mask((__m512i)sums.v[0], _mm512_set1_epi32(threshold));
   }
-  static Flags above(const Sums& sums, std::int32_t threshold) {
-    return near_rows(sums, threshold);
-  }
+  static Flags above(const Sums& sums, int32_t threshold) { return near_rows(sums, threshold); }
   static bool any(Flags flags) { return flags != 0; }
 
   static constexpr int kWordQueries = 8;
-  using Words = Pack<Vector<std::uint64_t, 64>, 1>;
-  static void add_bits(Words& counts, std::uint64_t query, const Words& row) {
+  using Words = Pack<Vector<uint64_t, 64>, 1>;
+  static void add_bits(Words& counts, uint64_t query, const Words& row) {
     const auto differ = (__m512i)(row.v[0] ^ query);
-    counts.v[0] += (Vector<std::uint64_t, 64>)_mm512_popcnt_epi64(differ);
+    counts.v[0] += (Vector<uint64_t, 64>)_mm512_popcnt_epi64(differ);
   }
-  static unsigned near_words(const Words& counts, std::int32_t limit) {
+  static unsigned near_words(const Words& counts, int32_t limit) {
     return _mm512_cmple_epi64_mask((__m512i)counts.v[0], _mm512_set1_epi64(limit));
   }
 };

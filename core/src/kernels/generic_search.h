@@ -23,18 +23,17 @@ constexpr int kTileQueries = 4;
 // A negated distance is 2 p . q + bias. Sums start from half the bias and end as half the negated
 // distance, both rounded down; the lost bit is in the bias. A row whose half is above this
 // threshold may be a hit.
-std::int32_t threshold(std::int32_t limit) { return -((limit >> 1) + (limit & 1)) - 1; }
+int32_t threshold(int32_t limit) { return -((limit >> 1) + (limit & 1)) - 1; }
 
 // Appends the hits among those of a block's 16 rows whose bits are set in `near`.
-std::size_t append_hits(unsigned near, const std::int32_t* halves, const std::int32_t* biases,
-                        std::int32_t limit, std::size_t query, std::size_t first_row, Hit* hits) {
-  std::size_t found = 0;
+size_t append_hits(unsigned near, const int32_t* halves, const int32_t* biases, int32_t limit,
+                   size_t query, size_t first_row, Hit* hits) {
+  size_t found = 0;
   for (; near != 0; near &= near - 1) {
-    const auto r = static_cast<std::size_t>(__builtin_ctz(near));
-    const std::int32_t distance = -2 * halves[r] - (biases[r] & 1);
+    const auto r = static_cast<size_t>(__builtin_ctz(near));
+    const int32_t distance = -2 * halves[r] - (biases[r] & 1);
     if (distance > limit) continue;
-    hits[found++] = {static_cast<std::uint32_t>(query), static_cast<std::uint32_t>(first_row + r),
-                     distance};
+    hits[found++] = {static_cast<uint32_t>(query), static_cast<uint32_t>(first_row + r), distance};
   }
   return found;
 }
@@ -48,28 +47,28 @@ class Prefix {
         never_(rows.biases == nullptr || rows.prefix >= rows.dim || queries.n < kTileQueries),
         steps_in_full_(queries.steps_in_full) {
     // |p|^2 - 2 p . q over the other dimensions is at least minus the query's squared norm there.
-    for (std::size_t q = 0; q < queries_; ++q) {
-      const std::int32_t limit = queries.limits[q], rest = queries.rest_norms[q];
+    for (size_t q = 0; q < queries_; ++q) {
+      const int32_t limit = queries.limits[q], rest = queries.rest_norms[q];
       thresholds_[q] = threshold(limit > INT32_MAX - rest ? INT32_MAX : limit + rest);
     }
   }
 
-  const std::int32_t* thresholds() const { return thresholds_; }
+  const int32_t* thresholds() const { return thresholds_; }
   bool pays() {
     if (never_) return false;
     if (*steps_in_full_ == 0) return true;
     --*steps_in_full_;
     return false;
   }
-  void left(std::size_t queries) {
+  void left(size_t queries) {
     if (4 * queries > queries_) *steps_in_full_ = 15;
   }
 
  private:
-  std::size_t queries_;
+  size_t queries_;
   bool never_;
-  std::size_t* steps_in_full_;
-  std::int32_t thresholds_[kScanQueries];
+  size_t* steps_in_full_;
+  int32_t thresholds_[kScanQueries];
 };
 
 // Queries and rows to compare.
@@ -77,15 +76,15 @@ class Prefix {
 template <typename S>
 struct CodeTile {
   const typename S::Step* queries;
-  const std::int32_t* limits;
-  const std::int32_t* thresholds;
-  const std::int32_t* prefix_thresholds;
-  const std::int8_t* codes;
-  const std::int32_t* biases;
-  const std::int32_t* prefix_biases;
-  std::size_t dim;
-  std::size_t prefix;
-  std::size_t first_row;
+  const int32_t* limits;
+  const int32_t* thresholds;
+  const int32_t* prefix_thresholds;
+  const int8_t* codes;
+  const int32_t* biases;
+  const int32_t* prefix_biases;
+  size_t dim;
+  size_t prefix;
+  size_t first_row;
 };
 
 // Computes half the negated distances of the queries from `query` on over the first `dims`
@@ -94,18 +93,18 @@ struct CodeTile {
 //   S::Codes              4 dimensions of 16 rows: load_codes()
 //   S::dot(sums, query(step), codes)  adds the products of 4 dimensions
 template <typename S, int Queries, int Blocks>
-PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std::int32_t* biases,
-                             std::size_t dims, typename S::Sums (&acc)[Queries][Blocks]) {
+PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, size_t query, const int32_t* biases, size_t dims,
+                             typename S::Sums (&acc)[Queries][Blocks]) {
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
     const auto half = load_pack<typename S::Sums>(biases + b * kCodeRows) >> 1;
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) acc[q][b] = half;
   }
-  const std::int8_t* p = t.codes;
-  const std::size_t steps = t.dim / 4;
+  const int8_t* p = t.codes;
+  const size_t steps = t.dim / 4;
   const typename S::Step* step = t.queries + query * steps;
-  for (std::size_t s = 0; s < dims / 4; ++s, p += 4 * kCodeRows) {
+  for (size_t s = 0; s < dims / 4; ++s, p += 4 * kCodeRows) {
     typename S::Codes codes[Blocks];
 #pragma GCC unroll 8
     for (int b = 0; b < Blocks; ++b) codes[b] = S::load_codes(p + b * kCodeRows * t.dim);
@@ -122,18 +121,18 @@ PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, std::size_t query, const std:
 // fastest at.
 //   S::Norms              sums for the biases of 16 rows: add(codes), biases()
 template <typename S, int Queries, int Blocks>
-PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query,
+PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, size_t query,
                                          typename S::Sums (&biases)[Blocks],
                                          typename S::Sums (&acc)[Queries][Blocks]) {
-  const std::int8_t* p = t.codes;
-  const std::size_t steps = t.dim / 4;
+  const int8_t* p = t.codes;
+  const size_t steps = t.dim / 4;
   const typename S::Step* step = t.queries + query * steps;
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
     typename S::Norms norms;
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) acc[q][b] = {};
-    for (std::size_t s = 0; s < steps; ++s, p += 4 * kCodeRows) {
+    for (size_t s = 0; s < steps; ++s, p += 4 * kCodeRows) {
       const typename S::Codes codes = S::load_codes(p);
       norms.add(codes);
 #pragma GCC unroll 8
@@ -152,8 +151,7 @@ PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, std::size_t query
 //   S::Flags              of above(sums, threshold), joined by |, asked by any()
 //   S::max(a, b)          where S compares several blocks at a time
 template <typename S, int Blocks>
-PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
-                                        std::int32_t threshold) {
+PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks], int32_t threshold) {
   typename S::Sums best = acc[0];
   if constexpr (Blocks > 1) {
 #pragma GCC unroll 8
@@ -165,21 +163,21 @@ PROTOMARK_INLINE typename S::Flags near(const typename S::Sums (&acc)[Blocks],
 // Appends the hits of a tile.
 //   S::near_rows(sums, threshold)  a bit for each row above it
 template <typename S, int Queries, int Blocks, bool HasBiases>
-PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hit* hits) {
+PROTOMARK_TILE size_t scan_tile(const CodeTile<S>& t, size_t query, Hit* hits) {
   typename S::Sums acc[Queries][Blocks], own_biases[Blocks];
   if constexpr (HasBiases) {
     sum_up(t, query, t.biases, t.dim, acc);
   } else {
     sum_up_with_biases(t, query, own_biases, acc);
   }
-  const std::int32_t* thresholds = t.thresholds + query;
+  const int32_t* thresholds = t.thresholds + query;
   typename S::Flags any = near<S>(acc[0], thresholds[0]);
 #pragma GCC unroll 8
   for (int q = 1; q < Queries; ++q) any = any | near<S>(acc[q], thresholds[q]);
   if (!S::any(any)) [[likely]]
     return 0;
 
-  alignas(64) std::int32_t halves[Queries][Blocks][kCodeRows], biases[Blocks][kCodeRows];
+  alignas(64) int32_t halves[Queries][Blocks][kCodeRows], biases[Blocks][kCodeRows];
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
     if constexpr (HasBiases) own_biases[b] = load_pack<typename S::Sums>(t.biases + b * kCodeRows);
@@ -187,9 +185,9 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hi
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) store_pack(halves[q][b], acc[q][b]);
   }
-  std::size_t found = 0;
-  for (std::size_t q = 0; q < Queries; ++q) {
-    for (std::size_t b = 0; b < Blocks; ++b) {
+  size_t found = 0;
+  for (size_t q = 0; q < Queries; ++q) {
+    for (size_t b = 0; b < Blocks; ++b) {
       found += append_hits(S::near_rows(load_pack<typename S::Sums>(halves[q][b]), thresholds[q]),
                            halves[q][b], biases[b], t.limits[query + q], query + q,
                            t.first_row + b * kCodeRows, hits + found);
@@ -200,8 +198,8 @@ PROTOMARK_TILE std::size_t scan_tile(const CodeTile<S>& t, std::size_t query, Hi
 
 // Calls take<Queries>(query) for all n queries, kTileQueries at a time.
 template <typename Take>
-void each_tile(std::size_t n, const Take& take) {
-  std::size_t q = 0;
+void each_tile(size_t n, const Take& take) {
+  size_t q = 0;
   for (; q + kTileQueries <= n; q += kTileQueries) take.template operator()<kTileQueries>(q);
   static_assert(kTileQueries == 4);
   if (n - q == 1) take.template operator()<1>(q);
@@ -210,9 +208,9 @@ void each_tile(std::size_t n, const Take& take) {
 }
 
 template <typename S, int Blocks>
-std::size_t scan_blocks(const CodeTile<S>& t, std::size_t n, Hit* hits) {
-  std::size_t found = 0;
-  each_tile(n, [&]<int Queries>(std::size_t query) {
+size_t scan_blocks(const CodeTile<S>& t, size_t n, Hit* hits) {
+  size_t found = 0;
+  each_tile(n, [&]<int Queries>(size_t query) {
     found += t.biases != nullptr ? scan_tile<S, Queries, Blocks, true>(t, query, hits + found)
                                  : scan_tile<S, Queries, Blocks, false>(t, query, hits + found);
   });
@@ -221,16 +219,16 @@ std::size_t scan_blocks(const CodeTile<S>& t, std::size_t n, Hit* hits) {
 
 // Lists the queries that may have hits in S::kBlocks blocks, by the prefix.
 template <typename S>
-std::size_t near_by_prefix(const CodeTile<S>& t, std::size_t n, std::uint8_t* queries) {
-  std::size_t size = 0;
-  each_tile(n, [&]<int Queries>(std::size_t query) {
+size_t near_by_prefix(const CodeTile<S>& t, size_t n, uint8_t* queries) {
+  size_t size = 0;
+  each_tile(n, [&]<int Queries>(size_t query) {
     typename S::Sums acc[Queries][S::kBlocks];
     sum_up(t, query, t.prefix_biases, t.prefix, acc);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) {
       // Without a branch, as none could be predicted.
-      queries[size] = static_cast<std::uint8_t>(query + static_cast<std::size_t>(q));
-      size += S::any(near<S>(acc[q], t.prefix_thresholds[query + static_cast<std::size_t>(q)]));
+      queries[size] = static_cast<uint8_t>(query + static_cast<size_t>(q));
+      size += S::any(near<S>(acc[q], t.prefix_thresholds[query + static_cast<size_t>(q)]));
     }
   });
   return size;
@@ -238,11 +236,10 @@ std::size_t near_by_prefix(const CodeTile<S>& t, std::size_t n, std::uint8_t* qu
 
 //   S::convert(codes, n, steps)  where S::Step is not 4 bytes of the codes
 template <typename S>
-std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
-                      Hit* hits) {
+size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, size_t* block, Hit* hits) {
   [[maybe_unused]] typename S::Step room[kScanQueries * 64];
-  std::int32_t thresholds[kScanQueries];
-  for (std::size_t q = 0; q < queries.n; ++q) thresholds[q] = threshold(queries.limits[q]);
+  int32_t thresholds[kScanQueries];
+  for (size_t q = 0; q < queries.n; ++q) thresholds[q] = threshold(queries.limits[q]);
   Prefix prefix(queries, rows);
   CodeTile<S> tile{};
   if constexpr (requires { S::convert(queries.codes, 0, room); }) {
@@ -256,8 +253,8 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
   tile.prefix_thresholds = prefix.thresholds();
   tile.dim = rows.dim;
   tile.prefix = rows.prefix;
-  std::size_t found = 0;
-  std::size_t b = *block;
+  size_t found = 0;
+  size_t b = *block;
   while (b < rows.blocks && found < kHitsEnough) {
     tile.first_row = b * kCodeRows;
     tile.codes = rows.codes + tile.first_row * rows.dim;
@@ -271,9 +268,9 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
       continue;
     }
     if (prefix.pays()) {
-      std::uint8_t near[kScanQueries];
-      const std::size_t n = near_by_prefix(tile, queries.n, near);
-      for (std::size_t i = 0; i < n; ++i) {
+      uint8_t near[kScanQueries];
+      const size_t n = near_by_prefix(tile, queries.n, near);
+      for (size_t i = 0; i < n; ++i) {
         found += scan_tile<S, 1, S::kBlocks, true>(tile, near[i], hits + found);
       }
       prefix.left(n);
@@ -287,11 +284,11 @@ std::size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, std::
 }
 
 template <typename S>
-void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim, std::size_t prefix,
-                 std::int32_t* biases, std::int32_t* prefix_biases) {
-  for (std::size_t b = 0; b < blocks; ++b) {
+void code_biases(const int8_t* packed, size_t blocks, size_t dim, size_t prefix, int32_t* biases,
+                 int32_t* prefix_biases) {
+  for (size_t b = 0; b < blocks; ++b) {
     typename S::Norms norms;
-    std::size_t d = 0;
+    size_t d = 0;
     for (; d < prefix; d += 4, packed += 4 * kCodeRows) norms.add(S::load_codes(packed));
     if (prefix < dim) store_pack(prefix_biases + b * kCodeRows, norms.biases());
     for (; d < dim; d += 4, packed += 4 * kCodeRows) norms.add(S::load_codes(packed));
@@ -300,30 +297,29 @@ void code_biases(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
 }
 
 template <typename S>
-void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
-                  std::int8_t* codes) {
-  constexpr std::size_t kBytes = sizeof(S::Sums::v[0]), kStep = 4 * kCodeRows;
-  using Bytes = Vector<std::uint8_t, kBytes>;
-  using Shorts = Vector<std::uint16_t, kBytes>;
-  const auto twice = static_cast<std::uint16_t>(2 * scale);
-  const auto offset = static_cast<std::uint8_t>(15 * scale);
+void code_unpack4(const uint8_t* packed, size_t blocks, size_t dim, int scale, int8_t* codes) {
+  constexpr size_t kBytes = sizeof(S::Sums::v[0]), kStep = 4 * kCodeRows;
+  using Bytes = Vector<uint8_t, kBytes>;
+  using Shorts = Vector<uint16_t, kBytes>;
+  const auto twice = static_cast<uint16_t>(2 * scale);
+  const auto offset = static_cast<uint8_t>(15 * scale);
   // Two bytes at a time, whose products stay within them.
   const auto level = [&](Bytes u) { return (Bytes)((Shorts)u * twice) - offset; };
   // Which of the last 4 dimensions there are.
-  const std::uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
-  const std::size_t steps = (dim + 3) / 4;
-  for (std::size_t b = 0; b < blocks; ++b) {
-    for (std::size_t s = 0; s < steps; s += 2, packed += kStep) {
+  const uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
+  const size_t steps = (dim + 3) / 4;
+  for (size_t b = 0; b < blocks; ++b) {
+    for (size_t s = 0; s < steps; s += 2, packed += kStep) {
       const bool two = s + 1 < steps;
-      for (std::size_t i = 0; i < kStep; i += kBytes) {
+      for (size_t i = 0; i < kStep; i += kBytes) {
         const auto bytes = load<Bytes>(packed + i);
         store(codes + i, level(bytes & 15));
         if (two) store(codes + kStep + i, level(bytes >> 4));
       }
       codes += two ? 2 * kStep : kStep;
     }
-    for (std::size_t i = kStep; last != ~0u && i > 0; i -= 4) {
-      store(codes - i, load<std::uint32_t>(codes - i) & last);
+    for (size_t i = kStep; last != ~0u && i > 0; i -= 4) {
+      store(codes - i, load<uint32_t>(codes - i) & last);
     }
   }
 }
@@ -334,10 +330,9 @@ void code_unpack4(const std::uint8_t* packed, std::size_t blocks, std::size_t di
 //   S::BitCounts          where S counts S::kByteWords words in bytes first: add_bits() adds to
 //                         these, add_counts(counts, bytes) adds them up
 template <typename S, int Queries>
-std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limits,
-                         const std::uint64_t* packed, std::size_t words, std::size_t first_query,
-                         std::size_t first_row, Hit* hits) {
-  const auto count = [&](std::size_t w, std::size_t end, auto& sums) {
+size_t hamming_tile(const uint64_t* queries, const int32_t* limits, const uint64_t* packed,
+                    size_t words, size_t first_query, size_t first_row, Hit* hits) {
+  const auto count = [&](size_t w, size_t end, auto& sums) {
     for (; w < end; ++w, packed += kWordRows) {
       const auto row = load_pack<typename S::Words>(packed);
 #pragma GCC unroll 8
@@ -348,7 +343,7 @@ std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limit
   if constexpr (!requires { typename S::BitCounts; }) {
     count(0, words, counts);
   } else {
-    for (std::size_t w = 0; w < words; w += S::kByteWords) {
+    for (size_t w = 0; w < words; w += S::kByteWords) {
       typename S::BitCounts bytes[Queries] = {};
       count(w, words - w < S::kByteWords ? words : w + S::kByteWords, bytes);
 #pragma GCC unroll 8
@@ -364,34 +359,32 @@ std::size_t hamming_tile(const std::uint64_t* queries, const std::int32_t* limit
   if (any == 0) [[likely]]
     return 0;
 
-  std::size_t found = 0;
+  size_t found = 0;
 #pragma GCC unroll 8
   for (int q = 0; q < Queries; ++q) {
-    alignas(64) std::int64_t distances[kWordRows];
+    alignas(64) int64_t distances[kWordRows];
     store_pack(distances, counts[q]);
     for (; near[q] != 0; near[q] &= near[q] - 1) {
-      const auto r = static_cast<std::size_t>(__builtin_ctz(near[q]));
-      hits[found++] = {static_cast<std::uint32_t>(first_query + static_cast<std::size_t>(q)),
-                       static_cast<std::uint32_t>(first_row + r),
-                       static_cast<std::int32_t>(distances[r])};
+      const auto r = static_cast<size_t>(__builtin_ctz(near[q]));
+      hits[found++] = {static_cast<uint32_t>(first_query + static_cast<size_t>(q)),
+                       static_cast<uint32_t>(first_row + r), static_cast<int32_t>(distances[r])};
     }
   }
   return found;
 }
 
 template <typename S>
-std::size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, std::size_t* block,
-                         Hit* hits) {
-  const std::size_t words = rows.words;
-  std::size_t found = 0;
+size_t hamming_scan(const WordQueries& queries, const PackedWords& rows, size_t* block, Hit* hits) {
+  const size_t words = rows.words;
+  size_t found = 0;
   for (; *block < rows.blocks && found < kHitsEnough; ++*block) {
-    const std::size_t row = *block * kWordRows;
-    const auto scan = [&]<int Queries>(std::size_t q) {
+    const size_t row = *block * kWordRows;
+    const auto scan = [&]<int Queries>(size_t q) {
       found +=
           hamming_tile<S, Queries>(queries.words + q * words, queries.limits + q,
                                    rows.words_of_rows + row * words, words, q, row, hits + found);
     };
-    std::size_t q = 0;
+    size_t q = 0;
     for (; q + S::kWordQueries <= queries.n; q += S::kWordQueries) {
       scan.template operator()<S::kWordQueries>(q);
     }
@@ -406,8 +399,8 @@ constexpr Kernels kernels_of(const char* name) {
           .bit_sums = bit_sums<S>,
           .bit_sum = bit_sum<S>,
           .dense = dense<S>,
-          .activate16 = activation_of<S, std::int16_t>(),
-          .activate32 = activation_of<S, std::int32_t>(),
+          .activate16 = activation_of<S, int16_t>(),
+          .activate32 = activation_of<S, int32_t>(),
           .code_biases = code_biases<S>,
           .code_unpack4 = code_unpack4<S>,
           .code_scan = code_scan<S>,

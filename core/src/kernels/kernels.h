@@ -11,45 +11,45 @@
 namespace protomark::kernels {
 
 // The rows of a block share a vector register: 16 rows of 32-bit results, 8 rows of 64-bit words.
-inline constexpr std::size_t kCodeRows = 16;
-inline constexpr std::size_t kWordRows = 8;
+inline constexpr size_t kCodeRows = 16;
+inline constexpr size_t kWordRows = 8;
 
 // The encoder works on blocks of 64 outputs; layers are padded to whole blocks.
-inline constexpr std::size_t kOutputs = 64;
+inline constexpr size_t kOutputs = 64;
 
 // What follows the sums of 64 outputs: with s = sum + bias[o], which fits 32 bits,
 //   next = table[clamp((s * multipliers[o] + 2^(shift - 1)) >> shift, -128, 127) + 128].
 // Multipliers are positive.
 struct Activation {
-  const std::int32_t* bias;
-  const std::int32_t* multipliers;
-  const std::uint8_t* table;
+  const int32_t* bias;
+  const int32_t* multipliers;
+  const uint8_t* table;
   int shift;
 };
 
 // A row within the limit of a query, both counted from the first of the scan.
 struct Hit {
-  std::uint32_t query;
-  std::uint32_t row;
-  std::int32_t distance;
+  uint32_t query;
+  uint32_t row;
+  int32_t distance;
 };
 
 // Queries that a scan takes at a time, so that they share its loads.
-inline constexpr std::size_t kScanQueries = 16;
+inline constexpr size_t kScanQueries = 16;
 // Up to this many queries a scan computes the biases itself, which costs less than reading them.
-inline constexpr std::size_t kFewQueries = 4;
+inline constexpr size_t kFewQueries = 4;
 // A scan pauses after this many hits, so that the caller can tighten the limits. Its last step may
 // exceed that by what kScanQueries queries can hit in 64 rows.
-inline constexpr std::size_t kHitsEnough = 64;
-inline constexpr std::size_t kHitRoom = kHitsEnough + kScanQueries * 64;
+inline constexpr size_t kHitsEnough = 64;
+inline constexpr size_t kHitRoom = kHitsEnough + kScanQueries * 64;
 
 // n x dim codes q as unsigned bytes q + 128; n is 1 to kScanQueries.
 struct CodeQueries {
-  const std::uint8_t* codes;
-  const std::int32_t* limits;
-  const std::int32_t* rest_norms;  // squared norm of each query behind the dimension prefix
-  std::size_t n;
-  std::size_t* steps_in_full;  // for scans to pass on to later ones; 0 at first
+  const uint8_t* codes;
+  const int32_t* limits;
+  const int32_t* rest_norms;  // squared norm of each query behind the dimension prefix
+  size_t n;
+  size_t* steps_in_full;  // for scans to pass on to later ones; 0 at first
 };
 
 // Codes p, -127 to 127, in blocks of 16 rows: for every 4 dimensions, 16 rows x 4 codes. `dim` is a
@@ -58,26 +58,26 @@ struct CodeQueries {
 // `prefix`, a multiple of 4 up to dim, is the number of dimensions that usually show that a row is
 // too far away; a set may compare these first. prefix_biases are not used where it equals dim.
 struct PackedCodes {
-  const std::int8_t* codes;
-  const std::int32_t* biases;  // from code_biases of the same set; nullptr: at most kFewQueries
-  const std::int32_t* prefix_biases;
-  std::size_t blocks;
-  std::size_t dim;
-  std::size_t prefix;
+  const int8_t* codes;
+  const int32_t* biases;  // from code_biases of the same set; nullptr: at most kFewQueries
+  const int32_t* prefix_biases;
+  size_t blocks;
+  size_t dim;
+  size_t prefix;
 };
 
 // n x words; n is 1 to kScanQueries.
 struct WordQueries {
-  const std::uint64_t* words;
-  const std::int32_t* limits;
-  std::size_t n;
+  const uint64_t* words;
+  const int32_t* limits;
+  size_t n;
 };
 
 // Descriptors in blocks of 8 rows: for every 64-bit word, that word of 8 rows.
 struct PackedWords {
-  const std::uint64_t* words_of_rows;
-  std::size_t blocks;
-  std::size_t words;
+  const uint64_t* words_of_rows;
+  size_t blocks;
+  size_t words;
 };
 
 struct Kernels {
@@ -86,48 +86,46 @@ struct Kernels {
   // Inputs that are bits: sums[i * 64 + o] is the sum of weights[j * 64 + o] over the bits j that
   // are set in descriptor i, for 64 outputs and n descriptors of `count` words. Bit j % 64 of
   // words[j / 64 * n + i] is bit j of descriptor i. No sum may leave 16 bits.
-  void (*bit_sums)(const std::int8_t* weights, const std::uint64_t* words, std::size_t count,
-                   std::size_t n, std::int16_t* sums) = nullptr;
+  void (*bit_sums)(const int8_t* weights, const uint64_t* words, size_t count, size_t n,
+                   int16_t* sums) = nullptr;
 
   // The same for a single descriptor, of which the `count` bits in `set` are set.
-  void (*bit_sum)(const std::int8_t* weights, const std::uint16_t* set, std::size_t count,
-                  std::int16_t* sums) = nullptr;
+  void (*bit_sum)(const int8_t* weights, const uint16_t* set, size_t count,
+                  int16_t* sums) = nullptr;
 
   // Inputs that are bytes: sums[i * 64 + o] = sum_j weights[o][j] * x[i * stride + j] for n inputs
   // and the first `outputs` of 64 outputs, a multiple of 16. Weights are packed as prototypes are:
   // for every 16 outputs, for every 4 inputs, 16 outputs x 4 weights. `inputs` is a multiple of 64.
-  void (*dense)(const std::int8_t* weights, std::size_t inputs, const std::uint8_t* x,
-                std::size_t stride, std::size_t n, std::size_t outputs,
-                std::int32_t* sums) = nullptr;
+  void (*dense)(const int8_t* weights, size_t inputs, const uint8_t* x, size_t stride, size_t n,
+                size_t outputs, int32_t* sums) = nullptr;
 
   // 64 sums of n inputs to next[i * stride + o]. Sets other than portable take only shifts of 32
   // and more, where the upper half of a 64-bit product is enough.
-  void (*activate16)(const Activation& activation, const std::int16_t* sums, std::size_t n,
-                     std::uint8_t* next, std::size_t stride) = nullptr;
-  void (*activate32)(const Activation& activation, const std::int32_t* sums, std::size_t n,
-                     std::uint8_t* next, std::size_t stride) = nullptr;
+  void (*activate16)(const Activation& activation, const int16_t* sums, size_t n, uint8_t* next,
+                     size_t stride) = nullptr;
+  void (*activate32)(const Activation& activation, const int32_t* sums, size_t n, uint8_t* next,
+                     size_t stride) = nullptr;
 
   // Computes the biases for code_scan of the same set, for all dimensions and for the prefix.
-  void (*code_biases)(const std::int8_t* packed, std::size_t blocks, std::size_t dim,
-                      std::size_t prefix, std::int32_t* biases,
-                      std::int32_t* prefix_biases) = nullptr;
+  void (*code_biases)(const int8_t* packed, size_t blocks, size_t dim, size_t prefix,
+                      int32_t* biases, int32_t* prefix_biases) = nullptr;
 
   // Unpacks sq4 numbers u to codes scale * (2 u - 15), packed as code_scan takes them, with zeros
   // up to a multiple of 4 dimensions. They come in blocks of 16 rows: for every 8 dimensions, 16
   // rows x 4 bytes; byte j holds dimension j in its low four bits, 4 + j in its high ones. `scale`
   // is 1 to 8.
-  void (*code_unpack4)(const std::uint8_t* packed, std::size_t blocks, std::size_t dim, int scale,
-                       std::int8_t* codes) = nullptr;
+  void (*code_unpack4)(const uint8_t* packed, size_t blocks, size_t dim, int scale,
+                       int8_t* codes) = nullptr;
 
   // Finds the rows with |p|^2 - 2 p . q <= limits[q], and that value as their distance, from block
   // *block on. Stops at the end, or after a step that reaches kHitsEnough hits, and sets *block to
   // where to continue. Returns the number of hits, which are in no order.
-  std::size_t (*code_scan)(const CodeQueries& queries, const PackedCodes& rows, std::size_t* block,
-                           Hit* hits) = nullptr;
+  size_t (*code_scan)(const CodeQueries& queries, const PackedCodes& rows, size_t* block,
+                      Hit* hits) = nullptr;
 
   // The same for rows with a Hamming distance <= limits[q].
-  std::size_t (*hamming_scan)(const WordQueries& queries, const PackedWords& rows,
-                              std::size_t* block, Hit* hits) = nullptr;
+  size_t (*hamming_scan)(const WordQueries& queries, const PackedWords& rows, size_t* block,
+                         Hit* hits) = nullptr;
 };
 
 // Returns the best set that this CPU runs, or the one that the environment variable PROTOMARK_ISA

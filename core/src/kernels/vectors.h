@@ -9,11 +9,11 @@
 namespace protomark::kernels {
 namespace {
 
-template <typename T, std::size_t Bytes>
+template <typename T, size_t Bytes>
 struct VectorOf {
   typedef T Type __attribute__((vector_size(Bytes)));
 };
-template <typename T, std::size_t Bytes>
+template <typename T, size_t Bytes>
 using Vector = typename VectorOf<T, Bytes>::Type;
 
 // Numbers or vectors at any address. GCC would split a memcpy of them.
@@ -33,7 +33,7 @@ void store(void* p, const V& v) {
 // N vectors as one.
 template <typename V, int N>
 struct Pack {
-  static constexpr std::size_t kLanes = N * sizeof(V) / sizeof(V{}[0]);
+  static constexpr size_t kLanes = N * sizeof(V) / sizeof(V{}[0]);
   V v[N];
 
   friend Pack operator+(const Pack& a, const Pack& b) {
@@ -68,17 +68,17 @@ void store_pack(void* p, const P& pack) {
 // Multiplies bytes as 16-bit numbers, for sets without an instruction for bytes or whose one
 // saturates: the 4 dimensions of a row, a 32-bit lane, become numbers (0, 2) and (1, 3), and
 // Set::multiply_pairs(a, b) sums up the two products of each lane.
-template <typename Set, std::size_t Bytes>
+template <typename Set, size_t Bytes>
 struct ByPairs {
   static constexpr int kVectors = 64 / Bytes;
-  using Shorts = Vector<std::int16_t, Bytes>;
-  using Ints = Vector<std::int32_t, Bytes>;
+  using Shorts = Vector<int16_t, Bytes>;
+  using Ints = Vector<int32_t, Bytes>;
   using Sums = Pack<Ints, kVectors>;
 
   struct Codes {
     Shorts even[kVectors], odd[kVectors];
   };
-  static Codes load_codes(const std::int8_t* p) {
+  static Codes load_codes(const int8_t* p) {
     Codes codes;
     for (int i = 0; i < kVectors; ++i) {
       const auto both = load<Shorts>(p + Bytes * i);
@@ -97,8 +97,8 @@ struct ByPairs {
     }
   }
   // Four bytes for all rows.
-  static Query query(const std::uint8_t* codes) {
-    const auto four = (Vector<std::uint16_t, Bytes>)(Ints{} + load<std::int32_t>(codes));
+  static Query query(const uint8_t* codes) {
+    const auto four = (Vector<uint16_t, Bytes>)(Ints{} + load<int32_t>(codes));
     return {(Shorts)(four & 0xff), (Shorts)(four >> 8)};
   }
 

@@ -21,7 +21,7 @@ bool is_utc_time(std::string_view text) {
       })) {
     return false;
   }
-  const auto number = [&](std::size_t at, std::size_t digits) {
+  const auto number = [&](size_t at, size_t digits) {
     int value = 0;
     for (const char c : text.substr(at, digits)) value = 10 * value + (c - '0');
     return value;
@@ -116,22 +116,22 @@ std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {
       Encoder::parse(file.read(section::kEncoder), file.name() + ": encoder"));
 }
 
-std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim) {
+std::vector<int8_t> read_centroids(const ContainerReader& file, size_t dim) {
   if (!file.has(section::kCentroids)) return {};
-  const std::size_t size = file.map(section::kCentroids).size(), lists = size / dim;
+  const size_t size = file.map(section::kCentroids).size(), lists = size / dim;
   if (lists == 0 || lists > CoarseQuantizer::kMaxLists || size % dim != 0) {
     file.fail_size(section::kCentroids);
   }
-  auto centroids = read_section<std::int8_t>(file, section::kCentroids, size);
+  auto centroids = read_section<int8_t>(file, section::kCentroids, size);
   if (std::ranges::find(centroids, -128) != centroids.end()) {
     file.fail("its centroids are impossible");
   }
   return centroids;
 }
 
-void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids) {
+void check_ids(const ContainerReader& file, std::span<const int64_t> ids) {
   if (!ids.empty() && ids.front() < 0) file.fail("it has a negative landmark id");
-  for (std::size_t i = 1; i < ids.size(); ++i) {
+  for (size_t i = 1; i < ids.size(); ++i) {
     if (ids[i] <= ids[i - 1]) file.fail("its landmark ids do not ascend");
   }
 }
@@ -162,7 +162,7 @@ void expect_descriptor(const Encoder& encoder, const std::string& descriptor,
   invalid(map, ": it is a map of ", encoder.info().descriptor, " descriptors, not of ", descriptor);
 }
 
-std::vector<std::pair<std::string, std::size_t>> file_sections(const std::filesystem::path& path) {
+std::vector<std::pair<std::string, size_t>> file_sections(const std::filesystem::path& path) {
   return ContainerReader(MappedFile(path).bytes(), path.string()).sections();
 }
 

@@ -7,8 +7,8 @@
 namespace protomark {
 
 struct MapShape {
-  std::uint64_t landmarks = 0;
-  std::uint64_t dim = 0;
+  uint64_t landmarks = 0;
+  uint64_t dim = 0;
   Position origin{};  // of a sealed map's positions
 };
 
@@ -21,8 +21,8 @@ Metadata read_metadata(const ContainerReader& file);
 // std::invalid_argument if there are too many.
 Metadata merged(const Metadata& into, const Metadata& other);
 // Returns the centroids of inverted lists (nlist x dim); none without an index.
-std::vector<std::int8_t> read_centroids(const ContainerReader& file, std::size_t dim);
+std::vector<int8_t> read_centroids(const ContainerReader& file, size_t dim);
 // Fails unless ids ascend and are not negative.
-void check_ids(const ContainerReader& file, std::span<const std::int64_t> ids);
+void check_ids(const ContainerReader& file, std::span<const int64_t> ids);
 
 }  // namespace protomark

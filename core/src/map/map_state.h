@@ -18,7 +18,7 @@ namespace protomark {
 //   recall_mutex   whoever reads or replaces `recall_table`
 // So a search waits only for a piece of a change.
 struct MapState {
-  MapState(std::shared_ptr<const Encoder> its_encoder, std::size_t dim, std::size_t appearance_bits)
+  MapState(std::shared_ptr<const Encoder> its_encoder, size_t dim, size_t appearance_bits)
       : encoder(std::move(its_encoder)), store(dim, appearance_bits) {}
 
   std::shared_ptr<const Encoder> encoder;
@@ -35,7 +35,7 @@ struct MapState {
   // Returns how many lists to search for this recall, as measured on the map now, or earlier if
   // little has changed since or others measure or change the map. `lock` holds `searching`, and is
   // released while the recall table is measured.
-  std::size_t nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads);
+  size_t nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads);
 
   // Returns a map of these landmarks.
   PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;
@@ -53,7 +53,7 @@ struct MapState {
   std::shared_ptr<const MeasuredRecall> recall_table;
 };
 
-inline void check_pairs(std::size_t ids, std::size_t others, const char* what) {
+inline void check_pairs(size_t ids, size_t others, const char* what) {
   if (ids != others) invalid(ids, " landmark ids for ", others, " ", what);
 }
 
@@ -63,7 +63,7 @@ std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalCon
 // Measures the recall table of a store whose rounded prototypes are searched with value(v) in place
 // of each number v, where `search` finds the nearest landmarks of queries.
 RecallTable measure_recall_of(const PrototypeStore& store,
-                              const std::function<std::int8_t(std::int8_t)>& value,
+                              const std::function<int8_t(int8_t)>& value,
                               const ExactSearch& search);
 
 // A change of a map: while it exists no other one begins, and all that read the map for long wait.
@@ -71,7 +71,7 @@ RecallTable measure_recall_of(const PrototypeStore& store,
 class MapChange {
  public:
   // Observations or landmarks that are changed at a time.
-  static constexpr std::size_t kPiece = 1 << 11;
+  static constexpr size_t kPiece = 1 << 11;
 
   explicit MapChange(MapState& state) : MapChange(state, std::unique_lock(state.changing)) {}
   MapChange(MapState& state, std::unique_lock<FairSharedMutex> changing)
@@ -83,16 +83,16 @@ class MapChange {
   // Calls write_one(i) for all i below n, in pieces after each of which all rows are in their
   // lists.
   template <typename WriteOne>
-  void in_pieces(std::size_t n, const WriteOne& write_one) {
-    for (std::size_t first = 0; first < n; first += kPiece) {
+  void in_pieces(size_t n, const WriteOne& write_one) {
+    for (size_t first = 0; first < n; first += kPiece) {
       const auto lock = write();
-      for (std::size_t i = first; i < std::min(n, first + kPiece); ++i) write_one(i);
+      for (size_t i = first; i < std::min(n, first + kPiece); ++i) write_one(i);
       state_->store.reassign(1);
     }
   }
 
   void set_metadata(Metadata metadata);
-  void add(std::span<const std::int64_t> ids, Codes codes, int threads);
+  void add(std::span<const int64_t> ids, Codes codes, int threads);
   // Puts rows into the lists of other centroids (without any, drops the index): in a copy of the
   // map, or with `in_place` within it, which takes 5 bytes per row and, if arrays have to grow, the
   // largest of them once more, but makes searches wait.

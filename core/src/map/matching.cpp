@@ -14,13 +14,13 @@ namespace {
 // The note has a line for each length of codes: the length and three weights.
 constexpr char kNote[] = "match_calibration";
 
-std::optional<MatchCalibration> read_note(const std::string& note, std::size_t dim) {
+std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
   std::optional<MatchCalibration> found;
   std::istringstream lines(note);
   for (std::string line; std::getline(lines, line);) {
     std::istringstream in(line);
     in.imbue(std::locale::classic());
-    std::size_t length = 0;
+    size_t length = 0;
     MatchCalibration calibration;
     in >> length;
     for (double& weight : calibration.weights) in >> weight;
@@ -44,9 +44,9 @@ MatchList match_with(const Map& map, Descriptors descriptors, const MatchOptions
   search.among = options.among;
   search.threads = options.threads;
   const auto [ids, distances] = map.search(descriptors, 2, search);
-  std::vector<std::int64_t> nearest(ids.rows);
+  std::vector<int64_t> nearest(ids.rows);
   std::vector<double> probabilities(ids.rows);
-  for (std::size_t i = 0; i < ids.rows; ++i) {
+  for (size_t i = 0; i < ids.rows; ++i) {
     nearest[i] = ids.row(i)[0];
     probabilities[i] = calibration.probability(distances.row(i)[0], distances.row(i)[1]);
   }
@@ -55,7 +55,7 @@ MatchList match_with(const Map& map, Descriptors descriptors, const MatchOptions
 
 }  // namespace
 
-MatchCalibration MatchCalibration::of(const Encoder& encoder, std::size_t dim) {
+MatchCalibration MatchCalibration::of(const Encoder& encoder, size_t dim) {
   if (dim == 0) dim = encoder.dim();
   for (const auto& [key, note] : encoder.info().notes) {
     if (key != kNote) continue;
@@ -73,19 +73,19 @@ double MatchCalibration::probability(double nearest, double second) const {
   return (x >= 0 ? 1 : e) / (1 + e);
 }
 
-MatchList accept(std::span<const std::int64_t> nearest, std::span<const double> probabilities,
+MatchList accept(std::span<const int64_t> nearest, std::span<const double> probabilities,
                  double min_probability) {
   if (nearest.size() != probabilities.size()) {
     invalid(probabilities.size(), " probabilities do not fit ", nearest.size(), " landmarks");
   }
-  std::vector<std::size_t> order;
-  for (std::size_t i = 0; i < nearest.size(); ++i) {
+  std::vector<size_t> order;
+  for (size_t i = 0; i < nearest.size(); ++i) {
     if (nearest[i] >= 0 && probabilities[i] >= min_probability) order.push_back(i);
   }
-  std::ranges::stable_sort(order, std::greater(), [&](std::size_t i) { return probabilities[i]; });
+  std::ranges::stable_sort(order, std::greater(), [&](size_t i) { return probabilities[i]; });
   MatchList result;
-  std::unordered_set<std::int64_t> matched;
-  for (const std::size_t i : order) {
+  std::unordered_set<int64_t> matched;
+  for (const size_t i : order) {
     if (!matched.insert(nearest[i]).second) continue;
     result.keypoints.push_back(i);
     result.landmarks.push_back(nearest[i]);

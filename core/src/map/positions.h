@@ -7,15 +7,14 @@
 namespace protomark {
 
 // Adds a landmark to the summary of its map; NaN means that it has no position.
-inline void add_to_summary(MapSummary& summary, std::uint32_t observations,
-                           const Position& position) {
+inline void add_to_summary(MapSummary& summary, uint32_t observations, const Position& position) {
   summary.observations += observations;
   ++summary.count_histogram[std::min(observations, 255u)];
   if (std::isnan(position[0])) return;
   ++summary.landmarks_with_position;
   if (!summary.extent) summary.extent = {position, position};
   auto& [low, high] = *summary.extent;
-  for (std::size_t i = 0; i < 3; ++i) {
+  for (size_t i = 0; i < 3; ++i) {
     low[i] = std::min(low[i], position[i]);
     high[i] = std::max(high[i], position[i]);
   }
@@ -29,7 +28,7 @@ class PositionCodec {
   // For positions between these lowest and highest coordinates. Throws std::invalid_argument if
   // they are too far apart for floats.
   PositionCodec(const std::array<Position, 2>& extent, int bits) : bits_(bits) {
-    for (std::size_t i = 0; i < 3; ++i) {
+    for (size_t i = 0; i < 3; ++i) {
       const double low = extent[0][i], high = extent[1][i], middle = low / 2 + high / 2;
       if (std::max(high - middle, middle - low) > std::numeric_limits<float>::max()) {
         invalid("positions are too far apart for a sealed map");
@@ -43,7 +42,7 @@ class PositionCodec {
     if (!file.has(section::kSteps)) return;
     bits_ = 16;
     step_ = read_value<Position>(file, section::kSteps);
-    for (std::size_t i = 0; i < 3; ++i) {
+    for (size_t i = 0; i < 3; ++i) {
       if (!(step_[i] >= 0) || !std::isfinite(origin_[i] + step_[i] * kLast)) {
         file.fail("the steps of its positions are impossible");
       }
@@ -51,23 +50,22 @@ class PositionCodec {
   }
 
   int bits() const { return bits_; }
-  std::size_t size() const { return 3 * static_cast<std::size_t>(bits_) / 8; }  // bytes
+  size_t size() const { return 3 * static_cast<size_t>(bits_) / 8; }  // bytes
   const Position& origin() const { return origin_; }
   // The step along each axis; zeros with 32 bits.
   const Position& step() const { return step_; }
 
   // `to` and `from` are size() bytes.
   void encode(const Position& p, std::byte* to) const {
-    for (std::size_t i = 0; i < 3; ++i) {
+    for (size_t i = 0; i < 3; ++i) {
       const double distance = p[i] - origin_[i];
       if (bits_ == 32) {
         const auto number = static_cast<float>(distance);
         std::memcpy(to + i * sizeof(number), &number, sizeof(number));
       } else {
         const double steps = step_[i] > 0 ? std::round(distance / step_[i]) : 0;
-        const auto number = std::isnan(p[0])
-                                ? kNone
-                                : static_cast<std::uint16_t>(std::clamp(steps, 0.0, double{kLast}));
+        const auto number =
+            std::isnan(p[0]) ? kNone : static_cast<uint16_t>(std::clamp(steps, 0.0, double{kLast}));
         std::memcpy(to + i * sizeof(number), &number, sizeof(number));
       }
     }
@@ -75,13 +73,13 @@ class PositionCodec {
   // Returns NaN if there is no position, or no number in a broken file.
   Position decode(const std::byte* from) const {
     Position p = origin_;
-    for (std::size_t i = 0; i < 3; ++i) {
+    for (size_t i = 0; i < 3; ++i) {
       if (bits_ == 32) {
         float number;
         std::memcpy(&number, from + i * sizeof(number), sizeof(number));
         p[i] += number;
       } else {
-        std::uint16_t number;
+        uint16_t number;
         std::memcpy(&number, from + i * sizeof(number), sizeof(number));
         p[i] = number == kNone ? kNaN : p[i] + step_[i] * number;
       }
@@ -90,8 +88,8 @@ class PositionCodec {
   }
 
  private:
-  static constexpr std::uint16_t kLast = 65534;
-  static constexpr std::uint16_t kNone = 65535;  // along all axes
+  static constexpr uint16_t kLast = 65534;
+  static constexpr uint16_t kNone = 65535;  // along all axes
 
   int bits_ = 32;
   Position origin_{};

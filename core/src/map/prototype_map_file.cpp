@@ -6,44 +6,60 @@
 namespace protomark {
 namespace {
 
-// Bits per number of a sum of n codes: no such sum is beyond 127 n. n is 1 to 255.
+// In a file, each eight numbers of a sum have as few bits as they need, or up to three more.
+constexpr int kSpareBits = 2;
+
+// Bits that a number of a sum of n codes may need: none is beyond 127 n. n is 1 to 255.
 int sum_bits(int n) { return 8 + static_cast<int>(std::bit_width(static_cast<unsigned>(n - 1))); }
-// Bits per number of all rows with these counts.
-std::size_t sum_bits(std::span<const std::uint8_t> counts) {
-  std::size_t bits = 0;
-  for (const int n : counts) bits += static_cast<std::size_t>(sum_bits(n));
-  return bits;
+// Returns how many of these bits none of eight numbers needs.
+int spare_bits(const int16_t* eight, int bits) {
+  unsigned magnitudes = 0;
+  for (size_t i = 0; i < 8; ++i) {
+    magnitudes |= static_cast<uint16_t>(eight[i] ^ eight[i] >> 15);
+  }
+  return std::min(3, bits - 1 - static_cast<int>(std::bit_width(magnitudes)));
 }
 
 // Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
 // must not change until the file is written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
-  std::size_t n = 0, m = 0, bits = 0;
-  std::int64_t largest = -1;
+  const size_t dim = store.dim();
+  size_t n = 0, m = 0, spares_size = 0, sums_size = 0;
+  int64_t largest = -1;
   // A map whose positions were all removed equals one that never had any.
   bool positions = false;
-  const auto count = [&](LandmarkIndex landmark) {
+  const auto count_landmark = [&](LandmarkIndex landmark) {
     ++n;
     largest = std::max(largest, store.id(landmark));
-    store.each_row_of(landmark, [&](Row row) {
-      ++m;
-      bits += store.dim() * static_cast<std::size_t>(sum_bits(store.count(row)));
-    });
     positions = positions || has_position(store.position(landmark));
   };
+  const auto count_row = [&](Row row) {
+    ++m;
+    const Sum sum = store.sum(row);
+    const int width = sum_bits(store.count(row));
+    for (size_t d = 0; d < dim; d += 8) {
+      spares_size += kSpareBits;
+      sums_size += 8 * static_cast<size_t>(width - spare_bits(&sum[d], width));
+    }
+  };
   if (changed) {
-    std::ranges::for_each(*changed, count);
+    for (const LandmarkIndex landmark : *changed) {
+      count_landmark(landmark);
+      store.each_row_of(landmark, count_row);
+    }
   } else {
-    store.each_landmark(count);
+    store.each_landmark(count_landmark);
+    store.each_row(count_row);
   }
   const bool ids = IdBlockWriter::needed(n, largest), several = store.several();
   const auto appearance_bits = static_cast<int>(store.appearance_bits());
-  add_value(file, section::kShape, MapShape{n, store.dim(), {}});
+  add_value(file, section::kShape, MapShape{n, dim, {}});
   std::vector<ContainerWriter::Part> parts{{section::kCounts, m},
-                                           {section::kSums, packed_bytes(bits, 1)}};
+                                           {section::kSpareBits, packed_bytes(spares_size, 1)},
+                                           {section::kSums, packed_bytes(sums_size, 1)}};
   if (several) {
-    add_value(file, section::kAppearanceBits, static_cast<std::uint32_t>(appearance_bits));
+    add_value(file, section::kAppearanceBits, static_cast<uint32_t>(appearance_bits));
     parts.push_back({section::kAppearances, packed_bytes(m, appearance_bits + 1)});
   }
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
@@ -52,29 +68,36 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   file.add_together(std::move(parts), [=, &store](auto sinks) {
     auto sink = sinks.begin();
     const auto& count_sink = *sink++;
-    PackedWriter sums(*sink++);
+    PackedWriter spares(*sink++), sums(*sink++);
     std::optional<PackedWriter> appearances;
     if (several) appearances.emplace(*sink++);
     const auto* position_sink = positions ? &*sink++ : nullptr;
     std::optional<IdBlockWriter> id_writer;
     if (ids) id_writer.emplace(sink[0], sink[1]);
     const auto put_piece = [&](std::span<const LandmarkIndex> landmarks) {
-      constexpr std::size_t kAhead = 16;
+      constexpr size_t kAhead = 16;
       const std::vector<Row> sorted = store.sorted_rows(landmarks);
       const std::span<const Row> rows(sorted);
-      put_each<std::uint8_t>(count_sink, rows,
-                             [&](Row row) { return static_cast<std::uint8_t>(store.count(row)); });
-      for (std::size_t i = 0; i < rows.size(); ++i) {
+      put_each<uint8_t>(count_sink, rows,
+                        [&](Row row) { return static_cast<uint8_t>(store.count(row)); });
+      for (size_t i = 0; i < rows.size(); ++i) {
         if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
         const Sum sum = store.sum(rows[i]);
         const int width = sum_bits(store.count(rows[i]));
-        const std::uint64_t mask = (std::uint64_t{1} << width) - 1;
-        for (std::size_t d = 0; d < store.dim(); ++d) {
-          sums.add(static_cast<std::uint64_t>(sum[d]) & mask, width);
+        for (size_t d = 0; d < dim; d += 8) {
+          const int spare = spare_bits(&sum[d], width), bits = width - spare;
+          spares.add(static_cast<uint64_t>(spare), kSpareBits);
+          for (size_t half = d; half < d + 8; half += 4) {
+            uint64_t four = 0;
+            for (size_t j = half + 4; j-- > half;) {
+              four = four << bits | (static_cast<uint64_t>(sum[j]) & ((1u << bits) - 1));
+            }
+            sums.add(four, 4 * bits);
+          }
         }
         if (!several) continue;
         const bool last = i + 1 == rows.size() || store.owner(rows[i + 1]) != store.owner(rows[i]);
-        appearances->add(store.appearance(rows[i]) | std::uint64_t{last} << appearance_bits,
+        appearances->add(store.appearance(rows[i]) | uint64_t{last} << appearance_bits,
                          appearance_bits + 1);
       }
       for (const LandmarkIndex l : landmarks) {
@@ -85,15 +108,16 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                          [&](LandmarkIndex l) { return store.position(l); });
     };
     const auto put = [&](std::span<const LandmarkIndex> landmarks) {
-      constexpr std::size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
-      for (std::size_t first = 0, end = 0; first < landmarks.size(); first = end) {
-        for (std::size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
+      constexpr size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
+      for (size_t first = 0, end = 0; first < landmarks.size(); first = end) {
+        for (size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
           rows += store.row_count(landmarks[end]);
         }
         put_piece(landmarks.subspan(first, end - first));
       }
     };
     changed ? put(*changed) : store.visit_sorted_landmarks(put);
+    spares.finish();
     sums.finish();
     if (appearances) appearances->finish();
     if (id_writer) id_writer->finish();
@@ -101,10 +125,10 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
 }
 
 // Returns the signs that tell appearances apart; 0 if the file does not state any.
-std::size_t read_appearance_bits(const ContainerReader& file, std::size_t dim) {
+size_t read_appearance_bits(const ContainerReader& file, size_t dim) {
   if (!file.has(section::kAppearanceBits)) return 0;
-  const auto bits = read_value<std::uint32_t>(file, section::kAppearanceBits);
-  const std::size_t limit = std::min(PrototypeMap::kMaxAppearanceBits, dim);
+  const auto bits = read_value<uint32_t>(file, section::kAppearanceBits);
+  const size_t limit = std::min(PrototypeMap::kMaxAppearanceBits, dim);
   if (bits == 0 || bits > limit) {
     file.fail("its appearances have ", bits, " bits, not 1 to ", limit);
   }
@@ -128,15 +152,15 @@ class Reading {
     auto ids = read_landmarks(commit, shape.landmarks);
     if (commit.has(section::kRemoved)) {
       const Bytes bytes = commit.map(section::kRemoved);
-      const auto removed = read_section<std::int64_t>(commit, section::kRemoved,
-                                                      bytes.size() / sizeof(std::int64_t));
+      const auto removed =
+          read_section<int64_t>(commit, section::kRemoved, bytes.size() / sizeof(int64_t));
       check_ids(commit, removed);
       ids.insert(ids.end(), removed.begin(), removed.end());
     }
-    for (const std::int64_t id : ids) read_.insert(id);
+    for (const int64_t id : ids) read_.insert(id);
     if (commit.has(section::kCentroids)) {
       // Empty if the index was dropped.
-      auto centroids = commit.map(section::kCentroids).empty() ? std::vector<std::int8_t>()
+      auto centroids = commit.map(section::kCentroids).empty() ? std::vector<int8_t>()
                                                                : read_centroids(commit, shape.dim);
       if (!centroids_) centroids_ = std::move(centroids);
     }
@@ -158,19 +182,27 @@ class Reading {
 
  private:
   // Checks all landmarks of a file, takes those that no later commit names, and returns their ids.
-  std::vector<std::int64_t> read_landmarks(const ContainerReader& file, std::size_t n) {
-    const std::size_t dim = store_.dim();
+  std::vector<int64_t> read_landmarks(const ContainerReader& file, size_t n) {
+    const size_t dim = store_.dim();
     const auto bits = static_cast<int>(store_.appearance_bits());
     const bool several = store_.several();
-    const std::size_t m = several ? file.map(section::kCounts).size() : n;
+    const size_t m = several ? file.map(section::kCounts).size() : n;
     if (m > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
     if (m < n) file.fail_size(section::kCounts);
-    const auto counts = read_section<std::uint8_t>(file, section::kCounts, m);
+    const auto counts = read_section<uint8_t>(file, section::kCounts, m);
     if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
-    PackedReader sums(file, section::kSums, dim * sum_bits(counts));
+    const size_t spares_size = m * ((dim + 7) / 8) * kSpareBits;
+    PackedReader spares(file, section::kSpareBits, spares_size);
+    size_t sums_size = 0;
+    for (PackedReader in = spares; const int count : counts) {
+      for (size_t d = 0; d < dim; d += 8) {
+        sums_size += 8 * (static_cast<size_t>(sum_bits(count)) - in.next(kSpareBits));
+      }
+    }
+    PackedReader sums(file, section::kSums, sums_size);
     std::optional<PackedReader> appearances;
     if (several) {
-      appearances.emplace(file, section::kAppearances, m * static_cast<std::size_t>(bits + 1));
+      appearances.emplace(file, section::kAppearances, m * static_cast<size_t>(bits + 1));
     }
     if (file.has(section::kIdGaps)) file.read(section::kIdGaps);  // checks what is only mapped
     auto ids = LandmarkIds(file, n).all();
@@ -185,32 +217,36 @@ class Reading {
     }
     std::vector<LandmarkIndex> landmarks;  // if there are positions
     landmarks.reserve(positions.size());
-    std::size_t row = 0;
-    for (std::size_t i = 0; i < n; ++i) {
+    size_t row = 0;
+    for (size_t i = 0; i < n; ++i) {
       const bool is_newest = read_.empty() || !read_.contains(ids[i]);
       LandmarkIndex landmark = kNoLandmark;
-      std::int32_t before = -1;  // the appearance of the row before
+      int32_t before = -1;  // the appearance of the row before
       for (bool last = false; !last; ++row) {
         if (row == m) file.fail("it has a landmark without prototypes");
-        const int n_codes = counts[row], width = sum_bits(n_codes), sign = 1 << (width - 1);
+        const int count = counts[row];
         Sum sum{};
         bool possible = true;
-        for (std::size_t d = 0; d < dim; ++d) {
-          const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
-          possible = possible && std::abs(number) <= 127 * n_codes;
-          sum[d] = static_cast<std::int16_t>(number);
+        for (size_t d = 0; d < dim; d += 8) {
+          const int width = sum_bits(count) - static_cast<int>(spares.next(kSpareBits));
+          const int sign = 1 << (width - 1);
+          for (size_t j = d; j < d + 8; ++j) {
+            const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
+            possible = possible && std::abs(number) <= (j < dim ? 127 * count : 0);
+            sum[j] = static_cast<int16_t>(number);
+          }
         }
         if (!possible) file.fail("landmark ", ids[i], " has an impossible prototype");
-        const auto marked = several ? static_cast<std::int32_t>(appearances->next(bits + 1)) : 1;
-        const std::int32_t appearance = marked & ((1 << bits) - 1);
+        const auto marked = several ? static_cast<int32_t>(appearances->next(bits + 1)) : 1;
+        const int32_t appearance = marked & ((1 << bits) - 1);
         last = marked >> bits != 0;
         if (appearance <= before) {
           file.fail("the appearances of landmark ", ids[i], " do not ascend");
         }
         before = appearance;
         if (!is_newest) continue;
-        const Row to = store_.create_row(ids[i], landmark, static_cast<std::uint16_t>(appearance));
-        store_.set(to, sum, n_codes);
+        const Row to = store_.create_row(ids[i], landmark, static_cast<uint16_t>(appearance));
+        store_.set(to, sum, count);
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);
@@ -220,7 +256,7 @@ class Reading {
     }
     if (row != m) file.fail("it has prototypes of no landmark");
     // After the landmarks, so that room for positions is made once.
-    for (std::size_t i = 0; i < positions.size(); ++i) {
+    for (size_t i = 0; i < positions.size(); ++i) {
       if (landmarks[i] != kNoLandmark) store_.set_position(landmarks[i], positions[i]);
     }
     return ids;
@@ -231,7 +267,7 @@ class Reading {
   MapState& state_;
   IdSet read_;  // landmarks that later commits name
   std::optional<Metadata> metadata_;
-  std::optional<std::vector<std::int8_t>> centroids_;
+  std::optional<std::vector<int8_t>> centroids_;
 };
 
 std::unique_ptr<MapState> read_with_journal(const std::filesystem::path& path) {
@@ -260,7 +296,7 @@ ContainerWriter file_of(const MapState& state) {
   ContainerWriter file(FileKind::learning_map);
   file.add(section::kEncoder, state.encoder->serialize());
   add_metadata(file, state.metadata);
-  const std::vector<std::int8_t>& centroids = state.store.quantizer().centroids();
+  const std::vector<int8_t>& centroids = state.store.quantizer().centroids();
   if (!centroids.empty()) file.add(section::kCentroids, std::as_bytes(std::span(centroids)));
   add_landmarks(file, state.store);
   return file;
@@ -269,10 +305,10 @@ ContainerWriter file_of(const MapState& state) {
 // Adds the changes to the record of a commit, and returns its bytes.
 std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
                                  const Uncommitted& changes) {
-  std::vector<std::int64_t> ids(changes.ids().begin(), changes.ids().end()), removed;
+  std::vector<int64_t> ids(changes.ids().begin(), changes.ids().end()), removed;
   std::ranges::sort(ids);
   std::vector<LandmarkIndex> existing;
-  for (const std::int64_t id : ids) {
+  for (const int64_t id : ids) {
     const LandmarkIndex landmark = state.store.find(id);
     landmark == kNoLandmark ? removed.push_back(id) : existing.push_back(landmark);
   }
@@ -294,7 +330,7 @@ std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
 std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal) {
   file.expect(FileKind::learning_map);
   auto encoder = read_encoder(file);
-  const std::size_t dim = read_shape(file, *encoder).dim;
+  const size_t dim = read_shape(file, *encoder).dim;
   auto state = std::make_unique<MapState>(std::move(encoder), dim, read_appearance_bits(file, dim));
   Reading reading(*state);
   const auto commits = journal.commits(file.identity());
@@ -339,7 +375,7 @@ Journal& MapState::need_journal() const {
   invalid("this map has no journal: open it with a journal to commit");
 }
 
-std::size_t PrototypeMap::commit() {
+size_t PrototypeMap::commit() {
   const std::scoped_lock committing(state_->journal_mutex);
   Journal& journal = state_->need_journal();
   ContainerWriter file = journal.record(FileKind::commit);

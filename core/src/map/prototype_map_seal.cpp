@@ -16,45 +16,43 @@ class BlockPacker {
  public:
   // Numbers have 4 bits, or 8 if `scale` is 0.
   BlockPacker(const PrototypeStore& store, int scale) : store_(&store), scale_(scale) {
-    for (std::size_t i = 0; i < quantized_.size() && scale_ != 0; ++i) {
+    for (size_t i = 0; i < quantized_.size() && scale_ != 0; ++i) {
       quantized_[i] = sq4_quantize(static_cast<int>(i) - 128, scale_);
     }
   }
 
   int scale() const { return scale_; }
   // Bytes per block.
-  std::size_t size() const { return packed_size(kPackedRows, store_->dim(), scale_); }
+  size_t size() const { return packed_size(kPackedRows, store_->dim(), scale_); }
   // Returns the number that a code is stored as.
-  std::int8_t value(std::int8_t code) const {
-    return scale_ == 0 ? code : static_cast<std::int8_t>(sq4_level(u(code), scale_));
+  int8_t value(int8_t code) const {
+    return scale_ == 0 ? code : static_cast<int8_t>(sq4_level(u(code), scale_));
   }
 
   // `rows` are kPackedRows, kNoRow for padding.
-  void pack(const Row* rows, std::uint8_t* to) const {
-    const std::size_t dim = store_->dim();
-    std::array<std::int8_t, 256> code;
-    std::fill_n(to, size(), std::uint8_t{0});
-    for (std::size_t i = 0; i < kPackedRows; ++i) {
+  void pack(const Row* rows, uint8_t* to) const {
+    const size_t dim = store_->dim();
+    std::array<int8_t, 256> code;
+    std::fill_n(to, size(), uint8_t{0});
+    for (size_t i = 0; i < kPackedRows; ++i) {
       if (rows[i] == kNoRow) continue;
       store_->rounded(rows[i], code.data());
-      for (std::size_t d = 0; d < dim && scale_ == 0; d += 4) {
-        std::memcpy(to + packed_index(i, d, dim), &code[d], std::min<std::size_t>(4, dim - d));
+      for (size_t d = 0; d < dim && scale_ == 0; d += 4) {
+        std::memcpy(to + packed_index(i, d, dim), &code[d], std::min<size_t>(4, dim - d));
       }
-      for (std::size_t d = 0; d < dim && scale_ != 0; ++d) {
-        std::uint8_t& byte = to[packed4_index(i, d, dim)];
-        byte |= static_cast<std::uint8_t>(packed4_high(d) ? u(code[d]) << 4 : u(code[d]));
+      for (size_t d = 0; d < dim && scale_ != 0; ++d) {
+        uint8_t& byte = to[packed4_index(i, d, dim)];
+        byte |= static_cast<uint8_t>(packed4_high(d) ? u(code[d]) << 4 : u(code[d]));
       }
     }
   }
 
  private:
-  std::uint8_t u(std::int8_t code) const {
-    return quantized_[static_cast<std::size_t>(code + 128)];
-  }
+  uint8_t u(int8_t code) const { return quantized_[static_cast<size_t>(code + 128)]; }
 
   const PrototypeStore* store_;
   int scale_;
-  std::array<std::uint8_t, 256> quantized_{};
+  std::array<uint8_t, 256> quantized_{};
 };
 
 // Maps landmarks of a store to those of a sealed map, in little more than a byte per landmark: the
@@ -67,32 +65,32 @@ class SealedLandmarks {
   // Landmarks come by ascending id.
   void add(LandmarkIndex landmark) {
     if (added_ % kBlock == 0) first_ids_.push_back(store_->id(landmark));
-    in_block_[landmark.value] = static_cast<std::uint8_t>(added_++ % kBlock);
+    in_block_[landmark.value] = static_cast<uint8_t>(added_++ % kBlock);
   }
 
-  std::size_t operator[](LandmarkIndex landmark) const {
+  size_t operator[](LandmarkIndex landmark) const {
     const auto next = std::ranges::upper_bound(first_ids_, store_->id(landmark));
-    const auto block = static_cast<std::size_t>(next - first_ids_.begin()) - 1;
+    const auto block = static_cast<size_t>(next - first_ids_.begin()) - 1;
     return block * kBlock + in_block_[landmark.value];
   }
 
  private:
-  static constexpr std::size_t kBlock = 256;
+  static constexpr size_t kBlock = 256;
 
   const PrototypeStore* store_;
-  std::vector<std::uint8_t> in_block_;  // the index of a landmark in its block
-  std::vector<std::int64_t> first_ids_;
-  std::size_t added_ = 0;
+  std::vector<uint8_t> in_block_;  // the index of a landmark in its block
+  std::vector<int64_t> first_ids_;
+  size_t added_ = 0;
 };
 
 // Writes rows, each list beginning a new block, and their owners if there is a writer for these.
 class RowWriter {
  public:
-  RowWriter(const BlockPacker& packer, std::size_t landmarks, const Sink& prototypes,
+  RowWriter(const BlockPacker& packer, size_t landmarks, const Sink& prototypes,
             PackedWriter* owners = nullptr)
       : packer_(packer), landmarks_(landmarks), prototypes_(prototypes), owners_(owners) {}
 
-  void add(Row row, std::size_t owner = 0) {
+  void add(Row row, size_t owner = 0) {
     block_[filled_++] = row;
     if (owners_ != nullptr) owners_->add(owner, owner_bits(landmarks_));
     if (filled_ < kPackedRows) return;
@@ -110,23 +108,23 @@ class RowWriter {
   }
 
  private:
-  static constexpr std::size_t kPiece = 1 << 16;  // bytes
+  static constexpr size_t kPiece = 1 << 16;  // bytes
 
   const BlockPacker& packer_;
-  std::size_t landmarks_;
+  size_t landmarks_;
   const Sink& prototypes_;
   PackedWriter* owners_;
   std::array<Row, kPackedRows> block_{};
-  std::size_t filled_ = 0;
-  std::vector<std::uint8_t> packed_;
+  size_t filled_ = 0;
+  std::vector<uint8_t> packed_;
 };
 
 // Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
 // piece.
 Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
-                      std::size_t k) {
+                      size_t k) {
   // A piece is small compared with the map.
-  const std::size_t size = std::max<std::size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
+  const size_t size = std::max<size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
@@ -134,11 +132,11 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
   PackedPrototypes piece = store.view();
   piece.data = packed.data();
   piece.scale = packer.scale();
-  for (std::size_t first = 0; first < store.row_end(); first += piece.rows) {
+  for (size_t first = 0; first < store.row_end(); first += piece.rows) {
     piece.rows = std::min(size, store.row_end() - first);
-    auto* to = reinterpret_cast<std::uint8_t*>(packed.data());
-    for (std::size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
-      for (std::size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
+    auto* to = reinterpret_cast<uint8_t*>(packed.data());
+    for (size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
+      for (size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
       packer.pack(block.data(), to);
     }
     PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, piece.rows});
@@ -161,14 +159,14 @@ class SealedContent {
   SealedContent(const PrototypeStore& store, const PrototypeStore& map, const BlockPacker& packer,
                 const std::optional<PositionCodec>& codec)
       : store_(store), map_(map), packer_(packer), codec_(codec) {
-    std::int64_t largest = -1;
-    for (const std::int64_t id : store.ids()) largest = std::max(largest, id);
+    int64_t largest = -1;
+    for (const int64_t id : store.ids()) largest = std::max(largest, id);
     ids_are_stored_ = IdBlockWriter::needed(store.landmark_count(), largest);
   }
 
   // Adds the sections to a file that is written while this exists.
   void add_to(ContainerWriter& file) {
-    const std::size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
+    const size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
     const ContainerWriter::Part prototypes{section::kPrototypes,
                                            store_.lists().blocks() * packer_.size()};
     std::vector<ContainerWriter::Part> parts{{section::kCounts, n}};
@@ -178,23 +176,21 @@ class SealedContent {
     if (ids_are_stored_) IdBlockWriter::add_to(parts, n);
     file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
     if (nlist == 0) return;
-    const std::size_t words = packed_words(store_.row_end(), owner_bits(n));
+    const size_t words = packed_words(store_.row_end(), owner_bits(n));
     file.add_together({prototypes, {section::kOwners, packed_bytes(words, 64)}},
                       [this](Sinks sinks) { put_lists(sinks); });
-    file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(std::uint32_t),
+    file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(uint32_t),
              [this](const Sink& sink) { sink(std::as_bytes(std::span(owner_checksums_))); });
     file.add(section::kCentroids, std::as_bytes(std::span(store_.quantizer().centroids())));
-    file.add(section::kListRows, nlist * sizeof(std::uint32_t), [this, nlist](const Sink& sink) {
-      put_values<std::uint32_t>(sink, nlist, 1, [&](std::size_t list, std::uint32_t* to) {
-        *to = static_cast<std::uint32_t>(store_.lists().rows(static_cast<std::uint32_t>(list)));
+    file.add(section::kListRows, nlist * sizeof(uint32_t), [this, nlist](const Sink& sink) {
+      put_values<uint32_t>(sink, nlist, 1, [&](size_t list, uint32_t* to) {
+        *to = static_cast<uint32_t>(store_.lists().rows(static_cast<uint32_t>(list)));
       });
     });
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
-          store_, [this](std::int8_t code) { return packer_.value(code); },
-          [this](Codes queries, std::size_t k) {
-            return search_packed(store_, packer_, queries, k);
-          });
+          store_, [this](int8_t code) { return packer_.value(code); },
+          [this](Codes queries, size_t k) { return search_packed(store_, packer_, queries, k); });
       sink(std::as_bytes(std::span(table)));
     });
   }
@@ -218,12 +214,12 @@ class SealedContent {
       const auto in_map = [&](LandmarkIndex l) {
         return &store_ == &map_ ? l : map_.at(store_.id(l));
       };
-      put_each<std::uint8_t>(counts, landmarks, [&](LandmarkIndex l) {
-        return static_cast<std::uint8_t>(std::min(map_.observations(in_map(l)), 255u));
+      put_each<uint8_t>(counts, landmarks, [&](LandmarkIndex l) {
+        return static_cast<uint8_t>(std::min(map_.observations(in_map(l)), 255u));
       });
       if (row_counts != nullptr) {
-        put_each<std::uint8_t>(*row_counts, landmarks, [&](LandmarkIndex l) {
-          return static_cast<std::uint8_t>(store_.row_count(l));
+        put_each<uint8_t>(*row_counts, landmarks, [&](LandmarkIndex l) {
+          return static_cast<uint8_t>(store_.row_count(l));
         });
       }
       if (positions != nullptr) {
@@ -248,19 +244,19 @@ class SealedContent {
     owner_checksums_.clear();
     // Comes in pieces of whole blocks.
     PackedWriter owners([&](Bytes bytes) {
-      constexpr std::size_t kBlock = CheckedNumbers::kBlock * sizeof(std::uint64_t);
-      for (std::size_t at = 0; at < bytes.size(); at += kBlock) {
+      constexpr size_t kBlock = CheckedNumbers::kBlock * sizeof(uint64_t);
+      for (size_t at = 0; at < bytes.size(); at += kBlock) {
         owner_checksums_.push_back(crc32(bytes.subspan(at, std::min(kBlock, bytes.size() - at))));
       }
       sinks[1](bytes);
     });
     RowWriter writer(packer_, store_.landmark_count(), sinks[0], &owners);
-    for (std::uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
+    for (uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
       store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
         for (const Row row : rows) {
           const LandmarkIndex owner = store_.owner(row);
-          writer.add(
-              row, landmarks_ ? (*landmarks_)[owner] : static_cast<std::size_t>(store_.id(owner)));
+          writer.add(row,
+                     landmarks_ ? (*landmarks_)[owner] : static_cast<size_t>(store_.id(owner)));
         }
       });
       writer.end_list();
@@ -275,7 +271,7 @@ class SealedContent {
   const std::optional<PositionCodec>& codec_;
   bool ids_are_stored_;
   std::optional<SealedLandmarks> landmarks_;  // with an index, if ids are stored
-  std::vector<std::uint32_t> owner_checksums_;
+  std::vector<uint32_t> owner_checksums_;
 };
 
 }  // namespace
@@ -296,10 +292,10 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
   int scale = 0;
   if (format.bits == 4) {
     Histogram histogram{};
-    std::vector<std::int8_t> code(dim());
+    std::vector<int8_t> code(dim());
     store.each_row([&](Row row) {
       store.rounded(row, code.data());
-      for (const std::int8_t value : code) ++histogram[static_cast<std::size_t>(value + 128)];
+      for (const int8_t value : code) ++histogram[static_cast<size_t>(value + 128)];
     });
     scale = sq4_best_scale(histogram);
   }
@@ -309,7 +305,7 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
   add_value(file, section::kShape,
             MapShape{map.landmark_count(), dim(), codec ? codec->origin() : Position{}});
   add_metadata(file, state_->metadata);
-  if (scale != 0) add_value(file, section::kScale, static_cast<std::uint32_t>(scale));
+  if (scale != 0) add_value(file, section::kScale, static_cast<uint32_t>(scale));
   if (codec && codec->bits() == 16) add_value(file, section::kSteps, codec->step());
   const BlockPacker packer(store, scale);
   SealedContent content(store, map, packer, codec);

@@ -8,15 +8,15 @@ namespace protomark {
 namespace {
 
 // Adding to a large map mostly waits for memory: prefetches it this many observations ahead.
-constexpr std::size_t kAhead = 16;
+constexpr size_t kAhead = 16;
 
 // Rows that are assigned to lists at a time, and those that are moved at a time.
-constexpr std::size_t kAssignChunk = 1 << 14, kReassignChunk = 1 << 16;
+constexpr size_t kAssignChunk = 1 << 14, kReassignChunk = 1 << 16;
 
 // Eight numbers, and from a byte each.
-typedef std::int16_t Eight __attribute__((vector_size(16)));
-typedef std::int8_t EightBytes __attribute__((vector_size(8)));
-Eight eight(std::uint64_t bytes) {
+typedef int16_t Eight __attribute__((vector_size(16)));
+typedef int8_t EightBytes __attribute__((vector_size(8)));
+Eight eight(uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
 }
 
@@ -33,18 +33,18 @@ void store(void* to, const T& value) {
 
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
 // odd count is rounded down.
-std::int16_t half(int sum, int count) {
-  return static_cast<std::int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
+int16_t half(int sum, int count) {
+  return static_cast<int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
 }
 
 }  // namespace
 
-void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
+void PrototypeStore::make_room(size_t landmarks, size_t rows, size_t changed,
                                FairSharedMutex& searching) {
   // New rows begin in the first list, and each that moves may begin a block.
-  const std::size_t moving = quantizer_.nlist() == 0 ? 0 : std::min(changed, quantizer_.nlist());
-  const std::size_t blocks = 2 * packed_blocks(rows) + moving;
-  for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, std::size_t more, const auto&) {
+  const size_t moving = quantizer_.nlist() == 0 ? 0 : std::min(changed, quantizer_.nlist());
+  const size_t blocks = 2 * packed_blocks(rows) + moving;
+  for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, size_t more, const auto&) {
     if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), searching);
   });
   if (!index_.has_room(landmarks)) {
@@ -55,14 +55,13 @@ void PrototypeStore::make_room(std::size_t landmarks, std::size_t rows, std::siz
 }
 
 // Makes room for a row at the end of a list.
-Row PrototypeStore::take_row(std::uint32_t list) {
+Row PrototypeStore::take_row(uint32_t list) {
   if (row_end() + kPackedRows > UINT32_MAX) {
     throw std::length_error("a map holds under 2^32 prototypes");
   }
   lists_.make_room();
   slots_.make_room();
-  for_each_array(0, kPackedRows,
-                 [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
+  for_each_array(0, kPackedRows, [](auto& v, size_t more, const auto&) { make_room_in(v, more); });
   const Row row = lists_.append(list);
   if (row_end() != counts_.size()) resize(row_end());
   ++prototype_count_;
@@ -72,10 +71,10 @@ Row PrototypeStore::take_row(std::uint32_t list) {
 }
 
 void PrototypeStore::copy_row(Row from, Row to) {
-  for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
+  for_each_plain_array(0, 1, [&](auto& v, size_t width, const auto&) {
     std::copy_n(v.data() + from.value * width, width, v.data() + to.value * width);
   });
-  for (std::size_t d = 0; d < dim_; d += 4) {
+  for (size_t d = 0; d < dim_; d += 4) {
     std::memcpy(packed() + packed_index(to.value, d, dim_),
                 packed() + packed_index(from.value, d, dim_), 4);
   }
@@ -85,26 +84,26 @@ void PrototypeStore::copy_row(Row from, Row to) {
 // this empties.
 void PrototypeStore::close_gap(Row row) {
   vacate(row);
-  const std::uint32_t list = lists_.list_of(row);
+  const uint32_t list = lists_.list_of(row);
   if (const Row last = lists_.last(list); last != row) relocate(last, row);
-  const std::uint32_t emptied = lists_.pop(list);
+  const uint32_t emptied = lists_.pop(list);
   --prototype_count_;
   ++changes_;
   if (emptied == ListBlocks::kNone) return;
-  const std::size_t moved = lists_.blocks();
-  for (std::size_t i = 0; emptied != moved && i < kPackedRows; ++i) {
+  const size_t moved = lists_.blocks();
+  for (size_t i = 0; emptied != moved && i < kPackedRows; ++i) {
     const Row from = row_at(moved * kPackedRows + i);
     if (is_row(from)) relocate(from, row_at(emptied * kPackedRows + i));
   }
   resize(row_end());
 }
 
-std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const std::size_t> n) const {
-  std::vector<std::size_t> ascending(n.size());
-  std::iota(ascending.begin(), ascending.end(), std::size_t{0});
-  std::ranges::sort(ascending, {}, [&](std::size_t i) { return n[i]; });
+std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const size_t> n) const {
+  std::vector<size_t> ascending(n.size());
+  std::iota(ascending.begin(), ascending.end(), size_t{0});
+  std::ranges::sort(ascending, {}, [&](size_t i) { return n[i]; });
   std::vector<Row> result(n.size());
-  std::size_t seen = 0;
+  size_t seen = 0;
   auto next = ascending.begin();
   visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
     const std::vector<Row> rows = sorted_rows(landmarks);
@@ -116,56 +115,79 @@ std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const std::size_t> n) 
   return result;
 }
 
-void PrototypeStore::find_rows(std::span<const std::int64_t> ids, Codes codes,
-                               std::span<Row> rows) const {
-  const std::size_t n = rows.size();
-  for (std::size_t i = 0; i < n + 2 * kAhead; ++i) {
-    if (i < n) index_.prefetch_slot(ids[i]);
-    if (i >= kAhead && i < n + kAhead) index_.prefetch_ids(ids_, ids[i - kAhead]);
+void PrototypeStore::find_rows(std::span<const Key> keys, std::span<Row> rows) const {
+  constexpr size_t kMany = 64;
+  std::vector<size_t> left;  // keys of landmarks with many rows
+  for (size_t i = 0; i < keys.size() + 2 * kAhead; ++i) {
+    if (i < keys.size()) index_.prefetch_slot(keys[i].id);
+    if (i >= kAhead && i - kAhead < keys.size()) index_.prefetch_ids(ids_, keys[i - kAhead].id);
     if (i < 2 * kAhead) continue;
-    const std::size_t at = i - 2 * kAhead;
-    const LandmarkIndex landmark = find(ids[at]);
-    rows[at] = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance_of(codes.row(at)));
+    const size_t at = i - 2 * kAhead;
+    const auto [id, wanted] = keys[at];
+    const LandmarkIndex landmark = find(id);
+    rows[at] = landmark == kNoLandmark ? kNoRow : walk(first_row(landmark), wanted, kMany);
+    if (rows[at] == kNoRow || appearance(rows[at]) == wanted) continue;
+    rows[at] = kNoRow;
+    left.push_back(at);
+  }
+  // All rows of a landmark once, not once per key.
+  std::ranges::sort(left, {}, [&](size_t i) { return keys[i]; });
+  for (std::span<const size_t> rest(left); !rest.empty();) {
+    const int64_t id = keys[rest[0]].id;
+    const auto of_id = std::ranges::equal_range(rest, id, {}, [&](size_t i) { return keys[i].id; });
+    each_row_of(find(id), [&](Row row) {
+      const auto found = std::ranges::equal_range(of_id, appearance(row), {},
+                                                  [&](size_t i) { return keys[i].appearance; });
+      for (const size_t i : found) rows[i] = row;
+    });
+    rest = rest.subspan(of_id.size());
   }
 }
 
-void PrototypeStore::add(std::span<const std::int64_t> ids, Codes codes,
-                         std::span<const Row> rows) {
-  const std::size_t n = rows.size();
+void PrototypeStore::add(std::span<const Key> keys, Codes codes, std::span<const Row> rows) {
+  const size_t n = rows.size();
   if (quantizer_.nlist() != 0) to_reassign_.reserve(to_reassign_.size() + n);
   // Neighbours of the same row are added at once.
-  for (std::size_t i = 0, end = 0; i < n + kAhead; ++i) {
+  for (size_t i = 0, end = 0; i < n + kAhead; ++i) {
     if (i < n && rows[i] != kNoRow) prefetch(rows[i]);
-    const std::size_t nearer = i - kAhead / 2;
+    const size_t nearer = i - kAhead / 2;
     if (nearer < n && rows[nearer] != kNoRow) prefetch_slot(rows[nearer]);
     if (i < end + kAhead) continue;
-    const std::size_t at = end++;
+    const size_t at = end++;
     if (rows[at] == kNoRow) continue;
     while (end < n && rows[end] == rows[at]) ++end;
     add(rows[at], codes.row(at), end - at);
   }
   // If memory runs out, what was added so far stays, and answers.
-  for (std::size_t i = 0, end = 0; i < n; i = end) {
+  size_t created = 0;
+  for (size_t i = 0, end = 0; i < n; i = end) {
     end = i + 1;
     if (rows[i] != kNoRow) continue;
-    const std::uint16_t appearance = appearance_of(codes.row(i));
-    while (end < n && ids[end] == ids[i] && appearance_of(codes.row(end)) == appearance) ++end;
-    add(find_or_create_row(ids[i], appearance), codes.row(i), end - i);
+    while (end < n && keys[end] == keys[i]) ++end;
+    const auto [id, wanted] = keys[i];
+    LandmarkIndex landmark = find(id);
+    // New rows are the first of their landmark.
+    Row row = landmark == kNoLandmark ? kNoRow : walk(first_row(landmark), wanted, created);
+    if (row == kNoRow || appearance(row) != wanted) {
+      row = create_row(id, landmark, wanted);
+      ++created;
+    }
+    add(row, codes.row(i), end - i);
   }
 }
 
 // Adds n codes.
-void PrototypeStore::add(Row row, const std::int8_t* codes, std::size_t n) {
+void PrototypeStore::add(Row row, const int8_t* codes, size_t n) {
   Sum s = sum(row);
   int count = counts_[row.value];
-  for (const std::int8_t* code = codes; code != codes + n * dim_; code += dim_) {
+  for (const int8_t* code = codes; code != codes + n * dim_; code += dim_) {
     if (count == PrototypeMap::kMaxCount) {
       count /= 2;
-      for (std::size_t d = 0; d < dim_; ++d) s[d] = half(s[d], count);
+      for (size_t d = 0; d < dim_; ++d) s[d] = half(s[d], count);
     }
     // A caller may write over codes that were checked: even then no sum is impossible.
-    for (std::size_t d = 0; d < dim_; ++d) {
-      s[d] = static_cast<std::int16_t>(s[d] + std::max<std::int16_t>(code[d], -127));
+    for (size_t d = 0; d < dim_; ++d) {
+      s[d] = static_cast<int16_t>(s[d] + std::max<int16_t>(code[d], -127));
     }
     ++count;
   }
@@ -177,29 +199,29 @@ void PrototypeStore::merge(Row row, const Sum& other, int other_count) {
   const bool halved = total > PrototypeMap::kMaxCount;  // once is enough for 255 + 255
   const int n = halved ? total / 2 : total;
   Sum s = sum(row);
-  for (std::size_t d = 0; d < dim_; ++d) {
+  for (size_t d = 0; d < dim_; ++d) {
     const int both = s[d] + other[d];
-    s[d] = halved ? half(both, n) : static_cast<std::int16_t>(both);
+    s[d] = halved ? half(both, n) : static_cast<int16_t>(both);
   }
   set(row, s, n);
 }
 
 Sum PrototypeStore::sum(Row row) const {
   // Copies of members, which the compiler cannot know to stay.
-  const std::size_t dim = dim_;
-  const std::int8_t* means = packed() + packed_index(row.value, 0, dim);
-  const std::uint8_t* in_row = rest(row);
-  const auto n = static_cast<std::int16_t>(counts_[row.value]);
-  const std::int8_t* in_slot = has_slot(row) ? slots_[slot(row)] : nullptr;
+  const size_t dim = dim_;
+  const int8_t* means = packed() + packed_index(row.value, 0, dim);
+  const uint8_t* in_row = rest(row);
+  const auto n = static_cast<int16_t>(counts_[row.value]);
+  const int8_t* in_slot = has_slot(row) ? slots_[slot(row)] : nullptr;
   Sum sum;
-  for (std::size_t d = 0; d < dim; d += 8, means += 8 * kPackedRows) {
-    std::uint64_t mean = load<std::uint32_t>(means);
-    if (d + 4 < dim) mean |= std::uint64_t{load<std::uint32_t>(means + 4 * kPackedRows)} << 32;
+  for (size_t d = 0; d < dim; d += 8, means += 8 * kPackedRows) {
+    uint64_t mean = load<uint32_t>(means);
+    if (d + 4 < dim) mean |= uint64_t{load<uint32_t>(means + 4 * kPackedRows)} << 32;
     Eight left;
     if (in_slot != nullptr) {
-      left = eight(load<std::uint64_t>(in_slot + d));
+      left = eight(load<uint64_t>(in_slot + d));
     } else {
-      const std::uint64_t halves = load<std::uint32_t>(in_row + d / 2);
+      const uint64_t halves = load<uint32_t>(in_row + d / 2);
       left = (eight((halves | halves << 28) & 0x0f0f0f0f0f0f0f0f) ^ 8) - 8;
     }
     store(&sum[d], n * eight(mean) + left);
@@ -214,27 +236,27 @@ void PrototypeStore::set(Row row, const Sum& sum, int count) {
   } else if (had_slot && !needs_slot) {
     slots_.give_back(slot(row));
   }
-  std::int8_t* in_slot = needs_slot ? slots_[slot(row)] : nullptr;
-  std::uint8_t* in_row = rest(row);
-  counts_[row.value] = static_cast<std::uint8_t>(count);
-  const auto n = static_cast<std::int16_t>(count);
-  const std::size_t dim = dim_;
-  std::array<std::int8_t, 256> means;
+  int8_t* in_slot = needs_slot ? slots_[slot(row)] : nullptr;
+  uint8_t* in_row = rest(row);
+  counts_[row.value] = static_cast<uint8_t>(count);
+  const auto n = static_cast<int16_t>(count);
+  const size_t dim = dim_;
+  std::array<int8_t, 256> means;
   rounded_means(sum.data(), count, (dim + 7) / 8 * 8, means.data());
-  for (std::size_t d = 0; d < dim; d += 8) {
-    const Eight left = load<Eight>(&sum[d]) - n * eight(load<std::uint64_t>(&means[d]));
+  for (size_t d = 0; d < dim; d += 8) {
+    const Eight left = load<Eight>(&sum[d]) - n * eight(load<uint64_t>(&means[d]));
     if (in_slot != nullptr) {
       store(in_slot + d, __builtin_convertvector(left, EightBytes));
     } else {
-      const auto [low, high] = std::bit_cast<std::array<std::uint64_t, 2>>(left & 15);
-      const std::uint64_t pairs = low | high << 4, bytes = (pairs | pairs >> 8) & 0xffff0000ffff;
-      store(in_row + d / 2, static_cast<std::uint32_t>(bytes | bytes >> 16));
+      const auto [low, high] = std::bit_cast<std::array<uint64_t, 2>>(left & 15);
+      const uint64_t pairs = low | high << 4, bytes = (pairs | pairs >> 8) & 0xffff0000ffff;
+      store(in_row + d / 2, static_cast<uint32_t>(bytes | bytes >> 16));
     }
   }
-  std::uint32_t differences = 0;
-  std::int8_t* at = packed() + packed_index(row.value, 0, dim);
-  for (std::size_t d = 0; d < dim; d += 4, at += 4 * kPackedRows) {
-    std::uint32_t before, after;
+  uint32_t differences = 0;
+  int8_t* at = packed() + packed_index(row.value, 0, dim);
+  for (size_t d = 0; d < dim; d += 4, at += 4 * kPackedRows) {
+    uint32_t before, after;
     std::memcpy(&before, at, 4);
     std::memcpy(&after, &means[d], 4);
     std::memcpy(at, &after, 4);
@@ -250,25 +272,26 @@ void PrototypeStore::set(Row row, const Sum& sum, int count) {
 void PrototypeStore::reassign(int threads) {
   std::vector<Key> keys;
   std::vector<Row> rows;
-  for (std::size_t first = 0; first < to_reassign_.size(); first += kReassignChunk) {
+  for (size_t first = 0; first < to_reassign_.size(); first += kReassignChunk) {
+    const size_t n = std::min(kReassignChunk, to_reassign_.size() - first);
+    rows.resize(n);
+    find_rows({&to_reassign_[first], n}, rows);
     keys.clear();
-    rows.clear();
-    const std::size_t end = std::min(first + kReassignChunk, to_reassign_.size());
-    for (std::size_t i = first; i < end; ++i) {
-      const Row row = find_row(to_reassign_[i].id, to_reassign_[i].appearance);
-      if (row == kNoRow) continue;
-      keys.push_back(to_reassign_[i]);
-      rows.push_back(row);
+    for (size_t i = 0; i < n; ++i) {
+      if (rows[i] == kNoRow) continue;
+      rows[keys.size()] = rows[i];
+      keys.push_back(to_reassign_[first + i]);
     }
-    const std::vector<std::int8_t> codes = rounded(rows);
+    rows.resize(keys.size());
+    const std::vector<int8_t> codes = rounded(rows);
     auto lists = quantizer_.assign({codes.data(), rows.size(), dim_}, threads);
-    std::size_t moving = 0;
-    for (std::size_t i = 0; i < rows.size(); ++i) {
+    size_t moving = 0;
+    for (size_t i = 0; i < rows.size(); ++i) {
       if (lists_.list_of(rows[i]) == lists[i]) continue;
       keys[moving] = keys[i];
       lists[moving++] = lists[i];
     }
-    for (std::size_t i = 0; i < moving; ++i) {
+    for (size_t i = 0; i < moving; ++i) {
       const Row row = find_row(keys[i].id, keys[i].appearance);
       if (lists_.list_of(row) == lists[i]) continue;  // its key came twice
       relocate(row, take_row(lists[i]));
@@ -280,17 +303,17 @@ void PrototypeStore::reassign(int threads) {
 }
 
 PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, int threads) const {
-  const std::size_t nlist = std::max<std::size_t>(quantizer.nlist(), 1);
+  const size_t nlist = std::max<size_t>(quantizer.nlist(), 1);
   std::vector<Row> list_of_row(row_end(), kNoRow);
   std::vector<Row> rows;
   rows.reserve(std::min(prototype_count_, kAssignChunk));
   const auto assign = [&] {
-    std::vector<std::uint32_t> lists(rows.size(), 0);
+    std::vector<uint32_t> lists(rows.size(), 0);
     if (quantizer.nlist() != 0) {
-      const std::vector<std::int8_t> codes = rounded(rows);
+      const std::vector<int8_t> codes = rounded(rows);
       lists = quantizer.assign({codes.data(), rows.size(), dim_}, threads);
     }
-    for (std::size_t i = 0; i < rows.size(); ++i) list_of_row[rows[i].value].value = lists[i];
+    for (size_t i = 0; i < rows.size(); ++i) list_of_row[rows[i].value].value = lists[i];
     rows.clear();
   };
   each_row([&](Row row) {
@@ -301,20 +324,20 @@ PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, i
   ListOrder order(std::move(list_of_row), nlist);
   Arrangement result{std::move(quantizer), ListBlocks(nlist), std::move(order.new_rows)};
   result.lists.reserve(order.first_blocks.back());
-  for (std::uint32_t list = 0; list < nlist; ++list) {
-    for (std::uint32_t i = 0; i < order.sizes[list]; ++i) result.lists.append(list);
+  for (uint32_t list = 0; list < nlist; ++list) {
+    for (uint32_t i = 0; i < order.sizes[list]; ++i) result.lists.append(list);
   }
   return result;
 }
 
 void PrototypeStore::rearrange(Arrangement arrangement) {
   const ListBlocks& lists = arrangement.lists;
-  const std::size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
-  for_each_array(0, end + kPackedRows, [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
+  const size_t end = std::max(lists_.blocks(), lists.blocks()) * kPackedRows;
+  for_each_array(0, end + kPackedRows, [](auto& v, size_t n, const auto&) { v.reserve(n); });
   relink(arrangement.to);
   resize(end + kPackedRows);
   permute(arrangement.to, row_at(end));
-  for (std::uint32_t list = 0; list < lists.nlist(); ++list) {
+  for (uint32_t list = 0; list < lists.nlist(); ++list) {
     if (lists.rows(list) == 0) continue;
     for (Row row{lists.last(list).value + 1}; row.value % kPackedRows != 0; ++row.value)
       vacate(row);
@@ -342,7 +365,7 @@ void PrototypeStore::permute(std::vector<Row>& to, Row spare) {
     const auto prefetch_next = [&] {
       if (ahead == kNoRow) return;
       prefetch(ahead);
-      RowTable::for_each_array(0, 1, [&](auto& v, std::size_t width, const auto&) {
+      RowTable::for_each_array(0, 1, [&](auto& v, size_t width, const auto&) {
         __builtin_prefetch(v.data() + ahead.value * width, 1);
       });
       ahead = next(ahead);

@@ -15,16 +15,16 @@ class Uncommitted {
  public:
   bool empty() const { return !centroids && !metadata && ids_.empty() && !incomplete_; }
   // Landmarks that were added, changed or removed, each once.
-  const LargeVector<std::int64_t>& ids() const { return ids_.ids(); }
+  const LargeVector<int64_t>& ids() const { return ids_.ids(); }
   // Whether memory ran out, so that some ids are missing.
   bool incomplete() const { return incomplete_; }
 
   // Never throws, so that every change is noted.
-  void insert(std::int64_t id) noexcept try { ids_.insert(id); } catch (const std::bad_alloc&) {
+  void insert(int64_t id) noexcept try { ids_.insert(id); } catch (const std::bad_alloc&) {
     incomplete_ = true;
   }
   void insert(const Uncommitted& other) noexcept {
-    for (const std::int64_t id : other.ids()) insert(id);
+    for (const int64_t id : other.ids()) insert(id);
     centroids |= other.centroids;
     metadata |= other.metadata;
     incomplete_ |= other.incomplete_;
@@ -46,44 +46,51 @@ class Uncommitted {
 // that.
 class PrototypeStore : public RowTable {
  public:
-  PrototypeStore(std::size_t dim, std::size_t appearance_bits)
+  // Names a row, whose index changes when others are removed.
+  struct Key {
+    int64_t id;
+    uint16_t appearance;
+
+    friend auto operator<=>(const Key&, const Key&) = default;
+  };
+
+  PrototypeStore(size_t dim, size_t appearance_bits)
       : RowTable(appearance_bits != 0),
         dim_(dim),
         appearance_bits_(appearance_bits),
         rest_bytes_((dim + 7) / 8 * 4),
         slots_(2 * rest_bytes_) {}
 
-  std::size_t dim() const { return dim_; }
-  std::size_t appearance_bits() const { return appearance_bits_; }
+  size_t dim() const { return dim_; }
+  size_t appearance_bits() const { return appearance_bits_; }
   bool several() const { return several_; }
-  std::size_t landmark_count() const { return several_ ? ids_.size() : prototype_count_; }
-  std::size_t prototype_count() const { return prototype_count_; }
+  size_t landmark_count() const { return several_ ? ids_.size() : prototype_count_; }
+  size_t prototype_count() const { return prototype_count_; }
   // The number of rows, padding included.
-  std::size_t row_end() const { return lists_.blocks() * kPackedRows; }
+  size_t row_end() const { return lists_.blocks() * kPackedRows; }
   // Bytes per row of few observations, without what arrays have room for, so that equal maps have
   // the same.
-  std::size_t row_bytes() const {
+  size_t row_bytes() const {
     return rest_bytes_ + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
   }
 
   // Returns the appearance of a code: bit j is set if code[j] > 0, j < appearance_bits.
-  std::uint16_t appearance_of(const std::int8_t* code) const {
+  uint16_t appearance_of(const int8_t* code) const {
     unsigned signs = 0;
-    for (std::size_t j = 0; j < appearance_bits_; ++j) signs |= (code[j] > 0 ? 1u : 0u) << j;
-    return static_cast<std::uint16_t>(signs);
+    for (size_t j = 0; j < appearance_bits_; ++j) signs |= (code[j] > 0 ? 1u : 0u) << j;
+    return static_cast<uint16_t>(signs);
   }
 
-  void reserve(std::size_t landmarks, std::size_t rows) {
+  void reserve(size_t landmarks, size_t rows) {
     // One more block, as take_row wants one to be free.
-    const std::size_t blocks = packed_blocks(rows) + 1;
+    const size_t blocks = packed_blocks(rows) + 1;
     for_each_array(landmarks, blocks * kPackedRows,
-                   [](auto& v, std::size_t n, const auto&) { v.reserve(n); });
+                   [](auto& v, size_t n, const auto&) { v.reserve(n); });
     lists_.reserve(blocks);
   }
   // Makes room for more landmarks and rows in a change of `changed` rows. Others may read
   // meanwhile, as `searching` is held only to swap arrays.
-  void make_room(std::size_t landmarks, std::size_t rows, std::size_t changed,
-                 FairSharedMutex& searching);
+  void make_room(size_t landmarks, size_t rows, size_t changed, FairSharedMutex& searching);
   void make_room_for_positions(FairSharedMutex& searching) {
     if (!positions_.empty()) return;
     std::vector<Position> fresh(ids_.size(), kNoPosition);
@@ -91,15 +98,9 @@ class PrototypeStore : public RowTable {
     positions_.swap(fresh);
   }
 
-  // Returns the row of a landmark's appearance, if need be a new one with a sum and count of zero.
-  // If memory runs out nothing has changed.
-  Row find_or_create_row(std::int64_t id, std::uint16_t appearance) {
-    LandmarkIndex landmark = find(id);
-    const Row row = landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance);
-    return row != kNoRow ? row : create_row(id, landmark, appearance);
-  }
-  // Creates a row for an appearance that its landmark lacks; kNoLandmark becomes a new landmark.
-  Row create_row(std::int64_t id, LandmarkIndex& landmark, std::uint16_t appearance) {
+  // Creates a row, with a sum and count of zero, for an appearance that its landmark lacks;
+  // kNoLandmark becomes a new landmark. If memory runs out nothing has changed.
+  Row create_row(int64_t id, LandmarkIndex& landmark, uint16_t appearance) {
     if (landmark == kNoLandmark) make_room_for_landmark();
     const Row row = take_row(0);
     if (landmark != kNoLandmark) {
@@ -117,14 +118,14 @@ class PrototypeStore : public RowTable {
     remove_row(row);
     close_gap(row);
   }
-  void erase(std::int64_t id) {
+  void erase(int64_t id) {
     const LandmarkIndex landmark = at(id);
     while (next_row(first_row(landmark)) != kNoRow) erase_row(first_row(landmark));
     erase_row(first_row(landmark));
   }
 
-  std::uint32_t observations(LandmarkIndex landmark) const {
-    std::uint32_t n = 0;
+  uint32_t observations(LandmarkIndex landmark) const {
+    uint32_t n = 0;
     for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) n += counts_[row.value];
     return n;
   }
@@ -141,7 +142,7 @@ class PrototypeStore : public RowTable {
     __builtin_prefetch(rest(row), 1);
     __builtin_prefetch(rest(row) + rest_bytes_ - 1, 1);
     __builtin_prefetch(&counts_[row.value], 1);
-    for (std::size_t d = 0; d < dim_; d += 4) {
+    for (size_t d = 0; d < dim_; d += 4) {
       __builtin_prefetch(packed() + packed_index(row.value, d, dim_), 1);
     }
   }
@@ -149,15 +150,15 @@ class PrototypeStore : public RowTable {
   // has changed, and for a new row it does not.
   void set(Row row, const Sum& sum, int count);
   // Return the rounded prototypes of one row or several (rows x dim).
-  void rounded(Row row, std::int8_t* to) const {
-    for (std::size_t d = 0; d < dim_; d += 4) {
-      std::copy_n(packed() + packed_index(row.value, d, dim_), std::min<std::size_t>(4, dim_ - d),
+  void rounded(Row row, int8_t* to) const {
+    for (size_t d = 0; d < dim_; d += 4) {
+      std::copy_n(packed() + packed_index(row.value, d, dim_), std::min<size_t>(4, dim_ - d),
                   to + d);
     }
   }
-  std::vector<std::int8_t> rounded(std::span<const Row> rows) const {
-    std::vector<std::int8_t> result(rows.size() * dim_);
-    for (std::size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
+  std::vector<int8_t> rounded(std::span<const Row> rows) const {
+    std::vector<int8_t> result(rows.size() * dim_);
+    for (size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
     return result;
   }
 
@@ -183,7 +184,7 @@ class PrototypeStore : public RowTable {
     visit_sorted<LandmarkIndex>(
         landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
   }
-  void visit_sorted_rows(std::uint32_t list, const VisitRows& visit) const {
+  void visit_sorted_rows(uint32_t list, const VisitRows& visit) const {
     const auto each = [&](const auto& take) { lists_.each_row(list, take); };
     visit_sorted<Row>(
         lists_.rows(list), each,
@@ -197,32 +198,26 @@ class PrototypeStore : public RowTable {
     return result;
   }
   // Returns the rows that are n-th among all by id and then appearance.
-  std::vector<Row> sorted_rows_at(std::span<const std::size_t> n) const;
+  std::vector<Row> sorted_rows_at(std::span<const size_t> n) const;
 
-  // Finds the rows of these landmarks' codes, kNoRow for those that do not exist.
-  void find_rows(std::span<const std::int64_t> ids, Codes codes, std::span<Row> rows) const;
+  // Finds the rows of keys, kNoRow for those that do not exist.
+  void find_rows(std::span<const Key> keys, std::span<Row> rows) const;
   // Applies Eq. 2 for one code after the other, with new landmarks and rows where needed. `rows`
   // are those that find_rows found.
-  void add(std::span<const std::int64_t> ids, Codes codes, std::span<const Row> rows);
+  void add(std::span<const Key> keys, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const Sum& sum, int count);
   // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
   // which keeps its position if it has one.
-  void merge(std::int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
-    constexpr std::size_t kFew = 8;
+  void merge(int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
     LandmarkIndex into = find(id);
-    const std::vector<Row> others = from.sorted_rows(landmark);
-    // Both by ascending appearance, as looking up each of many would take long.
-    const bool sorted = into != kNoLandmark && others.size() > kFew;
-    const std::vector<Row> rows = sorted ? sorted_rows(into) : std::vector<Row>();
+    const std::vector<Row> rows = into == kNoLandmark ? std::vector<Row>() : sorted_rows(into);
     auto existing = rows.begin();
-    const bool look_up = into != kNoLandmark && !sorted;
-    for (const Row other : others) {
-      const std::uint16_t wanted = from.appearance(other);
+    for (const Row other : from.sorted_rows(landmark)) {
+      const uint16_t wanted = from.appearance(other);
       while (existing != rows.end() && appearance(*existing) < wanted) ++existing;
-      Row row = look_up ? find_row(into, wanted) : kNoRow;
-      if (existing != rows.end() && appearance(*existing) == wanted) row = *existing;
-      if (row == kNoRow) row = create_row(id, into, wanted);
+      const bool found = existing != rows.end() && appearance(*existing) == wanted;
+      const Row row = found ? *existing : create_row(id, into, wanted);
       merge(row, from.sum(other), from.count(other));
     }
     if (!has_position(position(into))) set_position(into, from.position(landmark));
@@ -250,16 +245,16 @@ class PrototypeStore : public RowTable {
   void rearrange(Arrangement arrangement);
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
     // One more block is for rows while they move.
-    const std::size_t blocks = std::max(lists_.blocks(), arrangement.lists.blocks()) + 1;
-    for_each_array(0, blocks * kPackedRows, [&](auto& v, std::size_t n, const auto&) {
+    const size_t blocks = std::max(lists_.blocks(), arrangement.lists.blocks()) + 1;
+    for_each_array(0, blocks * kPackedRows, [&](auto& v, size_t n, const auto&) {
       if (v.capacity() < n) enlarge(v, n, searching);
     });
   }
 
   // Grows with each new set of centroids.
-  std::size_t lists_version() const { return lists_version_; }
+  size_t lists_version() const { return lists_version_; }
   // Grows with each row that was added, changed or removed while there was an index.
-  std::size_t changes() const { return changes_; }
+  size_t changes() const { return changes_; }
   // What to commit; nullptr without a journal. A commit takes it while no change is going on.
   std::shared_ptr<Uncommitted> uncommitted;
 
@@ -271,21 +266,15 @@ class PrototypeStore : public RowTable {
   }
 
  private:
-  // Names a row, whose index changes when others are removed.
-  struct Key {
-    std::int64_t id;
-    std::uint16_t appearance;
-  };
-
-  const std::int8_t* packed() const { return reinterpret_cast<const std::int8_t*>(packed_.data()); }
-  std::int8_t* packed() { return reinterpret_cast<std::int8_t*>(packed_.data()); }
+  const int8_t* packed() const { return reinterpret_cast<const int8_t*>(packed_.data()); }
+  int8_t* packed() { return reinterpret_cast<int8_t*>(packed_.data()); }
   // The 4-bit numbers of a row: the low and high bits of byte d % 4 of each 4 bytes are numbers d
   // and d + 4 of each 8. Or the slot of its 8-bit ones.
-  const std::uint8_t* rest(Row row) const { return &rests_[row.value * rest_bytes_]; }
-  std::uint8_t* rest(Row row) { return &rests_[row.value * rest_bytes_]; }
+  const uint8_t* rest(Row row) const { return &rests_[row.value * rest_bytes_]; }
+  uint8_t* rest(Row row) { return &rests_[row.value * rest_bytes_]; }
   bool has_slot(Row row) const { return counts_[row.value] > kMaxSmallCount; }
-  std::uint32_t slot(Row row) const {
-    std::uint32_t slot;
+  uint32_t slot(Row row) const {
+    uint32_t slot;
     std::memcpy(&slot, rest(row), sizeof(slot));
     return slot;
   }
@@ -294,16 +283,16 @@ class PrototypeStore : public RowTable {
     __builtin_prefetch(slots_[slot(row)], 1);
     __builtin_prefetch(slots_[slot(row)] + 2 * rest_bytes_ - 1, 1);
   }
-  void add(Row row, const std::int8_t* codes, std::size_t n);
-  Row take_row(std::uint32_t list);
-  void resize(std::size_t rows) {
+  void add(Row row, const int8_t* codes, size_t n);
+  Row take_row(uint32_t list);
+  void resize(size_t rows) {
     for_each_array(ids_.size(), rows,
-                   [](auto& v, std::size_t n, const auto& padding) { v.resize(n, padding); });
+                   [](auto& v, size_t n, const auto& padding) { v.resize(n, padding); });
   }
   // Copies all of a row, but not what leads to it.
   void copy_row(Row from, Row to);
   void vacate(Row row) {
-    for_each_plain_array(0, 1, [&](auto& v, std::size_t width, const auto& padding) {
+    for_each_plain_array(0, 1, [&](auto& v, size_t width, const auto& padding) {
       std::fill_n(v.data() + row.value * width, width, padding);
     });
   }
@@ -319,35 +308,35 @@ class PrototypeStore : public RowTable {
   // As RowTable::for_each_array, with the arrays of this class, without and with the packed one, in
   // which rows are interleaved.
   template <typename Visit>
-  void for_each_plain_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
+  void for_each_plain_array(size_t landmarks, size_t rows, const Visit& visit) {
     RowTable::for_each_array(landmarks, rows, visit);
-    visit(rests_, rows * rest_bytes_, std::uint8_t{0});
-    visit(counts_, rows, std::uint8_t{0});
+    visit(rests_, rows * rest_bytes_, uint8_t{0});
+    visit(counts_, rows, uint8_t{0});
   }
   template <typename Visit>
-  void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
+  void for_each_array(size_t landmarks, size_t rows, const Visit& visit) {
     for_each_plain_array(landmarks, rows, visit);
     visit(packed_, packed_size(rows, dim_) / sizeof(CodeVector), CodeVector{});
   }
 
   static constexpr int kMaxSmallCount = 15;
 
-  std::size_t dim_;
-  std::size_t appearance_bits_;
-  std::size_t rest_bytes_;
-  std::size_t prototype_count_ = 0;
+  size_t dim_;
+  size_t appearance_bits_;
+  size_t rest_bytes_;
+  size_t prototype_count_ = 0;
 
   // By row.
-  LargeVector<std::uint8_t> rests_;  // rows x rest_bytes_
-  std::vector<std::uint8_t> counts_;
+  LargeVector<uint8_t> rests_;  // rows x rest_bytes_
+  std::vector<uint8_t> counts_;
   LargeVector<CodeVector> packed_;  // rounded prototypes, as PackedPrototypes has them
 
   Slots slots_;
   ListBlocks lists_;
   CoarseQuantizer quantizer_;
-  std::size_t lists_version_ = 0;
+  size_t lists_version_ = 0;
   std::vector<Key> to_reassign_;
-  std::size_t changes_ = 0;
+  size_t changes_ = 0;
 };
 
 }  // namespace protomark

@@ -23,20 +23,20 @@ inline bool is_finite(const Position& p) {
 
 // Arrays grow as with push_back, but before a change, which therefore cannot fail half-way.
 template <typename Vector>
-std::size_t larger_capacity(const Vector& v, std::size_t more) {
+size_t larger_capacity(const Vector& v, size_t more) {
   return std::max(2 * v.capacity(), v.size() + more);
 }
 template <typename Vector>
-bool has_room(const Vector& v, std::size_t more) {
+bool has_room(const Vector& v, size_t more) {
   return v.capacity() - v.size() >= more;
 }
 template <typename Vector>
-void make_room_in(Vector& v, std::size_t more) {
+void make_room_in(Vector& v, size_t more) {
   if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
 }
 // Replaces an array by one of more capacity; only the swap excludes searches.
 template <typename Vector>
-void enlarge(Vector& v, std::size_t capacity, FairSharedMutex& searching) {
+void enlarge(Vector& v, size_t capacity, FairSharedMutex& searching) {
   Vector larger;
   larger.reserve(capacity);
   larger.assign(v.begin(), v.end());
@@ -56,11 +56,11 @@ class RowTable {
   explicit RowTable(bool several) : several_(several) {}
 
   // By landmark index; -1 for padding.
-  const LargeVector<std::int64_t>& ids() const { return ids_; }
-  std::int64_t id(LandmarkIndex landmark) const { return ids_[landmark.value]; }
+  const LargeVector<int64_t>& ids() const { return ids_; }
+  int64_t id(LandmarkIndex landmark) const { return ids_[landmark.value]; }
   // Return the landmark with an id; if there is none, kNoLandmark, or `at` throws UnknownLandmark.
-  LandmarkIndex find(std::int64_t id) const { return index_.find(ids_, id); }
-  LandmarkIndex at(std::int64_t id) const {
+  LandmarkIndex find(int64_t id) const { return index_.find(ids_, id); }
+  LandmarkIndex at(int64_t id) const {
     const LandmarkIndex landmark = find(id);
     if (landmark == kNoLandmark) throw UnknownLandmark(id);
     return landmark;
@@ -72,7 +72,7 @@ class RowTable {
   bool is_row(Row row) const {
     return several_ ? owners_[row.value] != kNoLandmark : ids_[row.value] >= 0;
   }
-  std::uint16_t appearance(Row row) const { return several_ ? appearances_[row.value] : 0; }
+  uint16_t appearance(Row row) const { return several_ ? appearances_[row.value] : 0; }
   // Run through the rows of a landmark, in no order, up to kNoRow.
   Row first_row(LandmarkIndex landmark) const {
     return several_ ? first_rows_[landmark.value] : Row{landmark.value};
@@ -82,19 +82,28 @@ class RowTable {
   void each_row_of(LandmarkIndex landmark, const Take& take) const {
     for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) take(row);
   }
-  // Returns the row of a landmark's appearance, or kNoRow.
-  Row find_row(LandmarkIndex landmark, std::uint16_t appearance) const {
-    Row row = first_row(landmark);
-    while (several_ && row != kNoRow && appearances_[row.value] != appearance) row = next_row(row);
+  // Steps from a row of a landmark to that of an appearance, which may be kNoRow, but over at most
+  // `limit` others.
+  Row walk(Row row, uint16_t appearance, size_t limit) const {
+    if (!several_) return row;
+    size_t steps = 0;
+    for (; row != kNoRow && appearances_[row.value] != appearance && steps < limit; ++steps) {
+      row = next_row(row);
+    }
+    steps_ += steps;
     return row;
   }
-  Row find_row(std::int64_t id, std::uint16_t appearance) const {
+  // Returns the row of a landmark's appearance, or kNoRow. Only changes may call this.
+  Row find_row(LandmarkIndex landmark, uint16_t appearance) const {
+    return walk(first_row(landmark), appearance, SIZE_MAX);
+  }
+  Row find_row(int64_t id, uint16_t appearance) const {
     const LandmarkIndex landmark = find(id);
     return landmark == kNoLandmark ? kNoRow : find_row(landmark, appearance);
   }
 
-  std::size_t row_count(LandmarkIndex landmark) const {
-    std::size_t n = 0;
+  size_t row_count(LandmarkIndex landmark) const {
+    size_t n = 0;
     for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) ++n;
     return n;
   }
@@ -123,18 +132,18 @@ class RowTable {
   const std::vector<Position>& positions() const { return positions_; }
   bool any_position() const { return std::ranges::any_of(positions_, has_position); }
 
-  // Counts rows that were stepped over to remove or move others.
-  std::size_t steps() const { return steps_; }
+  // Counts rows that changes stepped over to find, remove or move others.
+  size_t steps() const { return steps_; }
 
  protected:
   // Makes room for a landmark, without which add_landmark could run out of memory.
   void make_room_for_landmark() {
     index_.make_room(ids_, 1);
     if (!several_) return;
-    for_each_array(1, 0, [](auto& v, std::size_t more, const auto&) { make_room_in(v, more); });
+    for_each_array(1, 0, [](auto& v, size_t more, const auto&) { make_room_in(v, more); });
   }
   // Makes a padding row the only one of a new landmark.
-  void add_landmark(std::int64_t id, Row row, std::uint16_t appearance) {
+  void add_landmark(int64_t id, Row row, uint16_t appearance) {
     if (!several_) {
       ids_[row.value] = id;
       index_.insert(ids_, LandmarkIndex{row.value});
@@ -148,7 +157,7 @@ class RowTable {
     add_row(landmark, row, appearance);
   }
   // Makes a padding row one more of a landmark.
-  void add_row(LandmarkIndex landmark, Row row, std::uint16_t appearance) {
+  void add_row(LandmarkIndex landmark, Row row, uint16_t appearance) {
     appearances_[row.value] = appearance;
     owners_[row.value] = landmark;
     next_rows_[row.value] = std::exchange(first_rows_[landmark.value], row);
@@ -187,31 +196,31 @@ class RowTable {
   }
 
   // Bytes per row as in a file, so that equal maps have the same.
-  std::size_t row_bytes() const {
+  size_t row_bytes() const {
     if (several_) return sizeof(appearances_[0]) + sizeof(owners_[0]) + sizeof(next_rows_[0]);
     return sizeof(ids_[0]) + (any_position() ? sizeof(Position) : 0);
   }
   // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
   // and rows.
   template <typename Visit>
-  void for_each_array(std::size_t landmarks, std::size_t rows, const Visit& visit) {
+  void for_each_array(size_t landmarks, size_t rows, const Visit& visit) {
     if (!several_) landmarks = rows;
-    visit(ids_, landmarks, std::int64_t{-1});
+    visit(ids_, landmarks, int64_t{-1});
     if (!positions_.empty()) visit(positions_, landmarks, kNoPosition);
     if (!several_) return;
     visit(first_rows_, landmarks, kNoRow);
-    visit(appearances_, rows, std::uint16_t{0});
+    visit(appearances_, rows, uint16_t{0});
     visit(owners_, rows, kNoLandmark);
     visit(next_rows_, rows, kNoRow);
   }
 
   bool several_;
   // By landmark; first rows only with several per landmark.
-  LargeVector<std::int64_t> ids_;
+  LargeVector<int64_t> ids_;
   std::vector<Position> positions_;
   std::vector<Row> first_rows_;
   // By row, only with several per landmark.
-  std::vector<std::uint16_t> appearances_;
+  std::vector<uint16_t> appearances_;
   std::vector<LandmarkIndex> owners_;
   std::vector<Row> next_rows_;
 
@@ -242,7 +251,7 @@ class RowTable {
     first_rows_.pop_back();
   }
 
-  std::size_t steps_ = 0;
+  mutable size_t steps_ = 0;
 };
 
 }  // namespace protomark

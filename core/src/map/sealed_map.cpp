@@ -18,7 +18,7 @@ struct SealedMap::Content {
     encoder = read_encoder(file);
     shape = read_shape(file, *encoder);
     metadata = read_metadata(file);
-    const std::size_t n = shape.landmarks;
+    const size_t n = shape.landmarks;
     prototype_count = n;
     if (file.has(section::kRows)) read_row_counts();
     prototypes.rows = prototype_count;
@@ -31,15 +31,15 @@ struct SealedMap::Content {
       prototypes.landmarks.row_counts = row_counts.empty() ? nullptr : row_counts.data();
     }
     if (file.has(section::kScale)) {
-      const auto scale = read_value<std::uint32_t>(file, section::kScale);
+      const auto scale = read_value<uint32_t>(file, section::kScale);
       if (scale < 1 || scale > kMaxScale) {
         file.fail("the scale of its prototypes is ", scale, ", not 1 to ", kMaxScale);
       }
       prototypes.scale = static_cast<int>(scale);
     }
-    const std::size_t size = packed_size(prototypes.rows, shape.dim, prototypes.scale);
+    const size_t size = packed_size(prototypes.rows, shape.dim, prototypes.scale);
     prototypes.data = file.map<std::byte>(section::kPrototypes, size).data();
-    counts = file.map<std::uint8_t>(section::kCounts, n);
+    counts = file.map<uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
     if (!file.has(section::kPositions)) return;
     codec.emplace(file, shape.origin);
@@ -47,11 +47,11 @@ struct SealedMap::Content {
   }
 
   void read_row_counts() {
-    row_counts = file.read<std::uint8_t>(section::kRows, shape.landmarks);
+    row_counts = file.read<uint8_t>(section::kRows, shape.landmarks);
     prototype_count = 0;
-    for (std::size_t i = 0; i < row_counts.size(); ++i) {
+    for (size_t i = 0; i < row_counts.size(); ++i) {
       if (row_counts[i] == 0) file.fail("it has a landmark without prototypes");
-      if (i % kFirstRowStep == 0) first_rows.push_back(static_cast<std::uint32_t>(prototype_count));
+      if (i % kFirstRowStep == 0) first_rows.push_back(static_cast<uint32_t>(prototype_count));
       prototype_count += row_counts[i];
     }
     if (prototype_count > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
@@ -60,27 +60,26 @@ struct SealedMap::Content {
   // Reads the inverted lists, which tell how many rows there are, padding included.
   void read_index() {
     centroids = read_centroids(file, shape.dim);
-    const std::size_t lists = centroids.size() / shape.dim;
+    const size_t lists = centroids.size() / shape.dim;
     packed_centroids = pack_codes({centroids.data(), lists, shape.dim});
-    list_rows = file.read<std::uint32_t>(section::kListRows, lists);
+    list_rows = file.read<uint32_t>(section::kListRows, lists);
     first_blocks.push_back(0);
-    std::uint64_t total = 0;
-    for (const std::uint64_t n : list_rows) {
+    uint64_t total = 0;
+    for (const uint64_t n : list_rows) {
       total += n;
       if (total > prototype_count) break;
-      first_blocks.push_back(first_blocks.back() + static_cast<std::uint32_t>(packed_blocks(n)));
+      first_blocks.push_back(first_blocks.back() + static_cast<uint32_t>(packed_blocks(n)));
     }
     if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
-    prototypes.rows = std::size_t{first_blocks.back()} * kPackedRows;
+    prototypes.rows = size_t{first_blocks.back()} * kPackedRows;
     const int bits = owner_bits(shape.landmarks);
-    const auto words =
-        file.map<std::uint64_t>(section::kOwners, packed_words(prototypes.rows, bits));
+    const auto words = file.map<uint64_t>(section::kOwners, packed_words(prototypes.rows, bits));
     owners = std::make_unique<const CheckedNumbers>(
         words, bits,
-        file.read<std::uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
+        file.read<uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
         file.name() + ": its section '" + section::kOwners + "'");
-    const std::size_t size = file.map(section::kRecall).size() / sizeof(std::uint32_t);
-    recall_table = read_section<std::uint32_t>(file, section::kRecall, size);
+    const size_t size = file.map(section::kRecall).size() / sizeof(uint32_t);
+    recall_table = read_section<uint32_t>(file, section::kRecall, size);
     if (size > kTestQueries || !std::ranges::is_sorted(recall_table) ||
         (size > 0 && (recall_table.front() < 1 || recall_table.back() > lists))) {
       file.fail("its recall table is impossible");
@@ -91,18 +90,18 @@ struct SealedMap::Content {
   // Only with an index. Throws FileError if the owners are broken.
   LandmarkIndex owner(Row row) const { return landmark_at((*owners)[row.value]); }
 
-  std::size_t nlist() const { return list_rows.size(); }
+  size_t nlist() const { return list_rows.size(); }
 
   Position position(LandmarkIndex landmark) const {
     return codec ? codec->decode(&positions[landmark.value * codec->size()]) : kNoPosition;
   }
 
   // Returns the first prototype of a landmark and the one after its last, counted by id.
-  std::pair<std::size_t, std::size_t> prototypes_of(LandmarkIndex landmark) const {
-    const std::size_t i = landmark.value;
+  std::pair<size_t, size_t> prototypes_of(LandmarkIndex landmark) const {
+    const size_t i = landmark.value;
     if (row_counts.empty()) return {i, i + 1};
-    std::size_t first = first_rows[i / kFirstRowStep];
-    for (std::size_t j = i / kFirstRowStep * kFirstRowStep; j < i; ++j) first += row_counts[j];
+    size_t first = first_rows[i / kFirstRowStep];
+    for (size_t j = i / kFirstRowStep * kFirstRowStep; j < i; ++j) first += row_counts[j];
     return {first, first + row_counts[i]};
   }
 
@@ -110,18 +109,18 @@ struct SealedMap::Content {
   void append_rows(LandmarkIndex landmark, std::vector<Row>& to) const {
     const auto [first, end] = prototypes_of(landmark);
     if (nlist() != 0) find_rows();
-    for (std::size_t i = first; i < end; ++i) to.push_back(nlist() == 0 ? row_at(i) : rows[i]);
+    for (size_t i = first; i < end; ++i) to.push_back(nlist() == 0 ? row_at(i) : rows[i]);
   }
   void find_rows() const {
     std::call_once(rows_found, [&] {
       std::vector<Row> found(prototype_count);
-      std::vector<std::uint32_t> taken(shape.landmarks, 0);
-      std::size_t total = 0;
+      std::vector<uint32_t> taken(shape.landmarks, 0);
+      size_t total = 0;
       for (Row row{0}; row.value < prototypes.rows; ++row.value) {
         const LandmarkIndex landmark = owner(row);
         if (landmark.value >= shape.landmarks) continue;
         const auto [first, last] = prototypes_of(landmark);
-        const std::size_t at = first + taken[landmark.value]++;
+        const size_t at = first + taken[landmark.value]++;
         if (at == last) file.fail("it has more prototypes of a landmark than it counts");
         found[at] = row;
         ++total;
@@ -131,35 +130,35 @@ struct SealedMap::Content {
     });
   }
 
-  int value(Row row, std::size_t d) const {
-    const auto* data = static_cast<const std::int8_t*>(prototypes.data);
+  int value(Row row, size_t d) const {
+    const auto* data = static_cast<const int8_t*>(prototypes.data);
     if (code_bits() == 8) return data[packed_index(row.value, d, shape.dim)];
-    const auto byte = static_cast<std::uint8_t>(data[packed4_index(row.value, d, shape.dim)]);
+    const auto byte = static_cast<uint8_t>(data[packed4_index(row.value, d, shape.dim)]);
     return sq4_level(packed4_high(d) ? byte >> 4 : byte & 15, prototypes.scale);
   }
 
-  static constexpr std::size_t kFirstRowStep = 64;  // landmarks
+  static constexpr size_t kFirstRowStep = 64;  // landmarks
 
   std::unique_ptr<MappedFile> mapped;  // nullptr if the caller keeps the bytes
   ContainerReader file;
   std::shared_ptr<const Encoder> encoder;
   MapShape shape;
   Metadata metadata;
-  std::size_t prototype_count = 0;
-  std::span<const std::uint8_t> row_counts;  // empty if each landmark has one row
-  std::vector<std::uint32_t> first_rows;     // of every kFirstRowStep-th landmark
+  size_t prototype_count = 0;
+  std::span<const uint8_t> row_counts;  // empty if each landmark has one row
+  std::vector<uint32_t> first_rows;     // of every kFirstRowStep-th landmark
   PackedPrototypes prototypes;
   // With an index.
-  std::vector<std::int8_t> centroids;
+  std::vector<int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
-  std::span<const std::uint32_t> list_rows;
-  std::vector<std::uint32_t> first_blocks;       // of each list, and the end
+  std::span<const uint32_t> list_rows;
+  std::vector<uint32_t> first_blocks;            // of each list, and the end
   std::unique_ptr<const CheckedNumbers> owners;  // of each row
   RecallTable recall_table;
   mutable std::once_flag rows_found;
   mutable std::vector<Row> rows;  // of prototypes by id
 
-  std::span<const std::uint8_t> counts;
+  std::span<const uint8_t> counts;
   LandmarkIds ids;
   std::optional<PositionCodec> codec;
   std::span<const std::byte> positions;
@@ -194,12 +193,12 @@ const SealedMap::Content& SealedMap::unchanged() const {
 
 const std::shared_ptr<const Encoder>& SealedMap::encoder() const { return content_->encoder; }
 const Metadata& SealedMap::metadata() const { return content_->metadata; }
-std::size_t SealedMap::dim() const { return content_->shape.dim; }
-std::size_t SealedMap::size() const { return content_->shape.landmarks; }
-std::size_t SealedMap::prototype_count() const { return content_->prototype_count; }
+size_t SealedMap::dim() const { return content_->shape.dim; }
+size_t SealedMap::size() const { return content_->shape.landmarks; }
+size_t SealedMap::prototype_count() const { return content_->prototype_count; }
 int SealedMap::code_bits() const { return content_->code_bits(); }
-std::size_t SealedMap::nlist() const { return content_->nlist(); }
-std::vector<std::int64_t> SealedMap::ids() const { return unchanged().ids.all(); }
+size_t SealedMap::nlist() const { return content_->nlist(); }
+std::vector<int64_t> SealedMap::ids() const { return unchanged().ids.all(); }
 
 double SealedMap::bytes_per_landmark() const {
   if (size() == 0) return 0;
@@ -207,7 +206,7 @@ double SealedMap::bytes_per_landmark() const {
          static_cast<double>(size());
 }
 
-std::size_t SealedMap::nprobe(double recall) const {
+size_t SealedMap::nprobe(double recall) const {
   check_recall(recall, nlist(), kRemedy);
   return nprobe_for(content_->recall_table, recall, nlist());
 }
@@ -220,23 +219,23 @@ std::optional<Position> SealedMap::position_error() const {
   return Position{step[0] / 2, step[1] / 2, step[2] / 2};
 }
 
-std::vector<std::uint32_t> SealedMap::counts(std::span<const std::int64_t> landmark_ids) const {
+std::vector<uint32_t> SealedMap::counts(std::span<const int64_t> landmark_ids) const {
   const Content& c = unchanged();
-  std::vector<std::uint32_t> result;
-  for (const std::int64_t id : landmark_ids) {
+  std::vector<uint32_t> result;
+  for (const int64_t id : landmark_ids) {
     result.push_back(c.counts[c.ids.find(id).value]);
   }
   return result;
 }
 
-Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) const {
+Matrix<float> SealedMap::prototypes(std::span<const int64_t> landmark_ids) const {
   const Content& c = unchanged();
   Matrix<float> means(landmark_ids.size(), dim());
   std::vector<Row> rows;
-  for (std::size_t i = 0; i < landmark_ids.size(); ++i) {
+  for (size_t i = 0; i < landmark_ids.size(); ++i) {
     rows.clear();
     c.append_rows(c.ids.find(landmark_ids[i]), rows);
-    for (std::size_t d = 0; d < dim(); ++d) {
+    for (size_t d = 0; d < dim(); ++d) {
       int sum = 0;
       for (const Row row : rows) sum += c.value(row, d);
       means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(rows.size());
@@ -245,23 +244,23 @@ Matrix<float> SealedMap::prototypes(std::span<const std::int64_t> landmark_ids) 
   return means;
 }
 
-Matrix<float> SealedMap::appearances(std::int64_t id) const {
+Matrix<float> SealedMap::appearances(int64_t id) const {
   const Content& c = unchanged();
   std::vector<Row> rows;
   c.append_rows(c.ids.find(id), rows);
   Matrix<float> result(rows.size(), dim());
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    for (std::size_t d = 0; d < dim(); ++d) {
+  for (size_t i = 0; i < rows.size(); ++i) {
+    for (size_t d = 0; d < dim(); ++d) {
       result.row(i)[d] = static_cast<float>(c.value(rows[i], d));
     }
   }
   return result;
 }
 
-std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmark_ids) const {
+std::vector<Position> SealedMap::positions(std::span<const int64_t> landmark_ids) const {
   const Content& c = unchanged();
   std::vector<Position> result;
-  for (const std::int64_t id : landmark_ids) {
+  for (const int64_t id : landmark_ids) {
     result.push_back(c.position(c.ids.find(id)));
   }
   return result;
@@ -270,21 +269,20 @@ std::vector<Position> SealedMap::positions(std::span<const std::int64_t> landmar
 MapSummary SealedMap::summary() const {
   const Content& c = unchanged();
   MapSummary result;
-  for (std::size_t i = 0; i < size(); ++i) {
+  for (size_t i = 0; i < size(); ++i) {
     add_to_summary(result, c.counts[i], c.position(landmark_at(i)));
   }
   return result;
 }
 
-Matches SealedMap::search(Descriptors queries, std::size_t k, const SearchOptions& options) const {
+Matches SealedMap::search(Descriptors queries, size_t k, const SearchOptions& options) const {
   return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
 }
 
-Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOptions& options) const {
+Matches SealedMap::search_codes(Codes queries, size_t k, const SearchOptions& options) const {
   const Content& c = unchanged();
   check_lists(options, nlist(), kRemedy);
-  const std::size_t lists =
-      options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
+  const size_t lists = options.recall ? nprobe(*options.recall) : options.nprobe.value_or(SIZE_MAX);
   const auto append = [&](LandmarkIndex landmark, std::vector<Row>& rows) {
     c.append_rows(landmark, rows);
   };
@@ -294,8 +292,8 @@ Matches SealedMap::search_codes(Codes queries, std::size_t k, const SearchOption
                                queries, k, options);
   // Search returns landmark indices, with which ids ascend, so that ties went to the smaller id.
   if (c.ids.are_indices()) return matches;
-  for (std::int64_t& id : matches.ids.data) {
-    if (id >= 0) id = c.ids[landmark_at(static_cast<std::size_t>(id))];
+  for (int64_t& id : matches.ids.data) {
+    if (id >= 0) id = c.ids[landmark_at(static_cast<size_t>(id))];
   }
   return matches;
 }

@@ -10,9 +10,9 @@ namespace protomark {
 namespace {
 
 // A sealed map stores the number of a landmark's prototypes in a byte.
-constexpr std::size_t kMaxRows = 255;
+constexpr size_t kMaxRows = 255;
 
-std::size_t prototype_bytes(std::size_t dim, int bits) {
+size_t prototype_bytes(size_t dim, int bits) {
   return packed_size(kPackedRows, dim, bits == 8 ? 0 : 1) / kPackedRows;
 }
 
@@ -22,11 +22,11 @@ struct LandmarkSums {
     for (const Row row : store.sorted_rows(landmark)) {
       const Sum sum = store.sum(row);
       sums.insert(sums.end(), sum.begin(), sum.begin() + store.dim());
-      counts.push_back(static_cast<std::uint8_t>(store.count(row)));
+      counts.push_back(static_cast<uint8_t>(store.count(row)));
     }
   }
-  std::vector<std::int16_t> sums;
-  std::vector<std::uint8_t> counts;
+  std::vector<int16_t> sums;
+  std::vector<uint8_t> counts;
 };
 
 // The merges of all landmarks, and how many of each landmark are made.
@@ -34,12 +34,12 @@ class Merges {
  public:
   // Makes those of least cost over the whole map, ties to the first landmark, until there are at
   // most `limit` rows.
-  Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, std::size_t limit)
+  Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, size_t limit)
       : ends_(landmarks.size()), made_(landmarks.size()) {
-    std::size_t rows = store.prototype_count();
-    using Next = std::pair<double, std::size_t>;  // cost, index in landmarks
+    size_t rows = store.prototype_count();
+    using Next = std::pair<double, size_t>;  // cost, index in landmarks
     std::vector<Next> first;
-    for (std::size_t i = 0; i < landmarks.size(); ++i) {
+    for (size_t i = 0; i < landmarks.size(); ++i) {
       const LandmarkSums of_landmark(store, landmarks[i]);
       const auto merges = appearance_merges(of_landmark.sums, of_landmark.counts, store.dim());
       merges_.insert(merges_.end(), merges.begin(), merges.end());
@@ -50,62 +50,62 @@ class Merges {
     }
     std::priority_queue next(std::greater<>(), std::move(first));
     for (; rows > limit && !next.empty(); --rows) {
-      const std::size_t i = next.top().second;
+      const size_t i = next.top().second;
       next.pop();
       if (++made_[i] < of(i).size()) next.emplace(of(i)[made_[i]].cost, i);
     }
   }
 
-  std::span<const AppearanceMerge> made(std::size_t i) const { return of(i).first(made_[i]); }
+  std::span<const AppearanceMerge> made(size_t i) const { return of(i).first(made_[i]); }
 
  private:
-  std::span<const AppearanceMerge> of(std::size_t i) const {
-    const std::size_t begin = i == 0 ? 0 : ends_[i - 1];
+  std::span<const AppearanceMerge> of(size_t i) const {
+    const size_t begin = i == 0 ? 0 : ends_[i - 1];
     return std::span(merges_).subspan(begin, ends_[i] - begin);
   }
 
   std::vector<AppearanceMerge> merges_;
-  std::vector<std::size_t> ends_;  // of each landmark's merges
-  std::vector<std::size_t> made_;
+  std::vector<size_t> ends_;  // of each landmark's merges
+  std::vector<size_t> made_;
 };
 
 // Comparing all pairs of more rows would take seconds to minutes. A sealed map keeps far fewer per
 // landmark.
-constexpr std::size_t kMaxCompared = 2048;
+constexpr size_t kMaxCompared = 2048;
 
 // The prototypes that remain, each with the later one of least merge cost as partner: the generic
 // algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering algorithms".
 class Clusters {
  public:
   // Adds to `merges` those that bring the number of rows down to kMaxCompared.
-  Clusters(std::span<const std::int16_t> sums, std::span<const std::uint8_t> counts,
-           std::size_t dim, std::vector<AppearanceMerge>& merges)
+  Clusters(std::span<const int16_t> sums, std::span<const uint8_t> counts, size_t dim,
+           std::vector<AppearanceMerge>& merges)
       : dim_(dim),
         sums_(sums.begin(), sums.end()),
         counts_(counts.begin(), counts.end()),
         remaining_(counts.size()),
         partner_(counts.size(), 0),
         cost_(counts.size(), 0) {
-    std::iota(remaining_.begin(), remaining_.end(), std::size_t{0});
+    std::iota(remaining_.begin(), remaining_.end(), size_t{0});
     while (remaining_.size() > kMaxCompared) halve(merges);
-    for (std::size_t at = 0; at + 1 < remaining_.size(); ++at) find_partner(at);
+    for (size_t at = 0; at + 1 < remaining_.size(); ++at) find_partner(at);
   }
 
-  std::size_t size() const { return remaining_.size(); }
+  size_t size() const { return remaining_.size(); }
 
   // Merges the pair of least cost.
   AppearanceMerge merge_best() {
-    std::size_t best = 0;
-    for (std::size_t at = 1; at + 1 < remaining_.size(); ++at) {
+    size_t best = 0;
+    for (size_t at = 1; at + 1 < remaining_.size(); ++at) {
       if (cost_[remaining_[at]] < cost_[remaining_[best]]) best = at;
     }
-    const std::size_t into = remaining_[best], source = partner_[into];
-    const AppearanceMerge result{cost_[into], static_cast<std::uint16_t>(into),
-                                 static_cast<std::uint16_t>(source)};
+    const size_t into = remaining_[best], source = partner_[into];
+    const AppearanceMerge result{cost_[into], static_cast<uint16_t>(into),
+                                 static_cast<uint16_t>(source)};
     merge(into, source);
     std::erase(remaining_, source);
-    for (std::size_t at = 0; at + 1 < remaining_.size() && remaining_[at] < source; ++at) {
-      const std::size_t row = remaining_[at];
+    for (size_t at = 0; at + 1 < remaining_.size() && remaining_[at] < source; ++at) {
+      const size_t row = remaining_[at];
       if (at == best || partner_[row] == into || partner_[row] == source) {
         find_partner(at);
       } else if (at < best) {
@@ -116,34 +116,34 @@ class Clusters {
   }
 
  private:
-  void merge(std::size_t into, std::size_t source) {
-    for (std::size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[source * dim_ + d];
+  void merge(size_t into, size_t source) {
+    for (size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[source * dim_ + d];
     counts_[into] += counts_[source];
   }
 
   // Merges each second row into the one before it.
   void halve(std::vector<AppearanceMerge>& merges) {
-    std::vector<std::size_t> halved;
-    for (std::size_t at = 0; at < remaining_.size(); at += 2) {
+    std::vector<size_t> halved;
+    for (size_t at = 0; at < remaining_.size(); at += 2) {
       halved.push_back(remaining_[at]);
       if (at + 1 == remaining_.size()) break;
       merge(remaining_[at], remaining_[at + 1]);
-      merges.push_back({0.0, static_cast<std::uint16_t>(remaining_[at]),
-                        static_cast<std::uint16_t>(remaining_[at + 1])});
+      merges.push_back(
+          {0.0, static_cast<uint16_t>(remaining_[at]), static_cast<uint16_t>(remaining_[at + 1])});
     }
     remaining_ = std::move(halved);
   }
 
-  void find_partner(std::size_t at) {
-    const std::size_t row = remaining_[at];
+  void find_partner(size_t at) {
+    const size_t row = remaining_[at];
     partner_[row] = remaining_[at + 1];
     cost_[row] = cost(row, partner_[row]);
-    for (std::size_t other = at + 2; other < remaining_.size(); ++other) {
+    for (size_t other = at + 2; other < remaining_.size(); ++other) {
       offer(row, remaining_[other]);
     }
   }
 
-  void offer(std::size_t row, std::size_t other) {
+  void offer(size_t row, size_t other) {
     const double c = cost(row, other);
     if (c < cost_[row] || (c == cost_[row] && other < partner_[row])) {
       cost_[row] = c;
@@ -153,14 +153,14 @@ class Clusters {
 
   // |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)). All but the division is exact
   // below 2^53, which no real landmark exceeds.
-  double cost(std::size_t i, std::size_t j) const {
+  double cost(size_t i, size_t j) const {
     const double *a = &sums_[i * dim_], *b = &sums_[j * dim_];
     const double n = counts_[i], m = counts_[j];
     // Four sums, so that a compiler may use vectors without changing the order of additions.
     double part[4] = {};
-    std::size_t d = 0;
+    size_t d = 0;
     for (; d + 4 <= dim_; d += 4) {
-      for (std::size_t k = 0; k < 4; ++k) {
+      for (size_t k = 0; k < 4; ++k) {
         const double difference = m * a[d + k] - n * b[d + k];
         part[k] += difference * difference;
       }
@@ -172,41 +172,40 @@ class Clusters {
     return ((part[0] + part[1]) + (part[2] + part[3])) / (n * m * (n + m));
   }
 
-  std::size_t dim_;
+  size_t dim_;
   std::vector<double> sums_;  // whole numbers
   std::vector<double> counts_;
-  std::vector<std::size_t> remaining_;  // ascending
-  std::vector<std::size_t> partner_;    // of all but the last that remains
-  std::vector<double> cost_;            // of merging with the partner
+  std::vector<size_t> remaining_;  // ascending
+  std::vector<size_t> partner_;    // of all but the last that remains
+  std::vector<double> cost_;       // of merging with the partner
 };
 
 }  // namespace
 
-std::vector<AppearanceMerge> appearance_merges(std::span<const std::int16_t> sums,
-                                               std::span<const std::uint8_t> counts,
-                                               std::size_t dim) {
+std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
+                                               std::span<const uint8_t> counts, size_t dim) {
   std::vector<AppearanceMerge> result;
   Clusters clusters(sums, counts, dim, result);
   while (clusters.size() > 1) result.push_back(clusters.merge_best());
   return result;
 }
 
-std::size_t sealed_bytes(std::size_t landmarks, std::size_t rows, std::size_t dim, int bits) {
+size_t sealed_bytes(size_t landmarks, size_t rows, size_t dim, int bits) {
   return rows * prototype_bytes(dim, bits) + landmarks * (rows > landmarks ? 2 : 1);
 }
 
-int owner_bits(std::size_t landmarks) {
-  return static_cast<int>(std::bit_width(std::max<std::size_t>(landmarks, 1)));
+int owner_bits(size_t landmarks) {
+  return static_cast<int>(std::bit_width(std::max<size_t>(landmarks, 1)));
 }
 
 SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark) {
-  const std::size_t n = store.landmark_count(), dim = store.dim();
-  std::size_t rows = store.prototype_count();
+  const size_t n = store.landmark_count(), dim = store.dim();
+  size_t rows = store.prototype_count();
   store.each_landmark([&](LandmarkIndex l) {
     if (store.several()) rows -= store.row_count(l) - std::min(store.row_count(l), kMaxRows);
   });
   if (!bytes_per_landmark) return {8, rows};
-  const std::size_t smallest = sealed_bytes(1, 1, dim, 4);
+  const size_t smallest = sealed_bytes(1, 1, dim, 4);
   if (!(*bytes_per_landmark >= static_cast<double>(smallest))) {
     invalid("bytes_per_landmark must be at least ", smallest,
             " for this map, which one prototype of 4 bits per number takes");
@@ -218,34 +217,34 @@ SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_
   }
   const double limit =
       (budget - 2 * static_cast<double>(n)) / static_cast<double>(prototype_bytes(dim, 4));
-  return {4, std::max(n, static_cast<std::size_t>(std::max(limit, 0.0)))};
+  return {4, std::max(n, static_cast<size_t>(std::max(limit, 0.0)))};
 }
 
-std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std::size_t limit) {
+std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t limit) {
   if (store.prototype_count() <= limit) return std::nullopt;
   const std::vector<LandmarkIndex> landmarks = store.sorted_landmarks();
   const Merges merges(store, landmarks, limit);
-  const std::size_t dim = store.dim();
+  const size_t dim = store.dim();
   PrototypeStore result(dim, store.appearance_bits());
   result.reserve(landmarks.size(), std::min(limit, store.prototype_count()));
-  for (std::size_t i = 0; i < landmarks.size(); ++i) {
+  for (size_t i = 0; i < landmarks.size(); ++i) {
     const LandmarkSums before(store, landmarks[i]);
-    std::vector<std::int64_t> sums(before.sums.begin(), before.sums.end());
-    std::vector<std::int64_t> counts(before.counts.begin(), before.counts.end());
+    std::vector<int64_t> sums(before.sums.begin(), before.sums.end());
+    std::vector<int64_t> counts(before.counts.begin(), before.counts.end());
     for (const AppearanceMerge& m : merges.made(i)) {
-      for (std::size_t d = 0; d < dim; ++d) sums[m.into * dim + d] += sums[m.source * dim + d];
+      for (size_t d = 0; d < dim; ++d) sums[m.into * dim + d] += sums[m.source * dim + d];
       counts[m.into] += std::exchange(counts[m.source], 0);
     }
     LandmarkIndex landmark = kNoLandmark;
-    for (std::size_t from = 0; from < counts.size(); ++from) {
+    for (size_t from = 0; from < counts.size(); ++from) {
       if (counts[from] == 0) continue;
-      const auto appearance = static_cast<std::uint16_t>(from);
+      const auto appearance = static_cast<uint16_t>(from);
       const Row row = result.create_row(store.id(landmarks[i]), landmark, appearance);
       const bool fits_row = counts[from] <= PrototypeMap::kMaxCount;
       Sum own_sum{};
-      for (std::size_t d = 0; d < dim; ++d) {
-        const std::int64_t sum = sums[from * dim + d];
-        own_sum[d] = fits_row ? static_cast<std::int16_t>(sum) : rounded_mean(sum, counts[from]);
+      for (size_t d = 0; d < dim; ++d) {
+        const int64_t sum = sums[from * dim + d];
+        own_sum[d] = fits_row ? static_cast<int16_t>(sum) : rounded_mean(sum, counts[from]);
       }
       result.set(row, own_sum, fits_row ? static_cast<int>(counts[from]) : 1);
     }

@@ -6,8 +6,8 @@
 namespace protomark {
 
 struct SealFormat {
-  int bits;               // per number of a prototype, 8 or 4
-  std::size_t row_limit;  // prototypes in all
+  int bits;          // per number of a prototype, 8 or 4
+  size_t row_limit;  // prototypes in all
 };
 
 // Chooses the format for a number of bytes per landmark (SealOptions). Throws
@@ -15,16 +15,16 @@ struct SealFormat {
 SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark);
 
 // Returns the bytes that prototypes, their number and the counts of landmarks take.
-std::size_t sealed_bytes(std::size_t landmarks, std::size_t rows, std::size_t dim, int bits);
+size_t sealed_bytes(size_t landmarks, size_t rows, size_t dim, int bits);
 
 // Returns the bits of a row's owner, which is a landmark or, for padding, the number of landmarks.
-int owner_bits(std::size_t landmarks);
+int owner_bits(size_t landmarks);
 
 // Merges prototype `source` into prototype `into`, which precedes it and keeps its index.
 struct AppearanceMerge {
   double cost;
-  std::uint16_t into;
-  std::uint16_t source;
+  uint16_t into;
+  uint16_t source;
 };
 
 // Returns all merges that make one prototype of several, at each step the one of least cost, ties
@@ -34,14 +34,13 @@ struct AppearanceMerge {
 // The cost of merging the means a and b of n and m observations is what that adds to the sum of
 // squared distances of all observations to their means (Ward 1963), |a - b|^2 n m / (n + m). It is
 // the same double on every machine, as the order of operations on the integer sums is fixed.
-std::vector<AppearanceMerge> appearance_merges(std::span<const std::int16_t> sums,
-                                               std::span<const std::uint8_t> counts,
-                                               std::size_t dim);
+std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
+                                               std::span<const uint8_t> counts, size_t dim);
 
 // Merges appearances until there are at most `limit` rows (SealFormat), and 255 of any landmark.
 // Returns a store of the prototypes, in lists of the same centroids, or nullopt if nothing has to
 // be merged. A prototype of more than 255 observations has its rounded mean as sum, and a count of
 // one.
-std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, std::size_t limit);
+std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t limit);
 
 }  // namespace protomark

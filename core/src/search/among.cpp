@@ -7,7 +7,7 @@ namespace {
 
 // Landmarks that are packed at a time: so many that the work on each query is small beside that on
 // rows, so few that they stay in the cache.
-constexpr std::size_t kPiece = 1 << 14;
+constexpr size_t kPiece = 1 << 14;
 // The time to read a row, and to pack one from anywhere, in comparisons of a row and a query.
 constexpr double kReading = 40, kPacking = 900;
 
@@ -22,26 +22,26 @@ class PackedPiece {
     for (const LandmarkIndex landmark : some) {
       landmarks.append(landmark, rows_);
       owners_.resize(rows_.size(), landmark_at(ids_.size()));
-      const std::int64_t* ids = from.landmarks.ids;
-      ids_.push_back(ids != nullptr ? ids[landmark.value] : std::int64_t{landmark.value});
+      const int64_t* ids = from.landmarks.ids;
+      ids_.push_back(ids != nullptr ? ids[landmark.value] : int64_t{landmark.value});
     }
-    const std::size_t block = packed_size(kPackedRows, from.dim, from.scale);
+    const size_t block = packed_size(kPackedRows, from.dim, from.scale);
     packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector));
     const auto* source = static_cast<const std::byte*>(from.data);
     auto* to = reinterpret_cast<std::byte*>(packed_.data());
-    const auto start = [&](std::size_t row) {
+    const auto start = [&](size_t row) {
       return row / kPackedRows * block + row % kPackedRows * kWord;
     };
-    for (std::size_t i = 0; i < rows_.size(); ++i) {
+    for (size_t i = 0; i < rows_.size(); ++i) {
       if (i + kAhead < rows_.size()) {
         const std::byte* next = source + start(rows_[i + kAhead].value);
-        for (std::size_t at = 0; at < block; at += sizeof(CodeVector)) {
+        for (size_t at = 0; at < block; at += sizeof(CodeVector)) {
           __builtin_prefetch(next + at);
         }
       }
       const std::byte* row = source + start(rows_[i].value);
       std::byte* packed = to + start(i);
-      for (std::size_t at = 0; at < block; at += sizeof(CodeVector)) {
+      for (size_t at = 0; at < block; at += sizeof(CodeVector)) {
         std::memcpy(packed + at, row + at, kWord);
       }
     }
@@ -53,11 +53,11 @@ class PackedPiece {
   const PackedPrototypes& view() const { return view_; }
 
  private:
-  static constexpr std::size_t kWord = 4, kAhead = 8;
+  static constexpr size_t kWord = 4, kAhead = 8;
 
   std::vector<Row> rows_;
   std::vector<LandmarkIndex> owners_;
-  std::vector<std::int64_t> ids_;
+  std::vector<int64_t> ids_;
   std::vector<CodeVector> packed_;
   PackedPrototypes view_;
 };
@@ -65,20 +65,19 @@ class PackedPiece {
 }  // namespace
 
 Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
-                   const PackedPrototypes& centroids, const LandmarkRows& landmarks,
-                   std::size_t nprobe, Codes queries, std::size_t k, const SearchOptions& options) {
+                   const PackedPrototypes& centroids, const LandmarkRows& landmarks, size_t nprobe,
+                   Codes queries, size_t k, const SearchOptions& options) {
   if (!options.among) {
     return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
   }
   std::vector<LandmarkIndex> some;
-  for (const std::int64_t id : *options.among) some.push_back(landmarks.at(id));
+  for (const int64_t id : *options.among) some.push_back(landmarks.at(id));
   sort_unique(some);
-  const double share = static_cast<double>(some.size()) /
-                       static_cast<double>(std::max<std::size_t>(landmarks.end, 1));
+  const double share =
+      static_cast<double>(some.size()) / static_cast<double>(std::max<size_t>(landmarks.end, 1));
   if (options.recall && share > 0) {
     const double wanted = std::ceil(static_cast<double>(nprobe) / share);
-    nprobe =
-        wanted < static_cast<double>(lists.nlist()) ? static_cast<std::size_t>(wanted) : SIZE_MAX;
+    nprobe = wanted < static_cast<double>(lists.nlist()) ? static_cast<size_t>(wanted) : SIZE_MAX;
   }
   const double compared = nprobe < lists.nlist()
                               ? static_cast<double>(nprobe) / static_cast<double>(lists.nlist())
@@ -94,7 +93,7 @@ Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.neighbours(k, options);
   PackedPiece piece;
-  for (std::size_t first = 0; first < some.size(); first += kPiece) {
+  for (size_t first = 0; first < some.size(); first += kPiece) {
     piece.pack(landmarks, std::span(some).subspan(first, std::min(kPiece, some.size() - first)),
                prototypes);
     scan_all(piece.view(), prepared, options.threads, nearest);

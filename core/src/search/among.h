@@ -7,8 +7,8 @@ namespace protomark {
 
 // The landmarks of a map.
 struct LandmarkRows {
-  std::size_t end;  // all indices are below
-  std::function<LandmarkIndex(std::int64_t id)> at;
+  size_t end;  // all indices are below
+  std::function<LandmarkIndex(int64_t id)> at;
   // Appends the rows of a landmark.
   std::function<void(LandmarkIndex, std::vector<Row>&)> append;
 };
@@ -19,7 +19,7 @@ struct LandmarkRows {
 // With options.recall more lists are then searched than `nprobe`, as many as hold so many of these
 // rows.
 Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
-                   const PackedPrototypes& centroids, const LandmarkRows& landmarks,
-                   std::size_t nprobe, Codes queries, std::size_t k, const SearchOptions& options);
+                   const PackedPrototypes& centroids, const LandmarkRows& landmarks, size_t nprobe,
+                   Codes queries, size_t k, const SearchOptions& options);
 
 }  // namespace protomark

@@ -14,49 +14,49 @@ namespace protomark {
 namespace {
 
 constexpr int kIterations = 8;
-constexpr std::size_t kGroupProbes = 4;
+constexpr size_t kGroupProbes = 4;
 // Centroids of a group at most, in terms of the mean.
-constexpr std::size_t kLargestGroup = 4;
+constexpr size_t kLargestGroup = 4;
 // Codes that are assigned at a time.
-constexpr std::size_t kAssignChunk = 1 << 14;
+constexpr size_t kAssignChunk = 1 << 14;
 
 // Returns the id that search(codes) finds for each code.
 template <typename Search>
-std::vector<std::uint32_t> nearest_ids(Codes codes, const Search& search) {
-  std::vector<std::uint32_t> result;
+std::vector<uint32_t> nearest_ids(Codes codes, const Search& search) {
+  std::vector<uint32_t> result;
   result.reserve(codes.rows);
-  for (std::size_t first = 0; first < codes.rows; first += kAssignChunk) {
-    const std::size_t n = std::min(kAssignChunk, codes.rows - first);
+  for (size_t first = 0; first < codes.rows; first += kAssignChunk) {
+    const size_t n = std::min(kAssignChunk, codes.rows - first);
     const Matches nearest = search(Codes{codes.row(first), n, codes.columns});
-    for (const std::int64_t id : nearest.ids.data) result.push_back(static_cast<std::uint32_t>(id));
+    for (const int64_t id : nearest.ids.data) result.push_back(static_cast<uint32_t>(id));
   }
   return result;
 }
 
 // Replaces each centroid without codes by a code of the largest lists.
-void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
-            const std::vector<std::uint32_t>& counts, std::vector<std::int8_t>& centroids) {
-  const std::size_t nlist = counts.size(), dim = codes.columns;
-  std::vector<std::uint32_t> first(nlist + 1, 0), members(codes.rows);
-  for (std::size_t c = 0; c < nlist; ++c) first[c + 1] = first[c] + counts[c];
-  std::vector<std::uint32_t> next(first.begin(), first.end() - 1);
-  for (std::uint32_t i = 0; i < codes.rows; ++i) members[next[list_of[i]]++] = i;
+void refill(Codes codes, const std::vector<uint32_t>& list_of, const std::vector<uint32_t>& counts,
+            std::vector<int8_t>& centroids) {
+  const size_t nlist = counts.size(), dim = codes.columns;
+  std::vector<uint32_t> first(nlist + 1, 0), members(codes.rows);
+  for (size_t c = 0; c < nlist; ++c) first[c + 1] = first[c] + counts[c];
+  std::vector<uint32_t> next(first.begin(), first.end() - 1);
+  for (uint32_t i = 0; i < codes.rows; ++i) members[next[list_of[i]]++] = i;
   struct Large {
-    std::size_t share;  // codes per centroid that the list has got
-    std::size_t list;
-    std::size_t parts;
+    size_t share;  // codes per centroid that the list has got
+    size_t list;
+    size_t parts;
     bool operator<(const Large& other) const {
       return std::pair(share, other.list) < std::pair(other.share, list);
     }
   };
   std::priority_queue<Large> largest;
-  for (std::size_t c = 0; c < nlist; ++c) largest.push({counts[c], c, 1});
-  for (std::size_t c = 0; c < nlist; ++c) {
+  for (size_t c = 0; c < nlist; ++c) largest.push({counts[c], c, 1});
+  for (size_t c = 0; c < nlist; ++c) {
     if (counts[c] != 0) continue;
     Large from = largest.top();
     largest.pop();
     // Another code each time, spread over the list.
-    const std::size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
+    const size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
     std::copy_n(codes.row(members[at]), dim, &centroids[c * dim]);
     ++from.parts;
     from.share = counts[from.list] / from.parts;
@@ -66,25 +66,25 @@ void refill(Codes codes, const std::vector<std::uint32_t>& list_of,
 
 // `assign(centroids)` returns the list of each code.
 template <typename Assign>
-std::vector<std::int8_t> k_means(Codes codes, std::size_t nlist, const Assign& assign) {
-  const std::size_t dim = codes.columns;
-  std::vector<std::int8_t> centroids(nlist * dim);
-  for (std::size_t c = 0; c < nlist; ++c) {
+std::vector<int8_t> k_means(Codes codes, size_t nlist, const Assign& assign) {
+  const size_t dim = codes.columns;
+  std::vector<int8_t> centroids(nlist * dim);
+  for (size_t c = 0; c < nlist; ++c) {
     std::copy_n(codes.row(c * codes.rows / nlist), dim, &centroids[c * dim]);
   }
   for (int i = 0; i < kIterations; ++i) {
-    const std::vector<std::uint32_t> list_of = assign(centroids);
-    std::vector<std::int64_t> sums(centroids.size(), 0);
-    std::vector<std::uint32_t> counts(nlist, 0);
-    for (std::size_t row = 0; row < codes.rows; ++row) {
-      const std::size_t c = list_of[row];
-      for (std::size_t d = 0; d < dim; ++d) sums[c * dim + d] += codes.row(row)[d];
+    const std::vector<uint32_t> list_of = assign(centroids);
+    std::vector<int64_t> sums(centroids.size(), 0);
+    std::vector<uint32_t> counts(nlist, 0);
+    for (size_t row = 0; row < codes.rows; ++row) {
+      const size_t c = list_of[row];
+      for (size_t d = 0; d < dim; ++d) sums[c * dim + d] += codes.row(row)[d];
       ++counts[c];
     }
-    for (std::size_t c = 0; c < nlist; ++c) {
+    for (size_t c = 0; c < nlist; ++c) {
       if (counts[c] == 0) continue;
-      for (std::size_t d = 0; d < dim; ++d) {
-        centroids[c * dim + d] = rounded_mean<std::int64_t>(sums[c * dim + d], counts[c]);
+      for (size_t d = 0; d < dim; ++d) {
+        centroids[c * dim + d] = rounded_mean<int64_t>(sums[c * dim + d], counts[c]);
       }
     }
     refill(codes, list_of, counts, centroids);
@@ -94,64 +94,64 @@ std::vector<std::int8_t> k_means(Codes codes, std::size_t nlist, const Assign& a
 
 }  // namespace
 
-ListOrder::ListOrder(std::vector<Row> lists, std::size_t nlist)
+ListOrder::ListOrder(std::vector<Row> lists, size_t nlist)
     : sizes(nlist, 0), first_blocks(nlist + 1, 0), new_rows(std::move(lists)) {
   for (const Row list : new_rows) {
     if (list != kNoRow) ++sizes[list.value];
   }
-  std::vector<std::uint32_t> next(nlist);
-  for (std::size_t c = 0; c < nlist; ++c) {
-    next[c] = first_blocks[c] * static_cast<std::uint32_t>(kPackedRows);
-    first_blocks[c + 1] = first_blocks[c] + static_cast<std::uint32_t>(packed_blocks(sizes[c]));
+  std::vector<uint32_t> next(nlist);
+  for (size_t c = 0; c < nlist; ++c) {
+    next[c] = first_blocks[c] * static_cast<uint32_t>(kPackedRows);
+    first_blocks[c + 1] = first_blocks[c] + static_cast<uint32_t>(packed_blocks(sizes[c]));
   }
   for (Row& list_or_row : new_rows) {
     if (list_or_row != kNoRow) list_or_row.value = next[list_or_row.value]++;
   }
 }
 
-CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim)
+CoarseQuantizer::CoarseQuantizer(std::vector<int8_t> centroids, size_t dim)
     : dim_(dim), centroids_(std::move(centroids)) {
   packed_ = pack_codes({centroids_.data(), nlist(), dim_});
   // Of equal centroids only the first one gets codes.
-  std::vector<std::int8_t> distinct;
+  std::vector<int8_t> distinct;
   std::vector<LandmarkIndex> lists;
-  std::set<std::span<const std::int8_t>, decltype(std::ranges::lexicographical_compare)> seen;
+  std::set<std::span<const int8_t>, decltype(std::ranges::lexicographical_compare)> seen;
   for (LandmarkIndex list{0}; list.value < nlist(); ++list.value) {
-    const std::span<const std::int8_t> centroid(&centroids_[list.value * dim_], dim_);
+    const std::span<const int8_t> centroid(&centroids_[list.value * dim_], dim_);
     if (!seen.insert(centroid).second) continue;
     distinct.insert(distinct.end(), centroid.begin(), centroid.end());
     lists.push_back(list);
   }
-  const std::size_t n = lists.size();
+  const size_t n = lists.size();
   const Codes all{distinct.data(), n, dim_};
 
   const auto groups =
-      std::min(n, static_cast<std::size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
-  const auto assign = [&](const std::vector<std::int8_t>& to) {
+      std::min(n, static_cast<size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
+  const auto assign = [&](const std::vector<int8_t>& to) {
     const std::vector<CodeVector> packed = pack_codes({to.data(), groups, dim_});
     return nearest_ids(
         all, [&](Codes codes) { return search_exact(packed_view(packed, groups), codes, 1, {}); });
   };
-  const std::vector<std::int8_t> group_centroids = k_means(all, groups, assign);
+  const std::vector<int8_t> group_centroids = k_means(all, groups, assign);
   // Cuts large groups into parts, as k-means may leave nearly all centroids in one, with all of
   // which each code would be compared. Groups without centroids are left out.
-  const std::size_t limit = kLargestGroup * ((n + groups - 1) / groups);
-  std::vector<std::int8_t> used;
-  std::vector<std::uint32_t> sizes(groups, 0), parts(groups);
+  const size_t limit = kLargestGroup * ((n + groups - 1) / groups);
+  std::vector<int8_t> used;
+  std::vector<uint32_t> sizes(groups, 0), parts(groups);
   std::vector<Row> group_of;
-  for (const std::uint32_t g : assign(group_centroids)) {
+  for (const uint32_t g : assign(group_centroids)) {
     if (sizes[g]++ % limit == 0) {
-      parts[g] = static_cast<std::uint32_t>(used.size() / dim_);
+      parts[g] = static_cast<uint32_t>(used.size() / dim_);
       used.insert(used.end(), &group_centroids[g * dim_], &group_centroids[g * dim_] + dim_);
     }
     group_of.push_back({parts[g]});
   }
   ListOrder order(std::move(group_of), used.size() / dim_);
   group_centroids_ = pack_codes({used.data(), order.sizes.size(), dim_});
-  const std::size_t rows = order.first_blocks.back() * kPackedRows;
-  std::vector<std::int8_t> grouped(rows * dim_, 0);
+  const size_t rows = order.first_blocks.back() * kPackedRows;
+  std::vector<int8_t> grouped(rows * dim_, 0);
   list_of_.assign(rows, kNoLandmark);
-  for (std::size_t i = 0; i < n; ++i) {
+  for (size_t i = 0; i < n; ++i) {
     const Row row = order.new_rows[i];
     std::copy_n(all.row(i), dim_, &grouped[row.value * dim_]);
     list_of_[row.value] = lists[i];
@@ -161,15 +161,14 @@ CoarseQuantizer::CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t
   group_blocks_ = std::move(order.first_blocks);
 }
 
-CoarseQuantizer CoarseQuantizer::learn(Codes codes, std::size_t nlist, int threads) {
-  const auto assign = [&](const std::vector<std::int8_t>& centroids) {
+CoarseQuantizer CoarseQuantizer::learn(Codes codes, size_t nlist, int threads) {
+  const auto assign = [&](const std::vector<int8_t>& centroids) {
     return CoarseQuantizer(centroids, codes.columns).assign(codes, threads);
   };
   return {k_means(codes, nlist, assign), codes.columns};
 }
 
-std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t dim,
-                                           std::size_t row_bytes) {
+size_t CoarseQuantizer::default_nlist(size_t prototypes, size_t dim, size_t row_bytes) {
   const auto n = static_cast<double>(prototypes), k = static_cast<double>(packed_dim(dim));
   constexpr double kBytes = 4;
   // A sealed map stores the landmark of each row, the recall table, and for each list its centroid,
@@ -182,10 +181,10 @@ std::size_t CoarseQuantizer::default_nlist(std::size_t prototypes, std::size_t d
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
   const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
   const double nlist = std::min({4 * std::sqrt(n), sealed, learning});
-  return static_cast<std::size_t>(std::clamp(nlist, 1.0, static_cast<double>(kMaxLists)));
+  return static_cast<size_t>(std::clamp(nlist, 1.0, static_cast<double>(kMaxLists)));
 }
 
-std::vector<std::uint32_t> CoarseQuantizer::assign(Codes codes, int threads) const {
+std::vector<uint32_t> CoarseQuantizer::assign(Codes codes, int threads) const {
   PackedPrototypes grouped = packed_view(grouped_, list_of_.size());
   grouped.landmarks.of_row = list_of_.data();
   const InvertedLists groups(group_sizes_, group_blocks_);

@@ -11,51 +11,51 @@ namespace protomark {
 // nearest of all and takes some hundred comparisons for thousands of lists.
 class CoarseQuantizer {
  public:
-  static constexpr std::size_t kMaxLists = 1 << 16;
+  static constexpr size_t kMaxLists = 1 << 16;
 
   CoarseQuantizer() = default;  // without lists
   // `centroids` are (nlist x dim), at least one.
-  CoarseQuantizer(std::vector<std::int8_t> centroids, std::size_t dim);
+  CoarseQuantizer(std::vector<int8_t> centroids, size_t dim);
   // Learns by Lloyd's k-means, in integers; `nlist` is at most the number of codes.
-  static CoarseQuantizer learn(Codes codes, std::size_t nlist, int threads);
+  static CoarseQuantizer learn(Codes codes, size_t nlist, int threads);
   // Returns a number of lists with which the index takes at most 4 bytes per prototype, both in a
   // learning map, where a row takes `row_bytes`, and in a sealed one.
-  static std::size_t default_nlist(std::size_t prototypes, std::size_t dim, std::size_t row_bytes);
+  static size_t default_nlist(size_t prototypes, size_t dim, size_t row_bytes);
   // Returns how many prototypes suffice to learn this many lists.
-  static std::size_t sample_size(std::size_t nlist) { return 48 * nlist; }
+  static size_t sample_size(size_t nlist) { return 48 * nlist; }
 
-  std::size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }
-  const std::vector<std::int8_t>& centroids() const { return centroids_; }
+  size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }
+  const std::vector<int8_t>& centroids() const { return centroids_; }
   PackedPrototypes packed() const { return packed_view(packed_, nlist()); }
 
   // Returns the list of each code.
-  std::vector<std::uint32_t> assign(Codes codes, int threads) const;
+  std::vector<uint32_t> assign(Codes codes, int threads) const;
 
  private:
-  PackedPrototypes packed_view(const std::vector<CodeVector>& codes, std::size_t rows) const {
+  PackedPrototypes packed_view(const std::vector<CodeVector>& codes, size_t rows) const {
     return {codes.data(), rows, dim_};
   }
 
-  std::size_t dim_ = 0;
-  std::vector<std::int8_t> centroids_;
+  size_t dim_ = 0;
+  std::vector<int8_t> centroids_;
   std::vector<CodeVector> packed_;
 
   std::vector<CodeVector> group_centroids_;
-  std::vector<CodeVector> grouped_;          // centroids by group
-  std::vector<LandmarkIndex> list_of_;       // the list of each row of grouped_
-  std::vector<std::uint32_t> group_sizes_;   // of each group
-  std::vector<std::uint32_t> group_blocks_;  // first block of each group, and the end
+  std::vector<CodeVector> grouped_;     // centroids by group
+  std::vector<LandmarkIndex> list_of_;  // the list of each row of grouped_
+  std::vector<uint32_t> group_sizes_;   // of each group
+  std::vector<uint32_t> group_blocks_;  // first block of each group, and the end
 };
 
 // The new rows of prototypes if lists follow each other, each beginning a new block, with
 // prototypes in their present order.
 struct ListOrder {
   // `lists` has the list of each row as its value, or kNoRow for padding.
-  ListOrder(std::vector<Row> lists, std::size_t nlist);
+  ListOrder(std::vector<Row> lists, size_t nlist);
 
-  std::vector<std::uint32_t> sizes;         // of each list
-  std::vector<std::uint32_t> first_blocks;  // of each list, and the end
-  std::vector<Row> new_rows;                // of each row
+  std::vector<uint32_t> sizes;         // of each list
+  std::vector<uint32_t> first_blocks;  // of each list, and the end
+  std::vector<Row> new_rows;           // of each row
 };
 
 }  // namespace protomark

@@ -17,15 +17,14 @@ namespace protomark {
 // distance.
 class TopK {
  public:
-  TopK(std::int64_t* ids, std::int32_t* distances, std::size_t k)
-      : ids_(ids), distances_(distances), k_(k) {}
+  TopK(int64_t* ids, int32_t* distances, size_t k) : ids_(ids), distances_(distances), k_(k) {}
 
   // Returns the distance that a candidate must not exceed.
-  std::int32_t limit() const { return distances_[k_ - 1]; }
+  int32_t limit() const { return distances_[k_ - 1]; }
 
   // Takes a candidate whose id was not offered before. One or two neighbours, as most searches ask
   // for, need no loop.
-  void offer(std::int32_t distance, std::int64_t id) {
+  void offer(int32_t distance, int64_t id) {
     if (k_ > 2) {
       if (before(distance, id, k_ - 1)) insert(distance, id, k_ - 1);
     } else if (before(distance, id, 0)) {
@@ -37,9 +36,9 @@ class TopK {
   }
 
   // Takes a candidate whose id may be among the nearest already, at another distance.
-  void offer_distinct(std::int32_t distance, std::int64_t id) {
+  void offer_distinct(int32_t distance, int64_t id) {
     if (!before(distance, id, k_ - 1)) return;
-    const auto at = static_cast<std::size_t>(std::find(ids_, ids_ + k_, id) - ids_);
+    const auto at = static_cast<size_t>(std::find(ids_, ids_ + k_, id) - ids_);
     if (at == k_) {
       insert(distance, id, k_ - 1);
     } else if (distance < distances_[at]) {
@@ -48,46 +47,44 @@ class TopK {
   }
 
  private:
-  bool before(std::int32_t distance, std::int64_t id, std::size_t i) const {
-    return distance < distances_[i] ||
-           (distance == distances_[i] &&
-            static_cast<std::uint64_t>(id) < static_cast<std::uint64_t>(ids_[i]));
+  bool before(int32_t distance, int64_t id, size_t i) const {
+    return distance < distances_[i] || (distance == distances_[i] &&
+                                        static_cast<uint64_t>(id) < static_cast<uint64_t>(ids_[i]));
   }
 
   // Overwrites entry i and moves the new one up to where it belongs.
-  void insert(std::int32_t distance, std::int64_t id, std::size_t i) {
+  void insert(int32_t distance, int64_t id, size_t i) {
     for (; i > 0 && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
     set(i, distance, id);
   }
 
-  void set(std::size_t i, std::int32_t distance, std::int64_t id) {
+  void set(size_t i, int32_t distance, int64_t id) {
     distances_[i] = distance;
     ids_[i] = id;
   }
 
-  std::int64_t* ids_;
-  std::int32_t* distances_;
-  std::size_t k_;
+  int64_t* ids_;
+  int32_t* distances_;
+  size_t k_;
 };
 
 // The nearest of several queries.
 class Neighbours {
  public:
   // A query takes no neighbour beyond its limit.
-  Neighbours(std::size_t k, std::span<const std::int32_t> limits)
-      : k_(k), ids_(limits.size() * k, -1) {
+  Neighbours(size_t k, std::span<const int32_t> limits) : k_(k), ids_(limits.size() * k, -1) {
     distances_.reserve(ids_.size());
-    for (const std::int32_t limit : limits) distances_.insert(distances_.end(), k, limit);
+    for (const int32_t limit : limits) distances_.insert(distances_.end(), k, limit);
   }
 
-  std::size_t queries() const { return ids_.size() / k_; }
-  std::size_t k() const { return k_; }
-  std::int32_t limit(std::size_t query) const { return distances_[query * k_ + k_ - 1]; }
-  TopK operator[](std::size_t query) {
+  size_t queries() const { return ids_.size() / k_; }
+  size_t k() const { return k_; }
+  int32_t limit(size_t query) const { return distances_[query * k_ + k_ - 1]; }
+  TopK operator[](size_t query) {
     return {ids_.data() + query * k_, distances_.data() + query * k_, k_};
   }
-  const std::int64_t* ids(std::size_t query) const { return ids_.data() + query * k_; }
-  const std::int32_t* distances(std::size_t query) const { return distances_.data() + query * k_; }
+  const int64_t* ids(size_t query) const { return ids_.data() + query * k_; }
+  const int32_t* distances(size_t query) const { return distances_.data() + query * k_; }
 
   Neighbours part(Range queries) const {
     Neighbours result(k_, {});
@@ -96,55 +93,54 @@ class Neighbours {
     return result;
   }
   // Takes the neighbours of `part`, whose queries begin with `first`.
-  void merge(std::size_t first, const Neighbours& part) {
-    for (std::size_t i = 0; i < part.ids_.size(); ++i) {
+  void merge(size_t first, const Neighbours& part) {
+    for (size_t i = 0; i < part.ids_.size(); ++i) {
       if (part.ids_[i] < 0) continue;
       (*this)[first + i / k_].offer_distinct(part.distances_[i], part.ids_[i]);
     }
   }
 
  private:
-  std::size_t k_;
-  std::vector<std::int64_t> ids_;
-  std::vector<std::int32_t> distances_;
+  size_t k_;
+  std::vector<int64_t> ids_;
+  std::vector<int32_t> distances_;
 };
 
 // Divides a search into ranges of queries times ranges of work (rows, or visits to lists).
 struct Division {
-  std::size_t query_ranges = 1;
-  std::size_t work_ranges = 1;
+  size_t query_ranges = 1;
+  size_t work_ranges = 1;
 
   // Divides the queries first, as those of a range share the reading of each row, and the rows as
   // well if the queries are too few for all threads.
-  static Division of_rows(int threads, std::size_t queries, std::size_t rows) {
-    constexpr std::size_t kQueries = 64, kRows = 4096;
+  static Division of_rows(int threads, size_t queries, size_t rows) {
+    constexpr size_t kQueries = 64, kRows = 4096;
     if (threads <= 1 || queries == 0) return {};
-    const auto n = static_cast<std::size_t>(threads);
-    const std::size_t query_ranges = std::min(4 * n, divide_up(queries, kQueries));
-    const std::size_t work_ranges = std::min(divide_up(n, query_ranges), divide_up(rows, kRows));
-    return {query_ranges, std::max<std::size_t>(work_ranges, 1)};
+    const auto n = static_cast<size_t>(threads);
+    const size_t query_ranges = std::min(4 * n, divide_up(queries, kQueries));
+    const size_t work_ranges = std::min(divide_up(n, query_ranges), divide_up(rows, kRows));
+    return {query_ranges, std::max<size_t>(work_ranges, 1)};
   }
   // Divides only the visits, as all queries that visit a list share the reading of it.
-  static Division of_lists(int threads, std::size_t visits) {
-    constexpr std::size_t kVisits = 64;
+  static Division of_lists(int threads, size_t visits) {
+    constexpr size_t kVisits = 64;
     if (threads <= 1) return {};
-    return {1, std::clamp<std::size_t>(divide_up(visits, kVisits), 1,
-                                       4 * static_cast<std::size_t>(threads))};
+    return {1, std::clamp<size_t>(divide_up(visits, kVisits), 1, 4 * static_cast<size_t>(threads))};
   }
 
  private:
-  static std::size_t divide_up(std::size_t a, std::size_t b) { return (a + b - 1) / b; }
+  static size_t divide_up(size_t a, size_t b) { return (a + b - 1) / b; }
 };
 
 // Calls scan(queries, work, neighbours of these queries) for all ranges.
 template <typename Scan>
-void run_search(int threads, const Division& division, std::size_t work, Neighbours& nearest,
+void run_search(int threads, const Division& division, size_t work, Neighbours& nearest,
                 const Scan& scan) {
   std::mutex mutex;
-  const std::size_t tasks = division.query_ranges * division.work_ranges;
-  run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](std::size_t i) {
+  const size_t tasks = division.query_ranges * division.work_ranges;
+  run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](size_t i) {
     if (tasks == 1) return scan(Range{0, nearest.queries()}, Range{0, work}, nearest);
-    const std::size_t part_of_queries = i / division.work_ranges;
+    const size_t part_of_queries = i / division.work_ranges;
     const Range queries = range_of(nearest.queries(), division.query_ranges, part_of_queries, 16);
     std::unique_lock lock(mutex);
     Neighbours part = nearest.part(queries);
@@ -158,16 +154,16 @@ void run_search(int threads, const Division& division, std::size_t work, Neighbo
 // Calls take(query, distance, row) for the rows of a chunk within limit_of(query), which `take` may
 // tighten. kernel(first, n, limits, &block, hits) scans for n queries from a block on.
 template <typename Kernel, typename LimitOf, typename Take>
-void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel& kernel,
-              const LimitOf& limit_of, const Take& take) {
+void each_hit(size_t n, size_t rows, size_t blocks, const Kernel& kernel, const LimitOf& limit_of,
+              const Take& take) {
   kernels::Hit hits[kernels::kHitRoom];
-  std::int32_t limits[kernels::kScanQueries];
-  for (std::size_t first = 0; first < n; first += kernels::kScanQueries) {
-    const std::size_t group = std::min(kernels::kScanQueries, n - first);
-    for (std::size_t block = 0; block < blocks;) {
-      for (std::size_t i = 0; i < group; ++i) limits[i] = limit_of(first + i);
-      const std::size_t found = kernel(first, group, limits, &block, hits);
-      for (std::size_t i = 0; i < found; ++i) {
+  int32_t limits[kernels::kScanQueries];
+  for (size_t first = 0; first < n; first += kernels::kScanQueries) {
+    const size_t group = std::min(kernels::kScanQueries, n - first);
+    for (size_t block = 0; block < blocks;) {
+      for (size_t i = 0; i < group; ++i) limits[i] = limit_of(first + i);
+      const size_t found = kernel(first, group, limits, &block, hits);
+      for (size_t i = 0; i < found; ++i) {
         const kernels::Hit& hit = hits[i];
         // Earlier hits may have tightened the limit.
         if (hit.row >= rows || hit.distance > limits[hit.query]) continue;
@@ -180,17 +176,17 @@ void each_hit(std::size_t n, std::size_t rows, std::size_t blocks, const Kernel&
 
 // Writes the neighbours to rows of `matches`, from `first` on. `norms`, if there are any, are added
 // to the distances of each query.
-inline void write_answer(const Neighbours& nearest, std::span<const std::int32_t> norms,
-                         const SearchOptions& options, std::size_t first, Matches& matches) {
-  const std::int32_t limit = options.max_distance.value_or(INT32_MAX);
+inline void write_answer(const Neighbours& nearest, std::span<const int32_t> norms,
+                         const SearchOptions& options, size_t first, Matches& matches) {
+  const int32_t limit = options.max_distance.value_or(INT32_MAX);
   const std::optional<double> ratio = options.ratio;
-  for (std::size_t q = 0; q < nearest.queries(); ++q) {
-    const std::int32_t norm = norms.empty() ? 0 : norms[q];
-    const std::int64_t* found = nearest.ids(q);
-    const std::int32_t* found_at = nearest.distances(q);
+  for (size_t q = 0; q < nearest.queries(); ++q) {
+    const int32_t norm = norms.empty() ? 0 : norms[q];
+    const int64_t* found = nearest.ids(q);
+    const int32_t* found_at = nearest.distances(q);
     const bool accepted = !ratio || nearest.k() < 2 || found[1] < 0 ||
                           found_at[0] + norm < *ratio * *ratio * (found_at[1] + norm);
-    for (std::size_t j = 0; j < matches.ids.columns; ++j) {
+    for (size_t j = 0; j < matches.ids.columns; ++j) {
       const bool reported = accepted && found[j] >= 0 && found_at[j] + norm <= limit;
       matches.ids.row(first + q)[j] = reported ? found[j] : -1;
       matches.distances.row(first + q)[j] = reported ? found_at[j] + norm : INT32_MAX;
@@ -200,8 +196,7 @@ inline void write_answer(const Neighbours& nearest, std::span<const std::int32_t
 
 // Returns room for the answer of a search. Throws std::invalid_argument if k is 0 or max_distance
 // is negative.
-inline Matches room_for_answer(std::size_t queries, std::size_t k,
-                               std::optional<std::int32_t> max_distance) {
+inline Matches room_for_answer(size_t queries, size_t k, std::optional<int32_t> max_distance) {
   if (k == 0) invalid("k must be at least 1");
   if (max_distance && *max_distance < 0) invalid("max_distance must not be negative");
   return {{queries, k}, {queries, k}};

@@ -10,12 +10,12 @@ namespace {
 using kernels::kWordRows;
 
 // Packs rows as kernels::PackedWords, the last word of each padded with zeros.
-void pack(Descriptors database, Range rows, std::size_t words, std::uint64_t* packed) {
-  const std::size_t rest = database.columns % 8;
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    const std::uint8_t* bytes = database.row(rows.begin + i);
-    std::uint64_t* to = packed + i / kWordRows * kWordRows * words + i % kWordRows;
-    for (std::size_t w = 0; w < database.columns / 8; ++w, to += kWordRows) {
+void pack(Descriptors database, Range rows, size_t words, uint64_t* packed) {
+  const size_t rest = database.columns % 8;
+  for (size_t i = 0; i < rows.size(); ++i) {
+    const uint8_t* bytes = database.row(rows.begin + i);
+    uint64_t* to = packed + i / kWordRows * kWordRows * words + i % kWordRows;
+    for (size_t w = 0; w < database.columns / 8; ++w, to += kWordRows) {
       std::memcpy(to, bytes + 8 * w, 8);
     }
     if (rest != 0) {
@@ -34,45 +34,44 @@ void check(Descriptors queries, Descriptors database, const HammingOptions& opti
   }
   if (database.rows > UINT32_MAX) invalid("the database has over 2^32 rows");
   if (!options.landmarks) return;
-  const std::span<const std::int64_t> landmarks = *options.landmarks;
+  const std::span<const int64_t> landmarks = *options.landmarks;
   if (landmarks.size() != database.rows) {
     invalid("the database has ", database.rows, " rows, landmarks has ", landmarks.size());
   }
-  for (const std::int64_t id : landmarks) {
+  for (const int64_t id : landmarks) {
     if (id < 0) invalid("landmark ids must not be negative");
   }
 }
 
 // Compares queries with some rows, whose landmarks are nullptr if ids are rows.
-void scan(Descriptors queries, Descriptors database, Range rows, const std::int64_t* landmarks,
+void scan(Descriptors queries, Descriptors database, Range rows, const int64_t* landmarks,
           Neighbours& nearest) {
   // Bytes that are packed and then compared with all queries, from the L1 cache.
-  constexpr std::size_t kChunkBytes = 16384;
-  const std::size_t words = (queries.columns + 7) / 8;
-  std::vector<std::uint64_t> query_words(queries.rows * words, 0);
-  for (std::size_t q = 0; q < queries.rows; ++q) {
+  constexpr size_t kChunkBytes = 16384;
+  const size_t words = (queries.columns + 7) / 8;
+  std::vector<uint64_t> query_words(queries.rows * words, 0);
+  for (size_t q = 0; q < queries.rows; ++q) {
     std::memcpy(&query_words[q * words], queries.row(q), queries.columns);
   }
-  const std::size_t blocks = std::max<std::size_t>(kChunkBytes / (8 * words * kWordRows), 1);
-  std::vector<std::uint64_t> packed(blocks * kWordRows * words);
-  for (std::size_t begin = rows.begin; begin < rows.end; begin += blocks * kWordRows) {
+  const size_t blocks = std::max<size_t>(kChunkBytes / (8 * words * kWordRows), 1);
+  std::vector<uint64_t> packed(blocks * kWordRows * words);
+  for (size_t begin = rows.begin; begin < rows.end; begin += blocks * kWordRows) {
     const Range chunk{begin, std::min(rows.end, begin + blocks * kWordRows)};
     pack(database, chunk, words, packed.data());
     const kernels::PackedWords packed_rows{packed.data(),
                                            (chunk.size() + kWordRows - 1) / kWordRows, words};
     each_hit(
         queries.rows, chunk.size(), packed_rows.blocks,
-        [&](std::size_t first, std::size_t n, const std::int32_t* limits, std::size_t* block,
-            kernels::Hit* found) {
+        [&](size_t first, size_t n, const int32_t* limits, size_t* block, kernels::Hit* found) {
           return kernels::active().hamming_scan({&query_words[first * words], limits, n},
                                                 packed_rows, block, found);
         },
-        [&](std::size_t q) { return nearest.limit(q); },
-        [&](std::size_t q, std::int32_t distance, std::size_t row) {
+        [&](size_t q) { return nearest.limit(q); },
+        [&](size_t q, int32_t distance, size_t row) {
           if (landmarks != nullptr) {
             nearest[q].offer_distinct(distance, landmarks[begin + row]);
           } else {
-            nearest[q].offer(distance, static_cast<std::int64_t>(begin + row));
+            nearest[q].offer(distance, static_cast<int64_t>(begin + row));
           }
         });
   }
@@ -80,14 +79,14 @@ void scan(Descriptors queries, Descriptors database, Range rows, const std::int6
 
 }  // namespace
 
-Matches hamming_search(Descriptors queries, Descriptors database, std::size_t k,
+Matches hamming_search(Descriptors queries, Descriptors database, size_t k,
                        const HammingOptions& options) {
   check(queries, database, options);
   Matches matches = room_for_answer(queries.rows, k, options.max_distance);
-  const std::int64_t* landmarks = options.landmarks ? options.landmarks->data() : nullptr;
-  const auto bits = static_cast<std::int32_t>(8 * queries.columns);
-  const std::vector<std::int32_t> limits(queries.rows,
-                                         std::min(bits, options.max_distance.value_or(bits)));
+  const int64_t* landmarks = options.landmarks ? options.landmarks->data() : nullptr;
+  const auto bits = static_cast<int32_t>(8 * queries.columns);
+  const std::vector<int32_t> limits(queries.rows,
+                                    std::min(bits, options.max_distance.value_or(bits)));
   Neighbours nearest(k, limits);
   run_search(options.threads, Division::of_rows(options.threads, queries.rows, database.rows),
              database.rows, nearest, [&](Range range, Range rows, Neighbours& part) {

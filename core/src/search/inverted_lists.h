@@ -11,21 +11,21 @@ class InvertedLists {
  public:
   explicit InvertedLists(const ListBlocks& chained) : chained_(&chained) {}
   // `rows` counts those of each list; `first_blocks` has the first block of each list, and the end.
-  InvertedLists(std::span<const std::uint32_t> rows, std::span<const std::uint32_t> first_blocks)
+  InvertedLists(std::span<const uint32_t> rows, std::span<const uint32_t> first_blocks)
       : rows_(rows), first_blocks_(first_blocks) {}
 
-  std::size_t nlist() const { return chained_ != nullptr ? chained_->nlist() : rows_.size(); }
-  std::size_t rows(std::uint32_t list) const {
+  size_t nlist() const { return chained_ != nullptr ? chained_->nlist() : rows_.size(); }
+  size_t rows(uint32_t list) const {
     return chained_ != nullptr ? chained_->rows(list) : rows_[list];
   }
   // Replaces `blocks` by those of a list, in order, all full but the last one.
-  void read(std::uint32_t list, std::vector<std::uint32_t>& blocks) const {
+  void read(uint32_t list, std::vector<uint32_t>& blocks) const {
     blocks.clear();
     if (chained_ != nullptr) {
       chained_->append_blocks(list, blocks);
       std::reverse(blocks.begin(), blocks.end());
     } else {
-      for (std::uint32_t b = first_blocks_[list]; b < first_blocks_[list + 1]; ++b) {
+      for (uint32_t b = first_blocks_[list]; b < first_blocks_[list + 1]; ++b) {
         blocks.push_back(b);
       }
     }
@@ -33,21 +33,20 @@ class InvertedLists {
 
  private:
   const ListBlocks* chained_ = nullptr;
-  std::span<const std::uint32_t> rows_;
-  std::span<const std::uint32_t> first_blocks_;
+  std::span<const uint32_t> rows_;
+  std::span<const uint32_t> first_blocks_;
 };
 
 // Returns the indices of the centroids nearest to each query (queries x nprobe), ties to the
 // smaller, the nearest first, the others in no order. `nprobe` is 1 to the number of centroids.
-std::vector<std::uint32_t> nearest_lists(const PackedPrototypes& centroids,
-                                         const PreparedCodes& queries, std::size_t nprobe,
-                                         int threads);
+std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const PreparedCodes& queries,
+                                    size_t nprobe, int threads);
 
 // Searches as search_exact does, but only in the `nprobe` lists (at least 1) nearest to each query,
 // ties to the smaller list; in all prototypes if there are no more lists than that. Prototype i of
 // `centroids` is the centroid of list i.
 Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
-                     const PackedPrototypes& centroids, std::size_t nprobe, Codes queries,
-                     std::size_t k, const SearchOptions& options);
+                     const PackedPrototypes& centroids, size_t nprobe, Codes queries, size_t k,
+                     const SearchOptions& options);
 
 }  // namespace protomark

@@ -10,38 +10,36 @@ namespace protomark {
 
 // Blocks of 16 rows; within a block, for every 4 dimensions, 16 rows x 4 numbers. Zeros pad the
 // last block and the last dimensions. Number d of a row is at packed_index.
-inline constexpr std::size_t kPackedRows = 16;
+inline constexpr size_t kPackedRows = 16;
 
-constexpr std::size_t packed_dim(std::size_t dim) { return (dim + 3) / 4 * 4; }
+constexpr size_t packed_dim(size_t dim) { return (dim + 3) / 4 * 4; }
 
-constexpr std::size_t packed_blocks(std::size_t rows) {
-  return (rows + kPackedRows - 1) / kPackedRows;
-}
+constexpr size_t packed_blocks(size_t rows) { return (rows + kPackedRows - 1) / kPackedRows; }
 
 // Bytes of rows; with a `scale`, of sq4 numbers.
-constexpr std::size_t packed_size(std::size_t rows, std::size_t dim, int scale = 0) {
-  const std::size_t row = scale == 0 ? packed_dim(dim) : (dim + 7) / 8 * 4;
+constexpr size_t packed_size(size_t rows, size_t dim, int scale = 0) {
+  const size_t row = scale == 0 ? packed_dim(dim) : (dim + 7) / 8 * 4;
   return packed_blocks(rows) * kPackedRows * row;
 }
 
-constexpr std::size_t packed_index(std::size_t row, std::size_t d, std::size_t dim) {
+constexpr size_t packed_index(size_t row, size_t d, size_t dim) {
   return row / kPackedRows * packed_size(kPackedRows, dim) + d / 4 * 4 * kPackedRows +
          row % kPackedRows * 4 + d % 4;
 }
 
 // The same with sq4 numbers (base/quantize.h): for every 8 dimensions, 16 rows x 4 bytes, of which
 // byte j holds dimension j in its low bits and dimension 4 + j in its high ones.
-constexpr std::size_t packed4_index(std::size_t row, std::size_t d, std::size_t dim) {
+constexpr size_t packed4_index(size_t row, size_t d, size_t dim) {
   return row / kPackedRows * packed_size(kPackedRows, dim, 1) + d / 8 * 4 * kPackedRows +
          row % kPackedRows * 4 + d % 4;
 }
 
-constexpr bool packed4_high(std::size_t d) { return d % 8 >= 4; }
+constexpr bool packed4_high(size_t d) { return d % 8 >= 4; }
 
 // Codes of 16 rows x 4 dimensions. Aligned, as a scan whose loads cross cache lines takes a quarter
 // longer.
 struct alignas(64) CodeVector {
-  std::int8_t codes[4 * kPackedRows];
+  int8_t codes[4 * kPackedRows];
 };
 
 std::vector<CodeVector> pack_codes(Codes codes);
@@ -51,20 +49,20 @@ std::vector<CodeVector> pack_codes(Codes codes);
 struct RowLandmarks {
   const LandmarkIndex* of_row = nullptr;
   // Number of rows of each landmark, at least 1; landmark after landmark.
-  const std::uint8_t* row_counts = nullptr;
+  const uint8_t* row_counts = nullptr;
   std::function<LandmarkIndex(Row)> look_up;
   // Rows of this landmark and of later ones are padding.
   LandmarkIndex end = kNoLandmark;
   // The id of each landmark, negative if its rows are padding. nullptr: ids are indices.
-  const std::int64_t* ids = nullptr;
+  const int64_t* ids = nullptr;
   // Which landmarks to search; nullptr: all.
   const std::vector<bool>* among = nullptr;
 };
 
 struct PackedPrototypes {
   const void* data = nullptr;
-  std::size_t rows = 0;
-  std::size_t dim = 0;
+  size_t rows = 0;
+  size_t dim = 0;
   int scale = 0;  // of sq4 numbers; 0: numbers are int8
   RowLandmarks landmarks = {};
 };

@@ -6,9 +6,9 @@ static_assert(kPackedRows == kernels::kCodeRows);
 
 std::vector<CodeVector> pack_codes(Codes codes) {
   std::vector<CodeVector> result(packed_size(codes.rows, codes.columns) / sizeof(CodeVector));
-  auto* to = reinterpret_cast<std::int8_t*>(result.data());
-  for (std::size_t row = 0; row < codes.rows; ++row) {
-    for (std::size_t d = 0; d < codes.columns; ++d) {
+  auto* to = reinterpret_cast<int8_t*>(result.data());
+  for (size_t row = 0; row < codes.rows; ++row) {
+    for (size_t d = 0; d < codes.columns; ++d) {
       to[packed_index(row, d, codes.columns)] = codes.row(row)[d];
     }
   }
@@ -23,7 +23,7 @@ void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, 
              });
 }
 
-Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::size_t k,
+Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
                      const SearchOptions& options) {
   Matches matches = check_search(prototypes.dim, queries, k, options);
   const PreparedCodes prepared(queries);
@@ -33,7 +33,7 @@ Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::siz
   return matches;
 }
 
-Matches check_search(std::size_t dim, Codes queries, std::size_t k, const SearchOptions& options) {
+Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options) {
   if (queries.columns != dim) {
     invalid("queries have ", queries.columns, " dimensions, prototypes ", dim);
   }

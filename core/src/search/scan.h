@@ -8,14 +8,14 @@
 
 namespace protomark {
 
-inline std::int32_t squared_norm(const std::uint8_t* code, std::size_t dim) {
-  std::int32_t sum = 0;
-  for (std::size_t d = 0; d < dim; ++d) sum += (code[d] - 128) * (code[d] - 128);
+inline int32_t squared_norm(const uint8_t* code, size_t dim) {
+  int32_t sum = 0;
+  for (size_t d = 0; d < dim; ++d) sum += (code[d] - 128) * (code[d] - 128);
   return sum;
 }
 
 // Above all distances without norms, whose magnitude is below 2^24.
-inline constexpr std::int32_t kNoLimit = 1 << 25;
+inline constexpr int32_t kNoLimit = 1 << 25;
 
 // Queries as kernels take them: unsigned, padded to a multiple of 4 dimensions.
 class PreparedCodes {
@@ -23,36 +23,36 @@ class PreparedCodes {
   explicit PreparedCodes(Codes codes)
       : dim_(packed_dim(codes.columns)), codes_(codes.rows * dim_, 128) {
     norms_.reserve(codes.rows);
-    for (std::size_t q = 0; q < codes.rows; ++q) {
-      for (std::size_t d = 0; d < codes.columns; ++d) {
-        codes_[q * dim_ + d] = static_cast<std::uint8_t>(codes.row(q)[d] + 128);
+    for (size_t q = 0; q < codes.rows; ++q) {
+      for (size_t d = 0; d < codes.columns; ++d) {
+        codes_[q * dim_ + d] = static_cast<uint8_t>(codes.row(q)[d] + 128);
       }
       norms_.push_back(squared_norm((*this)[q], dim_));
     }
   }
 
-  std::size_t queries() const { return norms_.size(); }
-  std::size_t dim() const { return dim_; }
-  const std::uint8_t* operator[](std::size_t query) const { return codes_.data() + query * dim_; }
+  size_t queries() const { return norms_.size(); }
+  size_t dim() const { return dim_; }
+  const uint8_t* operator[](size_t query) const { return codes_.data() + query * dim_; }
   // Squared norms, which the distances that kernels give lack.
-  const std::vector<std::int32_t>& norms() const { return norms_; }
+  const std::vector<int32_t>& norms() const { return norms_; }
 
   // Returns room for the k nearest of each query, for two if the ratio test needs them.
-  Neighbours neighbours(std::size_t k, const SearchOptions& options) const {
-    std::vector<std::int32_t> limits(queries(), kNoLimit);
+  Neighbours neighbours(size_t k, const SearchOptions& options) const {
+    std::vector<int32_t> limits(queries(), kNoLimit);
     // The ratio test needs the second nearest at any distance.
     if (options.max_distance && !options.ratio) {
-      for (std::size_t q = 0; q < limits.size(); ++q) {
+      for (size_t q = 0; q < limits.size(); ++q) {
         limits[q] = std::min(limits[q], *options.max_distance - norms_[q]);
       }
     }
-    return {options.ratio ? std::max<std::size_t>(k, 2) : k, limits};
+    return {options.ratio ? std::max<size_t>(k, 2) : k, limits};
   }
 
  private:
-  std::size_t dim_;
-  std::vector<std::uint8_t> codes_;
-  std::vector<std::int32_t> norms_;
+  size_t dim_;
+  std::vector<uint8_t> codes_;
+  std::vector<int32_t> norms_;
 };
 
 // Compares queries with codes, on one thread.
@@ -67,10 +67,10 @@ class CodeScan {
         prefix_(queries.dim()),
         rest_norms_(range.size(), 0) {}
   // Compares only these of them from now on.
-  void select(std::span<const std::uint32_t> queries) {
-    const std::size_t dim = all_.dim();
+  void select(std::span<const uint32_t> queries) {
+    const size_t dim = all_.dim();
     selected_.resize(queries.size() * dim);
-    for (std::size_t i = 0; i < queries.size(); ++i) {
+    for (size_t i = 0; i < queries.size(); ++i) {
       std::copy_n(all_[range_.begin + queries[i]], dim, &selected_[i * dim]);
     }
     codes_ = selected_.data();
@@ -79,24 +79,24 @@ class CodeScan {
 
   // Returns how many rows to compare at a time, a multiple of 16: many queries find them in the L2
   // cache; for few, memory should deliver rows while earlier ones are compared.
-  std::size_t chunk_rows() const {
+  size_t chunk_rows() const {
     const auto bytes =
-        std::clamp<std::size_t>(256 * n_, n_ <= kernels::kFewQueries ? 16384 : 8192, 65536);
-    return std::max<std::size_t>(bytes / all_.dim() / kPackedRows, 1) * kPackedRows;
+        std::clamp<size_t>(256 * n_, n_ <= kernels::kFewQueries ? 16384 : 8192, 65536);
+    return std::max<size_t>(bytes / all_.dim() / kPackedRows, 1) * kPackedRows;
   }
 
   // Compares later rows first over a prefix of the dimensions, after `met` rows. Encoders put those
   // that tell most first, so that they usually show that a row is not among the nearest.
-  void choose_prefix(std::size_t met) {
+  void choose_prefix(size_t met) {
     // Few queries wait for memory, which is read as a whole. The more rows were met, the nearer are
     // the neighbours, and the fewer dimensions suffice.
-    constexpr std::size_t kManyRows = std::size_t{1} << 18;
+    constexpr size_t kManyRows = size_t{1} << 18;
     if (n_ <= kernels::kFewQueries) return;
-    const std::size_t eighths = met < kManyRows ? 6 : 5;
-    const std::size_t prefix = (all_.dim() * eighths / 8 + 3) / 4 * 4;
+    const size_t eighths = met < kManyRows ? 6 : 5;
+    const size_t prefix = (all_.dim() * eighths / 8 + 3) / 4 * 4;
     if (prefix == prefix_) return;
     prefix_ = prefix;
-    for (std::size_t q = 0; q < range_.size(); ++q) {
+    for (size_t q = 0; q < range_.size(); ++q) {
       rest_norms_[q] = squared_norm(all_[range_.begin + q] + prefix, all_.dim() - prefix);
     }
   }
@@ -104,13 +104,11 @@ class CodeScan {
   // Calls take(i, distance, row) for the rows of a packed chunk within limit_of(i) of the i-th
   // query. Distances are squared and lack the query's norm, which does not change their order.
   template <typename LimitOf, typename Take>
-  void compare(const std::int8_t* packed, std::size_t rows, const LimitOf& limit_of,
-               const Take& take) {
+  void compare(const int8_t* packed, size_t rows, const LimitOf& limit_of, const Take& take) {
     const kernels::PackedCodes chunk = prepare(packed, rows);
     each_hit(
         n_, rows, chunk.blocks,
-        [&](std::size_t first, std::size_t n, const std::int32_t* limits, std::size_t* block,
-            kernels::Hit* hits) {
+        [&](size_t first, size_t n, const int32_t* limits, size_t* block, kernels::Hit* hits) {
           return kernels::active().code_scan(
               {codes_ + first * chunk.dim, limits, &rest_norms_[first], n, &steps_in_full_}, chunk,
               block, hits);
@@ -119,8 +117,8 @@ class CodeScan {
   }
 
  private:
-  kernels::PackedCodes prepare(const std::int8_t* packed, std::size_t rows) {
-    const std::size_t dim = all_.dim(), blocks = packed_blocks(rows);
+  kernels::PackedCodes prepare(const int8_t* packed, size_t rows) {
+    const size_t dim = all_.dim(), blocks = packed_blocks(rows);
     if (n_ <= kernels::kFewQueries) return {packed, nullptr, nullptr, blocks, dim, prefix_};
     biases_.resize(std::max(biases_.size(), blocks * kPackedRows));
     prefix_biases_.resize(biases_.size());
@@ -131,20 +129,20 @@ class CodeScan {
 
   const PreparedCodes& all_;
   Range range_;
-  const std::uint8_t* codes_;  // of the queries to compare
-  std::size_t n_;              // their number
-  std::vector<std::uint8_t> selected_;
-  std::size_t prefix_;                    // dimensions that are compared first
-  std::vector<std::int32_t> rest_norms_;  // see kernels::CodeQueries
-  std::size_t steps_in_full_ = 0;
-  std::vector<std::int32_t> biases_, prefix_biases_;
+  const uint8_t* codes_;  // of the queries to compare
+  size_t n_;              // their number
+  std::vector<uint8_t> selected_;
+  size_t prefix_;                    // dimensions that are compared first
+  std::vector<int32_t> rest_norms_;  // see kernels::CodeQueries
+  size_t steps_in_full_ = 0;
+  std::vector<int32_t> biases_, prefix_biases_;
 };
 
 // Reads blocks of prototypes as int8 codes, on one thread.
 class BlockReader {
  public:
   explicit BlockReader(const PackedPrototypes& prototypes)
-      : data_(static_cast<const std::uint8_t*>(prototypes.data)),
+      : data_(static_cast<const uint8_t*>(prototypes.data)),
         dim_(prototypes.dim),
         scale_(prototypes.scale),
         block_bytes_(packed_size(kPackedRows, dim_, scale_)),
@@ -152,43 +150,43 @@ class BlockReader {
 
   // Returns the codes of these blocks, one after the other, valid until the next call. sq4 numbers
   // are unpacked into the cache, once for all queries.
-  const std::int8_t* read(std::size_t first_block, std::size_t n) {
-    const std::uint8_t* stored = data_ + first_block * block_bytes_;
-    if (scale_ == 0) return reinterpret_cast<const std::int8_t*>(stored);
-    std::int8_t* codes = room(n);
+  const int8_t* read(size_t first_block, size_t n) {
+    const uint8_t* stored = data_ + first_block * block_bytes_;
+    if (scale_ == 0) return reinterpret_cast<const int8_t*>(stored);
+    int8_t* codes = room(n);
     copy(first_block, n, codes);
     return codes;
   }
-  const std::int8_t* read(std::span<const std::uint32_t> blocks) {
+  const int8_t* read(std::span<const uint32_t> blocks) {
     bool consecutive = true;
-    for (std::size_t i = 1; i < blocks.size(); ++i) {
+    for (size_t i = 1; i < blocks.size(); ++i) {
       consecutive = consecutive && blocks[i] == blocks[i - 1] + 1;
     }
     if (consecutive) return read(blocks[0], blocks.size());
-    std::int8_t* codes = room(blocks.size());
-    for (std::size_t i = 0; i < blocks.size(); ++i) copy(blocks[i], 1, codes + i * code_bytes_);
+    int8_t* codes = room(blocks.size());
+    for (size_t i = 0; i < blocks.size(); ++i) copy(blocks[i], 1, codes + i * code_bytes_);
     return codes;
   }
 
  private:
-  void copy(std::size_t first_block, std::size_t n, std::int8_t* codes) const {
-    const std::uint8_t* stored = data_ + first_block * block_bytes_;
+  void copy(size_t first_block, size_t n, int8_t* codes) const {
+    const uint8_t* stored = data_ + first_block * block_bytes_;
     if (scale_ == 0) {
       std::memcpy(codes, stored, n * block_bytes_);
     } else {
       kernels::active().code_unpack4(stored, n, dim_, scale_, codes);
     }
   }
-  std::int8_t* room(std::size_t blocks) {
+  int8_t* room(size_t blocks) {
     room_.resize(std::max(room_.size(), blocks * code_bytes_ / sizeof(CodeVector)));
-    return reinterpret_cast<std::int8_t*>(room_.data());
+    return reinterpret_cast<int8_t*>(room_.data());
   }
 
-  const std::uint8_t* data_;
-  std::size_t dim_;
+  const uint8_t* data_;
+  size_t dim_;
   int scale_;
-  std::size_t block_bytes_;  // as stored
-  std::size_t code_bytes_;   // of a block as int8 codes
+  size_t block_bytes_;  // as stored
+  size_t code_bytes_;   // of a block as int8 codes
   std::vector<CodeVector> room_;
 };
 
@@ -206,32 +204,31 @@ class PrototypeScan {
   // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16. With
   // RowLandmarks::row_counts, calls must ascend.
   void scan(Range rows) {
-    const std::size_t chunk_rows = scan_.chunk_rows();
-    for (std::size_t row = rows.begin; row < rows.end; row += chunk_rows) {
-      const std::size_t n = std::min(chunk_rows, rows.end - row);
+    const size_t chunk_rows = scan_.chunk_rows();
+    for (size_t row = rows.begin; row < rows.end; row += chunk_rows) {
+      const size_t n = std::min(chunk_rows, rows.end - row);
       scan_.choose_prefix(row - rows.begin);
       chunk_ = {row, row + n};
       of_chunk_.clear();
       scan_.compare(
           blocks_.read(row / kPackedRows, packed_blocks(n)), n,
-          [&](std::size_t q) { return nearest_.limit(q); },
-          [&](std::size_t q, std::int32_t distance, std::size_t i) {
+          [&](size_t q) { return nearest_.limit(q); },
+          [&](size_t q, int32_t distance, size_t i) {
             offer(nearest_[q], distance, row_at(row + i));
           });
     }
   }
   // Compares some queries with the `rows` rows of some blocks, all full but the last.
-  void scan(std::span<const std::uint32_t> queries, std::span<const std::uint32_t> blocks,
-            std::size_t rows) {
-    constexpr std::size_t kChunk = 32;
+  void scan(std::span<const uint32_t> queries, std::span<const uint32_t> blocks, size_t rows) {
+    constexpr size_t kChunk = 32;
     scan_.select(queries);
-    for (std::size_t first = 0; first < blocks.size(); first += kChunk) {
+    for (size_t first = 0; first < blocks.size(); first += kChunk) {
       const auto chunk = blocks.subspan(first, std::min(kChunk, blocks.size() - first));
-      const std::size_t n = std::min(chunk.size() * kPackedRows, rows - first * kPackedRows);
+      const size_t n = std::min(chunk.size() * kPackedRows, rows - first * kPackedRows);
       scan_.compare(
-          blocks_.read(chunk), n, [&](std::size_t i) { return nearest_.limit(queries[i]); },
-          [&](std::size_t i, std::int32_t distance, std::size_t at) {
-            const std::size_t row = chunk[at / kPackedRows] * kPackedRows + at % kPackedRows;
+          blocks_.read(chunk), n, [&](size_t i) { return nearest_.limit(queries[i]); },
+          [&](size_t i, int32_t distance, size_t at) {
+            const size_t row = chunk[at / kPackedRows] * kPackedRows + at % kPackedRows;
             offer(nearest_[queries[i]], distance, row_at(row));
           });
     }
@@ -239,12 +236,12 @@ class PrototypeScan {
 
  private:
   // Offers the landmark of a row to a query, unless the row is padding.
-  void offer(TopK best, std::int32_t distance, Row row) {
+  void offer(TopK best, int32_t distance, Row row) {
     const LandmarkIndex landmark = landmark_of(row);
     if (landmark >= landmarks_.end) return;
     if (landmarks_.among != nullptr && !(*landmarks_.among)[landmark.value]) return;
-    const std::int64_t id =
-        landmarks_.ids != nullptr ? landmarks_.ids[landmark.value] : std::int64_t{landmark.value};
+    const int64_t id =
+        landmarks_.ids != nullptr ? landmarks_.ids[landmark.value] : int64_t{landmark.value};
     if (id < 0) return;
     if (several_rows_) {
       best.offer_distinct(distance, id);
@@ -261,12 +258,12 @@ class PrototypeScan {
     return of_chunk_[row.value - chunk_.begin];
   }
   void count_chunk() {
-    const std::uint8_t* counts = landmarks_.row_counts;
+    const uint8_t* counts = landmarks_.row_counts;
     while (counted_ + counts[landmark_.value] <= chunk_.begin)
       counted_ += counts[landmark_.value++];
     LandmarkIndex landmark = landmark_;
-    std::size_t end = counted_ + counts[landmark.value];
-    for (std::size_t row = chunk_.begin; row < chunk_.end; ++row) {
+    size_t end = counted_ + counts[landmark.value];
+    for (size_t row = chunk_.begin; row < chunk_.end; ++row) {
       if (row == end) end += counts[++landmark.value];
       of_chunk_.push_back(landmark);
     }
@@ -282,7 +279,7 @@ class PrototypeScan {
   Range chunk_{};
   std::vector<LandmarkIndex> of_chunk_;  // the landmarks of its rows
   LandmarkIndex landmark_;               // no row of the chunk is of an earlier one
-  std::size_t counted_ = 0;              // rows of earlier landmarks
+  size_t counted_ = 0;                   // rows of earlier landmarks
 };
 
 // Compares all queries with all prototypes.
@@ -291,11 +288,11 @@ void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, 
 
 // Finds the nearest landmarks among all prototypes (protomark/search.h), whatever options.recall
 // and options.nprobe say. Throws std::invalid_argument if the arguments do not fit.
-Matches search_exact(const PackedPrototypes& prototypes, Codes queries, std::size_t k,
+Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
                      const SearchOptions& options);
 
 // Returns room for the answer of a search. Throws std::invalid_argument if its arguments do not
 // fit.
-Matches check_search(std::size_t dim, Codes queries, std::size_t k, const SearchOptions& options);
+Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options);
 
 }  // namespace protomark
