@@ -122,7 +122,10 @@ def structure_of(poses: np.ndarray, points: np.ndarray) -> Structure:
     ids = structure.create(points)
     for i, pose in enumerate(poses):
         pixels = PINHOLE.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
-        frame = Frame(i, str(i), float(i), 1, pixels.astype(np.float32), PINHOLE.rays(pixels))
+        frame = Frame(
+            *(i, str(i), float(i), 1, pixels.astype(np.float32), PINHOLE.rays(pixels)),
+            np.ones(len(ids)),
+        )
         frame = frame.at(pose)
         structure.frames.append(frame)
         structure.observe(frame, np.arange(len(ids)), ids)

@@ -8,12 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.geometry.absolute_pose import (
-    MAX_ITERATIONS,
-    MIN_ITERATIONS,
-    estimate_pose,
-    reprojection_error,
-)
+from protomark.geometry.absolute_pose import MAX_ITERATIONS, MIN_ITERATIONS, estimate_pose
+from protomark.geometry.bundle import Bundle
 from protomark.geometry.camera import Camera
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 from protomark.mapping.frame import Array, Frame, Ids
@@ -34,6 +30,7 @@ _MIN_LEAD = 1.05
 _MIN_LEAD_TWO_WITNESSES = 1.2
 _MAX_WITNESSES = 4
 _MIN_COMMON = 40
+_REFINE_STEPS = 10
 # Of more waiting frames every second one is dropped; it is retried at the end as a lost frame.
 _MAX_WAITING = 40
 # A new frame is paired with at most so many waiting ones, from the oldest to the newest.
@@ -95,19 +92,19 @@ class Initialiser:
             self.best_parallax = max(self.best_parallax, *parallax)
             return None
         witnesses = self._witnesses(first, second)
-        scores = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
-        best = int(np.argmax([support for support, _ in scores]))
-        support, share = scores[best]
-        if share < _MIN_SUPPORT:
+        supports = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
+        best = max(supports, key=lambda support: support.score)
+        if best.share < _MIN_SUPPORT:
             return None
-        self.best_parallax = max(self.best_parallax, parallax[best])
-        if parallax[best] < MIN_PARALLAX:
+        parallax = [self._parallax(best.pose, *rays)]
+        self.best_parallax = max(self.best_parallax, *parallax)
+        if parallax[0] < MIN_PARALLAX:
             return None
         lead = _MIN_LEAD if len(witnesses) > 2 else _MIN_LEAD_TWO_WITNESSES
-        for pose, (rival, _) in zip(candidates, scores, strict=True):
-            if support < lead * rival and not _same_pose(pose, candidates[best]):
+        for rival in supports:
+            if best.score < lead * rival.score and not _same_pose(rival.pose, best.pose):
                 return None
-        return candidates[best]
+        return best.pose
 
     def _candidates(self, one: Frame, other: Frame, rows: Ids) -> list[Array]:
         """The relative pose that fits best, and those that a planar scene admits."""
@@ -143,7 +140,8 @@ class Initialiser:
                 continue
             pose[:, 3] /= length
             good = self._verify(pose, ray_a, ray_b)[0]
-            if good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
+            new = not any(_same_pose(pose, other) for other in out)
+            if new and good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
                 out.append(pose)
         return out
 
@@ -187,30 +185,60 @@ class Initialiser:
         rows: Ids,
         pose: Array,
         witnesses: list[tuple[Frame, Ids]],
-    ) -> tuple[float, float]:
-        """How well the landmarks of a relative pose fit the witnesses: a score, and a share.
+    ) -> _Support:
+        """How well a relative pose, adjusted together with the witnesses, fits what these see.
 
         The score counts each landmark as 1 minus its squared error over the squared limit.
         """
-        good, depth, _ = self._verify(pose, one.rays[rows[:, 0]], other.rays[rows[:, 1]])
-        points = np.full((len(one.keypoints), 3), np.nan)
-        at = rows[good, 0]
-        points[at] = np.column_stack([one.rays[at], np.ones(len(at))]) * depth[good, None]
+        rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
+        verified, depth, _ = self._verify(pose, *rays)
+        # Noise moves what is far away beyond infinity.
+        depth = np.where(depth > 0, depth, np.median(depth[verified]))
+        good = epipolar_error(pose[:, :3], pose[:, 3], *rays) * self._focal <= self.max_error
+        at, count = rows[good, 0], int(good.sum())
+        landmark = np.full(len(one.keypoints), -1)
+        landmark[at] = np.arange(count)
+        points = np.column_stack([one.rays[at], np.ones(count)]) * depth[good, None]
+        poses, observed = [np.eye(3, 4), pose], [landmark[at]] * 2
+        seen = [one.rays[at], other.rays[rows[good, 1]]]
         limit = 0.75 * self.max_error
-        score, inliers, total = 0.0, 0, 0
         for witness, pairs in witnesses:
-            pairs = pairs[np.isfinite(points[pairs[:, 0], 0])]
+            pairs = pairs[landmark[pairs[:, 0]] >= 0]
             if len(pairs) < _MIN_COMMON:
                 continue
-            pixels = witness.keypoints[pairs[:, 1]].astype(np.float64)
-            seen = points[pairs[:, 0]]
-            total += len(seen)
-            found = estimate_pose(pixels, seen, self.camera, limit)
-            if found is not None:
-                error = reprojection_error(found.cam_from_world, pixels, seen, self.camera)
-                score += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
-                inliers += int((error <= limit).sum())
-        return score, inliers / max(total, 1)
+            pixels, ids = witness.keypoints[pairs[:, 1]].astype(np.float64), landmark[pairs[:, 0]]
+            found = estimate_pose(pixels, points[ids], self.camera, limit)
+            observed.append(ids)
+            seen.append(witness.rays[pairs[:, 1]])
+            poses.append(poses[0] if found is None else found.cam_from_world)
+        counts = [len(ids) for ids in observed]
+        bundle = Bundle(
+            poses=np.array(poses),
+            moving=np.arange(len(poses)) > 0,
+            camera=np.zeros(len(poses), np.int64),
+            lenses=np.array([[self._focal, 0.0]]),
+            refined=np.zeros(1, bool),
+            points=points,
+            frame=np.repeat(np.arange(len(poses)), counts),
+            point=np.concatenate(observed),
+            pixels=self._focal * np.concatenate(seen),
+            sigma=np.ones(sum(counts)),
+        )
+        bundle.adjust(_REFINE_STEPS, 0.5 * self.max_error)
+        error = bundle.errors()[bundle.frame > 1]
+        length = np.linalg.norm(bundle.poses[1, :, 3])
+        refined = np.column_stack([bundle.poses[1, :, :3], bundle.poses[1, :, 3] / length])
+        score = float(np.maximum(1 - (error / limit) ** 2, 0).sum())
+        return _Support(refined, score, float((error <= limit).mean()) if len(error) else 0.0)
+
+
+@dataclass
+class _Support:
+    """How well a relative pose fits the witnesses."""
+
+    pose: Array  # (3, 4) float64, adjusted
+    score: float
+    share: float  # of landmarks that fit
 
 
 def _same_pose(first: Array, second: Array) -> bool:
