@@ -87,18 +87,18 @@ class Initialiser:
         candidates = self._candidates(one, other, rows)
         if not candidates:
             return None
-        parallax = [self._parallax(pose, *rays) for pose in candidates]
-        if max(parallax) < MIN_PARALLAX:
-            self.best_parallax = max(self.best_parallax, *parallax)
+        parallax = self._parallax(candidates[0], *rays)
+        if parallax < MIN_PARALLAX:
+            self.best_parallax = max(self.best_parallax, parallax)
             return None
         witnesses = self._witnesses(first, second)
         supports = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
         best = max(supports, key=lambda support: support.score)
         if best.share < _MIN_SUPPORT:
             return None
-        parallax = [self._parallax(best.pose, *rays)]
-        self.best_parallax = max(self.best_parallax, *parallax)
-        if parallax[0] < MIN_PARALLAX:
+        parallax = self._parallax(best.pose, *rays)
+        self.best_parallax = max(self.best_parallax, parallax)
+        if parallax < MIN_PARALLAX:
             return None
         lead = _MIN_LEAD if len(witnesses) > 2 else _MIN_LEAD_TWO_WITNESSES
         for rival in supports:

@@ -191,9 +191,6 @@ class Mapper:
                 other = self.tracker.track_local_map(frame, rough.pose) if rough else None
                 if found is None or (other and len(other.matches) > len(found.matches)):
                     found = other
-            if found is None:
-                window = [self.structure.frames[i] for i in self._window()[-3:]]
-                found = self.tracker.track_by_keyframes(frame, window) if window else None
         return found
 
     def _observe(self, frame: Frame, found: TrackedPose) -> int:
@@ -434,6 +431,8 @@ class Mapper:
             culling.cull_landmarks(
                 self.structure, self.memory, self.structure.ids, self.options.min_angle
             )
+        if self.structure.frames:
+            self._adjust_global_bundle(1)
         for frame in self.structure.frames:
             frame.leave_window()
         for name, seconds in self.clock.lap().items():

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.extras import optional
 from protomark.geometry.absolute_pose import estimate_pose, refine_pose, reprojection_error
 from protomark.geometry.neighbours import near_pairs, runs
 from protomark.mapping.frame import Array, Frame, Ids
-from protomark.mapping.initialisation import RATIO
 from protomark.mapping.memory import Memory
 from protomark.mapping.structure import Structure
-from protomark.tracks.matching import mutual_matches
 
 # Radius of the search around projected landmarks, as a share of the image's longer side: under a
 # predicted pose, and under a pose found by RANSAC.
@@ -29,7 +25,6 @@ _SAME_PLACE = 3.0
 _SAMPLE = 997
 # This share of the keypoints, or of the landmarks in view if these are fewer, must match.
 _MIN_SEEN = 0.03
-_MIN_KNOWN = 10
 # This share of the matches that should be right must agree with a pose found anywhere in the map.
 _MIN_EXPECTED = 0.2
 
@@ -101,50 +96,6 @@ class Tracker:
         found = self._solve(frame, _unique_landmarks(rows, ids[rows, 0]))
         expected = self.memory.expected(distances[rows])
         return found if found and len(found.matches) >= _MIN_EXPECTED * expected else None
-
-    def track_by_keyframes(self, frame: Frame, keyframes: Sequence[Frame]) -> TrackedPose | None:
-        """The pose of a frame by matches with keyframes, whether these have landmarks or not.
-
-        A frame may see few landmarks of a map but much of what its neighbour saw first. Matches
-        without a landmark must lie near their epipolar lines.
-        """
-        poselib = optional("poselib")
-        rows, ids, pairs, poses = [], [], [], []
-        for number, keyframe in enumerate(keyframes):
-            assert keyframe.descriptors is not None
-            assert frame.descriptors is not None
-            matches = mutual_matches(keyframe.descriptors, frame.descriptors, RATIO)
-            landmarks = keyframe.landmarks[matches[:, 0]]
-            rows.append(matches[landmarks >= 0, 1])
-            ids.append(landmarks[landmarks >= 0])
-            pair, free = poselib.PairwiseMatches(), matches[landmarks < 0]
-            pair.cam_id1, pair.cam_id2 = number, 0
-            pair.x1 = keyframe.keypoints[free[:, 0]].astype(np.float64)
-            pair.x2 = frame.keypoints[free[:, 1]].astype(np.float64)
-            pairs.append(pair)
-            pose = poselib.CameraPose()
-            pose.R, pose.t = keyframe.pose[:, :3], keyframe.pose[:, 3]
-            poses.append(pose)
-        known = _unique_landmarks(np.concatenate(rows), np.concatenate(ids))
-        if len(known) < _MIN_KNOWN:
-            return None
-        limit = self.structure.tolerance(frame.camera_id, self.max_error)
-        cameras = [self.structure.cameras[k.camera_id].as_dict() for k in (frame, *keyframes)]
-        pose, found = poselib.estimate_hybrid_pose(
-            frame.keypoints[known.rows].astype(np.float64),
-            self.structure.positions[known.ids],
-            pairs,
-            cameras[0],
-            poses,
-            cameras[1:],
-            {"max_reproj_error": limit, "max_epipolar_error": limit, "seed": 0},
-            {},
-        )
-
-        inliers = np.asarray(found["inliers"], bool)
-        if inliers.sum() < _MIN_KNOWN:
-            return None
-        return TrackedPose(np.asarray(pose.Rt, np.float64), known.where(inliers))
 
     def track_among(self, frame: Frame, predicted: Array, among: Ids) -> TrackedPose | None:
         """The pose of a frame near a predicted one, by these landmarks only."""
