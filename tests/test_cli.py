@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import protomark as pm
 from conftest import balanced_encoder, protomark, random_descriptors, random_layers
 from protomark import sample
+from protomark.cli import terminal
 from protomark.geometry.camera import Camera
 from protomark.maps.build import build_map
 from protomark.tracks.file import Tracks
@@ -422,3 +424,36 @@ def test_sigterm_is_ctrl_c_even_after_pycolmap_was_imported() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("stopped\n", "")
+
+
+@pytest.mark.parametrize("module", ["protomark._core", "typer", "protomark.cli.train"])
+def test_ctrl_c_during_imports_ends_without_a_traceback(module: str) -> None:
+    program = f"""
+import os, signal, sys
+class Finder:
+    def find_spec(name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder)
+sys.argv = ["/usr/bin/protomark", "--help"]
+from protomark.__main__ import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_progress_of_a_redirected_command_is_plain_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(terminal, "error_console", Console(stderr=True))
+    with terminal.progress_bar("plane: ") as report:
+        for step in range(12):
+            now[0] += 2
+            report("match, 3 registered", step, 20 if step < 6 else 0)
+    assert capsys.readouterr().err.splitlines() == [
+        "plane: match, 3 registered: 4 of 20",
+        "plane: match, 3 registered: 9",
+    ]

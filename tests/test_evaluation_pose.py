@@ -152,14 +152,6 @@ def test_scene_depth_against_every_observation() -> None:
     assert scene_depth(tracks) == pytest.approx(np.median(depths))
 
 
-def test_camera_models_that_no_pose_can_be_found_for_are_named() -> None:
-    tracks = ring_scene(keyframes=3)
-    tracks.cameras[1] = replace(CAMERA, model="FOV", params=(500.0, 500.0, 320.0, 240.0, 0.1))
-    chosen = choose_methods(method_choices(), ["first"])
-    with pytest.raises(ValueError, match=r"camera model FOV.*undistort"):
-        evaluate(tracks, "ring", chosen, EvaluationOptions(seeds=[0]))
-
-
 def test_frames_are_whole_query_keyframes() -> None:
     tracks = ring_scene(keyframes=40)
     part = split(tracks, 0)

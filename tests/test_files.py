@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from protomark.files import check_folder, check_outputs, replacing, write_text
+from protomark.files import check_folder, check_outputs, only_writer, replacing, write_text
+from test_tracks_command import fails, run
+from tracks_scene import write_sequence
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -26,6 +28,42 @@ def test_links_are_written_through_and_devices_stay(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="not a regular file"):
         write_text(tmp_path / "pipe", "x")
     assert (tmp_path / "pipe").is_fifo()
+
+
+def test_one_process_at_a_time_writes_to_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "folder"
+    with only_writer(folder):
+        with pytest.raises(BlockingIOError, match=rf"folder: process {os.getpid()} on .* writing"):
+            only_writer(folder).__enter__()
+        with only_writer(folder, "one file"), only_writer(folder, "another"):
+            pass
+        (folder / "a").touch()
+    assert os.listdir(folder) == ["a"]
+    (folder / "a").unlink()
+    (folder / ".lock").touch()  # of a process that was killed
+    with only_writer(folder):
+        pass
+    folder.rmdir()
+    with pytest.raises(ValueError), only_writer(folder):  # noqa: PT011, PT012
+        assert folder.is_dir()
+        raise ValueError
+    assert not folder.exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match="file is not a folder"):
+        only_writer(tmp_path / "file").__enter__()
+
+
+def test_commands_do_not_write_where_another_does(tmp_path: Path) -> None:
+    sequence, out = write_sequence(tmp_path / "plane", count=2), tmp_path / "out"
+    images = sequence / "images"
+    with only_writer(out), only_writer(out, "plane.orb.safetensors"):
+        for done in (
+            run(images, "-o", out, "--camera", "PINHOLE:300,300,160,120", command="map"),
+            run(tmp_path / "map.pmk", images, "-o", out, command="localize"),
+            run(sequence, "-o", out, "-d", "orb"),
+        ):
+            fails(done, f"out: process {os.getpid()}", "wait for it, or name another folder")
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])

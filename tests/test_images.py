@@ -13,7 +13,7 @@ import pytest
 
 from protomark.features.extractor import Extractor
 from protomark.features.images import image_names, passed_over, read_gray
-from protomark.mapping.source import ImageFolder
+from protomark.mapping.source import EXIF, ImageFolder
 from tracks_scene import texture
 
 
@@ -23,17 +23,20 @@ def encoded(suffix: str, image: np.ndarray) -> bytes:
 
 def test_links_are_followed_and_hidden_files_are_not_taken(tmp_path: Path) -> None:
     folder, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
-    for path in (folder / "@eaDir", folder / ".trash", elsewhere):
+    for path in (folder / "@eaDir", folder / ".trash", folder / "Depth_maps", elsewhere):
         path.mkdir(parents=True)
     for name in ("10.jpg", "9.jpg", "1²3.JPE", "._9.jpg", "@eaDir/a.jpg", ".trash/a.jpg", "a.heic"):
         (folder / name).touch()
     (elsewhere / "b.png").touch()
+    (folder / "Depth_maps" / "9.png").touch()
     (folder / "linked").symlink_to(elsewhere)
     (folder / "circle").symlink_to(folder)
     with open(os.fsencode(folder) + b"/caf\xe9.jpg", "wb"):
         pass
     assert image_names(folder) == ["1²3.JPE", "9.jpg", "10.jpg", "linked/b.png"]
     assert "1 heic" in passed_over(folder)
+    assert "1 folder Depth_maps/" in passed_over(folder)
+    assert image_names(folder / "Depth_maps") == ["9.png"]  # who names it wants it
     assert "1 whose name is not UTF-8 (caf" in passed_over(folder)
     assert passed_over(elsewhere) == ""
 
@@ -82,6 +85,21 @@ def test_an_overwritten_opencv_is_named(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(Extractor("orb")(texture(200)))
     with pytest.raises(ModuleNotFoundError, match=r"no BRISK_create.*uninstall all of them"):
         Extractor("freak")
+
+
+def test_exif_data_are_those_of_the_first_image_that_can_be_read(tmp_path: Path) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x8769] = {0xA405: 34}  # focal length of 35 mm film
+    Image.fromarray(texture(320)).save(tmp_path / "2.jpg", exif=exif)
+    cv2.imwrite(str(tmp_path / "1.jpg"), texture(64))  # of another size
+    Image.fromarray(texture(320)).save(tmp_path / "3.jpg", exif=exif)
+    for name in ("0.jpg", "._1.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    camera, origin = ImageFolder(tmp_path).guess_camera()
+    assert origin == EXIF
+    assert camera.params[0] == pytest.approx(34 / 43.27 * np.hypot(320, 320), rel=0.02)
 
 
 def test_the_most_frequent_size_is_that_of_the_folder(tmp_path: Path) -> None:

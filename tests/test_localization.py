@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import pickle
 import re
 import shutil
@@ -28,11 +29,14 @@ from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose import camera_centers, pose_error
 from protomark.geometry.pose_files import read_poses
 from protomark.localization import Localization, Localizer, PosePrior
+from protomark.localization.batch import LocalizationRequest, localize_files
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
 from protomark.tracks.extract import TracksOptions, find_sequence
 from protomark.tracks.file import Tracks
 from protomark.tracks.make import make_tracks
+from test_tracks_command import fails
+from test_tracks_command import run as run_command
 from tracks_scene import PINHOLE, poses, quaternion, render, texture, write_model, write_sequence
 
 KEYPOINTS = 600
@@ -209,8 +213,6 @@ def test_wrong_use(scene: pm.PrototypeMap, encoder: pm.Encoder, images: list[Any
     localizer = Localizer(scene)
     with pytest.raises(ValueError, match="320 x 240 pixels, but its camera 640 x 480"):
         localizer.localize(images[0], replace(PINHOLE, width=640, height=480))
-    with pytest.raises(ValueError, match="undistort"):
-        localizer.localize(images[0], replace(PINHOLE, model="FOV", params=(*PINHOLE.params, 1.0)))
     with pytest.raises(ValueError, match="PINHOLE has 4 parameters, not 3"):
         localizer.localize(images[0], replace(PINHOLE, params=(300.0, 160.0, 120.0)))
     with pytest.raises(ValueError, match="uint8"):
@@ -314,6 +316,44 @@ def query(folder: Path, scene: pm.PrototypeMap, images: list[Any], tmp_path: Pat
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["localize", *map(str, arguments)])
+
+
+def test_what_is_no_image_of_the_scene_is_named(query: Path) -> None:
+    name = os.fsencode(query / "images") + b"/caf\xe9.png"
+    shutil.copy(query / "images" / "2.png", name)
+    (query / "images" / "masks").mkdir()
+    shutil.copy(query / "images" / "2.png", query / "images" / "masks")
+    for command, arguments in (
+        ("localize", [query / "scene.pmk", query / "images", "-o", query / "o"]),
+        ("map", [query / "images", "-o", query / "m", "--camera", PINHOLE, "-d", "orb"]),
+    ):
+        done = run_command(*arguments, command=command)
+        assert "1 whose name is not UTF-8 (caf\\udce9.png)" in done.stderr
+        assert "1 folder masks/" in done.stderr
+    assert len(list(csv.DictReader((query / "o" / "poses.csv").open()))) == 3
+    done = run_command(
+        query / "scene.pmk", os.fsdecode(name), "-o", query / "x", command="localize"
+    )
+    fails(done, "the name of this image is not UTF-8, rename it")
+
+
+@pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
+def test_what_was_localized_is_written_whatever_ends_the_run(
+    query: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    def until_the_third(self: Localizer, image: NDArray[np.uint8], *rest: Any, **how: Any) -> Any:
+        if np.array_equal(image, third):
+            raise error
+        return localize(self, image, *rest, **how)
+
+    localize, third = Localizer.localize, cv2.imread(str(query / "images" / "3.png"), 0)
+    monkeypatch.setattr(Localizer, "localize", until_the_third)
+    request = LocalizationRequest(query / "scene.pmk", [query / "images"])
+    with pytest.raises(error):
+        localize_files(request, query / "out")
+    rows = list(csv.DictReader((query / "out" / "poses.csv").open()))
+    assert [row["image"] for row in rows] == ["1.png", "2.png"]
+    assert all(row["accepted"] == "1" for row in rows)
 
 
 def test_command(query: Path) -> None:

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -7,8 +8,13 @@ from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
+from protomark.mapping import source
+from protomark.mapping.history import FrameRecord
+from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
+from protomark.mapping.options import MappingOptions
 from protomark.mapping.source import ImageFolder, Video, open_source
+from protomark.mapping.trust import WAITING, no_map
 from tracks_scene import PINHOLE
 
 
@@ -128,8 +134,6 @@ def test_poses_that_are_none(tmp_path, content, say):
 
 
 def test_images_come_in_natural_order_and_know_their_times(tmp_path):
-    import cv2
-
     for name in ("img10.png", "img2.png", "notes.txt"):
         if name.endswith("png"):
             cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
@@ -149,8 +153,6 @@ def test_images_come_in_natural_order_and_know_their_times(tmp_path):
 
 
 def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
-    import cv2
-
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 6), np.uint8))
     (tmp_path / "b.png").write_bytes(b"no image")
     pictures = list(open_source(tmp_path).images())
@@ -160,8 +162,6 @@ def test_an_image_that_cannot_be_read_is_a_picture_with_a_reason(tmp_path):
 
 
 def video_of(path, frames):
-    import cv2
-
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
     for value in frames:
         writer.write(np.full((48, 64, 3), value, np.uint8))
@@ -184,6 +184,43 @@ def test_a_video_frame_by_frame(tmp_path):
     assert [p.index for p in video.images(7)] == [7, 8, 9]
 
 
+class Capture:
+    """A video of six frames that shows each at its own time, in milliseconds."""
+
+    def __init__(self, times):
+        self.times, self.number = times, -1
+
+    def grab(self):
+        self.number += 1
+        return self.number < len(self.times)
+
+    def get(self, what):
+        return self.times[self.number] if what == cv2.CAP_PROP_POS_MSEC else 10.0
+
+    def retrieve(self):
+        return True, np.zeros((48, 64), np.uint8)
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ([0, 100, 200, 400, 600, 1000], [0, 0.1, 0.2, 0.4, 0.6, 1.0]),  # a varying rate
+        ([0, 0, 0, 0, 0, 0], [0, 0.1, 0.2, 0.3, 0.4, 0.5]),  # a decoder that does not know
+        ([0, 100, 90, -1, np.nan, 800], [0, 0.1, 0.2, 0.3, 0.4, 0.8]),
+    ],
+)
+def test_times_of_a_video_are_those_of_its_frames(monkeypatch, tmp_path, times, expected):
+    monkeypatch.setattr(source, "_open_video", lambda path: Capture(times))
+    video = Video(tmp_path / "a.mp4")
+    np.testing.assert_allclose([time for _, time in video.listing()], expected)
+    np.testing.assert_allclose([i.time for i in video.images(backward=True)], expected[::-1])
+    other = Video(tmp_path / "a.mp4", every=2)
+    np.testing.assert_allclose([i.time for i in other.images()], expected[::2])
+
+
 def test_a_file_that_is_no_video(tmp_path):
     path = tmp_path / "walk.mp4"
     path.write_bytes(b"\0" * 1000)
@@ -194,3 +231,11 @@ def test_a_file_that_is_no_video(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="no images"):
         open_source(tmp_path / "empty")
+
+
+def test_a_parallax_that_is_too_small_is_not_rounded_up(tmp_path):
+    mapper = Mapper(MappingOptions(), PINHOLE)
+    mapper.initialiser.best_parallax = 1.98
+    mapper.history.records = {name: FrameRecord(0, name, WAITING) for name in "ab"}
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((240, 320), np.uint8))
+    assert "has 1.9 degrees of parallax, 2 are" in no_map(mapper, ImageFolder(tmp_path))

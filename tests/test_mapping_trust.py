@@ -10,20 +10,24 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping_scene import show, walk, write_images
+from mapping_scene import interrupted_at, show, walk, write_images
 from protomark.features.static_regions import describe, outside, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
+from protomark.geometry.colmap import read_model
 from protomark.geometry.given_poses import agreeing, misfit, pose_errors
 from protomark.geometry.pose import camera_centers, quaternion_from_rotation, transform
+from protomark.localization import Localizer
 from protomark.mapping.frame import Frame, InputImage
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
+from protomark.mapping.request import MapRequest
 from protomark.mapping.self_calibration import (
     Calibration,
     elect_focal_length,
     is_plausible,
 )
+from protomark.mapping.session import make_map
 from protomark.mapping.source import open_source
 from protomark.mapping.structure import Structure
 from protomark.mapping.survey import MatchedPair
@@ -329,24 +333,43 @@ def test_the_size_of_most_images_counts(tmp_path: Path) -> None:
     assert "AlbumArt.png: 160x120 pixels, but the camera has 320x240" in done.stdout
 
 
-def test_a_map_takes_one_camera(tmp_path: Path) -> None:
-    images = write_images(tmp_path / "images", walk(4))
-    model = tmp_path / "model"
+def test_each_image_has_its_own_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    poses, images, model = walk(COUNT), tmp_path / "images", tmp_path / "model"
+    cameras = [PINHOLE, Camera("SIMPLE_RADIAL", 400, 300, (330.0, 200.0, 150.0, 0.05))]
+    images.mkdir()
+    for i, pose in enumerate(poses):
+        cv2.imwrite(str(images / f"img{i + 1}.png"), show(pose, cameras[i % 2]))
     model.mkdir()
-    images_txt(walk(4), model / "images.txt")
-    text = (model / "images.txt").read_text().splitlines()
-    for camera in range(1, 5):
-        text[2 * camera - 2] = text[2 * camera - 2].replace(" 1 img", f" {camera} img")
-    (model / "images.txt").write_text("\n".join(text) + "\n")
-    lines = [f"{i} PINHOLE 320 240 {300 + 10 * i} 300 160 120" for i in range(1, 5)]
+    images_txt(poses, model / "images.txt")
+    text = (model / "images.txt").read_text()
+    for i in range(2, COUNT + 1, 2):
+        text = text.replace(f" 1 img{i}.png", f" 2 img{i}.png")
+    (model / "images.txt").write_text(text)
+    lines = [f"{i} {camera}" for i, camera in enumerate(cameras, 1)]
     (model / "cameras.txt").write_text("\n".join(lines) + "\n")
-    done = run(images, "-o", tmp_path / "x", "--poses", model, "-d", "orb")
-    fails(done, "4 different cameras", "--camera", "PINHOLE 320 240 310 300 160 120")
+    options = MappingOptions(descriptor="orb", max_keypoints=600)
+    for given in (None, model):  # found poses, and given ones
+        scene = tmp_path / f"scene-{given is None}"
+        figures = make_map(MapRequest(images, scene, options, camera=str(model), poses=given))
+        assert figures["registered"] == COUNT
+        assert error_of(scene, poses) < 0.01
+        made = read_model(scene / "sparse")
+        used = {n: made.cameras[int(i)] for n, i in zip(made.names, made.camera_ids, strict=True)}
+        assert used == {f"img{i + 1}.png": cameras[i % 2] for i in range(COUNT)}
+        assert set(Localizer(scene).cameras.cameras) == set(cameras)
+    request = MapRequest(images, tmp_path / "resumed", options, camera=str(model))
+    interrupted_at(6, request, monkeypatch)
+    resumed = make_map(replace(request, resume=True))
+    assert (
+        resumed["landmarks"]
+        == json.loads((tmp_path / "scene-True" / "report.json").read_text())["landmarks"]
+    )
     # COLMAP gives each image its own camera, and these hardly differ.
-    lines = [f"{i} PINHOLE 320 240 {300 + i / 10} 300 160 120" for i in range(1, 5)]
+    lines = [f"{i} PINHOLE 320 240 {300 + i / 10} 300 160 120" for i in range(1, 3)]
     (model / "cameras.txt").write_text("\n".join(lines) + "\n")
-    found = open_source(images).find_camera(read_cameras(str(model)))
-    assert found.params == (300.3, 300, 160, 120)
+    source = open_source(images)
+    found = source.find_camera(read_cameras(str(model)))
+    assert set(source.cameras.values()) == {found}
 
 
 def test_one_image_makes_no_map(tmp_path: Path) -> None:

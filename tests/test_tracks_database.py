@@ -91,6 +91,18 @@ def test_reading_writes_nothing(scene: tuple[Path, Tracks], tmp_path: Path) -> N
     assert [p.name for p in tmp_path.iterdir()] == ["changed.db"]
 
 
+def test_a_database_that_is_being_written(scene: tuple[Path, Tracks], tmp_path: Path) -> None:
+    path = change(scene, tmp_path, "PRAGMA journal_mode = DELETE")
+    writer = sqlite3.connect(path, isolation_level=None)
+    writer.execute("BEGIN EXCLUSIVE")
+    writer.execute("UPDATE images SET name = name || 'x'")
+    with pytest.raises(ValueError, match=r"changed\.db is locked: another process writes to it"):
+        tracks_from_database(path, scene[0] / "points", "orb")
+    writer.execute("ROLLBACK")
+    writer.close()
+    assert len(tracks_from_database(path, scene[0] / "points", "orb").keypoints)
+
+
 def test_other_descriptor(scene: tuple[Path, Tracks]) -> None:
     with pytest.raises(ValueError, match=r"32 bytes, but freak has 64.*orb or latch or teblid"):
         tracks_from_database(scene[0] / "database.db", scene[0] / "points", "freak")

@@ -8,6 +8,9 @@ scene.add(landmark_ids, descriptors)
 ids, distances = scene.search(new_descriptors, k=2)
 """
 
+from protomark import interrupt as _interrupt  # noqa: F401  (first: see there)
+
+# isort: split
 from importlib import import_module as _import_module
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING

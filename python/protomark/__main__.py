@@ -13,8 +13,6 @@ def main() -> None:
         if error.name not in ("typer", "rich"):
             raise
         raise SystemExit(f"error: {missing(error.name)}") from None
-    except KeyboardInterrupt:
-        raise SystemExit(130) from None
     run()
 
 

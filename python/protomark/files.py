@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import re
 import secrets
 import shutil
+import socket
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -89,6 +91,50 @@ def _sync_folder(folder: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+@contextmanager
+def only_writer(folder: Path, name: str = "") -> Iterator[None]:
+    """Keep other processes from writing to a folder, or to one file in it, during the block.
+
+    The folder is made, and removed again if nothing is in it in the end.
+
+    Raises:
+        NotADirectoryError: it is a file.
+        BlockingIOError: another process writes there.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder} is not a folder: name one with -o")
+    existed = folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f".lock{name and '-' + name}"
+    handle = _lock(path)
+    try:
+        os.ftruncate(handle, 0)
+        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(handle)
+        if not existed:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
+
+
+def _lock(path: Path) -> int:
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
+                return handle
+        except BlockingIOError:
+            owner = path.read_text(errors="replace") or "another process"
+            os.close(handle)
+            raise BlockingIOError(
+                f"{path.parent}: {owner} is writing there: wait for it, or name another folder"
+            ) from None
+        os.close(handle)  # its last owner has just removed it
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

@@ -1,8 +1,13 @@
-"""Defers Ctrl-C and SIGTERM until long work is between two steps."""
+"""Defers Ctrl-C and SIGTERM until long work is between two steps.
+
+While the command still imports, Ctrl-C ends it without a traceback.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +18,16 @@ from types import FrameType
 class Interrupted(Exception):  # noqa: N818 - like KeyboardInterrupt
     """Ctrl-C ended long work between two steps; the message says how to continue."""
 
+
+def _exit(number: int, frame: FrameType | None) -> None:
+    os._exit(130)
+
+
+# `python -m` has put "-m" in place of the script's name while it imports the package.
+if os.path.basename(sys.argv[0]) in ("protomark", "-m") and (
+    signal.getsignal(signal.SIGINT) is signal.default_int_handler
+):
+    signal.signal(signal.SIGINT, _exit)
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # Seconds after a signal within which the step at hand may still end.

@@ -80,6 +80,8 @@ def main() -> None:
     130.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     warnings.showwarning = _warn
     from protomark.interrupt import Interrupted
 

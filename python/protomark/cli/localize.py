@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile, MaxKeypoints, Threads
+from protomark.cli.options import JsonFile, MaxKeypoints, MaxSize, Threads
 
 if TYPE_CHECKING:
     from protomark.localization.batch import LocalizationBatch
@@ -69,6 +69,7 @@ def localize(
         ),
     ] = 0.9,
     max_keypoints: MaxKeypoints = 2000,
+    max_size: MaxSize = 1600,
     recall: Annotated[
         float | None,
         typer.Option(
@@ -88,7 +89,7 @@ def localize(
     """
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.features.images import passed_over
-    from protomark.files import check_outputs
+    from protomark.files import check_outputs, only_writer
     from protomark.localization.batch import LocalizationRequest, localize_files
 
     check_outputs(json_file, inputs=[scene, *images, camera, poses, priors], folder=output)
@@ -105,10 +106,11 @@ def localize(
         prior_degrees=prior_degrees,
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
+        max_size=max_size,
         recall=recall,
         threads=threads,
     )
-    with progress_bar() as progress:
+    with only_writer(output), progress_bar() as progress:
         batch = localize_files(request, output, progress)
     write_json(json_file, batch.as_dict())
     _show(batch, output)

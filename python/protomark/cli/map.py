@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import CameraText, EncoderName, JsonFile, MaxKeypoints, NoSeal, Threads
+from protomark.cli.options import (
+    CameraText,
+    EncoderName,
+    JsonFile,
+    MaxKeypoints,
+    MaxSize,
+    NoSeal,
+    Threads,
+)
 
 
 def map_(
@@ -52,6 +60,7 @@ def map_(
     dim: Annotated[int, typer.Option(help="Numbers per prototype.")] = 48,
     encoder: EncoderName = None,
     max_keypoints: MaxKeypoints = 2000,
+    max_size: MaxSize = 1600,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted map.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the map in OUTPUT.")] = False,
     view: Annotated[bool, typer.Option("--view", help="Also write a recording for Rerun.")] = False,
@@ -89,7 +98,8 @@ def map_(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
     check_outputs(json_file, inputs=[images, camera, poses, mask, encoder], folder=scene)
-    if line := passed_over(images):
+    inner = images / "images"
+    if line := passed_over(inner if inner.is_dir() else images):
         note(line)
     if view:
         optional("rerun")
@@ -99,6 +109,7 @@ def map_(
         options=MappingOptions(
             descriptor=descriptor,
             max_keypoints=max_keypoints,
+            max_size=max_size,
             encoder=encoder or "",
             dim=dim,
             window=window,

@@ -35,6 +35,12 @@ MaxKeypoints = Annotated[
     int,
     typer.Option(min=4, help="Limit on keypoints per image: the strongest, spread over the image."),
 ]
+MaxSize = Annotated[
+    int,
+    typer.Option(
+        min=64, help="Images with a longer side of more pixels are reduced to it before detection."
+    ),
+]
 Threads = Annotated[
     int,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import JsonFile, MaxKeypoints, Threads
+from protomark.cli.options import JsonFile, MaxKeypoints, MaxSize, Threads
 
 _BAR = 30  # characters
 
@@ -44,6 +44,7 @@ def tracks(
         ),
     ] = None,
     max_keypoints: MaxKeypoints = 2000,
+    max_size: MaxSize = 1600,
     partners: Annotated[int, typer.Option(help="How many keyframes each is matched with.")] = 24,
     ratio: Annotated[
         float,
@@ -96,6 +97,7 @@ def tracks(
         TracksOptions(
             descriptor=name,
             max_keypoints=max_keypoints,
+            max_size=max_size,
             partners=partners,
             ratio=ratio,
             max_error=max_error,

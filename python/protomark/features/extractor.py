@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,9 @@ MIN_DISTANCE = 4.0
 
 _AKAZE_THRESHOLDS = (1e-3, 1e-4)  # the second is for images with little contrast
 
+# Images whose longer side is larger are reduced to this many pixels before detection.
+MAX_SIZE = 1600
+_MIN_MAX_SIZE = 64
 
 FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
 
@@ -44,6 +47,25 @@ class Features:
         """The keypoints at these rows (k,), or for which `rows` (n,) is true."""
         return Features(*(getattr(self, name)[rows] for name in FEATURE_ARRAYS))
 
+    def scaled(self, scale: tuple[float, float]) -> Features:
+        """The keypoints in an image of so many times the width and height."""
+        return replace(
+            self,
+            keypoints=self.keypoints * np.array(scale, np.float32),
+            sizes=self.sizes * np.float32(np.mean(scale)),
+        )
+
+
+def reduced_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
+    """Width and height in pixels that features of images of this size are detected at."""
+    width, height = (max(1, round(side / pixel_size(size, max_size))) for side in size)
+    return width, height
+
+
+def pixel_size(size: tuple[int, int], max_size: int) -> float:
+    """Size of a pixel that features are detected at, in pixels of images of this size."""
+    return max(1.0, max(size) / max_size)
+
 
 class Extractor:
     """Detects and describes the keypoints of images.
@@ -53,13 +75,16 @@ class Extractor:
     Args:
         name: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
+        max_size: images whose longer side has more pixels are reduced to it before detection.
     """
 
-    def __init__(self, name: str, max_keypoints: int = 2000) -> None:
+    def __init__(self, name: str, max_keypoints: int = 2000, max_size: int = MAX_SIZE) -> None:
         if max_keypoints < 1:
             raise ValueError(f"max_keypoints is {max_keypoints}, but it must be at least 1")
+        if max_size < _MIN_MAX_SIZE:
+            raise ValueError(f"max_size is {max_size}, but it must be at least {_MIN_MAX_SIZE}")
         self.kind = descriptor_kind(name)
-        self.max_keypoints = max_keypoints
+        self.max_keypoints, self.max_size = max_keypoints, max_size
         # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
         self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
@@ -86,16 +111,20 @@ class Extractor:
         }[self.kind.name]().compute
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
-        """The features of a (height, width) uint8 image, the strongest first.
+        """The features of a (height, width) uint8 image in its pixels, the strongest first.
 
         Raises:
             ValueError: OpenCV refuses the image, for example as it is a few pixels wide.
         """
+        cv2 = optional("cv2")
+        height, width = image.shape
+        size = reduced_size((width, height), self.max_size)
         # Some descriptors drop keypoints near the border.
         try:
+            if size != (width, height):
+                image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             described, descriptors = self._describe(image)
-        except optional("cv2").error as error:
-            height, width = image.shape
+        except cv2.error as error:
             raise ValueError(
                 f"OpenCV computes no {self.kind.name} features of {width}x{height} pixels "
                 f"({error.err})"
@@ -120,7 +149,8 @@ class Extractor:
         # Some descriptors reorder keypoints by pyramid level.
         order = np.lexsort((octaves, xy[:, 0], xy[:, 1], -responses))
         xy += np.float32(0.5)
-        return Features(xy, sizes, angles, responses, octaves, descriptors).where(order)
+        features = Features(xy, sizes, angles, responses, octaves, descriptors).where(order)
+        return features.scaled((width / size[0], height / size[1]))
 
     def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
         """Selected keypoints and their descriptors."""

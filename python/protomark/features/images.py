@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,10 @@ from numpy.typing import NDArray
 from protomark.extras import optional
 from protomark.files import is_utf8, natural_key
 
+# Folders below a folder of images that, by their names, hold no images of the scene.
+_OTHER_FOLDERS = re.compile(
+    r"(depth|mask|normal|semantic|segmentation|thumb(nail)?)s?(_?(map|image)s?)?", re.IGNORECASE
+)
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"),
     *(".bmp", ".ppm", ".pgm", ".webp"),
@@ -23,14 +28,14 @@ IMAGE_SUFFIXES = (
 def image_names(folder: Path) -> list[str]:
     """Names of the images below a folder, relative to it, in natural order (img2 before img10).
 
-    Links are followed. Hidden files and folders, and those of storage servers (@eaDir), do not
-    count, and neither do names that are not UTF-8.
+    Links are followed. Hidden files and folders, those of storage servers (@eaDir) and of depth
+    maps or masks do not count, and neither do names that are not UTF-8.
     """
     return sorted(filter(_is_image, _file_names(folder)), key=natural_key)
 
 
 def passed_over(folder: Path) -> str:
-    """A sentence on the files below a folder that `image_names` leaves out, "" without any."""
+    """A sentence on what below a folder `image_names` leaves out, "" if nothing."""
     others = [name for name in _file_names(folder) if not _is_image(name)]
     kinds = Counter(_kind(name) for name in others)
     if not kinds:
@@ -42,7 +47,11 @@ def passed_over(folder: Path) -> str:
 def _file_names(folder: Path) -> Iterator[str]:
     for here, folders, files in os.walk(folder, followlinks=True):
         below = Path(here)
-        folders[:] = [f for f in folders if f[0] not in ".@" and not _is_circle(below / f)]
+        other = [f for f in folders if _OTHER_FOLDERS.fullmatch(f)]
+        yield from ((below / f).relative_to(folder).as_posix() + "/" for f in other)
+        folders[:] = [
+            f for f in folders if f[0] not in ".@" and f not in other and not _is_circle(below / f)
+        ]
         yield from ((below / f).relative_to(folder).as_posix() for f in files if f[0] not in ".@")
 
 
@@ -57,6 +66,8 @@ def _is_image(name: str) -> bool:
 def _kind(name: str) -> str:
     if not is_utf8(name):
         return f"whose name is not UTF-8 ({name})"
+    if name.endswith("/"):
+        return f"folder {name}"
     return Path(name).suffix[1:].lower() or "without a suffix"
 
 

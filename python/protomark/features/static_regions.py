@@ -30,13 +30,16 @@ _MAX_NAMED = 3
 
 
 def static_regions(
-    pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]], size: tuple[int, int]
+    pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+    size: tuple[int, int],
+    pixel: float = 1.0,
 ) -> Mask:
     """A mask (height, width) that is true where the image does not move with the scene.
 
     Args:
         pairs: pixels (n, 2) of the matches of two frames, in each of them.
         size: width and height of the images.
+        pixel: see `pixel_size`.
     """
     width, height = size
     cell = max(8, round(_CELL * max(size)))
@@ -45,7 +48,7 @@ def static_regions(
     for first, second in pairs:
         if not len(first):
             continue
-        still = np.linalg.norm(second - first, axis=1) <= _MAX_MOTION
+        still = np.linalg.norm(second - first, axis=1) <= _MAX_MOTION * pixel
         if (~still).mean() < _MIN_MOVED:
             continue
         column, row = np.minimum(first // cell, [shape[1] - 1, shape[0] - 1]).astype(int).T

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.geometry.camera import Camera
-from protomark.geometry.pose import transform
+from protomark.geometry.camera import MAX_PLANE_RAY, Camera
+from protomark.geometry.pose import transform, turned
 from protomark.geometry.triangulation import reprojection_residuals
 
 Array = NDArray[np.float64]
@@ -20,17 +20,6 @@ MIN_ITERATIONS = 100
 
 # A camera's focal length is right, roughly right and to be refined, or to be estimated.
 FocalLength = Literal["known", "rough", "unknown"]
-
-# Camera models that both COLMAP and PoseLib know.
-POSE_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "OPENCV_FISHEYE",
-)
 
 # In refinement, errors count less beyond this share of the largest error, and cost at most this.
 _LOSS_SHARE = 0.5
@@ -51,18 +40,6 @@ class AbsolutePose:
     camera: Camera  # the camera, with the estimated focal length if that was not known
 
 
-def check_pose_model(camera: Camera) -> None:
-    """Raise ValueError unless poses can be estimated for this camera."""
-    if camera.model not in POSE_MODELS:
-        raise ValueError(
-            f"poses cannot be estimated for camera model {camera.model}: undistort the images to "
-            f"one of {', '.join(POSE_MODELS)}"
-        )
-    camera.check_params()
-    if camera.params[0] <= 0:
-        raise ValueError(f"camera {camera.model} {camera.params} has no valid focal length")
-
-
 def estimate_pose(
     pixels: Array,
     positions: Array,
@@ -73,8 +50,8 @@ def estimate_pose(
     """Absolute pose by RANSAC and refinement; None if no four matches agree.
 
     With a known focal length this is PoseLib's LO-RANSAC with progressive sampling (Chum and Matas,
-    PROSAC, CVPR 2005), otherwise COLMAP's, whose refinement moves the focal length, too. Equal
-    matches give equal poses.
+    PROSAC, CVPR 2005), otherwise, and for wide cameras, COLMAP's, whose refinement moves the focal
+    length, too. Equal matches give equal poses.
 
     Args:
         pixels: (n, 2) float64, keypoints, the likeliest matches first.
@@ -82,18 +59,12 @@ def estimate_pose(
         camera: the camera; if its focal length is unknown, only principal point and size count.
         max_error: largest reprojection error of an inlier, pixels.
         focal_length: "known", "rough" to have it refined, or "unknown" to have it estimated.
-
-    Raises:
-        ValueError: poses cannot be estimated for this camera model.
     """
-    check_pose_model(camera)
     if len(positions) < 4:
         return None
     pixels = np.ascontiguousarray(pixels, np.float64)
-    if focal_length != "known":
-        return _estimate_with_focal_length(
-            pixels, positions, camera, max_error, unknown=focal_length == "unknown"
-        )
+    if focal_length != "known" or camera.wide:
+        return _estimate_by_colmap(pixels, positions, camera, max_error, focal_length)
     # PoseLib takes COLMAP's pixels and camera parameters as they are.
     pose, found = optional("poselib").estimate_absolute_pose(
         pixels,
@@ -114,19 +85,19 @@ def estimate_pose(
     return AbsolutePose(matrix, np.asarray(found["inliers"], dtype=bool), camera)
 
 
-def _estimate_with_focal_length(
-    pixels: Array, positions: Array, camera: Camera, max_error: float, unknown: bool
+def _estimate_by_colmap(
+    pixels: Array, positions: Array, camera: Camera, max_error: float, focal_length: FocalLength
 ) -> AbsolutePose | None:
     from protomark.geometry.colmap import pycolmap, quiet
 
     estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.estimate_focal_length = unknown
+    estimation.estimate_focal_length = focal_length == "unknown"
     estimation.ransac.max_error = max_error
     estimation.ransac.max_num_trials = MAX_ITERATIONS
     estimation.ransac.min_num_trials = MIN_ITERATIONS
     estimation.ransac.random_seed = 0
     refinement = pycolmap.AbsolutePoseRefinementOptions()
-    refinement.refine_focal_length = True
+    refinement.refine_focal_length = focal_length != "known"
     # COLMAP writes the refined parameters into this camera.
     refined = pycolmap.Camera(camera.as_dict())
     with quiet():
@@ -166,9 +137,12 @@ def refine_pose(
     """
     weights = np.ones(len(pixels)) if weights is None else weights
     pose = cam_from_world
-    if len(pixels) >= 4:
+    rays, turns = camera.local_rays(pixels)
+    found = np.isfinite(rays).all(1)
+    if found.sum() >= 4:
         scale = (_LOSS_SHARE * max_error / camera.focal_length) ** 2
-        pose, _ = _minimise(pose, positions, camera.rays(pixels), weights, scale)
+        seen = rays[found], None if turns is None else turns[found]
+        pose, _ = _minimise(pose, positions[found], seen, weights[found], scale)
     error = np.sqrt(weights) * reprojection_error(pose, pixels, positions, camera)
     return pose, error <= max_error
 
@@ -197,6 +171,8 @@ def free_lens(
     """
     rays = camera.rays(pixels)
     seen = np.isfinite(rays).all(1) & (transform(cam_from_world, positions)[:, 2] > 0)
+    if camera.wide:
+        seen &= (np.abs(rays) < MAX_PLANE_RAY).all(1)
     if seen.sum() < _MIN_FREE:
         return FreeLens(cam_from_world, 0.0, np.inf)
     rays, positions = rays[seen], positions[seen]
@@ -209,7 +185,7 @@ def free_lens(
         error = lens[0] * np.stack([x / z, y / z], 1) + lens[1:] - rays
         return np.nan_to_num((error**2).sum(1), nan=np.inf)
 
-    pose, lens = _minimise(cam_from_world, positions, rays, weights, scale, fixed)
+    pose, lens = _minimise(cam_from_world, positions, (rays, None), weights, scale, fixed)
     before, after = square(cam_from_world, fixed), square(pose, lens)
     losses = [np.minimum(np.log1p(s / scale), _MAX_LOSS).mean() for s in (before, after)]
     inlier = after <= scale / _LOSS_SHARE**2
@@ -233,19 +209,20 @@ def free_lens(
 def _minimise(
     pose: Array,
     positions: Array,
-    rays: Array,
+    seen: tuple[Array, Array | None],
     weights: Array,
     scale: float,
     lens: Array | None = None,
 ) -> tuple[Array, Array]:
     """Returns pose and lens: by how much rays are stretched, and shifted along x and y.
 
-    The lens moves only if it is given.
+    What is seen are `Camera.local_rays`. The lens moves only if it is given.
     """
     free = lens is not None
+    rays, turns = seen
 
     def evaluate(pose: Array, lens: Array) -> tuple[Array, Array, float]:
-        x, y, depth = transform(pose, positions).T
+        x, y, depth = transform(turned(pose, turns), positions).T
         safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
         residual = lens[0] * np.stack([x / safe, y / safe], 1) + lens[1:] - rays
         square = np.where(depth > 0, (residual**2).sum(1), np.inf)
@@ -258,7 +235,7 @@ def _minimise(
     residual, square, cost = evaluate(pose, lens)
     for _ in range(_REFINE_STEPS):
         in_front = square < np.inf
-        jacobian = lens[0] * _jacobian(pose, positions, in_front)
+        jacobian = lens[0] * _jacobian(pose, positions, in_front, turns)
         if free:
             projected = (residual + rays - lens[1:]) / lens[0]
             jacobian = np.concatenate([jacobian, _lens_jacobian(projected)], axis=2)
@@ -289,14 +266,19 @@ def _lens_jacobian(projected: Array) -> Array:
     return np.concatenate([projected[:, :, None], shift], axis=2)
 
 
-def _jacobian(pose: Array, positions: Array, in_front: NDArray[np.bool_]) -> Array:
+def _jacobian(
+    pose: Array, positions: Array, in_front: NDArray[np.bool_], turns: Array | None = None
+) -> Array:
     """Derivatives (n, 2, 6) of rays by a small rotation, then a small translation of the camera."""
-    x, y, z = transform(pose, positions).T
+    x, y, z = transform(turned(pose, turns), positions).T
     z = np.where(in_front, z, 1.0)
     u, v, zero, one = x / z, y / z, np.zeros_like(z), np.ones_like(z)
     by_rotation = np.array([[-u * v, one + u * u, -v], [-one - v * v, u * v, u]])
     by_translation = np.array([[one, zero, -u], [zero, one, -v]]) / z
-    return np.concatenate([by_rotation, by_translation], axis=1).transpose(2, 0, 1)
+    jacobian = np.concatenate([by_rotation, by_translation], axis=1).transpose(2, 0, 1)
+    if turns is None:
+        return jacobian
+    return np.concatenate([jacobian[:, :, :3] @ turns, jacobian[:, :, 3:] @ turns], axis=2)
 
 
 def pose_covariance(
@@ -319,11 +301,16 @@ def pose_covariance(
         `cam_from_world` in world units. None for fewer than four inliers, or if they leave a
         direction open.
     """
+    rays, turns = camera.local_rays(pixels)
+    if not np.isfinite(rays).all():
+        found = np.isfinite(rays).all(1)
+        return pose_covariance(cam_from_world, pixels[found], positions[found], camera)
     if len(pixels) < 4:
         return None
-    poses = np.broadcast_to(cam_from_world, (len(positions), 3, 4))
-    residual, depth = reprojection_residuals(positions, poses, camera.rays(pixels))
-    return _covariance(_jacobian(cam_from_world, positions, depth > 0), float((residual**2).sum()))
+    poses = np.broadcast_to(turned(cam_from_world, turns), (len(positions), 3, 4))
+    residual, depth = reprojection_residuals(positions, poses, rays)
+    jacobian = _jacobian(cam_from_world, positions, depth > 0, turns)
+    return _covariance(jacobian, float((residual**2).sum()))
 
 
 def _covariance(jacobian: Array, square: float) -> Array | None:

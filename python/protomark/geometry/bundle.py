@@ -45,6 +45,7 @@ class Bundle:
     point: Ids  # (n,) int64, its point
     pixels: Array  # (n, 2) float64, relative to the principal point
     sigma: Array  # (n,) float64, standard deviation in pixels
+    turns: Array | None = None  # (n, 3, 3) float64, see `Camera.local_rays`
 
     def __post_init__(self) -> None:
         first = np.full(len(self.points), len(self.poses))
@@ -55,6 +56,7 @@ class Bundle:
         order = np.lexsort((self.frame, chunk[self.point]))
         for name in ("frame", "point", "pixels", "sigma"):
             setattr(self, name, getattr(self, name)[order])
+        self.turns = None if self.turns is None else self.turns[order]
         chunks = chunk[self.point]
         self._chunks = _slices(chunks)
         # The observations of one chunk in one frame.
@@ -117,6 +119,8 @@ class Bundle:
         for a, b in self._blocks:
             pose = self.poses[self.frame[a]]
             local[:, a:b] = pose[:, :3] @ local[:, a:b] + pose[:, 3:]
+        if self.turns is not None:
+            local = np.einsum("nij,jn->in", self.turns, local)
         front = local[2] > 1e-9
         local[:, ~front] = [[0], [0], [1]]
         rays = local[:2] / local[2]
@@ -196,7 +200,7 @@ class Bundle:
         diagonal *= 1 + damping
         diagonal += 1e-12
         for rows, points, coupling in self._couplings(by_motion, by_point):
-            reduced[np.ix_(rows, rows)] -= coupling @ coupling.T
+            reduced[rows[:, None], rows] -= coupling @ coupling.T
             target[rows] -= coupling @ gradient[:, points].reshape(-1)
         return reduced, target, by_motion, by_point, gradient, root
 
@@ -260,6 +264,9 @@ class Bundle:
         if out.shape[1] > 6:
             out[:, 6] = self.refined[self._lens_of] * stretch * rays
             out[:, 7] = self.refined[self._lens_of] * weight * focal * square * rays
+        if self.turns is not None:
+            for part in (slice(3), slice(3, 6)):
+                out[:, part] = np.einsum("rin,nij->rjn", out[:, part], self.turns)
         by_point = np.empty((2, 3, len(u)))
         for a, b in self._blocks:
             by_point[:, :, a:b] = self.poses[self.frame[a], :, :3].T @ out[:, 3:6, a:b]

@@ -35,8 +35,10 @@ CAMERA_MODELS = {
 }
 # COLMAP's guess of an unknown focal length, as a share of the image's longer side.
 DEFAULT_FOCAL_RATIO = 1.2
-# Models whose field of view may reach behind the camera, where rays are no x / z.
 _WIDE_MODELS = ("FISHEYE", "FOV", "EUCM", "DIVISION", "EQUIRECTANGULAR")
+_MAX_ROUND_TRIP = 0.5  # pixels
+# Farther than 60 degrees from the axis (tangent), small angles are long ways in the image plane.
+MAX_PLANE_RAY = 1.7
 _MIN_VIEW, _MAX_VIEW = 1.0, 170.0  # degrees
 # Lenses do not bend rays to less than this share of their distance from the axis.
 _MIN_BENDING = 0.5
@@ -67,7 +69,7 @@ class Camera:
         """Read MODEL:PARAMETERS, or MODEL WIDTH HEIGHT PARAMETERS as in COLMAP's cameras.txt.
 
         Raises:
-            ValueError: the text is no such camera, or its first parameter is not positive.
+            ValueError: the text is no such camera.
         """
         has_size = ":" not in text
         words = text.replace(":", " ").replace(",", " ").split()
@@ -88,8 +90,6 @@ class Camera:
             raise ValueError(f"camera {text!r} has no pixels: write, for example, {CAMERA_EXAMPLE}")
         camera = cls(name, *size, params)
         camera.check_params()
-        if camera.params[0] <= 0:
-            raise ValueError(f"camera {text!r} has a focal length that is not positive")
         if has_size:
             camera.check_lens()
         return camera
@@ -137,7 +137,7 @@ class Camera:
         self.check_params()
 
     def check_params(self) -> None:
-        """Raise ValueError unless the model is COLMAP's and has as many finite parameters."""
+        """Raise ValueError unless model, number of parameters and focal length are COLMAP's."""
         expected = CAMERA_MODELS.get(self.model) if isinstance(self.model, str) else None
         if expected is None:
             raise ValueError(
@@ -150,6 +150,10 @@ class Camera:
             )
         if not all(isinstance(p, Real) and math.isfinite(p) for p in self.params):
             raise ValueError(f"the parameters {self.params} are not all finite numbers")
+        if self.params[0] <= 0:
+            raise ValueError(
+                f"a camera of model {self.model} has a focal length that is not positive"
+            )
 
     def sized(self, width: int, height: int) -> Camera:
         """The camera for images of this size, if it fits any size; else itself.
@@ -161,13 +165,24 @@ class Camera:
         camera.check_lens()
         return camera
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same images at another size."""
+        if (width, height) == (self.width, self.height):
+            return self
+        from protomark.geometry.colmap import pycolmap
+
+        camera = pycolmap.Camera(self.as_dict())
+        camera.rescale(width, height)
+        return Camera.from_colmap(camera)
+
     def resembles(self, other: Camera) -> bool:
         """Whether both project alike: same size, and rays within 1 % of the image."""
         if (self.width, self.height) != (other.width, other.height):
             return False
-        corners = np.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]]) * (self.width, self.height)
-        difference = (self.rays(corners) - other.rays(corners)) * other.focal_length
-        return bool(np.abs(difference).max() <= 0.01 * max(self.width, self.height))
+        share = np.linspace(0, 1, 5)
+        grid = np.stack(np.meshgrid(share * self.width, share * self.height), -1).reshape(-1, 2)
+        difference = np.abs(self.bearings(grid) - other.bearings(grid)) * other.focal_length
+        return bool(np.nanmax(difference, initial=0.0) <= 0.01 * max(self.width, self.height))
 
     def check_lens(self) -> None:
         """Warn if the camera is unlikely to be the image's, for example of another resolution.
@@ -190,20 +205,67 @@ class Camera:
 
     @property
     def focal_length(self) -> float:
-        """Mean focal length in pixels."""
-        return float(self.colmap.mean_focal_length())
+        """Mean focal length in pixels; of spherical images, pixels per radian."""
+        return float(self.colmap.mean_focal_length()) or self.width / (2 * math.pi)
+
+    @property
+    def wide(self) -> bool:
+        """Whether the model is one for wide angles, which may reach behind the camera."""
+        return any(word in self.model for word in _WIDE_MODELS)
 
     def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
-        """Undistort pixels (n, 2) to x / z and y / z (n, 2) float64, NaN where the model fails."""
+        """Undistort pixels (n, 2) to x / z and y / z (n, 2) float64, NaN where the model fails.
+
+        Rays of wide cameras are NaN where they do not lead forward.
+        """
         out = np.full((len(pixels), 2), np.nan)
-        if len(pixels):
+        if self.wide:
+            bearings = self.bearings(pixels)
+            front = bearings[:, 2] > 0
+            out[front] = bearings[front, :2] / bearings[front, 2:]
+        elif len(pixels):
             out[:] = np.asarray(self.colmap.cam_from_img(np.asarray(pixels, np.float64)))
         return out
+
+    def bearings(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
+        """Unit vectors (n, 3) float64 toward what pixels (n, 2) show, NaN where the model fails."""
+        out = np.full((len(pixels), 3), np.nan)
+        if len(pixels):
+            pixels = np.asarray(pixels, np.float64)
+            out[:] = np.asarray(self.colmap.cam_ray_from_img(pixels))
+            # Beyond their reach, COLMAP's models unproject to rays of other pixels.
+            off = np.abs(self.project(out) - pixels).max(axis=1)
+            out[~(off < _MAX_ROUND_TRIP)] = np.nan
+        return out
+
+    def local_rays(
+        self, pixels: NDArray[Any]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Rays (n, 2) as by `rays`, and how the camera is turned (n, 3, 3) for each; None: not.
+
+        A wide camera is turned so that it looks along the ray, which is (0, 0) then: errors that
+        pinhole cameras have in the image plane are angles in any direction.
+        """
+        if not self.wide:
+            return self.rays(pixels), None
+        bearings = self.bearings(pixels)
+        found = np.isfinite(bearings)
+        x, y, z = np.where(found, bearings, [0.0, 0.0, 1.0]).T
+        near = np.maximum(1 + z, 1e-12)
+        turns = np.array(
+            [
+                [1 - x * x / near, -x * y / near, -x],
+                [-x * y / near, 1 - y * y / near, -y],
+                [x, y, z],
+            ]
+        )
+        return np.where(found[:, :2], 0.0, np.nan), turns.transpose(2, 0, 1)
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project points (n, 3) in camera coordinates to pixels (n, 2), infinite behind it."""
         out = np.full((len(points), 2), np.inf)
-        front = points[:, 2] > 0
+        spherical = self.model == "EQUIRECTANGULAR"
+        front = np.isfinite(points).all(axis=1) if spherical else points[:, 2] > 0
         if front.any():
             out[front] = np.asarray(self.colmap.img_from_cam(np.asarray(points[front], np.float64)))
         return out
@@ -227,7 +289,7 @@ def _check_lens(camera: Camera) -> None:
             f"camera {camera}: its principal point lies outside the image: was it calibrated at "
             "another resolution?"
         )
-    if any(word in camera.model for word in _WIDE_MODELS):
+    if camera.wide:
         view = math.degrees(size.max() / camera.focal_length)
     else:
         view = _perspective_view(camera, middle)

@@ -358,7 +358,7 @@ def model_from_reconstruction(reconstruction: Any, path: Path) -> ColmapModel:
     cameras = {}
     for camera_id, c in reconstruction.cameras.items():
         camera = Camera.from_colmap(c)
-        if not np.isfinite(camera.params).all() or c.mean_focal_length() <= 0:
+        if not np.isfinite(camera.params).all() or camera.focal_length <= 0:
             raise ValueError(f"{path}: camera {camera_id} has no valid focal length")
         try:
             camera.check_lens()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
+from protomark.geometry.camera import MAX_PLANE_RAY
 from protomark.geometry.pose import relative_pose
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 
@@ -28,9 +29,9 @@ _CLEAR_ANGLE = 0.5
 def agreeing(first: Array, second: Array, focal: float) -> NDArray[np.bool_]:
     """Which matches (n,) agree on a relative pose (PoseLib's LO-RANSAC); none if too few do.
 
-    Rays (n, 2) are NaN where undistortion fails.
+    Rays (n, 2) are NaN where undistortion fails. Those far from the axis do not count.
     """
-    found = np.asarray(np.isfinite(np.hstack([first, second])).all(axis=1))
+    found = np.asarray((np.abs(np.hstack([first, second])) < MAX_PLANE_RAY).all(axis=1))
     if found.sum() < _MIN_MATCHES:
         return np.zeros(len(first), bool)
     camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0, 0]}
@@ -50,7 +51,7 @@ def agreeing(first: Array, second: Array, focal: float) -> NDArray[np.bool_]:
 
 
 def pose_errors(one: Array, other: Array, first: Array, second: Array, focal: float) -> Array:
-    """Epipolar errors (n,) of matched rays (n, 2) under given poses, pixels.
+    """Epipolar errors (n,) of matched rays (n, 2) under poses (3, 4) or (n, 3, 4), pixels.
 
     Matches that meet behind the cameras are off by the focal length at least.
     """

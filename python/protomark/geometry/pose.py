@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,8 +11,8 @@ Array = NDArray[np.float64]
 
 
 def transform(cam_from_world: Array, points: Array) -> Array:
-    """Points (n, 3) in camera coordinates, of points (n, 3) in world coordinates."""
-    return np.asarray(points @ cam_from_world[:, :3].T + cam_from_world[:, 3])
+    """Points (n, 3) in coordinates of one camera (3, 4), or each of its own (n, 3, 4)."""
+    return rotate(cam_from_world[..., :3], points) + cam_from_world[..., 3]
 
 
 def camera_centers(cam_from_world: Array) -> Array:
@@ -19,10 +21,30 @@ def camera_centers(cam_from_world: Array) -> Array:
     return np.asarray(-np.einsum("...ji,...j->...i", rotation, translation))
 
 
+def turned(pose: Array, turns: Array | None) -> Array:
+    """Poses (n, 3, 4) of a camera after each of the turns (n, 3, 3); None: the pose (3, 4)."""
+    return pose if turns is None else np.asarray(turns @ pose)
+
+
+def pose_at(pose: Array, rows: NDArray[Any]) -> Array:
+    """The poses in these rows of (n, 3, 4); a pose (3, 4) is that of every row."""
+    return pose if pose.ndim == 2 else pose[rows]
+
+
+def rotate(rotation: Array, vectors: Array) -> Array:
+    """Vectors (n, 3) after one rotation (3, 3), or each after its own (n, 3, 3)."""
+    if rotation.ndim == 2:
+        return np.asarray(vectors @ rotation.T)
+    return np.asarray(np.einsum("nij,nj->ni", rotation, vectors))
+
+
 def relative_pose(first: Array, second: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and translation (3,) from the first camera's coordinates to the second's."""
-    rotation = second[:, :3] @ first[:, :3].T
-    return rotation, second[:, 3] - rotation @ first[:, 3]
+    """Rotation (..., 3, 3) and translation (..., 3) from the first to the second camera.
+
+    Poses are (3, 4) or (n, 3, 4).
+    """
+    rotation = second[..., :3] @ np.swapaxes(first[..., :3], -1, -2)
+    return rotation, second[..., 3] - (rotation @ first[..., 3:])[..., 0]
 
 
 def pose_error(estimate: Array, true: Array) -> tuple[float, float]:

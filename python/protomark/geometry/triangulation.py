@@ -1,4 +1,7 @@
-"""Two-view and multi-view geometry on undistorted rays (x / z, y / z)."""
+"""Two-view and multi-view geometry on undistorted rays (x / z, y / z).
+
+Where a camera is turned for each of its rays (`Camera.local_rays`), each has a pose of its own.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.neighbours import runs
+from protomark.geometry.pose import rotate
 
 Array = NDArray[np.float64]
 
@@ -14,18 +18,17 @@ def epipolar_error(rotation: Array, translation: Array, first: Array, second: Ar
     """Sampson distance (n,) of ray pairs (n, 2), in units of the image plane at z = 1.
 
     Times the focal length this is in pixels. Two cameras at one position have no epipolar lines:
-    then it is the distance to the point that the rotation predicts.
+    then it is the distance to the point that the rotation predicts. The relative pose is one, or
+    one for each pair.
     """
-    length = np.linalg.norm(translation)
-    a = np.column_stack([first, np.ones(len(first))])
+    length = np.linalg.norm(translation, axis=-1, keepdims=True)
+    moved = rotate(rotation, np.column_stack([first, np.ones(len(first))]))
     b = np.column_stack([second, np.ones(len(second))])
-    if length < 1e-12:
-        moved = a @ rotation.T
+    if not (length >= 1e-12).all():
         out: Array = np.linalg.norm(moved[:, :2] / moved[:, 2:] - second, axis=1)
         return out
-    x, y, z = translation / length
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    line_b, line_a = a @ essential.T, b @ essential
+    line_b = np.cross(translation / length, moved)
+    line_a = rotate(np.swapaxes(rotation, -1, -2), np.cross(b, translation / length))
     gradient = (line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1)
     error: Array = np.abs((b * line_b).sum(1)) / np.sqrt(np.maximum(gradient, 1e-24))
     return error
@@ -34,8 +37,11 @@ def epipolar_error(rotation: Array, translation: Array, first: Array, second: Ar
 def depth_of_first(
     rotation: Array, translation: Array, first: Array, second: Array
 ) -> tuple[Array, Array]:
-    """Depth (n,) along z in the first camera, and the angle (n,) between the rays in radians."""
-    a = np.column_stack([first, np.ones(len(first))]) @ rotation.T
+    """Depth (n,) along z in the first camera, and the angle (n,) between the rays in radians.
+
+    The relative pose is one, or one for each pair.
+    """
+    a = rotate(rotation, np.column_stack([first, np.ones(len(first))]))
     b = np.column_stack([second, np.ones(len(second))])
     # depth * a + translation is parallel to b: solve the cross product by least squares.
     ab, tb = np.cross(a, b), np.cross(np.broadcast_to(translation, a.shape), b)

@@ -6,16 +6,17 @@ import csv
 import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
 from protomark.files import is_utf8, write_text
-from protomark.geometry.absolute_pose import FocalLength, check_pose_model
+from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif, read_cameras
 from protomark.geometry.pose import camera_centers, pose_error
@@ -57,6 +58,7 @@ class LocalizationRequest:
     prior_degrees: float = 15.0  # largest error of a prior's orientation
     min_confidence: float = 0.9  # smallest probability of an accepted pose
     max_keypoints: int = 2000  # limit on keypoints per image
+    max_size: int = MAX_SIZE  # larger images are reduced to it before detection
     recall: float | None = None  # see `Localizer`
     threads: int = 1  # number of images to localize at a time
 
@@ -239,12 +241,15 @@ def localize_files(
             f"{output} holds a COLMAP model that `protomark localize` did not write: name another "
             "folder with -o"
         )
-    localizer = Localizer(request.scene, max_keypoints=request.max_keypoints, recall=request.recall)
+    localizer = Localizer(
+        request.scene,
+        max_keypoints=request.max_keypoints,
+        max_size=request.max_size,
+        recall=request.recall,
+    )
     given = request.camera is not None and request.camera != ESTIMATE
     names = [name for name, _ in images]
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
-    for camera in cameras.cameras if cameras else ():
-        check_pose_model(camera)
     true_poses, priors = (
         poses_of_images(path, names) if path else PoseSet({})
         for path in (request.true_poses, request.priors)
@@ -261,21 +266,28 @@ def localize_files(
         )
 
     results: list[ImageResult] = []
-    with deferred_interrupt() as interrupted, ThreadPoolExecutor(request.threads) as pool:
-        futures = [pool.submit(localize, image) for image in images]
-        for future in tracked(futures, progress, "localize"):
-            results.append(future.result())
-            if interrupted():
+    batch = LocalizationBatch(results, request.min_confidence)
+    try:
+        with deferred_interrupt() as interrupted, ThreadPoolExecutor(request.threads) as pool:
+            futures = [pool.submit(localize, image) for image in images]
+            try:
+                for future in tracked(futures, progress, "localize"):
+                    results.append(future.result())
+                    if interrupted():
+                        break
+            finally:
                 pool.shutdown(wait=False, cancel_futures=True)
-                break
-        stopped = interrupted() and len(results) < len(images)
+            stopped = interrupted() and len(results) < len(images)
+    except BaseException:
+        if any(result.found for result in results):
+            batch.write(output)
+        raise
     if all(result.found is None for result in results):
         raise ValueError(
             f"none of {len(results)} images is usable; {results[0].name}: {results[0].error}"
         )
-    batch = LocalizationBatch(results, request.min_confidence, stopped)
     batch.write(output)
-    return batch
+    return replace(batch, interrupted=stopped)
 
 
 def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:

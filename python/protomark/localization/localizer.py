@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.features.descriptors import DESCRIPTORS
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import MAX_SIZE, Extractor, Features
 from protomark.features.images import read_gray, to_gray
 from protomark.features.upright import SUFFIX, upright_descriptors
-from protomark.geometry.absolute_pose import FocalLength, check_pose_model
+from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.localization.prior import PosePrior, visible
@@ -49,6 +49,7 @@ class Localizer:
         scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
             that `protomark map` wrote.
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
+        max_size: images whose longer side has more pixels are reduced to it before detection.
         min_probability: smallest probability of an accepted match, in [0, 1].
         recall: in a map with an index, the share of nearest landmarks that an approximate search
             finds, in (0, 1]; None: the search is exact.
@@ -65,12 +66,13 @@ class Localizer:
         scene: pm.PrototypeMap | pm.SealedMap | str | Path,
         *,
         max_keypoints: int = 2000,
+        max_size: int = MAX_SIZE,
         min_probability: float = MIN_PROBABILITY,
         recall: float | None = None,
         threads: int = 1,
     ) -> None:
         self.scene = open_map(scene) if isinstance(scene, (str, Path)) else scene
-        self.max_keypoints = max_keypoints
+        self.max_keypoints, self.max_size = max_keypoints, max_size
         self.min_probability = min_probability
         self.recall = recall
         self.threads = threads
@@ -203,9 +205,8 @@ class Localizer:
 
         Raises:
             ValueError: the lengths differ, keypoints lie outside the image, the encoder takes other
-                descriptors, or poses cannot be estimated for this camera.
+                descriptors, or there is no such camera.
         """
-        check_pose_model(camera)
         camera.check_lens()
         if descriptors is None:  # what OpenCV computes for no keypoints
             descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)
@@ -257,7 +258,7 @@ class Localizer:
             )
         # OpenCV's detectors are not safe to share between threads.
         if not hasattr(self._extractors, "of_thread"):
-            self._extractors.of_thread = Extractor(plain, self.max_keypoints)
+            self._extractors.of_thread = Extractor(plain, self.max_keypoints, self.max_size)
         features: Features = self._extractors.of_thread(image)
         if descriptor.endswith(SUFFIX):
             features.descriptors = upright_descriptors(

@@ -169,7 +169,7 @@ def _lens_evidence(
     if not near.any():
         return np.inf, 0.0, np.inf
     free = free_lens(pose, pixels[near], positions[near], camera, max_error)
-    depth = abs(float(np.median(transform(pose, positions[near])[:, 2])))
+    depth = float(np.median(np.abs(transform(pose, positions[near])[:, 2])))
     distance, degrees = pose_error(free.cam_from_world, pose)
     shift = max(distance / (DEPTH_SHARE * depth), degrees / DEGREES)
     return shift, free.gain, free.spread / depth

@@ -109,8 +109,11 @@ def _bundle(
     focal, distortion = lenses[camera[frame]].T
     stretch = focal * (1 + distortion * (seen.rays * seen.rays).sum(1))
     poses = np.array([structure.frames[i].pose for i in frames.tolist()])
+    turns = None
+    if any(one.wide for one in models):
+        turns = seen.poses[:, :, :3] @ poses[frame, :, :3].transpose(0, 2, 1)
     return Bundle(
-        poses.reshape(-1, 3, 4),
+        poses,
         moves[frames],
         camera,
         lenses,
@@ -120,6 +123,7 @@ def _bundle(
         point,
         stretch[:, None] * seen.rays,
         seen.sigma,
+        turns,
     )
 
 

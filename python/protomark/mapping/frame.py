@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.geometry.camera import Camera
+from protomark.geometry.pose import rotate, turned
+
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
@@ -21,6 +24,7 @@ class InputImage:
     time: float  # seconds, or the index if the input has no times
     image: NDArray[np.uint8] | None  # (height, width) uint8, None if it cannot be read
     pose: Array | None = None  # (3, 4) given pose, or None
+    camera: Camera | None = None  # its camera, or None: that of the others
     problem: str = ""  # why there is no image, else ""
 
 
@@ -34,7 +38,7 @@ class Frame:
     camera_id: int  # its camera
     # (n, 2) float32, pixels; those without a landmark are dropped when the frame leaves the window.
     keypoints: NDArray[np.float32]
-    rays: Array  # (n, 2) float64, undistorted
+    rays: Array  # (n, 2) float64, undistorted, see `Camera.local_rays`
     # (n,) float64, standard deviation of the keypoints in pixels, which grows with their size.
     sigma: Array
     descriptors: NDArray[np.uint8] | None = None  # (n, B) uint8, None outside of the window
@@ -45,11 +49,27 @@ class Frame:
     # (n,) int64, the landmark that each keypoint observes, -1 for none.
     landmarks: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
     keyframe: bool = True  # whether its observations take part in bundle adjustment
+    turns: Array | None = None  # (n, 3, 3) float64, see `Camera.local_rays`
 
     def at(self, pose: Array) -> Frame:
         """A copy with a pose and without landmarks, to register in a map."""
         landmarks = np.full(len(self.keypoints), -1, np.int64)
         return replace(self, pose=np.ascontiguousarray(pose), landmarks=landmarks)
+
+    def local_poses(self, rows: Ids) -> Array:
+        """Poses (k, 3, 4) that the rays of these keypoints count from; (3, 4) if all are one."""
+        return turned(self.pose, None if self.turns is None else self.turns[rows])
+
+    def points(self, rows: Ids, depth: Array) -> Array:
+        """World coordinates (k, 3) of points that keypoints see so far (k,) away along z."""
+        poses = self.local_poses(rows)
+        local = np.column_stack([self.rays[rows], np.ones(len(rows))]) * depth[:, None]
+        return rotate(np.swapaxes(poses[..., :3], -1, -2), local - poses[..., 3])
+
+    def directions(self, rows: Ids) -> Array:
+        """Unit vectors (k, 3) of keypoints in camera coordinates."""
+        directions = self.at(np.eye(3, 4)).points(rows, np.ones(len(rows)))
+        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
     @property
     def observed(self) -> Ids:
@@ -78,6 +98,7 @@ class Frame:
         rows = self.observed
         for name in ("keypoints", "rays", "sigma", "landmarks"):
             setattr(self, name, getattr(self, name)[rows])
+        self.turns = None if self.turns is None else self.turns[rows]
         self.descriptors = self.encoded = None
 
 

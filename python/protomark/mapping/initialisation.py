@@ -7,19 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.extras import optional
-from protomark.geometry.absolute_pose import MAX_ITERATIONS, MIN_ITERATIONS, estimate_pose
+from protomark.geometry.absolute_pose import estimate_pose
 from protomark.geometry.bundle import Bundle
-from protomark.geometry.camera import Camera
+from protomark.geometry.pose import relative_pose, transform
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
+from protomark.geometry.two_views import (
+    estimate_relative_pose,
+    planar_poses,
+    refine_relative_pose,
+)
 from protomark.mapping.frame import Array, Frame, Ids
+from protomark.mapping.structure import Structure
 from protomark.tracks.matching import mutual_matches
 
 RATIO = 0.8
 # This many matches must agree with the relative pose.
 _MIN_MATCHES = 60
-# Median angle between the two rays of a match, degrees.
+# Angle between the two rays of a match, degrees: the median, and for wide cameras, which look ahead
+# as well as aside, the upper quartile.
 MIN_PARALLAX = 2.0
+_PARALLAX_QUANTILE, _WIDE_PARALLAX_QUANTILE = 0.5, 0.75
 # If a rotation alone explains this share of the matches, there is no parallax.
 _MAX_ROTATED = 0.7
 # A pose of each witness must agree with this share of the landmarks that it observes, within three
@@ -53,12 +60,18 @@ class Initialiser:
     frames, the witnesses, decide: landmarks of a wrong pose do not project where these see them.
     """
 
-    def __init__(self, camera: Camera, max_error: float) -> None:
-        self.camera, self.max_error = camera, max_error
+    def __init__(self, structure: Structure, max_error: float) -> None:
+        self._structure, self._max_error = structure, max_error
         self.waiting: list[Frame] = []
         self.best_parallax = 0.0
-        self._focal = camera.focal_length
+        self._use(next(iter(structure.cameras)))
         self._matches: dict[tuple[str, str], Ids] = {}
+
+    def _use(self, camera_id: int) -> None:
+        """Judge frames of this camera."""
+        self.camera = self._structure.cameras[camera_id]
+        self.max_error = self._structure.tolerance(camera_id, self._max_error)
+        self._focal = self.camera.focal_length
 
     def push(self, frame: Frame) -> TwoViewPose | None:
         """Pair a new frame with waiting ones, the oldest first; without success it waits, too."""
@@ -77,17 +90,19 @@ class Initialiser:
 
     def _relative_pose(self, first: int, second: int) -> Array | None:
         one, other = self.waiting[first], self.waiting[second]
+        if one.camera_id != other.camera_id:
+            return None
+        self._use(one.camera_id)
         rows = self._match(one, other)
         if len(rows) < _MIN_MATCHES:
             return None
-        rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
         # A cheap test that most pairs of a video fail.
-        if _rotated_share(np.eye(3), *rays, self.max_error / self._focal) > _MAX_ROTATED:
+        if self._rotated_share(np.eye(3), one, other, rows) > _MAX_ROTATED:
             return None
         candidates = self._candidates(one, other, rows)
         if not candidates:
             return None
-        parallax = self._parallax(candidates[0], *rays)
+        parallax = self._parallax(candidates[0], one, other, rows)
         if parallax < MIN_PARALLAX:
             self.best_parallax = max(self.best_parallax, parallax)
             return None
@@ -96,7 +111,7 @@ class Initialiser:
         best = max(supports, key=lambda support: support.score)
         if best.share < _MIN_SUPPORT:
             return None
-        parallax = self._parallax(best.pose, *rays)
+        parallax = self._parallax(best.pose, one, other, rows)
         self.best_parallax = max(self.best_parallax, parallax)
         if parallax < MIN_PARALLAX:
             return None
@@ -108,66 +123,61 @@ class Initialiser:
 
     def _candidates(self, one: Frame, other: Frame, rows: Ids) -> list[Array]:
         """The relative pose that fits best, and those that a planar scene admits."""
-        poselib = optional("poselib")
-        camera, focal = self.camera.as_dict(), self._focal
+        camera, error = self.camera, self.max_error
         a, b = (f.keypoints[rows[:, k]].astype(np.float64) for k, f in enumerate((one, other)))
-        sampling = {"min_iterations": MIN_ITERATIONS, "max_iterations": MAX_ITERATIONS, "seed": 0}
-        options = {"max_epipolar_error": self.max_error, **sampling}
-        found, facts = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
-        inliers = np.asarray(facts["inliers"], bool)
+        found, inliers = estimate_relative_pose(a, b, camera, error)
         if inliers.sum() < _MIN_MATCHES or inliers.mean() < 0.5:
             return []
-        ray_a, ray_b = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
-        pose = np.asarray(found.Rt, np.float64)
-        limit = self.max_error / focal
-        if _rotated_share(pose[:, :3], ray_a[inliers], ray_b[inliers], limit) > _MAX_ROTATED:
+        if self._rotated_share(found[:, :3], one, other, rows[inliers]) > _MAX_ROTATED:
             return []
-        plane, facts = poselib.estimate_homography(
-            focal * ray_a, focal * ray_b, {"max_reproj_error": self.max_error, **sampling}, {}
-        )
-        starts = [found]
-        if np.asarray(facts["inliers"], bool).sum() >= _MIN_COMMON:
-            scale = np.diag([focal, focal, 1.0])
-            normal = np.linalg.inv(scale) @ np.asarray(plane) @ scale
-            starts += poselib.motion_from_homography(normal)[0]
-        loss = {"loss_type": "CAUCHY", "loss_scale": 0.5 * self.max_error}
-        out = []
-        for start in starts:
-            refined, _ = poselib.refine_relative_pose(a, b, start, camera, camera, loss)
-            pose = np.asarray(refined.Rt, np.float64)
+        out: list[Array] = []
+        for start in (found, *planar_poses(a, b, camera, error, _MIN_COMMON)):
+            good = self._verify(start, one, other, rows)[0]
+            pose = refine_relative_pose(start, a, b, camera, error, good)
             length = np.linalg.norm(pose[:, 3])
             if not np.isfinite(pose).all() or length < 1e-9:
                 continue
             pose[:, 3] /= length
-            good = self._verify(pose, ray_a, ray_b)[0]
+            good = self._verify(pose, one, other, rows)[0]
             new = not any(_same_pose(pose, other) for other in out)
             if new and good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
                 out.append(pose)
         return out
 
-    def _parallax(self, pose: Array, ray_a: Array, ray_b: Array) -> float:
-        """Median angle between the two rays of a match, degrees."""
-        good, _, angle = self._verify(pose, ray_a, ray_b)
-        return float(np.degrees(np.median(angle[good])))
+    def _rotated_share(self, rotation: Array, one: Frame, other: Frame, rows: Ids) -> float:
+        """Share of matches that a rotation near the given one explains."""
+        a, b = one.directions(rows[:, 0]), other.directions(rows[:, 1])
+        return _rotated_share(rotation, a, b, self.max_error / self._focal)
+
+    def _parallax(self, pose: Array, one: Frame, other: Frame, rows: Ids) -> float:
+        """Typical angle between the two rays of a match, degrees."""
+        good, _, angle, _ = self._verify(pose, one, other, rows)
+        quantile = _WIDE_PARALLAX_QUANTILE if self.camera.wide else _PARALLAX_QUANTILE
+        return float(np.degrees(np.quantile(angle[good], quantile)))
 
     def _verify(
-        self, pose: Array, ray_a: Array, ray_b: Array
-    ) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Whether each match fits a pose, its depth in the first frame, and its angle."""
-        rotation, translation = pose[:, :3], pose[:, 3]
-        depth, angle = depth_of_first(rotation, translation, ray_a, ray_b)
-        error = epipolar_error(rotation, translation, ray_a, ray_b) * self._focal
-        in_second = np.column_stack([ray_a, np.ones(len(ray_a))]) @ rotation[2]
-        good = (depth > 0) & (depth * in_second + translation[2] > 0) & (error <= self.max_error)
-        return good, depth, angle
+        self, pose: Array, one: Frame, other: Frame, rows: Ids
+    ) -> tuple[NDArray[np.bool_], Array, Array, NDArray[np.bool_]]:
+        """Whether each match fits a pose, its depth in the first frame, and its angle.
+
+        The last array tells whether it lies near the epipolar line, maybe behind a camera.
+        """
+        one, other, (a, b) = one.at(np.eye(3, 4)), other.at(pose), rows.T
+        relative = relative_pose(one.local_poses(a), other.local_poses(b))
+        rays = one.rays[a], other.rays[b]
+        depth, angle = depth_of_first(*relative, *rays)
+        near = epipolar_error(*relative, *rays) * self._focal <= self.max_error
+        in_second = transform(other.local_poses(b), one.points(a, depth))[:, 2]
+        return (depth > 0) & (in_second > 0) & near, depth, angle, near
 
     def _witnesses(self, first: int, second: int) -> list[tuple[Frame, Ids]]:
         """Further frames, preferably between the two, and their matches with the first one."""
-        between = list(range(first + 1, second))
-        near = sorted(set(range(second)) - {first, *between}, key=lambda i: abs(i - first))
+        one = self.waiting[first]
+        same = [i for i in range(second) if self.waiting[i].camera_id == one.camera_id]
+        between = [i for i in same if i > first]
+        near = sorted({*same} - {first, *between}, key=lambda i: abs(i - first))
         at = np.linspace(0, len(between) - 1, min(_MAX_WITNESSES, len(between))).round().astype(int)
         chosen = [between[k] for k in at] + near[: max(0, _MAX_WITNESSES - len(at))]
-        one = self.waiting[first]
         return [(self.waiting[i], self._match(one, self.waiting[i])) for i in chosen]
 
     def _match(self, one: Frame, other: Frame) -> Ids:
@@ -190,17 +200,15 @@ class Initialiser:
 
         The score counts each landmark as 1 minus its squared error over the squared limit.
         """
-        rays = one.rays[rows[:, 0]], other.rays[rows[:, 1]]
-        verified, depth, _ = self._verify(pose, *rays)
+        verified, depth, _, good = self._verify(pose, one, other, rows)
         # Noise moves what is far away beyond infinity.
         depth = np.where(depth > 0, depth, np.median(depth[verified]))
-        good = epipolar_error(pose[:, :3], pose[:, 3], *rays) * self._focal <= self.max_error
         at, count = rows[good, 0], int(good.sum())
         landmark = np.full(len(one.keypoints), -1)
         landmark[at] = np.arange(count)
-        points = np.column_stack([one.rays[at], np.ones(count)]) * depth[good, None]
+        points = one.at(np.eye(3, 4)).points(at, depth[good])
         poses, observed = [np.eye(3, 4), pose], [landmark[at]] * 2
-        seen = [one.rays[at], other.rays[rows[good, 1]]]
+        seen = [(one, at), (other, rows[good, 1])]
         limit = 0.75 * self.max_error
         for witness, pairs in witnesses:
             pairs = pairs[landmark[pairs[:, 0]] >= 0]
@@ -209,9 +217,10 @@ class Initialiser:
             pixels, ids = witness.keypoints[pairs[:, 1]].astype(np.float64), landmark[pairs[:, 0]]
             found = estimate_pose(pixels, points[ids], self.camera, limit)
             observed.append(ids)
-            seen.append(witness.rays[pairs[:, 1]])
+            seen.append((witness, pairs[:, 1]))
             poses.append(poses[0] if found is None else found.cam_from_world)
         counts = [len(ids) for ids in observed]
+        turns = [f.turns[r] for f, r in seen if f.turns is not None]
         bundle = Bundle(
             poses=np.array(poses),
             moving=np.arange(len(poses)) > 0,
@@ -221,8 +230,9 @@ class Initialiser:
             points=points,
             frame=np.repeat(np.arange(len(poses)), counts),
             point=np.concatenate(observed),
-            pixels=self._focal * np.concatenate(seen),
+            pixels=self._focal * np.concatenate([frame.rays[r] for frame, r in seen]),
             sigma=np.ones(sum(counts)),
+            turns=np.concatenate(turns) if turns else None,
         )
         bundle.adjust(_REFINE_STEPS, 0.5 * self.max_error)
         error = bundle.errors()[bundle.frame > 1]
@@ -249,17 +259,13 @@ def _same_pose(first: Array, second: Array) -> bool:
 
 
 def _rotated_share(rotation: Array, first: Array, second: Array, limit: float) -> float:
-    """Share of ray pairs that a rotation alone explains.
+    """Share of pairs of unit vectors that a rotation alone explains.
 
     Starting at the given one, the rotation is fitted robustly: least squares over the better half.
     """
-    a = np.column_stack([first, np.ones(len(first))])
-    b = np.column_stack([second, np.ones(len(second))])
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
     for _ in range(5):
-        off = np.linalg.norm(a @ rotation.T - b, axis=1)
+        off = np.linalg.norm(first @ rotation.T - second, axis=1)
         near = off <= np.median(off)
-        u, _, vt = np.linalg.svd(b[near].T @ a[near])
+        u, _, vt = np.linalg.svd(second[near].T @ first[near])
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return float((np.linalg.norm(a @ rotation.T - b, axis=1) <= limit).mean())
+    return float((np.linalg.norm(first @ rotation.T - second, axis=1) <= limit).mean())

@@ -60,7 +60,7 @@ class Mapper:
     ) -> None:
         self.options, self.threads = options, threads
         self._new_memory = new_memory
-        self.structure = Structure({1: camera})
+        self.structure = Structure({1: camera}, options.max_size)
         self.memory = new_memory(options)
         self.history = History()
         self.clock = Clock()
@@ -72,7 +72,7 @@ class Mapper:
         # Features that are known already, and the part of the image that is left out.
         self.features: dict[str, Features] = {}
         self.mask: Mask | None = None
-        self._extractor = Extractor(options.descriptor, options.max_keypoints)
+        self._extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         self._reset_initialiser()
 
     @property
@@ -152,7 +152,8 @@ class Mapper:
             record.outcome = image.problem
             return None
         height, width = image.image.shape
-        camera = self.camera
+        camera_id = self._camera_id(image.camera)
+        camera = self.structure.cameras[camera_id]
         if (width, height) != (camera.width, camera.height):
             record.outcome = (
                 f"{width}x{height} pixels, but the camera has {camera.width}x{camera.height}"
@@ -168,17 +169,29 @@ class Mapper:
             return None
         with self.clock.stage("encode"):
             encoded = self.memory.encode(features.descriptors)
+        rays, turns = camera.local_rays(features.keypoints)
         return Frame(
             image.index,
             image.name,
             image.time,
-            self.camera_id,
+            camera_id,
             features.keypoints,
-            camera.rays(features.keypoints),
-            keypoint_sigma(features.sizes),
+            rays,
+            self.structure.pixel(camera_id) * keypoint_sigma(features.sizes),
             features.descriptors,
             encoded,
+            turns=turns,
         )
+
+    def _camera_id(self, camera: Camera | None) -> int:
+        """The id of a camera, a new one if no frame had it; None: that of the next frames."""
+        cameras = self.structure.cameras
+        if camera is None:
+            return self.camera_id
+        known = (i for i, other in cameras.items() if other == camera)
+        camera_id = next(known, max(cameras) + 1)
+        cameras[camera_id] = camera
+        return camera_id
 
     def _track_or_relocalize(self, frame: Frame) -> TrackedPose | None:
         """The pose of a frame near the one that its neighbours predict, or anywhere in the map."""
@@ -314,8 +327,7 @@ class Mapper:
     # Initialisation.
 
     def _reset_initialiser(self) -> None:
-        tolerance = self.structure.tolerance(self.camera_id, self.options.max_error)
-        self.initialiser = Initialiser(self.camera, tolerance)
+        self.initialiser = Initialiser(self.structure, self.options.max_error)
 
     def _initialise(self, frame: Frame, record: FrameRecord) -> None:
         """Start the map with two frames once a pair has enough parallax."""
@@ -362,7 +374,7 @@ class Mapper:
         structure = self.structure
         pose = structure.frames[0].pose
         depth = structure.positions[structure.ids] @ pose[2, :3] + pose[2, 3]
-        scale = 1 / float(np.median(depth))
+        scale = 1 / float(np.median(np.abs(depth)))
         structure.positions *= scale
         for frame in structure.frames:
             frame.pose[:, 3] *= scale
@@ -375,7 +387,7 @@ class Mapper:
             old.outcome, old.inliers, old.keyframe = f"initialised wrongly: {reason}", 0, False
         record.outcome = reason
         waiting = self.initialiser.waiting[-1:]
-        self.structure = Structure({self.camera_id: self.camera})
+        self.structure = Structure(self.structure.cameras, self.options.max_size)
         self.memory = self._new_memory(self.options)
         self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
         self._reset_initialiser()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protomark.features.descriptors import descriptor_kind
+from protomark.features.extractor import MAX_SIZE
 from protomark.maps.build import APPEARANCE_BITS, DIM
 
 
@@ -15,6 +16,7 @@ class MappingOptions:
     # Name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
     descriptor: str = "akaze"
     max_keypoints: int = 2000  # limit on keypoints per frame
+    max_size: int = MAX_SIZE  # frames with a longer side are reduced to it before detection
     encoder: str = ""  # name or file of the encoder; empty: the one that ships for the descriptor
     dim: int = DIM  # numbers per prototype
     # Number of signs of a code that tell the appearances of a landmark apart.

@@ -39,8 +39,6 @@ class MapRequest:
 def check_output(request: MapRequest) -> None:
     """Raise before any work if the output folder is not what the request needs."""
     scene = request.output
-    if scene.exists() and not scene.is_dir():
-        raise NotADirectoryError(f"{scene} is not a folder: name one for the map with -o")
     interrupted = (scene / CHECKPOINT).is_dir()
     if request.resume:
         if not interrupted:
@@ -54,7 +52,7 @@ def check_output(request: MapRequest) -> None:
                 f"{scene} holds an interrupted map: finish it with --resume first"
             )
         return
-    if request.force or not scene.exists() or not any(scene.iterdir()):
+    if request.force or all(path.name.startswith(".lock") for path in scene.iterdir()):
         return
     if interrupted:
         raise FileExistsError(

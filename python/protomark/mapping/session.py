@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from protomark.features.extractor import Extractor
+from protomark.features.extractor import Extractor, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
+from protomark.files import only_writer
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.given_poses import misfit
@@ -51,14 +51,9 @@ def make_map(
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
-    check_output(request)
-    existed = request.output.exists()
-    try:
+    with only_writer(request.output):
+        check_output(request)
         return _make_map(request, source, progress, note)
-    finally:
-        if not existed:
-            with suppress(OSError):  # it holds something
-                request.output.rmdir()
 
 
 def _make_map(
@@ -119,7 +114,6 @@ class _Session:
             self._extend()
         else:
             self._start()
-        request.output.mkdir(parents=True, exist_ok=True)
         self.recording = Recording(request.output / RECORDING) if request.record else None
 
     def _camera(self) -> Camera | None:
@@ -153,8 +147,10 @@ class _Session:
                 f"camera: the focal length of {camera.params[0]:.0f} pixels is {origin} and is "
                 "refined while mapping (--camera gives a calibrated one)"
             )
-        elif sentence := misfit(surveyed.pose_errors(camera)):
-            raise ValueError(f"{request.poses}: {sentence}")
+        else:
+            pixel = pixel_size((camera.width, camera.height), options.max_size)
+            if sentence := misfit(surveyed.pose_errors(camera, pixel)):
+                raise ValueError(f"{request.poses}: {sentence}")
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
@@ -179,6 +175,7 @@ class _Session:
             self.request.output, request_facts(self.request, self.source), facts["request"]
         )
         self._read_poses()
+        self._camera()  # for the source to know those of its images
         self.cursor, self.known = int(facts["cursor"]), int(facts["known"])
         self._prepare(self._survey(self.mapper.options), str(facts["prefix"]), facts["inputs"])
         self.source.shift(*facts["shift"])
@@ -199,9 +196,10 @@ class _Session:
         self.progress("look at the first frames", 0, 0)
         started = time.perf_counter()
         size = self.source.size()
-        extractor = Extractor(options.descriptor, options.max_keypoints)
+        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         surveyed = survey(self.source.images(), extractor, size)
-        mask = static_regions([(pair.first, pair.second) for pair in surveyed.pairs], size)
+        matches = [(pair.first, pair.second) for pair in surveyed.pairs]
+        mask = static_regions(matches, size, pixel_size(size, options.max_size))
         if region := describe(mask):
             self.note(f"left out, as it never moves while the rest does: {region}")
         if self.request.mask is not None:

@@ -40,6 +40,7 @@ class FrameSource(ABC):
         path: the folder or video.
         prefix: prefix of the frames' names in the map.
         poses: known poses, or None.
+        cameras: cameras by image name, see `find_camera`.
         timed: whether frames have times in seconds, not numbers.
         first_index: index of the first frame in the map.
         time_shift: what is added to the times of frames in the map.
@@ -51,6 +52,7 @@ class FrameSource(ABC):
         self.path = path
         self.prefix = ""
         self.poses: PoseSet | None = None
+        self.cameras: dict[str, Camera] = {}
         self.first_index, self.time_shift = 0, 0.0
         self._size: tuple[int, int] | None = None
 
@@ -99,6 +101,7 @@ class FrameSource(ABC):
                 name=self.prefix + image.name,
                 time=self.time_shift + image.time,
                 pose=self.poses.find(image.name, time) if self.poses else None,
+                camera=self.cameras.get(image.name),
             )
 
     def size(self) -> tuple[int, int]:
@@ -122,25 +125,25 @@ class FrameSource(ABC):
         return self._read(0, None, False)
 
     def find_camera(self, cameras: CameraSet) -> Camera:
-        """The one camera of all images.
+        """The camera of most images; those that a model names take their own.
 
         Raises:
-            ValueError: there is none of their size, or images have different ones.
+            ValueError: there is none of their size, or several that name no image.
         """
-        size = self.size()
-        named = {cameras.by_image[n] for n, _ in self.listing() if n in cameras.by_image}
-        of_size = [c for c in named if (c.width, c.height) == size]
-        of_size.sort(key=lambda camera: (camera.model, camera.params))
-        params = [c.params for c in of_size]
-        if len({c.model for c in of_size}) > 1 or (
-            of_size and np.ptp(params, axis=0).max() > _SAME_CAMERA * params[0][0]
-        ):
-            raise ValueError(
-                f"the images have {len(of_size)} different cameras, and a map takes one: give the "
-                f"one to use with --camera, such as '{of_size[0]}'"
-            )
+        named = {n: cameras.by_image[n] for n in self.names() if n in cameras.by_image}
+        if not named:
+            return cameras.find("", *self.size())
         # COLMAP calibrates each image of one camera for itself, unless told otherwise.
-        return of_size[len(of_size) // 2] if of_size else cameras.find("", *size)
+        groups: list[list[Camera]] = []
+        for camera in sorted(set(named.values()), key=str):
+            group = next((g for g in groups if _is_same(camera, g[0])), None)
+            if group is None:
+                groups.append([camera])
+            else:
+                group.append(camera)
+        middle = {c: sorted(g, key=lambda c: c.params)[len(g) // 2] for g in groups for c in g}
+        self.cameras = {name: middle[camera] for name, camera in named.items()}
+        return Counter(self.cameras.values()).most_common(1)[0][0]
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length."""
@@ -250,18 +253,20 @@ class Video(FrameSource):
         chunk: set[int] | None = None,
         decode: bool = True,
     ) -> Iterator[InputImage]:
-        video = _open_video(self.path)
+        video, position = _open_video(self.path), optional("cv2").CAP_PROP_POS_MSEC
         try:
-            number = -1
+            number, time = -1, -1 / self._rate
             while video.grab():
                 number += 1
+                # Frames need not follow each other at one rate; not every decoder knows when.
+                shown = video.get(position) / 1000
+                time = shown if shown > time else time + 1 / self._rate
                 index, rest = divmod(number, self._every)
                 name = f"{self.path.stem}-{number:06d}"
                 if rest or index < start or (only is not None and name not in only):
                     continue
                 if chunk is not None and index not in chunk:
                     continue
-                time = number / self._rate
                 if not decode:
                     yield InputImage(index, name, time, None)
                     continue
@@ -287,6 +292,13 @@ def open_source(path: Path, every: int = 1) -> FrameSource:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such folder of images or video file")
     return Video(path, every)
+
+
+def _is_same(one: Camera, other: Camera) -> bool:
+    if (one.model, one.width, one.height) != (other.model, other.width, other.height):
+        return False
+    off = np.abs(np.subtract(one.params, other.params)).max()
+    return bool(off <= _SAME_CAMERA * one.params[0])
 
 
 def _open_video(path: Path) -> Any:

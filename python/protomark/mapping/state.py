@@ -171,15 +171,9 @@ def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict
     used = 0
     for i, (index, name, time, camera_id, *flags) in enumerate(state["frames"] + state["waiting"]):
         a, b = int(offsets[i]), int(offsets[i + 1])
-        frame = Frame(
-            index,
-            name,
-            time,
-            camera_id,
-            keypoints[a:b].copy(),
-            structure.cameras[camera_id].rays(keypoints[a:b]),
-            arrays["sigma"][a:b].copy(),
-        )
+        rays, turns = structure.cameras[camera_id].local_rays(keypoints[a:b])
+        sigma = arrays["sigma"][a:b].copy()
+        frame = Frame(index, name, time, camera_id, keypoints[a:b].copy(), rays, sigma, turns=turns)
         keyframe, in_window = flags or (True, True)
         if in_window:
             used += b - a

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.extractor import MAX_SIZE, pixel_size
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
 from protomark.geometry.triangulation import pixel_errors
@@ -47,6 +48,7 @@ class Structure:
     """
 
     cameras: dict[int, Camera] = field(default_factory=dict)  # cameras by id
+    max_size: int = MAX_SIZE  # see `MappingOptions`
     frames: list[Frame] = field(default_factory=list)  # frames with a pose
     # (l, 3) float64, NaN for ids of removed landmarks and for id 0.
     positions: Array = field(default_factory=lambda: np.full((1, 3), np.nan))
@@ -76,7 +78,13 @@ class Structure:
     def tolerance(self, camera_id: int, share: float) -> float:
         """A share of the longer side of a camera's images in pixels, at least `_MIN_TOLERANCE`."""
         camera = self.cameras[camera_id]
-        return max(share * max(camera.width, camera.height), _MIN_TOLERANCE)
+        least = _MIN_TOLERANCE * self.pixel(camera_id)
+        return max(share * max(camera.width, camera.height), least)
+
+    def pixel(self, camera_id: int) -> float:
+        """See `pixel_size`: keypoints of a camera are so accurate."""
+        camera = self.cameras[camera_id]
+        return pixel_size((camera.width, camera.height), self.max_size)
 
     def keyframes(self) -> list[int]:
         """Indices of the keyframes."""
@@ -161,13 +169,14 @@ class Structure:
         ids = self.ids
         at = self.positions[ids]
         local = transform(pose, at)
-        front = local[:, 2] > 0
-        ids, at, local = ids[front], at[front], local[front]
         camera = self.cameras[camera_id]
-        # Beyond the image, distortion is undefined and may bend rays back into it.
-        bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
-        inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
-        ids, at, local = ids[inside], at[inside], local[inside]
+        if not camera.wide:
+            front = local[:, 2] > 0
+            ids, at, local = ids[front], at[front], local[front]
+            # Beyond the image, distortion is undefined and may bend rays back into it.
+            bound = 1.3 * np.array([camera.width, camera.height]) / (2 * self.focal(camera_id))
+            inside = (np.abs(local[:, :2] / local[:, 2:]) < bound + 0.3).all(1)
+            ids, at, local = ids[inside], at[inside], local[inside]
         toward = camera_centers(pose) - at
         distance = np.linalg.norm(toward, axis=1)
         mean = self.directions[ids]
@@ -196,14 +205,17 @@ class Structure:
         rows = [self.frames[i].observed for i in chosen]
         counts = [len(r) for r in rows]
         chosen_frames = [self.frames[i] for i in chosen]
-        poses = np.array([f.pose for f in chosen_frames]).reshape(-1, 3, 4)
+        poses = [
+            np.broadcast_to(f.local_poses(r), (len(r), 3, 4))
+            for f, r in zip(chosen_frames, rows, strict=True)
+        ]
         focal = np.array([self.focal(f.camera_id) for f in chosen_frames])
         rays = [f.rays[r] for f, r in zip(chosen_frames, rows, strict=True)]
         return Observations(
             np.repeat(np.array(chosen, np.int64), counts),
             np.concatenate([np.zeros(0, np.int64), *rows]),
             np.concatenate([np.zeros(0, np.int64), *(f.seen for f in chosen_frames)]),
-            np.repeat(poses, counts, axis=0),
+            np.concatenate([np.zeros((0, 3, 4)), *poses]),
             np.concatenate([np.zeros((0, 2)), *rays]),
             np.repeat(focal, counts),
             np.concatenate(
@@ -225,4 +237,4 @@ class Structure:
         self.cameras[camera_id] = camera
         for frame in self.frames:
             if frame.camera_id == camera_id:
-                frame.rays = camera.rays(frame.keypoints)
+                frame.rays, frame.turns = camera.local_rays(frame.keypoints)

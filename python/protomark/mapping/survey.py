@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from protomark.features.extractor import Extractor, Features
 from protomark.geometry.camera import Camera
 from protomark.geometry.given_poses import agreeing, pose_errors
+from protomark.geometry.pose import turned
 from protomark.mapping.frame import Array, InputImage
 from protomark.mapping.initialisation import RATIO
 from protomark.tracks.matching import mutual_matches
@@ -38,18 +39,21 @@ class Survey:
     mask: NDArray[np.bool_] | None = None
     seconds: float = 0.0  # how long the survey took
 
-    def pose_errors(self, camera: Camera) -> list[Array]:
-        """Errors of given poses for each pair whose matches can tell."""
+    def pose_errors(self, camera: Camera, pixel: float) -> list[Array]:
+        """Errors of given poses for each pair whose matches can tell; `pixel`: see `pixel_size`."""
         errors = []
         for pair in self.pairs:
             one, other = (image.pose for image in pair.images)
             if one is None or other is None:
                 continue
-            first, second = camera.rays(pair.first), camera.rays(pair.second)
-            agree = agreeing(first, second, camera.focal_length)
+            cameras = [image.camera or camera for image in pair.images]
+            focal = (cameras[0].focal_length + cameras[1].focal_length) / 2 / pixel
+            agree = agreeing(cameras[0].rays(pair.first), cameras[1].rays(pair.second), focal)
             if agree.any():
-                seen = first[agree], second[agree]
-                errors.append(pose_errors(one, other, *seen, camera.focal_length))
+                first, turns = cameras[0].local_rays(pair.first[agree])
+                second, other_turns = cameras[1].local_rays(pair.second[agree])
+                poses = turned(one, turns), turned(other, other_turns)
+                errors.append(pose_errors(*poses, first, second, focal))
         return errors
 
 

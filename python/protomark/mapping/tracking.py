@@ -142,7 +142,8 @@ class Tracker:
         best = near[nearest[runs(run[nearest])[0]]]
         x, y = projected.T
         apart = (x[near] - x[best][run]) ** 2 + (y[near] - y[best][run]) ** 2
-        other = np.where(apart > _SAME_PLACE**2, distance.astype(np.float64), np.inf)
+        same_place = _SAME_PLACE * structure.pixel(frame.camera_id)
+        other = np.where(apart > same_place**2, distance.astype(np.float64), np.inf)
         second = np.minimum.reduceat(other, starts)
         with np.errstate(invalid="ignore"):
             fits = first < self.memory.guided_ratio * second

@@ -62,7 +62,8 @@ def _pair(
 def _view(structure: Structure, frame: Frame) -> View:
     if frame.descriptors is None:
         raise ValueError(f"{frame.name}: the frame has left the window and has no descriptors")
-    return View(frame.descriptors, frame.rays, frame.pose, structure.focal(frame.camera_id))
+    poses = frame.local_poses(np.arange(len(frame.rays)))
+    return View(frame.descriptors, frame.rays, poses, structure.focal(frame.camera_id))
 
 
 def _create_landmarks(
@@ -77,17 +78,19 @@ def _create_landmarks(
 ) -> None:
     if not len(a):
         return
-    rotation, translation = relative_pose(old.pose, new.pose)
-    depth, angle = depth_of_first(rotation, translation, old.rays[a], new.rays[b])
+    relative = relative_pose(old.local_poses(a), new.local_poses(b))
+    depth, angle = depth_of_first(*relative, old.rays[a], new.rays[b])
     wide = (depth > 0) & (angle > np.radians(min_angle))
     a, b, depth = a[wide], b[wide], depth[wide]
-    local = np.column_stack([old.rays[a], np.ones(len(a))]) * depth[:, None]
-    points = (local - old.pose[:, 3]) @ old.pose[:, :3]
+    points = old.points(a, depth)
     count = len(points)
-    poses = np.repeat(np.stack([old.pose, new.pose]), count, axis=0)
+    poses = np.concatenate(
+        [np.broadcast_to(f.local_poses(r), (count, 3, 4)) for f, r in ((old, a), (new, b))]
+    )
     seen = np.concatenate([old.rays[a], new.rays[b]])
     focal = np.repeat([structure.focal(f.camera_id) for f in (old, new)], count)
-    points = refine_points(points, np.tile(np.arange(count), 2), poses, seen, focal, iterations=2)
+    which, pixel = np.tile(np.arange(count), 2), structure.pixel(new.camera_id)
+    points = refine_points(points, which, poses, seen, focal, iterations=2, huber=pixel)
     errors = pixel_errors(np.tile(points, (2, 1)), poses, seen, focal)
     limits = np.repeat([structure.tolerance(f.camera_id, max_error) for f in (old, new)], count)
     fits = (errors <= limits).reshape(2, count).all(0)
@@ -104,7 +107,7 @@ def _continue_tracks(
     """Let keypoints observe landmarks that project to them and are new to the frame."""
     if not len(rows):
         return
-    poses = np.repeat(frame.pose[None], len(ids), axis=0)
+    poses = np.broadcast_to(frame.local_poses(rows), (len(ids), 3, 4))
     focal = structure.focal(frame.camera_id)
     errors = pixel_errors(structure.positions[ids], poses, frame.rays[rows], focal)
     # Landmarks may have been created, and keypoints assigned, since the match.

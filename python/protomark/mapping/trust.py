@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -51,7 +52,7 @@ def is_uncertain(structure: Structure, frame: Frame, pose: Array, matches: Landm
     covariance = pose_covariance(pose, pixels, positions, structure.cameras[frame.camera_id])
     if covariance is None:
         return True
-    depth = float(np.median(transform(pose, positions)[:, 2]))
+    depth = float(np.median(np.abs(transform(pose, positions)[:, 2])))
     return bool(np.sqrt(np.trace(covariance[3:, 3:])) > _MAX_DEVIATION * depth)
 
 
@@ -84,7 +85,7 @@ def _thrown(structure: Structure, order: Sequence[int]) -> list[int]:
     centers = camera_centers(np.array([frame.pose for frame in frames]))
     indices = np.array([frame.index for frame in frames])
     depths = np.array(
-        [np.median(transform(f.pose, structure.positions[f.seen])[:, 2]) for f in frames]
+        [np.median(np.abs(transform(f.pose, structure.positions[f.seen])[:, 2])) for f in frames]
     )
     gaps = np.minimum(np.diff(indices), MAX_STEP)
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps
@@ -202,8 +203,9 @@ def no_map(mapper: Mapper, source: FrameSource, known: int = 0) -> str:
             f"{source.path}: no map: frames are taken far enough apart, but no pair of them fits "
             "what the others see: check --camera, and that nothing but the camera moves"
         )
+    best = math.floor(10 * parallax) / 10
     return (
         f"{source.path}: no map: no two of {len(records)} frames overlap enough and are taken far "
-        f"enough apart (the best pair has {parallax:.1f} degrees of parallax, {MIN_PARALLAX:g} are "
+        f"enough apart (the best pair has {best:.1f} degrees of parallax, {MIN_PARALLAX:g} are "
         "needed): move the camera sideways, or check that frames overlap and --camera is right"
     )

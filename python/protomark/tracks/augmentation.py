@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.features.extractor import FEATURE_ARRAYS, Extractor, Features
+from protomark.features.extractor import FEATURE_ARRAYS, MAX_SIZE, Extractor, Features, pixel_size
 from protomark.features.images import read_gray
+from protomark.geometry.neighbours import near_pairs
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
 from protomark.tracks.file import Tracks
@@ -88,7 +89,11 @@ def add_augmentations(
 
     def copies(index: int) -> list[tuple[Features, NDArray[np.int64]]]:
         if not hasattr(local, "extractor"):
-            local.extractor = Extractor(tracks.descriptor, int(options.get("max_keypoints", 2000)))
+            local.extractor = Extractor(
+                tracks.descriptor,
+                int(options.get("max_keypoints", 2000)),
+                int(options.get("max_size", MAX_SIZE)),
+            )
         image = read_gray(images / tracks.keyframe_names[index])
         rows = plain.keypoints_of(index)
         seen = (plain.keypoints[rows], plain.sizes[rows], plain.landmark_of_keypoint[rows])
@@ -140,30 +145,21 @@ def _copy(
     there = np.column_stack([features.keypoints - 0.5, np.ones(len(features))])
     back = there @ np.linalg.inv(homography).T
     xy = back[:, :2] / back[:, 2:] + 0.5
-    nearest, gap = _nearest(xy, keypoints)
-    ratio = features.sizes / scale / sizes[nearest]
-    fits = (gap < _MAX_DISTANCE**2) & (ratio < _MAX_SIZE_RATIO) & (ratio > 1 / _MAX_SIZE_RATIO)
+    limit = _MAX_DISTANCE * pixel_size(image.shape, extractor.max_size)
+    row, nearest = near_pairs(xy, keypoints.astype(np.float64), limit)
+    gap = ((xy[row] - keypoints[nearest]) ** 2).sum(1)
+    closest = np.lexsort((gap, row))
+    closest = closest[np.flatnonzero(np.diff(row[closest], prepend=-1))]
+    row, nearest, gap = row[closest], nearest[closest], gap[closest]
+    ratio = features.sizes[row] / scale / sizes[nearest]
+    fits = (ratio < _MAX_SIZE_RATIO) & (ratio > 1 / _MAX_SIZE_RATIO)
     # A keypoint of the original keeps the closest one that fits.
     order = np.lexsort((gap, ~fits, nearest))
-    first = np.zeros(len(xy), bool)
-    first[order[np.flatnonzero(np.diff(nearest[order], prepend=-1))]] = True
-    keep = fits & first
+    order = order[np.flatnonzero(np.diff(nearest[order], prepend=-1))]
+    keep = np.sort(order[fits[order]])
     features.keypoints[:] = xy
     features.sizes /= np.float32(scale)
     oriented = features.angles >= 0
     features.angles[oriented] = np.mod(features.angles[oriented] - np.float32(angle), 360)
     features.angles[features.angles >= 360] = 0
-    return features.where(keep), landmarks[nearest[keep]]
-
-
-def _nearest(
-    xy: NDArray[np.float64], keypoints: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The nearest keypoint to each point (n, 2), and its squared distance, in bounded memory."""
-    nearest, gap = np.empty(len(xy), np.int64), np.empty(len(xy))
-    for start in range(0, len(xy), 512):
-        rows = slice(start, start + 512)
-        distances = (xy[rows, None, 0] - keypoints[None, :, 0]) ** 2
-        distances += (xy[rows, None, 1] - keypoints[None, :, 1]) ** 2
-        nearest[rows], gap[rows] = distances.argmin(1), distances.min(1)
-    return nearest, gap
+    return features.where(row[keep]), landmarks[nearest[keep]]

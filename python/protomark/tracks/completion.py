@@ -35,7 +35,7 @@ def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> 
         scene.positions = refine_points(
             scene.positions,
             scene.labels[rows],
-            scene.model.cam_from_world[scene.keyframe[rows]],
+            scene.poses(rows),
             scene.rays[rows],
             scene.focal[rows],
             iterations,

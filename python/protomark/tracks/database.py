@@ -95,7 +95,7 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, Features]:
     """Keypoints and descriptors by image name."""
     # Read-only mode neither creates nor changes a database, which may be open elsewhere. COLMAP's
     # own mode needs to write files beside it, unless nobody has it open.
-    busy = database.with_name(f"{database.name}-wal").exists()
+    busy = any(database.with_name(database.name + end).exists() for end in ("-wal", "-journal"))
     uri = f"{database.resolve().as_uri()}?mode=ro{'' if busy else '&immutable=1'}"
     try:
         connection = sqlite3.connect(uri, uri=True)
@@ -107,6 +107,10 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, Features]:
         finally:
             connection.close()
     except sqlite3.Error as error:
+        if "locked" in str(error):
+            raise ValueError(
+                f"{database} is locked: another process writes to it, wait for it"
+            ) from None
         raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
     images: dict[str, Features] = {}
     empty = (None, None, None)

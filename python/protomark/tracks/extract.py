@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 import protomark
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import MAX_SIZE, Extractor, Features, reduced_size
 from protomark.features.images import image_names, read_gray
 from protomark.features.static_regions import Mask, describe, outside, static_regions
 from protomark.files import hash_files
 from protomark.geometry import colmap
 from protomark.geometry.given_poses import agreeing, misfit, pose_errors
+from protomark.geometry.pose import pose_at, turned
 from protomark.progress import Progress, silent
 from protomark.threads import parallel_map
 from protomark.tracks import completion, pairs, triangulation
@@ -56,6 +57,8 @@ class TracksOptions:
     # Name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
     descriptor: str = "freak"
     max_keypoints: int = 2000  # limit on keypoints per image
+    # Images with a longer side are reduced to it before detection; errors count in their pixels.
+    max_size: int = MAX_SIZE
     partners: int = 24  # about how many keyframes each keyframe is matched with
     ratio: float = 0.8  # limit on the ratio of the nearest to the second nearest Hamming distance
     max_error: float = 3.0  # largest epipolar and reprojection error, pixels
@@ -174,7 +177,7 @@ def extract(
     given = _read_posed_model(sequence.model)
     made_from = provenance(sequence, options, given)
     given, features, unreadable = _detect(sequence, given, options, threads, progress)
-    work = _Matching(given, features, options, threads, progress)
+    work = _Matching(*_reduced(given, features, options.max_size), options, threads, progress)
     region, errors = work.look_at_neighbours()
     if options.refine_poses != "yes" and (sentence := misfit(errors)):
         raise ValueError(f"{sequence.model}: {sentence} --refine-poses yes takes them nevertheless")
@@ -187,7 +190,7 @@ def extract(
     ) and work.refine_poses(error)
     matches = {p: m.where(m.errors <= options.max_error) for p, m in work.matches.items()}
     progress("triangulate", 0, 1)
-    keypoints = [f.keypoints for f in features]
+    keypoints = [f.keypoints for f in work.features]
     reconstruction = triangulation.triangulate(
         work.model, keypoints, matches, options.max_error, options.min_angle
     )
@@ -224,12 +227,25 @@ def extract(
             "pycolmap": colmap.pycolmap.__version__,
         },
     }
+    model = replace(work.model, cameras=given.cameras)
     tracks = Tracks.from_features(
-        options.descriptor, scene.model, features, scene.labels, scene.positions, info
+        options.descriptor, model, features, scene.labels, scene.positions, info
     )
     if options.max_unlabelled is not None:
         tracks = tracks.where(_labelled_or_strong(tracks, options.max_unlabelled))
     return tracks
+
+
+def _reduced(
+    model: colmap.ColmapModel, features: list[Features], max_size: int
+) -> tuple[colmap.ColmapModel, list[Features]]:
+    """Cameras and features in the pixels that these were detected at."""
+    full = model.cameras
+    sizes = {i: reduced_size((c.width, c.height), max_size) for i, c in full.items()}
+    scales = {i: (sizes[i][0] / c.width, sizes[i][1] / c.height) for i, c in full.items()}
+    cameras = {i: c.resized(*sizes[i]) for i, c in full.items()}
+    scaled = [f.scaled(scales[int(i)]) for f, i in zip(features, model.camera_ids, strict=True)]
+    return replace(model, cameras=cameras), scaled
 
 
 @dataclass
@@ -246,14 +262,17 @@ class _Matching:
     def __post_init__(self) -> None:
         cameras = [self.model.cameras[int(c)] for c in self.model.camera_ids]
         # Undistorted keypoints of each keyframe.
-        self.rays = [c.rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
+        local = [c.local_rays(f.keypoints) for c, f in zip(cameras, self.features, strict=True)]
+        self.rays, self.turns = [rays for rays, _ in local], [turns for _, turns in local]
+        self.cameras = cameras
         self.focal = np.array([camera.focal_length for camera in cameras])
         self.views = self._make_views()
         # Rows (k, 2) of the matches of neighbours that agree on a relative pose.
         self.agreeing: dict[tuple[int, int], NDArray[np.int64]] = {}
 
     def _make_views(self) -> list[View]:
-        parts = (self.features, self.rays, self.model.cam_from_world, self.focal)
+        poses = map(turned, self.model.cam_from_world, self.turns)
+        parts = (self.features, self.rays, poses, self.focal)
         return [View(f.descriptors, *rest) for f, *rest in zip(*parts, strict=True)]
 
     def _match(self, chosen: list[tuple[int, int]], stage: str) -> None:
@@ -288,20 +307,30 @@ class _Matching:
         for rays, keypoints in zip(self.rays, at, strict=True):
             rays[~outside(region, keypoints)] = np.nan
         for (i, j), rows in matches.items():
-            agree = agreeing(self.rays[i][rows[:, 0]], self.rays[j][rows[:, 1]], self._focal(i, j))
+            first, second = self._plane_rays(i, rows[:, 0]), self._plane_rays(j, rows[:, 1])
+            agree = agreeing(first, second, self._focal(i, j))
             if agree.any():
                 self.agreeing[i, j] = rows[agree]
         return region, self._errors()
+
+    def _plane_rays(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Rays (n, 2) of a camera that is not turned."""
+        rays = self.rays[i][rows]
+        if self.turns[i] is None:
+            return rays
+        return rays + self.cameras[i].rays(self.features[i].keypoints[rows])
 
     def _focal(self, i: int, j: int) -> float:
         return float(0.5 * (self.focal[i] + self.focal[j]))
 
     def _errors(self) -> list[NDArray[np.float64]]:
-        poses, rays = self.model.cam_from_world, self.rays
-        return [
-            pose_errors(poses[i], poses[j], rays[i][r[:, 0]], rays[j][r[:, 1]], self._focal(i, j))
-            for (i, j), r in self.agreeing.items()
-        ]
+        errors = []
+        for (i, j), rows in self.agreeing.items():
+            a, b = rows.T
+            poses = pose_at(self.views[i].pose, a), pose_at(self.views[j].pose, b)
+            rays = self.rays[i][a], self.rays[j][b]
+            errors.append(pose_errors(*poses, *rays, focal=self._focal(i, j)))
+        return errors
 
     def match_covisible(self) -> NDArray[np.float64]:
         """Match keyframes with overlapping views; returns the overlap (m, m)."""
@@ -353,6 +382,10 @@ class _Matching:
 def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.float64]) -> Scene:
     counts = np.array([len(f) for f in work.features])
     keyframe = np.repeat(np.arange(len(counts)), counts)
+    turns = None
+    if any(t is not None for t in work.turns):
+        parts = zip(work.turns, counts, strict=True)
+        turns = np.concatenate([np.eye(3)[None].repeat(n, 0) if t is None else t for t, n in parts])
     return Scene(
         model=work.model,
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
@@ -363,6 +396,7 @@ def _scene(work: _Matching, labels: NDArray[np.int64], positions: NDArray[np.flo
         descriptors=np.concatenate([f.descriptors for f in work.features]),
         labels=labels,
         positions=positions,
+        turns=turns,
     )
 
 
@@ -417,7 +451,7 @@ def _detect(
 
     def one(index: int) -> Features | str:
         if not hasattr(local, "extractor"):
-            local.extractor = Extractor(options.descriptor, options.max_keypoints)
+            local.extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         path = sequence.images / model.names[index]
         try:
             image = read_gray(path)

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from protomark.files import only_writer
 from protomark.progress import Progress, silent
 from protomark.tracks import database
 from protomark.tracks.augmentation import METHOD, add_augmentations
@@ -81,9 +82,9 @@ def _make_unless_current(
         existing = Tracks.load(path)
         if not force and all(existing.info.get(k) == v for k, v in made_from().items()):
             return TracksFile(path, existing, skipped=True)
-    begin = time.perf_counter()
-    tracks = make()
-    tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tracks.save(path)
+    with only_writer(path.parent, path.name):
+        begin = time.perf_counter()
+        tracks = make()
+        tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
+        tracks.save(path)
     return TracksFile(path, tracks, skipped=False)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark._core import hamming_search
-from protomark.geometry.pose import relative_pose
+from protomark.geometry.pose import pose_at, relative_pose
 from protomark.geometry.triangulation import epipolar_error
 
 
@@ -17,9 +17,10 @@ class View:
     """The data of a keyframe that matching needs."""
 
     descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
-    # (n, 2) float64, undistorted x / z and y / z, NaN where undistortion fails.
+    # (n, 2) float64, undistorted, NaN where undistortion fails, see `Camera.local_rays`.
     rays: NDArray[np.float64]
-    pose: NDArray[np.float64]  # (3, 4) float64, cam_from_world
+    # (3, 4) float64, cam_from_world; (n, 3, 4), turned for each ray, if the camera is wide.
+    pose: NDArray[np.float64]
     focal: float  # focal length in pixels
 
 
@@ -86,6 +87,6 @@ def with_errors(matches: VerifiedMatches, first: View, second: View) -> Verified
 def _epipolar_errors(
     first: View, second: View, rows: NDArray[np.int64], target: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    rotation, translation = relative_pose(first.pose, second.pose)
-    error = epipolar_error(rotation, translation, first.rays[rows], second.rays[target])
+    relative = relative_pose(pose_at(first.pose, rows), pose_at(second.pose, target))
+    error = epipolar_error(*relative, first.rays[rows], second.rays[target])
     return error * (0.5 * (first.focal + second.focal))

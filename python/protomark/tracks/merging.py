@@ -69,7 +69,7 @@ def _round(
     rows, after, keyframes = rows[touched], after[touched], keyframes[touched]
     if not len(rows):
         return into, refused
-    poses, seen, focal = scene.model.cam_from_world[keyframes], scene.rays[rows], scene.focal[rows]
+    poses, seen, focal = scene.poses(rows), scene.rays[rows], scene.focal[rows]
     moved = refine_points(scene.positions, after, poses, seen, focal)
     error = pixel_errors(moved[after], poses, seen, focal)
     # Of two keypoints in one keyframe the better one keeps the landmark.
@@ -107,7 +107,7 @@ def _apart(scene: Scene, pairs: NDArray[np.int64], rows: NDArray[np.int64]) -> N
     """Median distance (n,) in pixels between the landmarks of pairs, in keyframes of the first."""
     at, length = scene.rows_of(pairs[:, 0], rows)
     pair = np.repeat(np.arange(len(pairs)), length)
-    poses = scene.model.cam_from_world[scene.keyframe[at]]
+    poses = scene.poses(at)
     first, second = (
         reprojection_residuals(scene.positions[pairs[pair, k]], poses, np.zeros((len(at), 2)))[0]
         for k in (0, 1)

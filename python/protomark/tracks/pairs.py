@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.colmap import ColmapModel
-from protomark.geometry.pose import relative_pose
+from protomark.geometry.pose import pose_at, relative_pose
 from protomark.geometry.triangulation import depth_of_first
 from protomark.tracks.matching import VerifiedMatches, View
 
@@ -40,10 +40,9 @@ def depth_quartiles(
     seen: list[list[NDArray[np.float64]]] = [[] for _ in views]
     for (i, j), pair in matches.items():
         for a, b, rows in ((i, j, pair.rows), (j, i, pair.rows[:, ::-1])):
-            rotation, translation = relative_pose(views[a].pose, views[b].pose)
-            depth, angle = depth_of_first(
-                rotation, translation, views[a].rays[rows[:, 0]], views[b].rays[rows[:, 1]]
-            )
+            first, second = rows.T
+            relative = relative_pose(pose_at(views[a].pose, first), pose_at(views[b].pose, second))
+            depth, angle = depth_of_first(*relative, views[a].rays[first], views[b].rays[second])
             seen[a].append(depth[(depth > 0) & (angle > np.radians(0.5))])
     depths = [np.concatenate(d) if d else np.zeros(0) for d in seen]
     everything = np.concatenate(depths) if depths else np.zeros(0)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.geometry.colmap import ColmapModel
+from protomark.geometry.pose import turned
 from protomark.geometry.triangulation import pixel_errors
 
 
@@ -24,6 +25,7 @@ class Scene:
     descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
     labels: NDArray[np.int64]  # (n,) int64, row of the landmark in positions, -1 for none
     positions: NDArray[np.float64]  # (l, 3) float64
+    turns: NDArray[np.float64] | None = None  # (n, 3, 3) float64, see `Camera.local_rays`
 
     def observations(self) -> NDArray[np.int64]:
         """Rows with a landmark, sorted by landmark, then by row."""
@@ -40,11 +42,16 @@ class Scene:
         shift = np.repeat(start - np.cumsum(length) + length, length)
         return rows[np.arange(len(shift)) + shift], length
 
+    def poses(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Poses (n, 3, 4) that the rays of keypoints count from."""
+        poses = self.model.cam_from_world[self.keyframe[rows]]
+        return turned(poses, None if self.turns is None else self.turns[rows])
+
     def errors(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Reprojection errors (n,) of observations in pixels of the undistorted image."""
         return pixel_errors(
             self.positions[self.labels[rows]],
-            self.model.cam_from_world[self.keyframe[rows]],
+            self.poses(rows),
             self.rays[rows],
             self.focal[rows],
         )

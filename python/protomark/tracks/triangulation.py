@@ -144,7 +144,7 @@ def refine_poses(given: ColmapModel, reconstruction: Any, error: float) -> Colma
         if point.has_point3D()
     ]
     focal = min(camera.focal_length for camera in given.cameras.values())
-    spread = error / focal * float(np.median([depth[2] for depth in depths]))
+    spread = error / focal * float(np.median([abs(depth[2]) for depth in depths]))
     if not bundle_adjust(
         reconstruction, list(reconstruction.images), priors=given.centers, spread=spread
     ):
