@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from protomark.extras import optional
 from protomark.geometry.neighbours import runs
+from protomark.geometry.pose import camera_centers, rotate
 from protomark.interrupt import raise_if_overdue
 
 Array = NDArray[np.float64]
@@ -46,6 +47,8 @@ class Bundle:
     pixels: Array  # (n, 2) float64, relative to the principal point
     sigma: Array  # (n,) float64, standard deviation in pixels
     turns: Array | None = None  # (n, 3, 3) float64, see `Camera.local_rays`
+    priors: Array | None = None  # (f, 3) float64, where cameras are likely to be
+    spread: float = 1.0  # standard deviation of the priors along each axis
 
     def __post_init__(self) -> None:
         first = np.full(len(self.points), len(self.poses))
@@ -131,7 +134,14 @@ class Bundle:
         square /= loss_scale**2
         weight = np.where(front, 1 / (self.sigma * np.sqrt(1 + square)), 0.0)
         loss = float(np.log1p(square).sum()) if (self.lenses[:, 0] > 0).all() else np.inf
+        if self.priors is not None:
+            loss += float((self._off_priors() ** 2).sum())
         return loss, local, error, weight
+
+    def _off_priors(self) -> Array:
+        """Distances (f, 3) of the cameras from their priors, in standard deviations."""
+        assert self.priors is not None
+        return (camera_centers(self.poses) - self.priors) / self.spread
 
     def _step(self, local: Array, error: Array, weight: Array, damping: float) -> None:
         """Solve the normal equations, and move everything by the solution."""
@@ -192,11 +202,17 @@ class Bundle:
         for a, b in self._blocks:
             jacobian = np.concatenate(by_motion[:, :, a:b], axis=1)
             normal, slope = jacobian @ jacobian.T, jacobian @ residual[:, a:b].reshape(-1)
-            for i, rows in self._rows(self.frame[a]):
-                target[rows] += slope[i]
-                for j, columns in self._rows(self.frame[a]):
-                    reduced[rows, columns] += normal[i, j]
+            blocks = self._rows(self.frame[a])
+            for i, to in blocks:
+                target[to] += slope[i]
+                for j, across in blocks:
+                    reduced[to, across] += normal[i, j]
         diagonal = np.einsum("ii->i", reduced)
+        if self.priors is not None:
+            slopes = -rotate(self.poses[:, :, :3], self._off_priors()) / self.spread
+            of_centers = np.arange(self._first_lens).reshape(-1, 6)[:, 3:].ravel()
+            diagonal[of_centers] += 1 / self.spread**2
+            target[of_centers] += slopes[self.moving].ravel()
         diagonal *= 1 + damping
         diagonal += 1e-12
         for rows, points, coupling in self._couplings(by_motion, by_point):
