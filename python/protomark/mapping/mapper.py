@@ -37,7 +37,6 @@ _LOCAL_SIZE = 10
 _LOCAL_ITERATIONS = 2
 # Global bundle adjustment follows whenever the number of keyframes has grown by this factor.
 _GROWTH = 1.5
-_GLOBAL_ITERATIONS = 8
 _FIRST_GLOBAL = 6
 # A map with fewer keyframes that loses this many frames in a row was initialised wrongly.
 _YOUNG_KEYFRAMES = 4
@@ -275,16 +274,16 @@ class Mapper:
         keyframes = len(self.structure.keyframes())
         if keyframes >= self.next_global:
             self.next_global = int(keyframes * _GROWTH) + 1
-            self._adjust_global_bundle(1)
+            self._adjust_global_bundle(1, iterations=4)
 
-    def _adjust_global_bundle(self, rounds: int) -> None:
+    def _adjust_global_bundle(self, rounds: int, iterations: int = 10) -> None:
         """Adjust and cull the whole map, and the camera if it is being calibrated."""
         structure = self.structure
         with self.clock.stage("adjust"):
             for _ in range(rounds):
                 adjustment.adjust_global_bundle(
                     structure,
-                    iterations=_GLOBAL_ITERATIONS if self.calibration is None else 30,
+                    iterations=iterations if self.calibration is None else 30,
                     calibration=self.calibration,
                     poses=not self.options.fixed_poses,
                 )
