@@ -32,7 +32,13 @@ from protomark.mapping.source import open_source
 from protomark.mapping.structure import Structure
 from protomark.mapping.survey import MatchedPair
 from protomark.mapping.tracking import LandmarkMatches
-from protomark.mapping.trust import THROWN, UNCERTAIN, is_uncertain, untrusted_frames
+from protomark.mapping.trust import (
+    THROWN,
+    UNCERTAIN,
+    is_uncertain,
+    untrusted_frames,
+    weak_connections,
+)
 from test_mapping import CAMERA, COUNT, error_of, run
 from test_tracks_command import fails
 from tracks_scene import PINHOLE
@@ -126,7 +132,10 @@ def structure_of(poses: np.ndarray, points: np.ndarray) -> Structure:
     ids = structure.create(points)
     for i, pose in enumerate(poses):
         pixels = PINHOLE.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
-        frame = Frame(i, str(i), float(i), 1, pixels.astype(np.float32), PINHOLE.rays(pixels))
+        frame = Frame(
+            *(i, str(i), float(i), 1, pixels.astype(np.float32), PINHOLE.rays(pixels)),
+            np.ones(len(ids)),
+        )
         frame = frame.at(pose)
         structure.frames.append(frame)
         structure.observe(frame, np.arange(len(ids)), ids)
@@ -147,6 +156,22 @@ def test_a_frame_that_was_thrown_far_away_is_not_registered() -> None:
         frame.pose[:, 3] = 300 * walk(14)[frame.index][:, 3]
     structure.recompute_views()
     assert untrusted_frames(structure) == dict.fromkeys(range(4), THROWN)
+
+
+def test_parts_that_few_landmarks_connect_are_named() -> None:
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-0.6, 0.5, (80, 2)), rng.uniform(2, 3, 80)])
+    structure = structure_of(walk(14), points)
+    assert not weak_connections(structure, 20)
+    for frame in structure.frames:
+        frame.landmarks[slice(40, 80) if frame.index < 6 else slice(0, 30)] = -1
+    assert not weak_connections(structure, 10), "ten landmarks are left"
+    assert weak_connections(structure, 20) == ["6"]
+    structure.frames[4].landmarks[30:40] = structure.frames[5].landmarks[30:40] = -1
+    assert weak_connections(structure, 10) == []
+    structure.frames[0].landmarks[30:40] = structure.frames[1].landmarks[30:40] = -1
+    structure.frames[2].landmarks[30:40] = -1
+    assert weak_connections(structure, 10) == ["6"], "one keyframe does not know their depth"
 
 
 def test_a_pose_that_its_landmarks_leave_open_is_uncertain() -> None:

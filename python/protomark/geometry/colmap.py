@@ -11,7 +11,6 @@ import zlib  # noqa: F401  (must come before pycolmap, see above)
 
 # isort: split
 import contextlib
-import math
 import os
 import re
 import signal
@@ -32,7 +31,6 @@ from protomark.files import natural_key
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 from protomark.geometry.pose_files import check_images_txt
-from protomark.interrupt import raise_if_overdue
 
 # pycolmap takes SIGTERM for itself, to print a stack trace.
 _on_sigterm = signal.getsignal(signal.SIGTERM)
@@ -41,8 +39,6 @@ if _on_sigterm is not None and threading.current_thread() is threading.main_thre
     signal.signal(signal.SIGTERM, _on_sigterm)
 
 _FILES = ("cameras", "images")
-# Steps of the solver in one call.
-_SLICE = 10
 
 
 @dataclass
@@ -228,115 +224,6 @@ def new_reconstruction(
         )
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     return reconstruction
-
-
-def bundle_adjust(
-    reconstruction: Any,
-    image_ids: Iterable[int],
-    fixed: Sequence[int] = (),
-    *,
-    iterations: int = 30,
-    loss_scale: float = 1.0,
-    intrinsics: bool = False,
-    threads: int = 1,
-    priors: NDArray[np.float64] | None = None,
-    spread: float = 1.0,
-) -> bool:
-    """Move poses and points to the least (Cauchy) reprojection error; returns whether that worked.
-
-    Args:
-        reconstruction: a `pycolmap.Reconstruction`; changed.
-        image_ids: images that take part.
-        fixed: those of them whose poses stay; with fewer than two, two cameras fix the gauge.
-        iterations: limit on the solver's steps.
-        loss_scale: pixels beyond which an error counts less.
-        intrinsics: whether focal length and distortion move, too.
-        threads: threads of the solver; their number changes the last digits.
-        priors: (m, 3) camera centres that images 1 to m are likely to have.
-        spread: standard deviation of the priors along each axis.
-    """
-    images, usable = list(image_ids), False
-    # Python sees signals only between two calls of the solver.
-    for start in range(0, iterations, _SLICE):
-        raise_if_overdue()
-        limit = min(_SLICE, iterations - start)
-        adjuster = _adjuster(
-            reconstruction, images, fixed, limit, loss_scale, intrinsics, threads, priors, spread
-        )
-        with quiet():
-            summary = adjuster.solve()
-        usable = bool(summary.is_solution_usable())
-        if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
-            break
-    return usable
-
-
-def focal_deviations(reconstruction: Any, image_ids: Iterable[int]) -> dict[int, float]:
-    """Relative standard deviation of each camera's focal length after bundle adjustment.
-
-    Poses, points and distortion are free, and the residuals say how accurate a keypoint is. The
-    value is infinite where the images do not determine the focal length.
-    """
-    adjuster = _adjuster(reconstruction, image_ids, intrinsics=True)
-    options = pycolmap.BACovarianceOptions()
-    options.params = pycolmap.BACovarianceOptionsParams.ALL
-    with quiet():
-        covariance = pycolmap.estimate_ba_covariance(options, reconstruction, adjuster)
-    reconstruction.update_point_3d_errors()
-    # The mean length of an error with this deviation in x and in y is sqrt(pi / 2) times it.
-    noise = reconstruction.compute_mean_reprojection_error() / math.sqrt(math.pi / 2)
-    deviations = {}
-    for camera_id, camera in reconstruction.cameras.items():
-        block = None if covariance is None else covariance.get_other_params_cov(camera.params)
-        variance = float(block[0, 0]) if block is not None else math.inf
-        valid = math.isfinite(variance) and variance >= 0
-        deviation = noise * math.sqrt(variance) / camera.mean_focal_length() if valid else math.inf
-        deviations[int(camera_id)] = deviation
-    return deviations
-
-
-def _adjuster(
-    reconstruction: Any,
-    image_ids: Iterable[int],
-    fixed: Sequence[int] = (),
-    iterations: int = 30,
-    loss_scale: float = 1.0,
-    intrinsics: bool = False,
-    threads: int = 1,
-    priors: NDArray[np.float64] | None = None,
-    spread: float = 1.0,
-) -> Any:
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = intrinsics
-    options.refine_principal_point = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_scale
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.max_num_iterations = iterations
-    options.ceres.solver_options.function_tolerance = 1e-4
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in image_ids:
-        config.add_image(image_id)
-    for image_id in fixed:
-        config.set_constant_rig_from_world_pose(image_id)
-    if len(fixed) < 2:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Unlike pycolmap.bundle_adjustment, this does not write to the terminal.
-    if priors is None:
-        return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
-    known = [
-        pycolmap.PosePrior(
-            corr_data_id=reconstruction.images[i].data_id,
-            position=position,
-            position_covariance=spread**2 * np.eye(3),
-            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
-        )
-        for i, position in enumerate(priors, 1)
-    ]
-    return pycolmap.create_pose_prior_bundle_adjuster(
-        options, pycolmap.PosePriorBundleAdjustmentOptions(), config, known, reconstruction
-    )
 
 
 def read_model(folder: Path) -> ColmapModel:

@@ -1,23 +1,18 @@
-"""Bundle adjustment, local and global, by COLMAP and Ceres."""
+"""Bundle adjustment of a map, local and global."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from protomark.geometry.bundle import Bundle
 from protomark.geometry.camera import Camera
-from protomark.geometry.colmap import bundle_adjust
-from protomark.geometry.pose import transform
-from protomark.geometry.triangulation import refine_points
-from protomark.mapping.frame import Array, Ids
-from protomark.mapping.reconstruction import to_reconstruction
-from protomark.mapping.self_calibration import Calibration
+from protomark.mapping.frame import Ids
+from protomark.mapping.self_calibration import CALIBRATED_MODEL, Calibration
 from protomark.mapping.structure import Observations, Structure
 
-# Each frame's most observed landmarks take part in the adjustment; more cost time and do not lower
-# the error. The others are refined afterwards, under fixed poses.
-_POINTS_PER_POSE = 250
 # Of the keyframes around those that move, the ones that share most landmarks are held fixed.
 _MAX_FIXED = 15
 
@@ -41,12 +36,11 @@ def adjust_global_bundle(
     loss_scale: float = 1.0,
     calibration: Calibration | None = None,  # None: cameras stay as they are
     poses: bool = True,  # whether they move
-    threads: int = 1,
 ) -> None:
-    """Adjust all keyframes and landmarks."""
+    """Adjust all keyframes but the first, and all landmarks."""
     keyframes = structure.keyframes()
-    moving, fixed = (keyframes, []) if poses else ([], keyframes)
-    adjust(structure, moving, fixed, iterations, loss_scale, calibration, threads)
+    moving = keyframes[1:] if poses else []
+    adjust(structure, moving, keyframes, iterations, loss_scale, calibration)
     structure.recompute_views()
 
 
@@ -66,82 +60,78 @@ def adjust(
     iterations: int,
     loss_scale: float = 1.0,
     calibration: Calibration | None = None,  # None: cameras stay as they are
-    threads: int = 1,
 ) -> None:
     """Move frames and the landmarks they observe to the least (Cauchy) reprojection error."""
-    pixel = max(map(structure.pixel, structure.cameras))
     seen = structure.observations(sorted({*moving, *fixed}))
-    counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
-    seen = seen.where(counts[seen.landmarks] >= 2)
+    moves = np.zeros(len(structure.frames), bool)
+    moves[moving] = True
+    size = len(structure.positions)
+    chosen = np.bincount(seen.landmarks, minlength=size) >= 2
     if moving:
-        used = seen.where(np.isin(seen.landmarks, _most_observed(seen, counts, set(moving))))
-        before = {i: structure.frames[i].pose for i in moving}
-        present = sorted(np.unique(used.frames).tolist())
-        for intrinsics in (True, False) if calibration is not None else (False,):
-            reconstruction = to_reconstruction(structure, present, used)
-            images = [i + 1 for i in present]
-            bundle_adjust(
-                reconstruction,
-                images,
-                [i + 1 for i in fixed if i in present],
-                iterations=iterations,
-                loss_scale=loss_scale * pixel,
-                intrinsics=intrinsics,
-                threads=threads,
-            )
-            if calibration is None or not intrinsics or calibration.accept(reconstruction, images):
-                break
-        _read_back(structure, reconstruction, used, moving, intrinsics)
-        _move_with_frames(structure, np.setdiff1d(seen.landmarks, used.landmarks), before)
-    seen = structure.observations(sorted({*moving, *fixed}))
-    seen = seen.where(counts[seen.landmarks] >= 2)
-    structure.positions = refine_points(
-        structure.positions, seen.landmarks, seen.poses, seen.rays, seen.focal, huber=pixel
+        chosen &= np.bincount(seen.landmarks, moves[seen.frames], minlength=size) > 0
+    seen = seen.where(chosen[seen.landmarks])
+    if not len(seen.frames):
+        return
+    bundle = _bundle(structure, seen, moves, calibration is not None)
+    bundle.adjust(iterations, loss_scale)
+    if calibration is not None:
+        cameras = _calibrated(structure, seen, bundle)
+        if calibration.accept(list(cameras.values()), float(bundle.focal_deviations().max())):
+            for i, camera in cameras.items():
+                structure.set_camera(i, camera)
+        else:
+            bundle = _bundle(structure, seen, moves, False)
+            bundle.adjust(iterations, loss_scale)
+    for i, pose in zip(np.unique(seen.frames).tolist(), bundle.poses, strict=True):
+        if moves[i] and np.isfinite(pose).all():
+            structure.frames[i].pose = pose
+    finite = np.isfinite(bundle.points).all(1)
+    structure.positions[np.unique(seen.landmarks)[finite]] = bundle.points[finite]
+
+
+def _camera_ids(structure: Structure, seen: Observations) -> list[int]:
+    return sorted({structure.frames[i].camera_id for i in np.unique(seen.frames).tolist()})
+
+
+def _bundle(
+    structure: Structure, seen: Observations, moves: NDArray[np.bool_], calibrate: bool
+) -> Bundle:
+    """The frames, landmarks and cameras of observations, each in ascending order."""
+    frames, frame = np.unique(seen.frames, return_inverse=True)
+    ids, point = np.unique(seen.landmarks, return_inverse=True)
+    cameras = _camera_ids(structure, seen)
+    camera = np.array([cameras.index(structure.frames[i].camera_id) for i in frames.tolist()])
+    models = [structure.cameras[i] for i in cameras]
+    refined = np.array([calibrate and one.model == CALIBRATED_MODEL for one in models])
+    lenses = np.array(
+        [(c.focal_length, c.params[3] if r else 0.0) for c, r in zip(models, refined, strict=True)]
+    )
+    focal, distortion = lenses[camera[frame]].T
+    stretch = focal * (1 + distortion * (seen.rays * seen.rays).sum(1))
+    poses = np.array([structure.frames[i].pose for i in frames.tolist()])
+    turns = None
+    if any(one.wide for one in models):
+        turns = seen.poses[:, :, :3] @ poses[frame, :, :3].transpose(0, 2, 1)
+    return Bundle(
+        poses,
+        moves[frames],
+        camera,
+        lenses,
+        refined,
+        structure.positions[ids],
+        frame,
+        point,
+        stretch[:, None] * seen.rays,
+        seen.sigma,
+        turns,
     )
 
 
-def _most_observed(seen: Observations, counts: Ids, moving: set[int]) -> Ids:
-    """The landmarks with the most observations, `_POINTS_PER_POSE` for each moving frame."""
-    order = np.argsort(seen.landmarks, kind="stable")
-    ids, starts = np.unique(seen.landmarks[order], return_index=True)
-    observers = np.split(seen.frames[order], starts[1:])
-    chosen_per_frame: dict[int, int] = dict.fromkeys(np.unique(seen.frames).tolist(), 0)
-    chosen = []
-    for k in np.argsort(-counts[ids], kind="stable").tolist():
-        frames = observers[k].tolist()
-        if any(chosen_per_frame[i] < _POINTS_PER_POSE for i in frames if i in moving):
-            chosen.append(ids[k])
-            for i in frames:
-                chosen_per_frame[i] += 1
-    return np.array(chosen, np.int64)
-
-
-def _read_back(
-    structure: Structure, reconstruction: Any, seen: Observations, moving: list[int], cameras: bool
-) -> None:
-    present = set(np.unique(seen.frames).tolist())
-    for i in moving:
-        if i in present:
-            # In C order, as after loading: memory layout decides the last digits of products.
-            pose = np.ascontiguousarray(reconstruction.images[i + 1].cam_from_world().matrix())
-            if np.isfinite(pose).all():
-                structure.frames[i].pose = pose
-    for point in np.unique(seen.landmarks).tolist():
-        xyz = reconstruction.points3D[point].xyz
-        if np.isfinite(xyz).all():
-            structure.positions[point] = xyz
-    if cameras:
-        for camera_id, camera in reconstruction.cameras.items():
-            structure.set_camera(camera_id, Camera.from_colmap(camera))
-
-
-def _move_with_frames(structure: Structure, ids: Ids, before: dict[int, Array]) -> None:
-    """Move landmarks that took no part along with the first moved frame that observes them."""
-    remaining = np.zeros(len(structure.positions), bool)
-    remaining[ids] = True
-    for i, old in before.items():
-        frame = structure.frames[i]
-        moved = frame.seen[remaining[frame.seen]]
-        local = transform(old, structure.positions[moved])
-        structure.positions[moved] = (local - frame.pose[:, 3]) @ frame.pose[:, :3]
-        remaining[moved] = False
+def _calibrated(structure: Structure, seen: Observations, bundle: Bundle) -> dict[int, Camera]:
+    """The cameras that an adjustment refined."""
+    out = {}
+    for k, i in enumerate(_camera_ids(structure, seen)):
+        if bundle.refined[k]:
+            old, (focal, distortion) = structure.cameras[i], bundle.lenses[k].tolist()
+            out[i] = replace(old, params=(focal, *old.params[1:3], distortion))
+    return out

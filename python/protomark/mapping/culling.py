@@ -15,6 +15,8 @@ from protomark.mapping.structure import Observations, Structure
 _MIN_CONFIRMED = 3
 # A landmark needs this share of the triangulation angle of a new one.
 _ANGLE_SHARE = 0.6
+# Keyframes are apart, so the rays of this many are.
+_MANY = 5
 
 
 def cull(
@@ -57,7 +59,8 @@ def cull_landmarks(structure: Structure, memory: Memory, ids: Ids, min_angle: fl
     frames = structure.frames
     window_start = next((i for i, frame in enumerate(frames) if frame.in_window), len(frames))
     weak |= (structure.born[ids] <= window_start) & (counts[ids] < _MIN_CONFIRMED)
-    weak |= _angles(structure, ids) < np.radians(_ANGLE_SHARE * min_angle)
+    few = ids[counts[ids] < _MANY]
+    weak |= np.isin(ids, few[_angles(structure, few) < np.radians(_ANGLE_SHARE * min_angle)])
     removed = ids[weak & structure.existing[ids]]
     if len(removed):
         # A landmark whose observations were all subtracted has left the memory already.

@@ -39,6 +39,8 @@ class Frame:
     # (n, 2) float32, pixels; those without a landmark are dropped when the frame leaves the window.
     keypoints: NDArray[np.float32]
     rays: Array  # (n, 2) float64, undistorted, see `Camera.local_rays`
+    # (n,) float64, standard deviation of the keypoints in pixels, which grows with their size.
+    sigma: Array
     descriptors: NDArray[np.uint8] | None = None  # (n, B) uint8, None outside of the window
     # (n, width), the form that the memory compares; None outside of the window.
     encoded: NDArray[Any] | None = None
@@ -94,7 +96,15 @@ class Frame:
     def leave_window(self) -> None:
         """Drop the descriptors, and the keypoints that observe no landmark."""
         rows = self.observed
-        self.keypoints, self.rays = self.keypoints[rows], self.rays[rows]
+        for name in ("keypoints", "rays", "sigma", "landmarks"):
+            setattr(self, name, getattr(self, name)[rows])
         self.turns = None if self.turns is None else self.turns[rows]
-        self.landmarks = self.landmarks[rows]
         self.descriptors = self.encoded = None
+
+
+def keypoint_sigma(sizes: NDArray[np.float32]) -> Array:
+    """Standard deviations (n,) of keypoints with these sizes, 1 for the smallest of an image.
+
+    They grow like the size in sharp images, and less where blur hides the finest scales.
+    """
+    return np.sqrt(sizes.astype(np.float64) / sizes.min(initial=np.inf))

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.absolute_pose import estimate_pose, reprojection_error
+from protomark.geometry.absolute_pose import estimate_pose
+from protomark.geometry.bundle import Bundle
 from protomark.geometry.pose import relative_pose, transform
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
 from protomark.geometry.two_views import (
@@ -36,6 +37,7 @@ _MIN_LEAD = 1.05
 _MIN_LEAD_TWO_WITNESSES = 1.2
 _MAX_WITNESSES = 4
 _MIN_COMMON = 40
+_REFINE_STEPS = 10
 # Of more waiting frames every second one is dropped; it is retried at the end as a lost frame.
 _MAX_WAITING = 40
 # A new frame is paired with at most so many waiting ones, from the oldest to the newest.
@@ -100,24 +102,24 @@ class Initialiser:
         candidates = self._candidates(one, other, rows)
         if not candidates:
             return None
-        parallax = [self._parallax(pose, one, other, rows) for pose in candidates]
-        if max(parallax) < MIN_PARALLAX:
-            self.best_parallax = max(self.best_parallax, *parallax)
+        parallax = self._parallax(candidates[0], one, other, rows)
+        if parallax < MIN_PARALLAX:
+            self.best_parallax = max(self.best_parallax, parallax)
             return None
         witnesses = self._witnesses(first, second)
-        scores = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
-        best = int(np.argmax([support for support, _ in scores]))
-        support, share = scores[best]
-        if share < _MIN_SUPPORT:
+        supports = [self._support(one, other, rows, pose, witnesses) for pose in candidates]
+        best = max(supports, key=lambda support: support.score)
+        if best.share < _MIN_SUPPORT:
             return None
-        self.best_parallax = max(self.best_parallax, parallax[best])
-        if parallax[best] < MIN_PARALLAX:
+        parallax = self._parallax(best.pose, one, other, rows)
+        self.best_parallax = max(self.best_parallax, parallax)
+        if parallax < MIN_PARALLAX:
             return None
         lead = _MIN_LEAD if len(witnesses) > 2 else _MIN_LEAD_TWO_WITNESSES
-        for pose, (rival, _) in zip(candidates, scores, strict=True):
-            if support < lead * rival and not _same_pose(pose, candidates[best]):
+        for rival in supports:
+            if best.score < lead * rival.score and not _same_pose(rival.pose, best.pose):
                 return None
-        return candidates[best]
+        return best.pose
 
     def _candidates(self, one: Frame, other: Frame, rows: Ids) -> list[Array]:
         """The relative pose that fits best, and those that a planar scene admits."""
@@ -128,7 +130,7 @@ class Initialiser:
             return []
         if self._rotated_share(found[:, :3], one, other, rows[inliers]) > _MAX_ROTATED:
             return []
-        out = []
+        out: list[Array] = []
         for start in (found, *planar_poses(a, b, camera, error, _MIN_COMMON)):
             good = self._verify(start, one, other, rows)[0]
             pose = refine_relative_pose(start, a, b, camera, error, good)
@@ -137,7 +139,8 @@ class Initialiser:
                 continue
             pose[:, 3] /= length
             good = self._verify(pose, one, other, rows)[0]
-            if good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
+            new = not any(_same_pose(pose, other) for other in out)
+            if new and good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:
                 out.append(pose)
         return out
 
@@ -148,22 +151,24 @@ class Initialiser:
 
     def _parallax(self, pose: Array, one: Frame, other: Frame, rows: Ids) -> float:
         """Typical angle between the two rays of a match, degrees."""
-        good, _, angle = self._verify(pose, one, other, rows)
+        good, _, angle, _ = self._verify(pose, one, other, rows)
         quantile = _WIDE_PARALLAX_QUANTILE if self.camera.wide else _PARALLAX_QUANTILE
         return float(np.degrees(np.quantile(angle[good], quantile)))
 
     def _verify(
         self, pose: Array, one: Frame, other: Frame, rows: Ids
-    ) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Whether each match fits a pose, its depth in the first frame, and its angle."""
+    ) -> tuple[NDArray[np.bool_], Array, Array, NDArray[np.bool_]]:
+        """Whether each match fits a pose, its depth in the first frame, and its angle.
+
+        The last array tells whether it lies near the epipolar line, maybe behind a camera.
+        """
         one, other, (a, b) = one.at(np.eye(3, 4)), other.at(pose), rows.T
         relative = relative_pose(one.local_poses(a), other.local_poses(b))
         rays = one.rays[a], other.rays[b]
         depth, angle = depth_of_first(*relative, *rays)
-        error = epipolar_error(*relative, *rays) * self._focal
+        near = epipolar_error(*relative, *rays) * self._focal <= self.max_error
         in_second = transform(other.local_poses(b), one.points(a, depth))[:, 2]
-        good = (depth > 0) & (in_second > 0) & (error <= self.max_error)
-        return good, depth, angle
+        return (depth > 0) & (in_second > 0) & near, depth, angle, near
 
     def _witnesses(self, first: int, second: int) -> list[tuple[Frame, Ids]]:
         """Further frames, preferably between the two, and their matches with the first one."""
@@ -190,30 +195,60 @@ class Initialiser:
         rows: Ids,
         pose: Array,
         witnesses: list[tuple[Frame, Ids]],
-    ) -> tuple[float, float]:
-        """How well the landmarks of a relative pose fit the witnesses: a score, and a share.
+    ) -> _Support:
+        """How well a relative pose, adjusted together with the witnesses, fits what these see.
 
         The score counts each landmark as 1 minus its squared error over the squared limit.
         """
-        good, depth, _ = self._verify(pose, one, other, rows)
-        points = np.full((len(one.keypoints), 3), np.nan)
-        at = rows[good, 0]
-        points[at] = one.at(np.eye(3, 4)).points(at, depth[good])
+        verified, depth, _, good = self._verify(pose, one, other, rows)
+        # Noise moves what is far away beyond infinity.
+        depth = np.where(depth > 0, depth, np.median(depth[verified]))
+        at, count = rows[good, 0], int(good.sum())
+        landmark = np.full(len(one.keypoints), -1)
+        landmark[at] = np.arange(count)
+        points = one.at(np.eye(3, 4)).points(at, depth[good])
+        poses, observed = [np.eye(3, 4), pose], [landmark[at]] * 2
+        seen = [(one, at), (other, rows[good, 1])]
         limit = 0.75 * self.max_error
-        score, inliers, total = 0.0, 0, 0
         for witness, pairs in witnesses:
-            pairs = pairs[np.isfinite(points[pairs[:, 0], 0])]
+            pairs = pairs[landmark[pairs[:, 0]] >= 0]
             if len(pairs) < _MIN_COMMON:
                 continue
-            pixels = witness.keypoints[pairs[:, 1]].astype(np.float64)
-            seen = points[pairs[:, 0]]
-            total += len(seen)
-            found = estimate_pose(pixels, seen, self.camera, limit)
-            if found is not None:
-                error = reprojection_error(found.cam_from_world, pixels, seen, self.camera)
-                score += float(np.maximum(1 - (error / limit) ** 2, 0).sum())
-                inliers += int((error <= limit).sum())
-        return score, inliers / max(total, 1)
+            pixels, ids = witness.keypoints[pairs[:, 1]].astype(np.float64), landmark[pairs[:, 0]]
+            found = estimate_pose(pixels, points[ids], self.camera, limit)
+            observed.append(ids)
+            seen.append((witness, pairs[:, 1]))
+            poses.append(poses[0] if found is None else found.cam_from_world)
+        counts = [len(ids) for ids in observed]
+        turns = [f.turns[r] for f, r in seen if f.turns is not None]
+        bundle = Bundle(
+            poses=np.array(poses),
+            moving=np.arange(len(poses)) > 0,
+            camera=np.zeros(len(poses), np.int64),
+            lenses=np.array([[self._focal, 0.0]]),
+            refined=np.zeros(1, bool),
+            points=points,
+            frame=np.repeat(np.arange(len(poses)), counts),
+            point=np.concatenate(observed),
+            pixels=self._focal * np.concatenate([frame.rays[r] for frame, r in seen]),
+            sigma=np.ones(sum(counts)),
+            turns=np.concatenate(turns) if turns else None,
+        )
+        bundle.adjust(_REFINE_STEPS, 0.5 * self.max_error)
+        error = bundle.errors()[bundle.frame > 1]
+        length = np.linalg.norm(bundle.poses[1, :, 3])
+        refined = np.column_stack([bundle.poses[1, :, :3], bundle.poses[1, :, 3] / length])
+        score = float(np.maximum(1 - (error / limit) ** 2, 0).sum())
+        return _Support(refined, score, float((error <= limit).mean()) if len(error) else 0.0)
+
+
+@dataclass
+class _Support:
+    """How well a relative pose fits the witnesses."""
+
+    pose: Array  # (3, 4) float64, adjusted
+    score: float
+    share: float  # of landmarks that fit
 
 
 def _same_pose(first: Array, second: Array) -> bool:

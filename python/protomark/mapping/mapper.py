@@ -13,7 +13,7 @@ from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
 from protomark.mapping import adjustment, culling, loop, trust
 from protomark.mapping.clock import Clock
-from protomark.mapping.frame import Array, Frame, InputImage
+from protomark.mapping.frame import Array, Frame, InputImage, keypoint_sigma
 from protomark.mapping.history import REGISTERED, FrameRecord, History
 from protomark.mapping.initialisation import Initialiser, TwoViewPose
 from protomark.mapping.keyframes import is_keyframe
@@ -34,7 +34,7 @@ Reread = Callable[[set[str], bool], Iterable[InputImage]]
 _MIN_KEYPOINTS = 50
 # Local bundle adjustment moves this many keyframes, in at most so many steps.
 _LOCAL_SIZE = 10
-_LOCAL_ITERATIONS = 8
+_LOCAL_ITERATIONS = 2
 # Global bundle adjustment follows whenever the number of keyframes has grown by this factor.
 _GROWTH = 1.5
 _FIRST_GLOBAL = 6
@@ -176,6 +176,7 @@ class Mapper:
             camera_id,
             features.keypoints,
             rays,
+            self.structure.pixel(camera_id) * keypoint_sigma(features.sizes),
             features.descriptors,
             encoded,
             turns=turns,
@@ -233,7 +234,7 @@ class Mapper:
         with self.clock.stage("adjust"):
             if self.options.fixed_poses:
                 window = self._window()
-                adjustment.adjust(self.structure, [], window, 0)
+                adjustment.adjust(self.structure, [], window, 5)
                 return window
             return adjustment.adjust_local_bundle(
                 self.structure, index, _LOCAL_SIZE, _LOCAL_ITERATIONS
@@ -266,27 +267,25 @@ class Mapper:
             )
         if drift:
             with self.clock.stage("adjust"):
-                adjustment.adjust_global_bundle(
-                    self.structure, 20, loss_scale=_LOOP_LOSS_SCALE, threads=self.threads
-                )
+                adjustment.adjust_global_bundle(self.structure, 20, loss_scale=_LOOP_LOSS_SCALE)
             self._adjust_global_bundle(1)
 
     def _adjust_global_bundle_if_grown(self) -> None:
         keyframes = len(self.structure.keyframes())
         if keyframes >= self.next_global:
             self.next_global = int(keyframes * _GROWTH) + 1
-            self._adjust_global_bundle(2)
+            self._adjust_global_bundle(1, iterations=4)
 
-    def _adjust_global_bundle(self, rounds: int) -> None:
+    def _adjust_global_bundle(self, rounds: int, iterations: int = 10) -> None:
         """Adjust and cull the whole map, and the camera if it is being calibrated."""
         structure = self.structure
         with self.clock.stage("adjust"):
             for _ in range(rounds):
                 adjustment.adjust_global_bundle(
                     structure,
+                    iterations=iterations if self.calibration is None else 30,
                     calibration=self.calibration,
                     poses=not self.options.fixed_poses,
-                    threads=self.threads,
                 )
                 self._cull(structure.keyframes())
             self._refine_other_frames()
@@ -362,7 +361,7 @@ class Mapper:
         if len(self.structure.ids) < 2 * self.options.min_inliers:
             return False
         with self.clock.stage("adjust"):
-            adjustment.adjust(self.structure, [0, 1], [], iterations=20)
+            adjustment.adjust(self.structure, [1], [0], iterations=20)
             self._normalise_scale()
             self._cull([0, 1])
         self._record(0)
@@ -443,6 +442,8 @@ class Mapper:
             culling.cull_landmarks(
                 self.structure, self.memory, self.structure.ids, self.options.min_angle
             )
+        if self.structure.frames:
+            self._adjust_global_bundle(1)
         for frame in self.structure.frames:
             frame.leave_window()
         for name, seconds in self.clock.lap().items():

@@ -34,7 +34,7 @@ def to_reconstruction(structure: Structure, frames: Sequence[int], seen: Observa
     order = np.argsort(seen.landmarks, kind="stable")
     ids, starts = np.unique(seen.landmarks[order], return_index=True)
     image_ids, index = (seen.frames[order] + 1).tolist(), index[order].tolist()
-    ends = [*starts[1:].tolist(), len(image_ids)]
+    ends = [*starts.tolist(), len(image_ids)][1:]
     for landmark, a, b in zip(ids.tolist(), starts.tolist(), ends, strict=True):
         elements = [pycolmap.TrackElement(image_ids[k], index[k]) for k in range(a, b)]
         point = pycolmap.Point3D(xyz=structure.positions[landmark], track=pycolmap.Track(elements))

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from protomark.extras import optional
 from protomark.geometry.absolute_pose import MIN_ITERATIONS
 from protomark.geometry.camera import Camera
-from protomark.geometry.colmap import focal_deviations
 from protomark.mapping.survey import MatchedPair
 
+CALIBRATED_MODEL = "SIMPLE_RADIAL"
 # Focal lengths of lenses, as shares of the image's longer side. Distortion moves a point that is
 # seen at an angle of tangent r by at most this share of its distance from the centre, and by this
 # times r squared: only wide lenses distort much.
@@ -55,13 +54,15 @@ class Calibration:
         """Whether the images determine the focal length."""
         return math.isfinite(self.deviation)
 
-    def accept(self, reconstruction: Any, image_ids: Sequence[int]) -> bool:
-        """Whether adjusted cameras are plausible, and the images determine them."""
-        for camera in map(Camera.from_colmap, reconstruction.cameras.values()):
+    def accept(self, cameras: Sequence[Camera], deviation: float) -> bool:
+        """Whether adjusted cameras are plausible, and the images determine them.
+
+        `deviation` is the largest relative deviation of a focal length.
+        """
+        for camera in cameras:
             params = camera.params
             if not np.isfinite(params).all() or params[0] <= 0 or not is_plausible(camera):
                 return False
-        deviation = max(focal_deviations(reconstruction, image_ids).values())
         if not deviation <= self.limit:
             return False
         self.deviation = deviation

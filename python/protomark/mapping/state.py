@@ -53,6 +53,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         "poses": np.array([f.pose for f in frames]).reshape(-1, 3, 4),
         "offsets": np.cumsum([0, *(len(f.keypoints) for f in every)]),
         "keypoints": np.concatenate([np.zeros((0, 2), np.float32), *(f.keypoints for f in every)]),
+        "sigma": np.concatenate([np.zeros(0), *(f.sigma for f in every)]),
         "landmarks": np.concatenate([np.zeros(0, np.int64), *(f.landmarks for f in frames)]),
         "descriptors": np.concatenate([no_descriptors, *descriptors]),
     }
@@ -146,7 +147,7 @@ def _restore_structure(
         raise ValueError("positions are missing")
     types = {"born": "int64", "views": "int64", "offsets": "int64", "landmarks": "int64"}
     types |= {"keypoints": "float32", "descriptors": "uint8"}
-    for name in {*shapes, *types}:
+    for name in {*shapes, *types, "sigma"}:
         if arrays[name].dtype != types.get(name, "float64"):
             raise ValueError(f"{name} has the wrong type {arrays[name].dtype}")
     for name in ("positions", "directions", "views", "distances", "born"):
@@ -158,6 +159,8 @@ def _restore_structure(
 def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict[str, Any]) -> None:
     structure = mapper.structure
     offsets, keypoints = arrays["offsets"], arrays["keypoints"]
+    if arrays["sigma"].shape != (len(keypoints),):
+        raise ValueError("there are not as many deviations as keypoints")
     count = len(state["frames"]) + len(state["waiting"])
     if len(offsets) != count + 1 or (np.diff(offsets) < 0).any() or offsets[-1] > len(keypoints):
         raise ValueError("its frames do not fit together")
@@ -168,7 +171,8 @@ def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict
     for i, (index, name, time, camera_id, *flags) in enumerate(state["frames"] + state["waiting"]):
         a, b = int(offsets[i]), int(offsets[i + 1])
         rays, turns = structure.cameras[camera_id].local_rays(keypoints[a:b])
-        frame = Frame(index, name, time, camera_id, keypoints[a:b].copy(), rays=rays, turns=turns)
+        sigma = arrays["sigma"][a:b].copy()
+        frame = Frame(index, name, time, camera_id, keypoints[a:b].copy(), rays, sigma, turns=turns)
         keyframe, in_window = flags or (True, True)
         if in_window:
             used += b - a

@@ -33,6 +33,7 @@ class Observations:
     poses: Array  # (n, 3, 4) float64
     rays: Array  # (n, 2) float64, undistorted
     focal: Array  # (n,) float64, focal length in pixels
+    sigma: Array  # (n,) float64, see `Frame`
 
     def where(self, keep: Any) -> Observations:
         """The observations for which `keep` (n,) is true."""
@@ -217,6 +218,9 @@ class Structure:
             np.concatenate([np.zeros((0, 3, 4)), *poses]),
             np.concatenate([np.zeros((0, 2)), *rays]),
             np.repeat(focal, counts),
+            np.concatenate(
+                [np.zeros(0), *(f.sigma[r] for f, r in zip(chosen_frames, rows, strict=True))]
+            ),
         )
 
     def errors(self, seen: Observations) -> Array:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from protomark.geometry.absolute_pose import pose_covariance
+from protomark.geometry.neighbours import runs
 from protomark.geometry.pose import camera_centers, transform
 from protomark.mapping.frame import Array, Frame
 from protomark.mapping.history import REGISTERED
@@ -31,6 +32,9 @@ _MIN_LANDMARKS = 10
 _MAX_STEP_RATIO = 20.0
 _MAX_STEP_DEPTHS = 3.0
 _MIN_STEPS = 8
+# Connections are judged where at least this many keyframes lie on either side.
+_MIN_SIDE = 3
+_MAX_NAMED = 3
 # Maps with a smaller share of their frames are of something else than their input.
 _MIN_REGISTERED = 0.5
 
@@ -108,6 +112,37 @@ def _thrown(structure: Structure, order: Sequence[int]) -> list[int]:
     return thrown
 
 
+def weak_connections(structure: Structure, min_landmarks: int) -> list[str]:
+    """Names of keyframes before which too few landmarks carry the scale of the map on.
+
+    These are landmarks that at least two keyframes on either side observe, so that both sides know
+    how far away they are. Where there are fewer than the matches of a pose, two parts fit together
+    at many scales.
+    """
+    frames = structure.frames
+    order = sorted(structure.keyframes(), key=lambda i: (frames[i].camera_id, frames[i].index))
+    place = np.zeros(len(frames), np.int64)
+    place[order] = np.arange(len(order))
+    indices, landmarks = structure.pairs(order)
+    by_landmark = np.lexsort((place[indices], landmarks))
+    places = place[indices[by_landmark]]
+    starts, lengths = runs(landmarks[by_landmark])
+    starts, lengths = starts[lengths >= 4], lengths[lengths >= 4]
+    first, last = places[starts + 1], places[starts + lengths - 2]
+    changes = np.bincount(first + 1, minlength=len(order) + 1)
+    changes -= np.bincount(last + 1, minlength=len(order) + 1)
+    # Near both ends a side has too few keyframes.
+    carried = np.cumsum(changes)[_MIN_SIDE : len(order) + 1 - _MIN_SIDE]
+    weak = _MIN_SIDE + np.flatnonzero(carried < min_landmarks)
+    # A gap without enough landmarks counts once, in the middle of where there are fewest.
+    names = []
+    for a, n in zip(*runs(weak - np.arange(len(weak))), strict=True):
+        gap = weak[a : a + n]
+        fewest = gap[carried[gap - _MIN_SIDE] == carried[gap - _MIN_SIDE].min()]
+        names.append(frames[order[fewest[len(fewest) // 2]]].name)
+    return names
+
+
 def warnings(mapper: Mapper) -> list[str]:
     """Sentences on what in a map cannot be trusted; none if it can."""
     out = []
@@ -135,6 +170,13 @@ def warnings(mapper: Mapper) -> list[str]:
         out.append(
             f"parts of the map flew away, and {thrown} frames were taken out with them: what "
             "connects these parts has too little depth or overlap"
+        )
+    weak = weak_connections(mapper.structure, mapper.options.min_inliers)
+    if weak and not mapper.options.fixed_poses:
+        out.append(
+            f"the map may change its scale before {', '.join(weak[:_MAX_NAMED])}"
+            f"{', ...' if len(weak) > _MAX_NAMED else ''}: fewer than {mapper.options.min_inliers} "
+            "landmarks connect what comes before and after: add frames in between"
         )
     return out
 

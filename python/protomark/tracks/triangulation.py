@@ -10,18 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.colmap import (
-    ColmapModel,
-    bundle_adjust,
-    new_reconstruction,
-    pycolmap,
-    quiet,
-)
+from protomark.geometry.bundle import Bundle
+from protomark.geometry.colmap import ColmapModel, new_reconstruction, pycolmap, quiet
+from protomark.geometry.pose import transform
 from protomark.tracks.matching import VerifiedMatches
 
 _SEED = 0
-# More than enough points to determine the six numbers of a pose.
-_POINTS_PER_POSE = 200
+_REFINE_STEPS = 30
 
 
 def triangulate(
@@ -133,59 +128,45 @@ def refine_poses(given: ColmapModel, reconstruction: Any, error: float) -> Colma
 
     The given positions are priors, as uncertain as the error makes them, and the result stays in
     their world: its scale, rotation and origin bring the refined cameras closest to the given ones.
-    Points that the poses do not need are deleted.
     """
-    _thin(reconstruction)
     images = [reconstruction.images[i + 1] for i in range(len(given.names))]
-    depths = [
-        image.cam_from_world() * reconstruction.points3D[point.point3D_id].xyz
-        for image in images
+    elements = [
+        (i, point.point3D_id, *point.xy)
+        for i, image in enumerate(images)
         for point in image.points2D
         if point.has_point3D()
     ]
-    focal = min(camera.focal_length for camera in given.cameras.values())
-    spread = error / focal * float(np.median([abs(depth[2]) for depth in depths]))
-    if not bundle_adjust(
-        reconstruction, list(reconstruction.images), priors=given.centers, spread=spread
-    ):
-        raise ValueError("bundle adjustment failed: try --refine-poses no")
+    frame, ids = np.array([row[:2] for row in elements], np.int64).T
+    pixels = np.array([row[2:] for row in elements])
+    used, point = np.unique(ids, return_inverse=True)
+    cameras = sorted(given.cameras)
+    camera = np.searchsorted(cameras, given.camera_ids)
+    focal = np.array([given.cameras[i].focal_length for i in cameras])
+    rays, turns = np.empty_like(pixels), np.tile(np.eye(3), (len(pixels), 1, 1))
+    for k, i in enumerate(cameras):
+        rows = camera[frame] == k
+        rays[rows], turned = given.cameras[i].local_rays(pixels[rows])
+        if turned is not None:
+            turns[rows] = turned
+    seen = np.isfinite(rays).all(1)
+    frame, point, rays, turns = frame[seen], point[seen], rays[seen], turns[seen]
     poses = np.array([image.cam_from_world().matrix() for image in images])
-    return _aligned(replace(given, cam_from_world=poses), given)
-
-
-def _thin(reconstruction: Any) -> None:
-    """Delete all but the longest tracks, enough for every pose, to save time."""
-    points = sorted(
-        reconstruction.points3D.items(), key=lambda item: (-item[1].track.length(), item[0])
+    points = np.array([reconstruction.points3D[i].xyz for i in used.tolist()])
+    depths = transform(poses[frame], points[point])[:, 2]
+    bundle = Bundle(
+        poses,
+        np.ones(len(poses), bool),
+        camera,
+        np.column_stack([focal, np.zeros(len(focal))]),
+        np.zeros(len(focal), bool),
+        points,
+        frame,
+        point,
+        rays * focal[camera[frame], None],
+        np.ones(len(frame)),
+        turns,
+        given.centers,
+        error / focal.min() * float(np.median(depths)),
     )
-    seen: dict[int, int] = {}
-    for point_id, point in points:
-        images = {element.image_id for element in point.track.elements}
-        if any(seen.get(i, 0) < _POINTS_PER_POSE for i in images):
-            for i in images:
-                seen[i] = seen.get(i, 0) + 1
-        else:
-            reconstruction.delete_point3D(point_id)
-
-
-def _aligned(source: ColmapModel, target: ColmapModel) -> ColmapModel:
-    """The source, moved by the similarity that brings its cameras closest to those of target.
-
-    The rotation is that of the cameras' orientations, which also works if their centres lie on one
-    line; scale and shift are those of the centres.
-    """
-    turns = np.einsum(
-        "mji,mjk->ik", target.cam_from_world[:, :, :3], source.cam_from_world[:, :, :3]
-    )
-    u, _, vt = np.linalg.svd(turns)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    a = source.centers @ rotation.T
-    middle_a, middle_b = a.mean(0), target.centers.mean(0)
-    scale = float(
-        ((a - middle_a) * (target.centers - middle_b)).sum() / ((a - middle_a) ** 2).sum()
-    )
-    shift = middle_b - scale * middle_a
-    # x' = scale R x + shift, so cam_from_world' = [Rc R^T | scale tc - Rc R^T shift].
-    turned = source.cam_from_world[:, :, :3] @ rotation.T
-    moved = scale * source.cam_from_world[:, :, 3] - turned @ shift
-    return replace(source, cam_from_world=np.concatenate([turned, moved[:, :, None]], axis=2))
+    bundle.adjust(_REFINE_STEPS)
+    return replace(given, cam_from_world=bundle.poses)
