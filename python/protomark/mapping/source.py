@@ -133,7 +133,7 @@ class FrameSource(ABC):
         Raises:
             ValueError: there is none of their size, or several that name no image.
         """
-        named = {n: cameras.by_image[n] for n in self.names() if n in cameras.by_image}
+        named = cameras.for_images(self.names()).by_image if cameras.by_image else {}
         if not named:
             return cameras.find("", *self.size())
         # COLMAP calibrates each image of one camera for itself, unless told otherwise.
