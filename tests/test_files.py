@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -51,6 +52,16 @@ def test_one_process_at_a_time_writes_to_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError, match="file is not a folder"):
         only_writer(tmp_path / "file").__enter__()
+
+
+def test_a_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_lock(*_: int) -> None:
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr("fcntl.flock", no_lock)
+    with only_writer(tmp_path):
+        pass
+    assert os.listdir(tmp_path) == []
 
 
 def test_commands_do_not_write_where_another_does(tmp_path: Path) -> None:

@@ -4,7 +4,8 @@ import pytest
 
 import protomark as pm
 from mapping_memory import check_changes, check_search, observations
-from protomark.geometry.camera_files import read_cameras
+from protomark.geometry.camera import Camera
+from protomark.geometry.camera_files import CameraSet, read_cameras
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
@@ -239,3 +240,14 @@ def test_a_parallax_that_is_too_small_is_not_rounded_up(tmp_path):
     mapper.history.records = {name: FrameRecord(0, name, WAITING) for name in "ab"}
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((240, 320), np.uint8))
     assert "has 1.9 degrees of parallax, 2 are" in no_map(mapper, ImageFolder(tmp_path))
+
+
+def test_cameras_of_images_are_found_by_base_names_that_are_unique(tmp_path):
+    other = Camera("PINHOLE", 320, 240, (400.0, 400.0, 160.0, 120.0))
+    for name in ("1.png", "2.png", "3.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((240, 320), np.uint8))
+    given = {"left/1.png": PINHOLE, "left/2.png": other, "right/2.png": PINHOLE, "3.png": other}
+    folder = ImageFolder(tmp_path)
+    folder.find_camera(CameraSet((PINHOLE, other), given))
+    assert folder.cameras == {"1.png": PINHOLE, "3.png": other}
+    assert [i.camera for i in folder.images()] == [PINHOLE, None, other]

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import protomark as pm
-from mapping_scene import _paper, walk
+from mapping_scene import _paper, walk, write_images
 from protomark.geometry.absolute_pose import estimate_pose, pose_covariance, refine_pose
 from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import ColmapModel
@@ -22,10 +22,12 @@ from protomark.localization import Localizer
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
+from protomark.mapping.source import GIVEN, ImageFolder
 from protomark.maps.build import build_map
 from protomark.tracks.extract import TracksOptions, extract, find_sequence
 from protomark.tracks.pairs import overlaps
 from test_mapping import error_of
+from test_tracks_command import fails, run
 from tracks_scene import write_model
 
 COUNT = 8
@@ -183,6 +185,19 @@ def test_tracks_of_wide_images_lie_on_the_walls(camera: Camera, tmp_path: Path) 
     distance, degrees = pose_error(found.cam_from_world, POSES[5])
     assert distance < 0.02
     assert degrees < 0.5
+
+
+def test_a_fisheye_is_not_calibrated_as_a_perspective_camera(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for i in range(2):
+        cv2.imwrite(str(images / f"{i}.png"), picture(FISHEYE, i))
+    done = run(images, "-o", tmp_path / "map", command="map")
+    fails(done, "corners of its images are black", "--camera", "--focal")
+    for source in (images, write_images(tmp_path / "perspective", walk(2))):
+        camera, origin = ImageFolder(source).guess_camera(300.0)
+        assert (camera.focal_length, origin) == (300, GIVEN)
+    assert ImageFolder(tmp_path / "perspective").guess_camera()[0].focal_length == 1.2 * 320
 
 
 def test_spherical_views_overlap_whichever_way_they_turn() -> None:

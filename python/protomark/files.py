@@ -134,6 +134,10 @@ def _lock(path: Path) -> int:
             raise BlockingIOError(
                 f"{path.parent}: {owner} is writing there: wait for it, or name another folder"
             ) from None
+        except OSError as error:
+            if error.errno not in (errno.ENOTSUP, errno.ENOLCK):
+                raise
+            return handle  # a file system without locks
         os.close(handle)  # its last owner has just removed it
 
 

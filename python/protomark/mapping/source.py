@@ -29,6 +29,9 @@ _GUESSED_MODEL = "SIMPLE_RADIAL"
 _SIZE_SAMPLES = 15
 # Cameras whose parameters differ by this share of the focal length count as one.
 _SAME_CAMERA = 0.01
+# A fisheye's image circle leaves out squares of this part of the longer side in each corner, where
+# no pixel is brighter than that.
+_CORNER, _BLACK = 16, 6
 # Origins of a focal length that is no guess.
 GIVEN, EXIF = "given", "from EXIF data"
 
@@ -130,7 +133,7 @@ class FrameSource(ABC):
         Raises:
             ValueError: there is none of their size, or several that name no image.
         """
-        named = {n: cameras.by_image[n] for n in self.names() if n in cameras.by_image}
+        named = cameras.for_images(self.names()).by_image if cameras.by_image else {}
         if not named:
             return cameras.find("", *self.size())
         # COLMAP calibrates each image of one camera for itself, unless told otherwise.
@@ -146,16 +149,36 @@ class FrameSource(ABC):
         return Counter(self.cameras.values()).most_common(1)[0][0]
 
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
-        """A camera to start calibration with, and the origin of its focal length."""
+        """A camera to start calibration with, and the origin of its focal length.
+
+        Raises:
+            ValueError: the images are those of a fisheye lens, or the focal length is not positive.
+        """
         width, height = self.size()
         origin = GIVEN
         if focal is None:
             focal, origin = self._exif_focal_length(), EXIF
+        if focal is None and self._is_fisheye():
+            raise ValueError(
+                f"{self.path}: the corners of its images are black, as a fisheye lens leaves them, "
+                "which mapping does not calibrate: give --camera OPENCV_FISHEYE:..., or, if it is "
+                "none, --focal"
+            )
         if focal is None:
             focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), "a guess"
         if not (np.isfinite(focal) and focal > 0):
             raise ValueError(f"--focal {focal}: give a positive number of pixels")
         return Camera(_GUESSED_MODEL, width, height, (focal, width / 2, height / 2, 0.0)), origin
+
+    def _is_fisheye(self) -> bool:
+        """Whether the image circle leaves all corners of the images black."""
+        images = [i.image for i in self._samples() if i.image is not None]
+        side = max(self.size()) // _CORNER
+        ends = (slice(side), slice(-side, None))
+        bright = [image for image in images if np.median(image) > _BLACK]
+        return bool(bright) and all(
+            image[y, x].max() <= _BLACK for image in bright for y in ends for x in ends
+        )
 
     def _exif_focal_length(self) -> float | None:
         return None
