@@ -53,7 +53,8 @@ def make_map(
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
-    with only_writer(request.output):
+    # More threads of BLAS would change the order of sums.
+    with only_writer(request.output), one_blas_thread():
         check_output(request)
         return _make_map(request, source, progress, note)
 
