@@ -23,8 +23,6 @@ from protomark import sample
 from protomark.cli import app
 from protomark.evaluation.frames import QueryFrame, scene_depth
 from protomark.evaluation.protocol import split
-from protomark.geometry.absolute_pose import pose_covariance, refine_pose
-from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose import camera_centers, pose_error
 from protomark.geometry.pose_files import read_poses
@@ -140,30 +138,6 @@ def test_the_camera_of_the_map(scene: pm.PrototypeMap, images: list[Any], tmp_pa
     scene.metadata = {KEY: "1 PINHOLE 640 480 nonsense"}
     with pytest.raises(ValueError, match="the map's metadata 'cameras' hold no COLMAP camera"):
         Localizer(scene)
-
-
-def test_covariance_is_the_spread_of_repeated_poses() -> None:
-    rng = np.random.default_rng(0)
-    camera = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-    true = np.column_stack([cv2.Rodrigues(np.array([0.1, -0.2, 0.3]))[0], [0.2, -0.1, 0.5]])
-    points = rng.uniform((-2, -2, 4), (2, 2, 9), (60, 3))
-    world = (points - true[:, 3]) @ true[:, :3]
-    steps, covariances = [], []
-    for _ in range(400):
-        pixels = camera.project(points) + rng.normal(0, 0.8, (60, 2))
-        pose, _ = refine_pose(true, pixels, world, camera, 20.0)
-        turn = cv2.Rodrigues(pose[:, :3] @ true[:, :3].T)[0].ravel()
-        steps.append([*turn, *(pose[:, 3] - cv2.Rodrigues(turn)[0] @ true[:, 3])])
-        covariances.append(pose_covariance(pose, pixels, world, camera))
-    spread, expected = np.cov(np.array(steps).T), np.mean(covariances, axis=0)
-    # In units of the expected spread the differences are normal: squared norms average 6.
-    whitened = np.linalg.solve(np.linalg.cholesky(expected), np.array(steps).T)
-    assert (whitened**2).sum(0).mean() == pytest.approx(6, rel=0.15)
-    np.testing.assert_allclose(np.diag(spread), np.diag(expected), rtol=0.3)
-    assert pose_covariance(true, pixels[:3], world[:3], camera) is None
-    # On one ray all points look alike.
-    same = np.tile(world[:1], (10, 1))
-    assert pose_covariance(true, camera.project(np.tile(points[:1], (10, 1))), same, camera) is None
 
 
 def test_unknown_and_rough_focal_lengths(scene: pm.PrototypeMap, images: list[Any]) -> None:

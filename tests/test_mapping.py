@@ -258,6 +258,13 @@ def test_resumed_with_an_unknown_camera(
         assert (tmp_path / "scene" / name).read_bytes() == whole
 
 
+def test_two_threads_make_the_same_map(images: Path, finished: Path, tmp_path: Path) -> None:
+    request = MapRequest(images, tmp_path / "scene", SETTINGS, camera=CAMERA, threads=2)
+    make_map(request)
+    for name in ("scene.pmk", "trajectory.txt"):
+        assert (tmp_path / "scene" / name).read_bytes() == (finished / name).read_bytes()
+
+
 def test_black_blurred_and_broken_frames_are_named_and_cost_nothing_else(
     images: Path, tmp_path: Path
 ) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from itertools import islice
 from typing import TypeVar
 
 from protomark.progress import Progress, silent, tracked
@@ -42,6 +43,18 @@ def parallel_map(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def read_ahead(items: Iterator[S], threads: int) -> Iterator[S]:
+    """The items; with several threads, one of them makes the next while the caller uses this."""
+    if threads <= 1:
+        yield from items
+        return
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(list, islice(items, 1))
+        while item := future.result():
+            future = pool.submit(list, islice(items, 1))
+            yield item[0]
 
 
 def one_blas_thread() -> AbstractContextManager[object]:

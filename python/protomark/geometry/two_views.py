@@ -14,7 +14,6 @@ from protomark.geometry.camera import MAX_PLANE_RAY, Camera
 
 Array = NDArray[np.float64]
 
-_MIN_INLIERS = 8  # without any, COLMAP ends the process
 _SAMPLING = {"min_iterations": MIN_ITERATIONS, "max_iterations": MAX_ITERATIONS, "seed": 0}
 
 
@@ -37,33 +36,6 @@ def estimate_relative_pose(
     options, both = {"max_epipolar_error": max_error, **_SAMPLING}, [camera.as_dict()] * 2
     pose, facts = optional("poselib").estimate_relative_pose(first, second, *both, options, {})
     return np.asarray(pose.Rt, np.float64), np.asarray(facts["inliers"], bool)
-
-
-def refine_relative_pose(
-    pose: Array,
-    first: Array,
-    second: Array,
-    camera: Camera,
-    max_error: float,
-    inliers: NDArray[np.bool_],
-) -> Array:
-    """Move a relative pose to the least error of its inliers, or robustly of all matches."""
-    if camera.wide:
-        from protomark.geometry.colmap import pycolmap, quiet
-
-        if inliers.sum() < _MIN_INLIERS:
-            return pose
-        start, model = pycolmap.Rigid3d(pose), camera.colmap
-        with quiet():
-            found = pycolmap.refine_relative_pose(start, model, first, model, second, inliers)
-        return pose if found is None else np.asarray(found["cam2_from_cam1"].matrix(), np.float64)
-    poselib = optional("poselib")
-    start, both = poselib.CameraPose(), [camera.as_dict()] * 2
-    start.R, start.t = pose[:, :3], pose[:, 3]
-    loss = {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error}
-    return np.asarray(
-        poselib.refine_relative_pose(first, second, start, *both, loss)[0].Rt, np.float64
-    )
 
 
 def planar_poses(

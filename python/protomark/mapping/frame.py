@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.extractor import Features
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import rotate, turned
 
@@ -26,6 +27,7 @@ class InputImage:
     pose: Array | None = None  # (3, 4) given pose, or None
     camera: Camera | None = None  # its camera, or None: that of the others
     problem: str = ""  # why there is no image, else ""
+    features: Features | None = None  # its features, if they are known already
 
 
 @dataclass

@@ -11,11 +11,7 @@ from protomark.geometry.absolute_pose import estimate_pose
 from protomark.geometry.bundle import Bundle
 from protomark.geometry.pose import relative_pose, transform
 from protomark.geometry.triangulation import depth_of_first, epipolar_error
-from protomark.geometry.two_views import (
-    estimate_relative_pose,
-    planar_poses,
-    refine_relative_pose,
-)
+from protomark.geometry.two_views import estimate_relative_pose, planar_poses
 from protomark.mapping.frame import Array, Frame, Ids
 from protomark.mapping.structure import Structure
 from protomark.tracks.matching import mutual_matches
@@ -132,12 +128,10 @@ class Initialiser:
             return []
         out: list[Array] = []
         for start in (found, *planar_poses(a, b, camera, error, _MIN_COMMON)):
-            good = self._verify(start, one, other, rows)[0]
-            pose = refine_relative_pose(start, a, b, camera, error, good)
-            length = np.linalg.norm(pose[:, 3])
-            if not np.isfinite(pose).all() or length < 1e-9:
+            length = np.linalg.norm(start[:, 3])
+            if not np.isfinite(start).all() or length < 1e-9:
                 continue
-            pose[:, 3] /= length
+            pose = np.column_stack([start[:, :3], start[:, 3] / length])
             good = self._verify(pose, one, other, rows)[0]
             new = not any(_same_pose(pose, other) for other in out)
             if new and good.sum() >= _MIN_MATCHES and good.mean() >= 0.5:

@@ -159,7 +159,8 @@ class Mapper:
             )
             return None
         with self.clock.stage("detect"):
-            features = self.features.get(image.name) or self._extractor(image.image)
+            features = image.features or self.features.get(image.name)
+            features = features or self._extractor(image.image)
             if self.mask is not None and self.mask.shape == image.image.shape:
                 features = features.where(outside(self.mask, features.keypoints))
         record.keypoints = len(features)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.given_poses import misfit
 from protomark.geometry.pose_files import poses_of_images
 from protomark.interrupt import Interrupted, deferred_interrupt
+from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.outputs import back_up, write_outputs
@@ -33,6 +34,7 @@ from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoi
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import no_map
 from protomark.progress import Progress, silent
+from protomark.threads import one_blas_thread, read_ahead
 
 RECORDING = "recording.rrd"
 # Seconds between checkpoints, each of which takes about a tenth of a second.
@@ -51,7 +53,8 @@ def make_map(
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
     source = open_source(request.images, request.every)
-    with only_writer(request.output):
+    # More threads of BLAS would change the order of sums.
+    with only_writer(request.output), one_blas_thread():
         check_output(request)
         return _make_map(request, source, progress, note)
 
@@ -107,6 +110,7 @@ class _Session:
         self.request, self.source = request, source
         self.progress, self.note = progress, note
         self.cursor = self.known = 0
+        self._ahead: Extractor | None = None  # of the thread that reads ahead
         self.facts: dict[str, Any] = {}
         if request.resume:
             self._resume()
@@ -239,20 +243,24 @@ class _Session:
     def _add_frames(self, interrupted: Callable[[], bool]) -> bool:
         saved = started = time.monotonic()
         first = self.cursor
-        images = self.source.images(self.cursor)
+        images = self._images(self.cursor)
         while True:
+            asked = time.perf_counter()
             image = next(images, None)
+            waited = time.perf_counter() - asked
             if self.mapper.needs_restart(at_end=image is None):
                 # The wrong focal length has bent the first part of the map.
                 self.mapper = self.mapper.restart()
                 self.note(self.mapper.history.events[-1])
                 self.cursor, first, started = 0, 0, time.monotonic()
-                images = self.source.images()
+                images = self._images()
                 continue
             if image is None:
                 break
             if image.name not in self.mapper.history.records:
-                self.mapper.add(image)
+                record = self.mapper.add(image)
+                if self.request.threads > 1:
+                    record.seconds["detect"] += waited
             self.cursor += 1
             if self.recording is not None:
                 self.recording.show(self.mapper, image)
@@ -269,6 +277,23 @@ class _Session:
             self.mapper.calibration.restarts = MAX_RESTARTS
         self._save()
         return True
+
+    def _images(self, start: int = 0) -> Iterator[InputImage]:
+        """The images; with several threads the features of the next are detected meanwhile."""
+        images = self.source.images(start)
+        if self.request.threads > 1:
+            images = map(self._with_features, images)
+        return read_ahead(images, self.request.threads)
+
+    def _with_features(self, image: InputImage) -> InputImage:
+        mapper = self.mapper
+        known = image.name in mapper.features or image.name in mapper.history.records
+        if known or image.image is None or image.image.shape[::-1] != self.source.size():
+            return image
+        options = mapper.options
+        if self._ahead is None:
+            self._ahead = Extractor(options.descriptor, options.max_keypoints, options.max_size)
+        return replace(image, features=self._ahead(image.image))
 
     def _stage(self) -> str:
         """The name of the stage: a progress bar starts anew with each."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from protomark.geometry.bundle import Bundle
 from protomark.geometry.colmap import ColmapModel, new_reconstruction, pycolmap, quiet
 from protomark.geometry.pose import transform
+from protomark.threads import one_blas_thread
 from protomark.tracks.matching import VerifiedMatches
 
 _SEED = 0
@@ -168,5 +169,6 @@ def refine_poses(given: ColmapModel, reconstruction: Any, error: float) -> Colma
         given.centers,
         error / focal.min() * float(np.median(depths)),
     )
-    bundle.adjust(_REFINE_STEPS)
+    with one_blas_thread():
+        bundle.adjust(_REFINE_STEPS)
     return replace(given, cam_from_world=bundle.poses)
