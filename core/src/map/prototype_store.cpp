@@ -131,16 +131,16 @@ void PrototypeStore::find_rows(std::span<const Key> keys, std::span<Row> rows) c
     left.push_back(at);
   }
   // All rows of a landmark once, not once per key.
-  std::ranges::sort(left, {}, [&](size_t i) { return keys[i]; });
-  for (std::span<const size_t> rest(left); !rest.empty();) {
-    const int64_t id = keys[rest[0]].id;
-    const auto of_id = std::ranges::equal_range(rest, id, {}, [&](size_t i) { return keys[i].id; });
+  const auto key = [&](size_t i) { return keys[i]; };
+  std::ranges::sort(left, {}, key);
+  for (size_t i = 0; i < left.size(); ++i) {
+    const int64_t id = keys[left[i]].id;
+    if (i > 0 && keys[left[i - 1]].id == id) continue;
     each_row_of(find(id), [&](Row row) {
-      const auto found = std::ranges::equal_range(of_id, appearance(row), {},
-                                                  [&](size_t i) { return keys[i].appearance; });
-      for (const size_t i : found) rows[i] = row;
+      const Key wanted{id, appearance(row)};
+      auto at = std::ranges::lower_bound(left, wanted, {}, key);
+      for (; at != left.end() && keys[*at] == wanted; ++at) rows[*at] = row;
     });
-    rest = rest.subspan(of_id.size());
   }
 }
 
