@@ -16,9 +16,15 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.colmap import read_model
 from protomark.geometry.given_poses import agreeing, misfit, pose_errors
-from protomark.geometry.pose import camera_centers, quaternion_from_rotation, transform
+from protomark.geometry.pose import (
+    camera_centers,
+    quaternion_from_rotation,
+    relative_pose,
+    transform,
+)
 from protomark.localization import Localizer
 from protomark.mapping.frame import Frame, InputImage
+from protomark.mapping.initialisation import Initialiser
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
@@ -385,3 +391,27 @@ def test_black_images_are_named_as_the_reason(tmp_path: Path) -> None:
     done = run(folder, "-o", tmp_path / "x", "--camera", CAMERA, "-d", "orb")
     fails(done, "4 have this in common", "black, blurred")
     assert not (tmp_path / "x").exists()
+
+
+def test_rivals_for_the_first_pair_are_adjusted_before_they_are_compared() -> None:
+    """A relative pose by little parallax is rough, and its landmarks fit other frames badly."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.8, 0.8, (250, 2)), rng.uniform(2, 2.4, 250)])
+    structure, poses = structure_of(walk(6, step=0.03), points), walk(6, step=0.03)
+    initialiser = Initialiser(structure, 0.01)
+    initialiser.waiting = structure.frames
+    one, other = structure.frames[0], structure.frames[5]
+    rows = np.repeat(np.arange(250)[:, None], 2, axis=1)
+    true = np.column_stack(relative_pose(poses[0], poses[5]))
+    true[:, 3] /= np.linalg.norm(true[:, 3])
+    rough = cv2.Rodrigues(np.radians([0.0, 15.0, 15.0]))[0] @ true[:, 3]
+    turn = cv2.Rodrigues(np.radians([0.3, -0.4, 0.2]))[0]
+    witnesses = [(frame, rows) for frame in structure.frames[1:5]]
+    found = [
+        initialiser._support(one, other, rows, pose, witnesses)
+        for pose in (np.column_stack([turn @ true[:, :3], rough]), true)
+    ]
+    for support in found:
+        assert support.pose[:, 3] @ true[:, 3] > np.cos(np.radians(10))
+        assert support.share > 0.9
+    assert found[0].score == pytest.approx(found[1].score, rel=0.05)
