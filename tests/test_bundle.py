@@ -43,12 +43,13 @@ def simulated(moved: float = 0.0, lens: tuple[float, float] = (FOCAL, DISTORTION
     )
 
 
-@pytest.mark.parametrize("chunk", [500, 7])
+@pytest.mark.parametrize(("chunk", "dense"), [(500, 2000), (7, 2000), (7, 10)])
 @pytest.mark.parametrize("lens", [(FOCAL, DISTORTION), (320.0, 0.0)])
 def test_poses_points_and_lens_are_found(
-    chunk: int, lens: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+    chunk: int, dense: int, lens: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bundles, "_CHUNK", chunk)
+    monkeypatch.setattr(bundles, "_DENSE", dense)
     monkeypatch.setattr(bundles, "_MIN_GAIN", 0.0)
     bundle, true = simulated(0.02, lens), simulated()
     assert np.median(bundle.errors()) > 1
@@ -83,7 +84,9 @@ def test_rays_that_count_from_cameras_of_their_own() -> None:
     np.testing.assert_allclose(bundle.poses, true.poses, atol=1e-3)
 
 
-def test_deviation_of_the_focal_length(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("dense", [2000, 10])
+def test_deviation_of_the_focal_length(dense: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bundles, "_DENSE", dense)
     monkeypatch.setattr(bundles, "_MIN_GAIN", 1e-9)
     found, deviations = [], []
     for seed in range(100, 130):

@@ -24,6 +24,8 @@ Flags = NDArray[np.bool_]
 _CHUNK = 500
 # Adjustment ends with a step that lowers the loss by a smaller share.
 _MIN_GAIN = 1e-4
+# Rows of a reduced system that is solved as a dense one.
+_DENSE = 2000
 # A point behind a camera counts as this many standard deviations off.
 _BEHIND = 1e3
 
@@ -108,11 +110,12 @@ class Bundle:
         error = np.linalg.norm(difference, axis=0) / self.sigma
         # The mean length of an error with this deviation in x and in y is sqrt(pi / 2) times it.
         noise = float(error.mean()) / np.sqrt(np.pi / 2)
+        rows = np.arange(self._first_lens, self._size, 2)
         try:
-            covariance = np.linalg.inv(reduced)
-        except np.linalg.LinAlgError:
+            covariance = reduced.solve(np.eye(self._size)[:, rows])
+        except (np.linalg.LinAlgError, RuntimeError):  # singular: a dense or a sparse one
             return np.full(len(self.lenses), np.inf)
-        variance = np.diag(covariance)[self._first_lens :: 2]
+        variance = covariance[rows, np.arange(len(rows))]
         valid = np.isfinite(variance) & (variance > 0)
         return np.where(valid, noise * np.sqrt(np.abs(variance)) / self.lenses[:, 0], np.inf)
 
@@ -148,7 +151,7 @@ class Bundle:
         reduced, target, by_motion, by_point, gradient, root = self._reduce(
             local, error, weight, damping
         )
-        step = -np.linalg.solve(reduced, target) if len(target) else target
+        step = -reduced.solve(target) if len(target) else target
         motions = np.zeros((len(self.poses), by_motion.shape[1]))
         motions[self.moving, :6] = step[: self._first_lens].reshape(-1, 6)
         lenses = step[self._first_lens :].reshape(-1, 2)
@@ -176,7 +179,7 @@ class Bundle:
 
     def _reduce(
         self, local: Array, error: Array, weight: Array, damping: float
-    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+    ) -> tuple[_Symmetric, Array, Array, Array, Array, Array]:
         """The normal equations without the points, and what gives the points' share.
 
         Returns matrix and right side; derivatives by the frame's motion and by its point; and the
@@ -198,36 +201,33 @@ class Bundle:
         by_point[:, 1] = by_point[:, 0] * xy + by_point[:, 1] * yy
         by_point[:, 0] *= xx
 
-        reduced, target = np.zeros((self._size, self._size)), np.zeros(self._size)
+        reduced, target = _Symmetric(self._size), np.zeros(self._size)
+        diagonal = np.zeros(self._size)
         for a, b in self._blocks:
-            jacobian = np.concatenate(by_motion[:, :, a:b], axis=1)
-            normal, slope = jacobian @ jacobian.T, jacobian @ residual[:, a:b].reshape(-1)
-            blocks = self._rows(self.frame[a])
-            for i, to in blocks:
-                target[to] += slope[i]
-                for j, across in blocks:
-                    reduced[to, across] += normal[i, j]
-        diagonal = np.einsum("ii->i", reduced)
+            rows, part = self._rows(self.frame[a])
+            jacobian = np.concatenate(by_motion[:, part, a:b], axis=1)
+            normal = jacobian @ jacobian.T
+            reduced.add(rows, normal)
+            diagonal[rows] += np.diag(normal)
+            target[rows] += jacobian @ residual[:, a:b].reshape(-1)
+        added = np.full(self._size, 1e-12)
         if self.priors is not None:
             slopes = -rotate(self.poses[:, :, :3], self._off_priors()) / self.spread
             of_centers = np.arange(self._first_lens).reshape(-1, 6)[:, 3:].ravel()
-            diagonal[of_centers] += 1 / self.spread**2
+            added[of_centers] += (1 + damping) / self.spread**2
             target[of_centers] += slopes[self.moving].ravel()
-        diagonal *= 1 + damping
-        diagonal += 1e-12
+        reduced.add_diagonal(damping * diagonal + added)
         for rows, points, coupling in self._couplings(by_motion, by_point):
-            reduced[rows[:, None], rows] -= coupling @ coupling.T
+            reduced.add(rows, -coupling @ coupling.T)
             target[rows] -= coupling @ gradient[:, points].reshape(-1)
         return reduced, target, by_motion, by_point, gradient, root
 
-    def _rows(self, frame: int) -> list[tuple[slice, slice]]:
-        """Where derivatives by a frame's motion belong in the reduced system."""
-        out, lens = [], self._first_lens + 2 * int(self.camera[frame])
-        if self.moving[frame]:
-            out.append((slice(6), slice(6 * self._column[frame], 6 * self._column[frame] + 6)))
-        if lens < self._size:
-            out.append((slice(6, 8), slice(lens, lens + 2)))
-        return out
+    def _rows(self, frame: int) -> tuple[Ids, Ids]:
+        """Rows of the reduced system that a frame moves, and which of its derivatives they are."""
+        first, lens = 6 * self._column[frame], self._first_lens + 2 * self.camera[frame]
+        moving = np.arange(6 if self.moving[frame] else 0)
+        free = np.arange(2 if self._size > self._first_lens else 0)
+        return np.r_[first + moving, lens + free], np.r_[moving, 6 + free]
 
     def _couplings(self, by_motion: Array, by_point: Array) -> Iterator[tuple[Ids, Ids, Array]]:
         """For each chunk: rows (r,), points (p,), and what couples them (r, 3 p)."""
@@ -287,6 +287,44 @@ class Bundle:
         for a, b in self._blocks:
             by_point[:, :, a:b] = self.poses[self.frame[a], :, :3].T @ out[:, 3:6, a:b]
         return out, by_point
+
+
+class _Symmetric:
+    """A symmetric system, dense if it is small, else sparse: few frames see a point."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._dense = np.zeros((size, size)) if size <= _DENSE else None
+        self._blocks: list[tuple[NDArray[np.int32], NDArray[np.int32], Array]] = []
+
+    def add(self, rows: Ids, block: Array) -> None:
+        """Add a matrix (r, r) in these rows (r,), and in the columns of the same numbers."""
+        if self._dense is not None:
+            self._dense[rows[:, None], rows] += block
+        else:
+            grid = np.meshgrid(rows.astype(np.int32), rows.astype(np.int32), indexing="ij")
+            self._blocks.append((grid[0].ravel(), grid[1].ravel(), block.ravel()))
+
+    def add_diagonal(self, values: Array) -> None:
+        """Add values (size,) to the diagonal."""
+        if self._dense is not None:
+            np.einsum("ii->i", self._dense)[:] += values
+        else:
+            rows = np.arange(self._size, dtype=np.int32)
+            self._blocks.append((rows, rows, values))
+
+    def solve(self, right: Array) -> Array:
+        """The solution (size, ...) for a right side of that shape."""
+        if self._dense is not None:
+            return np.asarray(np.linalg.solve(self._dense, right))
+        sparse = optional("scipy.sparse")
+        rows, columns, values = (np.concatenate(part) for part in zip(*self._blocks, strict=True))
+        matrix = sparse.coo_matrix((values, (rows, columns)), (self._size, self._size)).tocsc()
+        matrix.eliminate_zeros()
+        factors = optional("scipy.sparse.linalg").splu(
+            matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        return np.asarray(factors.solve(right))
 
 
 def _slices(values: Ids) -> list[tuple[int, int]]:
