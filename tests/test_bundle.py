@@ -94,3 +94,17 @@ def test_deviation_of_the_focal_length(monkeypatch: pytest.MonkeyPatch) -> None:
         deviations.append(float(bundle.focal_deviations()[0]))
     spread = np.std(found) / FOCAL
     assert 0.5 * spread < np.median(deviations) < 2 * spread
+
+
+def test_the_solver_of_the_reduced_system(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bundles, "_BLOCK", 6)
+    rng = np.random.default_rng(0)
+    band = np.abs(np.subtract.outer(np.arange(45), np.arange(45))) < 9
+    band[-3:], band[:, -3:] = True, True
+    matrix = np.where(band, rng.normal(size=(45, 45)), 0)
+    matrix = matrix + matrix.T + 40 * np.eye(45)
+    target = rng.normal(size=45)
+    np.testing.assert_allclose(
+        bundles._solve(matrix.copy(), target), np.linalg.solve(matrix, target), atol=1e-12
+    )
+    assert not len(bundles._solve(np.zeros((0, 0)), np.zeros(0)))

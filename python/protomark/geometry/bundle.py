@@ -22,6 +22,8 @@ Flags = NDArray[np.bool_]
 
 # So many points are eliminated at a time, those together that the same frames see.
 _CHUNK = 500
+# Rows of a block of the reduced system.
+_BLOCK = 240
 # Adjustment ends with a step that lowers the loss by a smaller share.
 _MIN_GAIN = 1e-4
 # A point behind a camera counts as this many standard deviations off.
@@ -82,8 +84,11 @@ class Bundle:
         for _ in range(iterations):
             raise_if_overdue()
             before = self.poses, self.points, self.lenses
-            self._step(*state[1:], damping)
-            after = self._evaluate(loss_scale)
+            try:
+                self._step(*state[1:], damping)
+                after = self._evaluate(loss_scale)
+            except np.linalg.LinAlgError:
+                after = (np.inf, *state[1:])
             if not after[0] <= state[0]:
                 self.poses, self.points, self.lenses = before
                 damping = min(10 * damping, 1e6)
@@ -108,13 +113,15 @@ class Bundle:
         error = np.linalg.norm(difference, axis=0) / self.sigma
         # The mean length of an error with this deviation in x and in y is sqrt(pi / 2) times it.
         noise = float(error.mean()) / np.sqrt(np.pi / 2)
-        try:
-            covariance = np.linalg.inv(reduced)
-        except np.linalg.LinAlgError:
-            return np.full(len(self.lenses), np.inf)
-        variance = np.diag(covariance)[self._first_lens :: 2]
-        valid = np.isfinite(variance) & (variance > 0)
-        return np.where(valid, noise * np.sqrt(np.abs(variance)) / self.lenses[:, 0], np.inf)
+        variances = []
+        for row in range(self._first_lens, self._size, 2):
+            unit = np.zeros(self._size)
+            unit[row] = 1
+            try:
+                variances.append(_solve(reduced.copy(), unit)[row])
+            except np.linalg.LinAlgError:
+                variances.append(np.inf)
+        return np.asarray(noise * np.sqrt(variances) / self.lenses[:, 0])
 
     def _evaluate(self, loss_scale: float) -> tuple[float, Array, Array, Array]:
         """The loss, points in their cameras (3, n), errors (2, n) in pixels and weights (n,)."""
@@ -148,7 +155,7 @@ class Bundle:
         reduced, target, by_motion, by_point, gradient, root = self._reduce(
             local, error, weight, damping
         )
-        step = -np.linalg.solve(reduced, target) if len(target) else target
+        step = -_solve(reduced, target)
         motions = np.zeros((len(self.poses), by_motion.shape[1]))
         motions[self.moving, :6] = step[: self._first_lens].reshape(-1, 6)
         lenses = step[self._first_lens :].reshape(-1, 2)
@@ -293,6 +300,32 @@ def _slices(values: Ids) -> list[tuple[int, int]]:
     """Start and end of each run of equal entries in a sorted array."""
     starts, lengths = runs(values)
     return list(zip(starts.tolist(), (starts + lengths).tolist(), strict=True))
+
+
+def _solve(matrix: Array, target: Array) -> Array:
+    """The solution of a positive definite system, by Cholesky; the matrix is overwritten.
+
+    Blocks that are zero, as of frames that see nothing in common, cost nothing.
+    """
+    ends = range(_BLOCK, len(target) + _BLOCK, _BLOCK)
+    blocks = [slice(end - _BLOCK, min(end, len(target))) for end in ends]
+    out, roots, below = target.copy(), [], []
+    for k, block in enumerate(blocks):
+        root = np.linalg.inv(np.linalg.cholesky(matrix[block, block]))
+        out[block] = root @ out[block]
+        rows = [i for i in blocks[k + 1 :] if matrix[i, block].any()]
+        for n, i in enumerate(rows):
+            matrix[i, block] = matrix[i, block] @ root.T
+            out[i] -= matrix[i, block] @ out[block]
+            for j in rows[: n + 1]:
+                matrix[i, j] -= matrix[i, block] @ matrix[j, block].T
+        roots.append(root)
+        below.append(rows)
+    for block, root, rows in zip(blocks[::-1], roots[::-1], below[::-1], strict=True):
+        for i in rows:
+            out[block] -= matrix[i, block].T @ out[i]
+        out[block] = root.T @ out[block]
+    return out
 
 
 def _root(normal: Array, damping: float) -> Array:
