@@ -17,7 +17,6 @@ _EXTRAS = {
     "rerun": ("the Rerun SDK (rerun-sdk)", "view"),
     "rich": ("Rich", "cli"),
     "safetensors": ("safetensors", "map"),
-    "scipy": ("SciPy", "map"),
     "torch": ("PyTorch", "train"),
     "typer": ("Typer", "cli"),
 }

@@ -22,10 +22,10 @@ Flags = NDArray[np.bool_]
 
 # So many points are eliminated at a time, those together that the same frames see.
 _CHUNK = 500
+# Rows of a block of the reduced system.
+_BLOCK = 240
 # Adjustment ends with a step that lowers the loss by a smaller share.
 _MIN_GAIN = 1e-4
-# Rows of a reduced system that is solved as a dense one.
-_DENSE = 2000
 # A point behind a camera counts as this many standard deviations off.
 _BEHIND = 1e3
 
@@ -84,8 +84,11 @@ class Bundle:
         for _ in range(iterations):
             raise_if_overdue()
             before = self.poses, self.points, self.lenses
-            self._step(*state[1:], damping)
-            after = self._evaluate(loss_scale)
+            try:
+                self._step(*state[1:], damping)
+                after = self._evaluate(loss_scale)
+            except np.linalg.LinAlgError:
+                after = (np.inf, *state[1:])
             if not after[0] <= state[0]:
                 self.poses, self.points, self.lenses = before
                 damping = min(10 * damping, 1e6)
@@ -110,14 +113,15 @@ class Bundle:
         error = np.linalg.norm(difference, axis=0) / self.sigma
         # The mean length of an error with this deviation in x and in y is sqrt(pi / 2) times it.
         noise = float(error.mean()) / np.sqrt(np.pi / 2)
-        rows = np.arange(self._first_lens, self._size, 2)
-        try:
-            covariance = reduced.solve(np.eye(self._size)[:, rows])
-        except (np.linalg.LinAlgError, RuntimeError):  # singular: a dense or a sparse one
-            return np.full(len(self.lenses), np.inf)
-        variance = covariance[rows, np.arange(len(rows))]
-        valid = np.isfinite(variance) & (variance > 0)
-        return np.where(valid, noise * np.sqrt(np.abs(variance)) / self.lenses[:, 0], np.inf)
+        variances = []
+        for row in range(self._first_lens, self._size, 2):
+            unit = np.zeros(self._size)
+            unit[row] = 1
+            try:
+                variances.append(_solve(reduced.copy(), unit)[row])
+            except np.linalg.LinAlgError:
+                variances.append(np.inf)
+        return np.asarray(noise * np.sqrt(variances) / self.lenses[:, 0])
 
     def _evaluate(self, loss_scale: float) -> tuple[float, Array, Array, Array]:
         """The loss, points in their cameras (3, n), errors (2, n) in pixels and weights (n,)."""
@@ -151,7 +155,7 @@ class Bundle:
         reduced, target, by_motion, by_point, gradient, root = self._reduce(
             local, error, weight, damping
         )
-        step = -reduced.solve(target) if len(target) else target
+        step = -_solve(reduced, target)
         motions = np.zeros((len(self.poses), by_motion.shape[1]))
         motions[self.moving, :6] = step[: self._first_lens].reshape(-1, 6)
         lenses = step[self._first_lens :].reshape(-1, 2)
@@ -179,7 +183,7 @@ class Bundle:
 
     def _reduce(
         self, local: Array, error: Array, weight: Array, damping: float
-    ) -> tuple[_Symmetric, Array, Array, Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
         """The normal equations without the points, and what gives the points' share.
 
         Returns matrix and right side; derivatives by the frame's motion and by its point; and the
@@ -201,33 +205,36 @@ class Bundle:
         by_point[:, 1] = by_point[:, 0] * xy + by_point[:, 1] * yy
         by_point[:, 0] *= xx
 
-        reduced, target = _Symmetric(self._size), np.zeros(self._size)
-        diagonal = np.zeros(self._size)
+        reduced, target = np.zeros((self._size, self._size)), np.zeros(self._size)
         for a, b in self._blocks:
-            rows, part = self._rows(self.frame[a])
-            jacobian = np.concatenate(by_motion[:, part, a:b], axis=1)
-            normal = jacobian @ jacobian.T
-            reduced.add(rows, normal)
-            diagonal[rows] += np.diag(normal)
-            target[rows] += jacobian @ residual[:, a:b].reshape(-1)
-        added = np.full(self._size, 1e-12)
+            jacobian = np.concatenate(by_motion[:, :, a:b], axis=1)
+            normal, slope = jacobian @ jacobian.T, jacobian @ residual[:, a:b].reshape(-1)
+            blocks = self._rows(self.frame[a])
+            for i, to in blocks:
+                target[to] += slope[i]
+                for j, across in blocks:
+                    reduced[to, across] += normal[i, j]
+        diagonal = np.einsum("ii->i", reduced)
         if self.priors is not None:
             slopes = -rotate(self.poses[:, :, :3], self._off_priors()) / self.spread
             of_centers = np.arange(self._first_lens).reshape(-1, 6)[:, 3:].ravel()
-            added[of_centers] += (1 + damping) / self.spread**2
+            diagonal[of_centers] += 1 / self.spread**2
             target[of_centers] += slopes[self.moving].ravel()
-        reduced.add_diagonal(damping * diagonal + added)
+        diagonal *= 1 + damping
+        diagonal += 1e-12
         for rows, points, coupling in self._couplings(by_motion, by_point):
-            reduced.add(rows, -coupling @ coupling.T)
+            reduced[rows[:, None], rows] -= coupling @ coupling.T
             target[rows] -= coupling @ gradient[:, points].reshape(-1)
         return reduced, target, by_motion, by_point, gradient, root
 
-    def _rows(self, frame: int) -> tuple[Ids, Ids]:
-        """Rows of the reduced system that a frame moves, and which of its derivatives they are."""
-        first, lens = 6 * self._column[frame], self._first_lens + 2 * self.camera[frame]
-        moving = np.arange(6 if self.moving[frame] else 0)
-        free = np.arange(2 if self._size > self._first_lens else 0)
-        return np.r_[first + moving, lens + free], np.r_[moving, 6 + free]
+    def _rows(self, frame: int) -> list[tuple[slice, slice]]:
+        """Where derivatives by a frame's motion belong in the reduced system."""
+        out, lens = [], self._first_lens + 2 * int(self.camera[frame])
+        if self.moving[frame]:
+            out.append((slice(6), slice(6 * self._column[frame], 6 * self._column[frame] + 6)))
+        if lens < self._size:
+            out.append((slice(6, 8), slice(lens, lens + 2)))
+        return out
 
     def _couplings(self, by_motion: Array, by_point: Array) -> Iterator[tuple[Ids, Ids, Array]]:
         """For each chunk: rows (r,), points (p,), and what couples them (r, 3 p)."""
@@ -289,48 +296,36 @@ class Bundle:
         return out, by_point
 
 
-class _Symmetric:
-    """A symmetric system, dense if it is small, else sparse: few frames see a point."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._dense = np.zeros((size, size)) if size <= _DENSE else None
-        self._blocks: list[tuple[NDArray[np.int32], NDArray[np.int32], Array]] = []
-
-    def add(self, rows: Ids, block: Array) -> None:
-        """Add a matrix (r, r) in these rows (r,), and in the columns of the same numbers."""
-        if self._dense is not None:
-            self._dense[rows[:, None], rows] += block
-        else:
-            grid = np.meshgrid(rows.astype(np.int32), rows.astype(np.int32), indexing="ij")
-            self._blocks.append((grid[0].ravel(), grid[1].ravel(), block.ravel()))
-
-    def add_diagonal(self, values: Array) -> None:
-        """Add values (size,) to the diagonal."""
-        if self._dense is not None:
-            np.einsum("ii->i", self._dense)[:] += values
-        else:
-            rows = np.arange(self._size, dtype=np.int32)
-            self._blocks.append((rows, rows, values))
-
-    def solve(self, right: Array) -> Array:
-        """The solution (size, ...) for a right side of that shape."""
-        if self._dense is not None:
-            return np.asarray(np.linalg.solve(self._dense, right))
-        sparse = optional("scipy.sparse")
-        rows, columns, values = (np.concatenate(part) for part in zip(*self._blocks, strict=True))
-        matrix = sparse.coo_matrix((values, (rows, columns)), (self._size, self._size)).tocsc()
-        matrix.eliminate_zeros()
-        factors = optional("scipy.sparse.linalg").splu(
-            matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        return np.asarray(factors.solve(right))
-
-
 def _slices(values: Ids) -> list[tuple[int, int]]:
     """Start and end of each run of equal entries in a sorted array."""
     starts, lengths = runs(values)
     return list(zip(starts.tolist(), (starts + lengths).tolist(), strict=True))
+
+
+def _solve(matrix: Array, target: Array) -> Array:
+    """The solution of a positive definite system, by Cholesky; the matrix is overwritten.
+
+    Blocks that are zero, as of frames that see nothing in common, cost nothing.
+    """
+    ends = range(_BLOCK, len(target) + _BLOCK, _BLOCK)
+    blocks = [slice(end - _BLOCK, min(end, len(target))) for end in ends]
+    out, roots, below = target.copy(), [], []
+    for k, block in enumerate(blocks):
+        root = np.linalg.inv(np.linalg.cholesky(matrix[block, block]))
+        out[block] = root @ out[block]
+        rows = [i for i in blocks[k + 1 :] if matrix[i, block].any()]
+        for n, i in enumerate(rows):
+            matrix[i, block] = matrix[i, block] @ root.T
+            out[i] -= matrix[i, block] @ out[block]
+            for j in rows[: n + 1]:
+                matrix[i, j] -= matrix[i, block] @ matrix[j, block].T
+        roots.append(root)
+        below.append(rows)
+    for block, root, rows in zip(blocks[::-1], roots[::-1], below[::-1], strict=True):
+        for i in rows:
+            out[block] -= matrix[i, block].T @ out[i]
+        out[block] = root.T @ out[block]
+    return out
 
 
 def _root(normal: Array, damping: float) -> Array:
