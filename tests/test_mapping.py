@@ -219,9 +219,10 @@ def test_an_unknown_camera_is_calibrated_along_the_way(
     assert figures["camera"]["model"] == "SIMPLE_RADIAL"
     assert figures["camera"]["params"][0] == pytest.approx(300, rel=0.03)
     assert not figures["warnings"]
-    # Without an election the map starts with 1.2 times 320, and again with what it finds.
+    # Without an election the map starts with 1.2 times 320, and again with what it finds; the
+    # first it finds, early, may be off by so much that it starts once more.
     restarts = [event for event in figures["events"] if "restarts" in event]
-    assert len(restarts) == (0 if elected else 1)
+    assert len(restarts) in ((0,) if elected else (1, 2))
     assert elected or "not 384 pixels" in restarts[0]
     frames = json.loads((tmp_path / "scene/report.json").read_text())["history"]
     last = sum(frame["seconds"]["triangulate"] for frame in frames)

@@ -419,6 +419,7 @@ class Mapper:
         new.calibration = self.calibration.restarted(self.camera.focal_length)
         new.features, new.mask = self.features, self.mask
         new.history.closing_seconds = self.history.total_seconds()
+        new.history.events = [e for e in self.history.events if e.startswith("the map restarts")]
         new.history.events.append(
             f"the map restarts: focal length {new.calibration.start:.0f}, not "
             f"{self.calibration.start:.0f} pixels"
