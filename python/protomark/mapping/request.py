@@ -67,7 +67,7 @@ def check_output(request: MapRequest) -> None:
 
 def request_facts(request: MapRequest, source: FrameSource) -> dict[str, Any]:
     """What must be the same when a map is resumed, as JSON values: the input, and the options."""
-    names = "\n".join(source.names())
+    names = "\n".join(sorted(source.names()))
     return {
         "the input": str(source.path.resolve()),
         "--every": request.every,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from protomark.features.extractor import Extractor, pixel_size
+from protomark.features.extractor import Extractor, Features, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
 from protomark.files import only_writer
 from protomark.geometry.camera import Camera
@@ -19,6 +19,7 @@ from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.options import MappingOptions
+from protomark.mapping.ordering import matching_order
 from protomark.mapping.outputs import back_up, write_outputs
 from protomark.mapping.recording import Recording
 from protomark.mapping.request import (
@@ -39,6 +40,8 @@ from protomark.threads import one_blas_thread, read_ahead
 RECORDING = "recording.rrd"
 # Seconds between checkpoints, each of which takes about a tenth of a second.
 _CHECKPOINT_INTERVAL = 20.0
+# For so few, another order is looked for even if most match the next one.
+_FEW_PHOTOS = 60
 
 
 def make_map(
@@ -110,6 +113,7 @@ class _Session:
         self.request, self.source = request, source
         self.progress, self.note = progress, note
         self.cursor = self.known = 0
+        self._order: list[str] = []  # names of photos that had none
         self._ahead: Extractor | None = None  # of the thread that reads ahead
         self.facts: dict[str, Any] = {}
         if request.resume:
@@ -143,6 +147,9 @@ class _Session:
             if camera is None:
                 raise ValueError("--poses needs the camera of the images: give it with --camera")
         surveyed = self._survey(options)
+        few = len(self.source) <= _FEW_PHOTOS
+        if (few or not surveyed.ordered) and not self.source.timed:
+            surveyed = self._reordered(options, surveyed)
         origin = ""
         if camera is None:
             camera, origin = self._guess_camera(surveyed)
@@ -175,9 +182,12 @@ class _Session:
     def _resume(self) -> None:
         folder = self.request.output / CHECKPOINT
         self.mapper, facts = load_state(folder, self.request.threads)
+        self._order = facts["order"]
         check_same_request(
             self.request.output, request_facts(self.request, self.source), facts["request"]
         )
+        if self._order:
+            self.source.reorder(self._order)
         self._read_poses()
         self._camera()  # for the source to know those of its images
         self.cursor, self.known = int(facts["cursor"]), int(facts["known"])
@@ -195,13 +205,25 @@ class _Session:
         self._prepare(self._survey(self.mapper.options), prefix, inputs)
         self.source.follow(self.mapper.structure, self.mapper.history.records)
 
-    def _survey(self, options: MappingOptions) -> Survey:
+    def _reordered(self, options: MappingOptions, surveyed: Survey) -> Survey:
+        """What the first frames show in the order in which they match, if that is another one."""
+        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
+        known = surveyed.features
+        images, count = self.source.images(), len(self.source)
+        self._order = matching_order(images, count, extractor, known, self.progress)
+        if not self._order:
+            return surveyed
+        self.note("the photos are in no order: each is mapped after one that it matches")
+        self.source.reorder(self._order)
+        return self._survey(options, known)
+
+    def _survey(self, options: MappingOptions, known: dict[str, Features] | None = None) -> Survey:
         """What the first frames show, and the region of the image to leave out."""
         self.progress("look at the first frames", 0, 0)
         started = time.perf_counter()
         size = self.source.size()
         extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
-        surveyed = survey(self.source.images(), extractor, size)
+        surveyed = survey(self.source.images(), extractor, size, known or {})
         matches = [(pair.first, pair.second) for pair in surveyed.pairs]
         mask = static_regions(matches, size, pixel_size(size, options.max_size))
         if region := describe(mask):
@@ -220,6 +242,7 @@ class _Session:
         self.mapper.history.closing_seconds["initialise"] = surveyed.seconds
         self.facts = {
             "request": request_facts(self.request, source),
+            "order": self._order,
             "prefix": prefix,
             "inputs": {**inputs, str(source.path.resolve()): prefix},
         }

@@ -70,6 +70,10 @@ class FrameSource(ABC):
     def listing(self) -> list[tuple[str, float]]:
         """Names of all frames, without the prefix, and their times."""
 
+    def reorder(self, names: list[str]) -> None:
+        """Give the frames another order, in which they then come and are numbered."""
+        raise NotImplementedError(f"{self.path} has an order")
+
     def names(self) -> list[str]:
         """Names of all frames, without the prefix."""
         return [name for name, _ in self.listing()]
@@ -205,6 +209,11 @@ class ImageFolder(FrameSource):
     def listing(self) -> list[tuple[str, float]]:
         """See `FrameSource.listing`."""
         return list(zip(self._names, self._times, strict=True))
+
+    def reorder(self, names: list[str]) -> None:
+        """See `FrameSource.reorder`."""
+        times = dict(self.listing())
+        self._names, self._times = names, [times[name] for name in names]
 
     def _samples(self) -> Iterator[InputImage]:
         step = -(-len(self._names) // _SIZE_SAMPLES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ _MOVED_SHARE = 0.2
 # Each frame is matched with those that come so many frames later.
 _STEPS = (1, 2, 4, 8)
 _MIN_MATCHES = 50
+# A frame follows another if this share of its keypoints match: fewer do so by chance.
+_FOLLOWING = 0.05
 
 
 @dataclass
@@ -35,6 +38,7 @@ class Survey:
     pairs: list[MatchedPair]  # matches of frames that moved
     # Features by image name, so that the map need not detect them again.
     features: dict[str, Features]
+    ordered: bool  # whether most frames match the next one
     # (height, width) bool, the part of the image to leave out; None: nothing.
     mask: NDArray[np.bool_] | None = None
     seconds: float = 0.0  # how long the survey took
@@ -66,7 +70,12 @@ class MatchedPair:
     second: Array  # (n, 2) float64, pixels in the later one
 
 
-def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, int]) -> Survey:
+def survey(
+    images: Iterable[InputImage],
+    extractor: Extractor,
+    size: tuple[int, int],
+    known: dict[str, Features],  # features by image name
+) -> Survey:
     """Match the first frames that moved with each other; images of another size do not count."""
     frames: list[tuple[InputImage, Features]] = []
     for count, image in enumerate(images):
@@ -74,7 +83,7 @@ def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, 
             break
         if image.image is None or image.image.shape[::-1] != size:
             continue
-        features = extractor(image.image)
+        features = known.get(image.name) or extractor(image.image)
         new = replace(image, image=None), features
         if len(features) < _MIN_MATCHES or (frames and not _moved(_pair(frames[-1], new), size)):
             continue
@@ -85,9 +94,13 @@ def survey(images: Iterable[InputImage], extractor: Extractor, size: tuple[int, 
         for step in _STEPS
         if i + step < len(frames)
     ]
+    following = [
+        len(_pair(one, other).first) >= _FOLLOWING * len(one[1]) for one, other in pairwise(frames)
+    ]
     return Survey(
         [pair for pair in pairs if len(pair.first) >= _MIN_MATCHES],
-        {image.name: features for image, features in frames},
+        {**known, **{image.name: features for image, features in frames}},
+        2 * sum(following) >= len(following),
     )
 
 
