@@ -35,8 +35,7 @@ void bind_files(nb::module_& m) {
         return nb::cast(without_gil([&] { return SealedMap(path); }));
       },
       "path"_a, nb::kw_only(), "journal"_a = false, "encoder"_a.none() = nb::none(),
-      "descriptor"_a = nb::none(),
-      "Open a map file: see `protomark.open`.");
+      "descriptor"_a = nb::none(), "Open a map file: see `protomark.open`.");
   m.def("file_sections", &file_sections, "path"_a, ReleaseGil(),
         nb::sig("def file_sections(path: str | os.PathLike[str]) -> list[tuple[str, int]]"),
         "Names and sizes in bytes of the sections of a model or map file. Raises FileError.");

@@ -8,7 +8,38 @@
 
 using namespace protomark;
 
+namespace {
+
+template <typename F>
+bool refused(const F& f, const std::string& message) {
+  return check::throws<std::invalid_argument>(f, message);
+}
+
+using Ids = std::vector<std::int64_t>;
+
+void test_limits() {
+  const std::vector<std::uint8_t> rows(4 * 8);
+  const Descriptors database{rows.data(), 4, 8}, queries{rows.data(), 2, 8};
+  CHECK(refused([&] { hamming_search({rows.data(), 2, 0}, {rows.data(), 2, 0}); },
+                "1 to 4096 bytes"));
+  CHECK(refused([&] { hamming_search(queries, database, 0); }, "k must be at least 1"));
+  HammingOptions options;
+  options.max_distance = -1;
+  CHECK(refused([&] { hamming_search(queries, database, 2, options); }, "max_distance"));
+  const Ids three = {1, 2, 3}, negative = {1, 2, 3, -4}, repeated = {7, 7, 5, 7};
+  CHECK(refused([&] { hamming_search(queries, database, 2, {.landmarks = three}); },
+                "4 rows, landmarks has 3"));
+  CHECK(
+      refused([&] { hamming_search(queries, database, 2, {.landmarks = negative}); }, "negative"));
+  CHECK(hamming_search(queries, database, 2, {.landmarks = repeated}).ids.data == Ids{5, 7, 5, 7});
+  const Matches none = hamming_search(queries, {rows.data(), 0, 8});
+  CHECK(none.ids.data == Ids{-1, -1, -1, -1} && none.distances.data[0] == INT32_MAX);
+}
+
+}  // namespace
+
 int main() {
+  test_limits();
   test::Random random(5);
   const std::size_t bytes = 61, n = 1500, q = 20, k = 3;
   const auto database = random.integers<std::uint8_t>(n * bytes, 0, 3);

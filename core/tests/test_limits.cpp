@@ -464,25 +464,6 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(refused([&] { SealedMap(std::span(bytes).subspan(1), "x"); }, "multiple of 64"));
 }
 
-void test_hamming() {
-  const std::vector<std::uint8_t> rows(4 * 8);
-  const Descriptors database{rows.data(), 4, 8}, queries{rows.data(), 2, 8};
-  CHECK(refused([&] { hamming_search({rows.data(), 2, 0}, {rows.data(), 2, 0}); },
-                "1 to 4096 bytes"));
-  CHECK(refused([&] { hamming_search(queries, database, 0); }, "k must be at least 1"));
-  HammingOptions options;
-  options.max_distance = -1;
-  CHECK(refused([&] { hamming_search(queries, database, 2, options); }, "max_distance"));
-  const Ids three = {1, 2, 3}, negative = {1, 2, 3, -4}, repeated = {7, 7, 5, 7};
-  CHECK(refused([&] { hamming_search(queries, database, 2, {.landmarks = three}); },
-                "4 rows, landmarks has 3"));
-  CHECK(
-      refused([&] { hamming_search(queries, database, 2, {.landmarks = negative}); }, "negative"));
-  CHECK(hamming_search(queries, database, 2, {.landmarks = repeated}).ids.data == Ids{5, 7, 5, 7});
-  const Matches none = hamming_search(queries, {rows.data(), 0, 8});
-  CHECK(none.ids.data == Ids{-1, -1, -1, -1} && none.distances.data[0] == INT32_MAX);
-}
-
 }  // namespace
 
 int main() {
@@ -497,7 +478,6 @@ int main() {
   test_small_maps(encoder, folder);
   test_merge_map(encoder);
   test_claims(encoder, folder);
-  test_hamming();
   fs::remove_all(folder);
   return check::result();
 }
