@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from mapping_scene import interrupted_at, walk, write_images
 from protomark import interrupt
 from protomark.mapping import session
+from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from test_mapping import CAMERA, SETTINGS, run
@@ -110,3 +112,16 @@ def test_times_stay_unique_and_the_old_map_is_kept(extended: Path, tmp_path: Pat
     along = rows[:, 1:4] @ np.linalg.svd(rows[:, 1:4] - rows[:, 1:4].mean(0))[2][0]
     assert (np.diff(along) > 0).all() or (np.diff(along) < 0).all()
     assert contents(extended / "previous") == before
+
+
+def test_a_stopped_extension_keeps_the_old_map(
+    extended: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = contents(extended)
+    more = write_images(tmp_path / "more", walk(FRAMES + 4)[FRAMES:])
+    request = MapRequest(more, extended, SETTINGS, extend=True)
+    interrupted_at(FRAMES + MAX_STEP + 2, request, monkeypatch)
+    assert contents(extended / "previous") == before
+    make_map(replace(request, resume=True))
+    assert contents(extended / "previous") == before
+    assert len(np.loadtxt(extended / "trajectory.txt")) == FRAMES + 4

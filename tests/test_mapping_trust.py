@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping_scene import interrupted_at, show, walk, write_images
+from mapping_scene import interrupted_at, show, turn_and_approach, walk, write_images
 from protomark.features.static_regions import describe, outside, read_mask, static_regions
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
@@ -44,6 +44,7 @@ from protomark.mapping.trust import (
     is_uncertain,
     untrusted_frames,
     weak_connections,
+    wrong_focal_lengths,
 )
 from test_mapping import CAMERA, COUNT, error_of, run
 from test_tracks_command import fails
@@ -415,3 +416,16 @@ def test_rivals_for_the_first_pair_are_adjusted_before_they_are_compared() -> No
         assert support.pose[:, 3] @ true[:, 3] > np.cos(np.radians(10))
         assert support.share > 0.9
     assert found[0].score > 0.6 * found[1].score
+
+
+def test_a_given_camera_that_the_images_contradict() -> None:
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=500), PINHOLE)
+    for i, pose in enumerate(turn_and_approach(14)):
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose)))
+    mapper.finish()
+    assert wrong_focal_lengths(mapper.structure) == []
+    wrong = replace(PINHOLE, params=(360.0, 360.0, *PINHOLE.params[2:]))
+    for i in mapper.structure.cameras:
+        mapper.structure.set_camera(i, wrong)
+    (sentence,) = wrong_focal_lengths(mapper.structure)
+    assert "the camera has a focal length of 360 pixels" in sentence

@@ -15,6 +15,8 @@ from protomark.mapping.structure import Observations, Structure
 
 # Of the keyframes around those that move, the ones that share most landmarks are held fixed.
 _MAX_FIXED = 15
+# Steps that show whether other focal lengths fit better.
+_FREE_STEPS = 30
 
 
 def adjust_local_bundle(structure: Structure, newest: int, size: int, iterations: int) -> list[int]:
@@ -87,6 +89,23 @@ def adjust(
             structure.frames[i].pose = pose
     finite = np.isfinite(bundle.points).all(1)
     structure.positions[np.unique(seen.landmarks)[finite]] = bundle.points[finite]
+
+
+def free_focal_lengths(structure: Structure) -> dict[int, tuple[float, float]]:
+    """Focal lengths that fit best, and their relative deviations, by camera; the map stays."""
+    keyframes = structure.keyframes()
+    seen = structure.observations(keyframes)
+    counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
+    seen = seen.where(counts[seen.landmarks] >= 2)
+    moves = np.zeros(len(structure.frames), bool)
+    moves[keyframes[1:]] = True
+    bundle = _bundle(structure, seen, moves, False)
+    if not len(seen.frames) or bundle.turns is not None:
+        return {}
+    bundle = replace(bundle, refined=np.ones(len(bundle.lenses), bool))
+    bundle.adjust(_FREE_STEPS)
+    found = zip(bundle.lenses[:, 0].tolist(), bundle.focal_deviations().tolist(), strict=True)
+    return dict(zip(_camera_ids(structure, seen), found, strict=True))
 
 
 def _camera_ids(structure: Structure, seen: Observations) -> list[int]:

@@ -27,7 +27,13 @@ MODEL, TRAJECTORY, REPORT, FIGURES = "sparse", "trajectory.txt", "report.html", 
 
 
 def back_up(scene: Path) -> None:
-    """Keep the files of a map that is about to be replaced in its folder `previous`."""
+    """Keep the files of a map that is about to be replaced in its folder `previous`.
+
+    Of a map that a signal stopped, the folder holds what was there before it.
+    """
+    figures = scene / FIGURES
+    if figures.is_file() and not json.loads(figures.read_text()).get("finished", True):
+        return
     kept = (PREVIOUS, CHECKPOINT)
     with replacing_folder(scene / PREVIOUS) as folder:
         shutil.copytree(

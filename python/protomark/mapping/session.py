@@ -80,7 +80,7 @@ def _make_map(
             shutil.rmtree(checkpoint, ignore_errors=True)
             raise ValueError(no_map(mapper, source, session.known))
     progress("write", 0, 0)
-    if finished and request.extend:
+    if request.extend:
         back_up(request.output)
     figures = write_outputs(mapper, request.output, source.path.name, finished, request.seal)
     if session.recording is not None:

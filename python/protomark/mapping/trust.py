@@ -12,6 +12,7 @@ import numpy as np
 from protomark.geometry.absolute_pose import pose_covariance
 from protomark.geometry.neighbours import runs
 from protomark.geometry.pose import camera_centers, transform
+from protomark.mapping.adjustment import free_focal_lengths
 from protomark.mapping.frame import Array, Frame
 from protomark.mapping.history import REGISTERED
 from protomark.mapping.initialisation import MIN_PARALLAX
@@ -35,6 +36,9 @@ _MIN_STEPS = 8
 # Connections are judged where at least this many keyframes lie on either side.
 _MIN_SIDE = 3
 _MAX_NAMED = 3
+# A given camera is wrong if another focal length fits better that is this share of it away, and so
+# many standard deviations.
+_MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
 # Maps with a smaller share of their frames are of something else than their input.
 _MIN_REGISTERED = 0.5
 
@@ -143,6 +147,20 @@ def weak_connections(structure: Structure, min_landmarks: int) -> list[str]:
     return names
 
 
+def wrong_focal_lengths(structure: Structure) -> list[str]:
+    """Sentences on given cameras that the images contradict."""
+    out = []
+    for i, (focal, deviation) in free_focal_lengths(structure).items():
+        given = structure.cameras[i].focal_length
+        off = abs(focal / given - 1)
+        if off > max(_MAX_OFF, _MAX_SIGMAS * deviation):
+            out.append(
+                f"the camera has a focal length of {given:.0f} pixels, but {focal:.0f} fit the "
+                "images better: check --camera, or leave it out"
+            )
+    return out
+
+
 def warnings(mapper: Mapper) -> list[str]:
     """Sentences on what in a map cannot be trusted; none if it can."""
     out = []
@@ -152,6 +170,8 @@ def warnings(mapper: Mapper) -> list[str]:
             f"the images do not determine the focal length, it stays at {camera.focal_length:.0f} "
             "pixels: give the camera with --camera, or add images that turn and that come closer"
         )
+    if calibration is None and not mapper.options.fixed_poses:
+        out += wrong_focal_lengths(mapper.structure)
     records = list(mapper.history.records.values())
     registered = sum(record.outcome == REGISTERED for record in records)
     if registered < _MIN_REGISTERED * len(records):
