@@ -128,6 +128,9 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         ("localized", f"{facts['localized']:,} (confidence {batch.min_confidence:g} or more)"),
         ("not found", f"{facts['images'] - facts['localized'] - facts['unreadable']:,}"),
     ]
+    reasons = [(i.name, i.found.reason) for i in batch.images if i.found and not batch.accepted(i)]
+    if example := next((f"{name}: {reason}" for name, reason in reasons if reason), ""):
+        rows.append(("for example", example))
     if facts["unreadable"]:
         rows.append(("not usable", f"{facts['unreadable']:,}"))
     if facts["median_inliers"] is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -152,4 +153,4 @@ def _show(figures: dict[str, Any], scene: Path) -> None:
     for warning in figures["warnings"]:
         say(f"  [red]cannot be trusted[/]: {escape(warning)}")
     if not figures["warnings"]:
-        say(f"  next: protomark localize {escape(str(scene))} IMAGES")
+        say(f"  next: protomark localize {escape(shlex.quote(str(scene)))} IMAGES")

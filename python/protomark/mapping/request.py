@@ -52,13 +52,16 @@ def check_output(request: MapRequest) -> None:
                 f"{scene} holds an interrupted map: finish it with --resume first"
             )
         return
-    if request.force or all(path.name.startswith(".lock") for path in scene.iterdir()):
+    if all(path.name.startswith(".lock") for path in scene.iterdir()):
+        return
+    is_map = interrupted or (scene / STATE).exists()
+    if request.force and is_map:
         return
     if interrupted:
         raise FileExistsError(
             f"{scene} holds an interrupted map: --resume continues it, --force starts anew"
         )
-    if (scene / STATE).exists():
+    if is_map:
         raise FileExistsError(
             f"{scene} holds a map already: --into {scene} extends it, --force makes it anew"
         )
