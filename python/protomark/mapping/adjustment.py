@@ -97,11 +97,11 @@ def free_focal_lengths(structure: Structure) -> dict[int, tuple[float, float]]:
     seen = structure.observations(keyframes)
     counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
     seen = seen.where(counts[seen.landmarks] >= 2)
+    if not len(seen.frames) or any(camera.wide for camera in structure.cameras.values()):
+        return {}
     moves = np.zeros(len(structure.frames), bool)
     moves[keyframes[1:]] = True
     bundle = _bundle(structure, seen, moves, False)
-    if not len(seen.frames) or bundle.turns is not None:
-        return {}
     bundle = replace(bundle, refined=np.ones(len(bundle.lenses), bool))
     bundle.adjust(_FREE_STEPS)
     found = zip(bundle.lenses[:, 0].tolist(), bundle.focal_deviations().tolist(), strict=True)
