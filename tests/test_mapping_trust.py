@@ -42,6 +42,7 @@ from protomark.mapping.trust import (
     THROWN,
     UNCERTAIN,
     is_uncertain,
+    other_lenses,
     untrusted_frames,
     weak_connections,
     wrong_focal_lengths,
@@ -429,3 +430,13 @@ def test_a_given_camera_that_the_images_contradict() -> None:
         mapper.structure.set_camera(i, wrong)
     (sentence,) = wrong_focal_lengths(mapper.structure)
     assert "the camera has a focal length of 360 pixels" in sentence
+
+
+def test_a_zoomed_frame_is_named() -> None:
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=500), PINHOLE)
+    zoomed = replace(PINHOLE, params=(360.0, 360.0, *PINHOLE.params[2:]))
+    for i, pose in enumerate(turn_and_approach(16)):
+        camera = zoomed if i == 14 else PINHOLE
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose, camera)))
+    mapper.finish()
+    assert other_lenses(mapper.structure, mapper.options.max_error) == ["14.png"]

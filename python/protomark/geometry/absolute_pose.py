@@ -156,6 +156,7 @@ class FreeLens:
     # By how much the mean loss falls, log(1 + (error / s)^2) with half the largest error s.
     gain: float
     spread: float  # standard deviation of the camera centre in world units, infinite if it is open
+    stretch: float = 1.0  # the focal length that fits best, by that of the camera
 
 
 def free_lens(
@@ -204,7 +205,7 @@ def free_lens(
         covariance = _covariance(jacobian, float(after[inlier].sum()))
         if covariance is not None:
             spread = float(np.sqrt(np.trace(covariance[3:6, 3:6])))
-    return FreeLens(pose, float(losses[0] - losses[1]), spread)
+    return FreeLens(pose, float(losses[0] - losses[1]), spread, float(lens[0]))
 
 
 def _minimise(

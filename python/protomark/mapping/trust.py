@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protomark.geometry.absolute_pose import pose_covariance
+from protomark.geometry.absolute_pose import free_lens, pose_covariance
 from protomark.geometry.neighbours import runs
 from protomark.geometry.pose import camera_centers, transform
 from protomark.mapping.adjustment import free_focal_lengths
@@ -39,6 +39,9 @@ _MAX_NAMED = 3
 # A given camera is wrong if another focal length fits better that is this share of it away, and so
 # many standard deviations.
 _MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
+# A frame is of another lens if a focal length fits better that is this share longer or shorter, and
+# so many standard deviations.
+_MAX_STRETCH, _STRETCH_SIGMAS = 0.025, 3.0
 # Maps with a smaller share of their frames are of something else than their input.
 _MIN_REGISTERED = 0.5
 
@@ -161,6 +164,24 @@ def wrong_focal_lengths(structure: Structure) -> list[str]:
     return out
 
 
+def other_lenses(structure: Structure, max_error: float) -> list[str]:
+    """Names of frames that fit better with another focal length: a zoom, another camera."""
+    names = []
+    for frame in structure.frames:
+        camera, rows = structure.cameras[frame.camera_id], frame.observed
+        if camera.wide or len(rows) < _MIN_LANDMARKS:
+            continue
+        positions = structure.positions[frame.landmarks[rows]]
+        pixels = frame.keypoints[rows].astype(np.float64)
+        tolerance = structure.tolerance(frame.camera_id, max_error)
+        free = free_lens(frame.pose, pixels, positions, camera, tolerance)
+        depth = float(np.median(transform(frame.pose, positions)[:, 2]))
+        # What leaves the camera's centre open along the view leaves the focal length as open.
+        if abs(free.stretch - 1) > max(_MAX_STRETCH, _STRETCH_SIGMAS * free.spread / depth):
+            names.append(frame.name)
+    return names
+
+
 def warnings(mapper: Mapper) -> list[str]:
     """Sentences on what in a map cannot be trusted; none if it can."""
     out = []
@@ -190,6 +211,12 @@ def warnings(mapper: Mapper) -> list[str]:
         out.append(
             f"parts of the map flew away, and {thrown} frames were taken out with them: what "
             "connects these parts has too little depth or overlap"
+        )
+    zoomed = other_lenses(mapper.structure, mapper.options.max_error)
+    if zoomed and not mapper.options.fixed_poses:
+        out.append(
+            f"{len(zoomed)} frames, such as {zoomed[0]}, fit better with another focal length: was "
+            "another lens or zoom used? Give each image its camera, or map them apart"
         )
     weak = weak_connections(mapper.structure, mapper.options.min_inliers)
     if weak and not mapper.options.fixed_poses:
