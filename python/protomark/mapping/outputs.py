@@ -58,7 +58,7 @@ def write_outputs(
 ) -> dict[str, Any]:
     """Write all files of a map to the folder `scene`; returns its figures."""
     structure = mapper.structure
-    figures = {"input": source, "finished": finished, **summarise(mapper)}
+    figures = {"input": source, "finished": finished, **summarise(mapper, finished)}
     ids = mapper.scene.ids
     mapper.scene.set_positions(ids, structure.positions[ids])
     used = {structure.cameras[frame.camera_id] for frame in structure.frames}

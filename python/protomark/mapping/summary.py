@@ -15,8 +15,8 @@ from protomark.plot import MapPictures
 from protomark.tracks.summary import track_figures
 
 
-def summarise(mapper: Mapper) -> dict[str, Any]:
-    """Counts, errors, bytes and times of a map, as JSON values."""
+def summarise(mapper: Mapper, finished: bool = True) -> dict[str, Any]:
+    """Counts, errors, bytes and times of a map, as JSON values; a stopped one is not judged."""
     structure = mapper.structure
     records = list(mapper.history.records.values())
     registered = [r for r in records if r.outcome == REGISTERED]
@@ -48,7 +48,7 @@ def summarise(mapper: Mapper) -> dict[str, Any]:
         "seconds_total": round(total, 3),
         "frames_per_second": len(records) / total if total else 0.0,
         "left_out": "" if mapper.mask is None else describe(mapper.mask),
-        "warnings": warnings(mapper),
+        "warnings": warnings(mapper) if finished else [],
         "events": mapper.history.events,
         "not_registered": unregistered,
     }
