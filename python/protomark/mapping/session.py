@@ -30,7 +30,7 @@ from protomark.mapping.request import (
     request_facts,
 )
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
-from protomark.mapping.source import EXIF, GIVEN, FrameSource, open_source
+from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open_source
 from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import no_map
@@ -147,9 +147,9 @@ class _Session:
             if camera is None:
                 raise ValueError("--poses needs the camera of the images: give it with --camera")
         surveyed = self._survey(options)
-        few = len(self.source) <= _FEW_PHOTOS
-        if (few or not surveyed.ordered) and not self.source.timed:
-            surveyed = self._reordered(options, surveyed)
+        source, few = self.source, len(self.source) <= _FEW_PHOTOS
+        if isinstance(source, ImageFolder) and not source.timed and (few or not surveyed.ordered):
+            surveyed = self._reordered(source, options, surveyed)
         origin = ""
         if camera is None:
             camera, origin = self._guess_camera(surveyed)
@@ -186,7 +186,7 @@ class _Session:
         check_same_request(
             self.request.output, request_facts(self.request, self.source), facts["request"]
         )
-        if self._order:
+        if isinstance(self.source, ImageFolder) and self._order:
             self.source.reorder(self._order)
         self._read_poses()
         self._camera()  # for the source to know those of its images
@@ -205,16 +205,16 @@ class _Session:
         self._prepare(self._survey(self.mapper.options), prefix, inputs)
         self.source.follow(self.mapper.structure, self.mapper.history.records)
 
-    def _reordered(self, options: MappingOptions, surveyed: Survey) -> Survey:
+    def _reordered(self, source: ImageFolder, options: MappingOptions, surveyed: Survey) -> Survey:
         """What the first frames show in the order in which they match, if that is another one."""
         extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         known = surveyed.features
-        images, count = self.source.images(), len(self.source)
+        images, count = source.images(), len(source)
         self._order = matching_order(images, count, extractor, known, self.progress)
         if not self._order:
             return surveyed
         self.note("the photos are in no order: each is mapped after one that it matches")
-        self.source.reorder(self._order)
+        source.reorder(self._order)
         return self._survey(options, known)
 
     def _survey(self, options: MappingOptions, known: dict[str, Features] | None = None) -> Survey:

@@ -70,10 +70,6 @@ class FrameSource(ABC):
     def listing(self) -> list[tuple[str, float]]:
         """Names of all frames, without the prefix, and their times."""
 
-    def reorder(self, names: list[str]) -> None:
-        """Give the frames another order, in which they then come and are numbered."""
-        raise NotImplementedError(f"{self.path} has an order")
-
     def names(self) -> list[str]:
         """Names of all frames, without the prefix."""
         return [name for name, _ in self.listing()]
@@ -211,7 +207,7 @@ class ImageFolder(FrameSource):
         return list(zip(self._names, self._times, strict=True))
 
     def reorder(self, names: list[str]) -> None:
-        """See `FrameSource.reorder`."""
+        """Give the images another order, in which they then come and are numbered."""
         times = dict(self.listing())
         self._names, self._times = names, [times[name] for name in names]
 
