@@ -302,19 +302,38 @@ Raises:
           "stays open, so that one may try again.")
       .def(
           "seal",
-          [](const PrototypeMap& self, const Path& path, std::optional<double> bytes_per_landmark,
-             int position_bits) {
+          [](const PrototypeMap& self, const Path& path, nb::object ids, nb::object array,
+             std::optional<double> bytes_per_landmark, int position_bits, bool tune, int threads) {
+            const SealOptions options{bytes_per_landmark, position_bits, tune, threads};
+            if (ids.is_none() != array.is_none()) {
+              throw nb::value_error("landmark_ids and descriptors come together");
+            }
+            if (array.is_none()) {
+              const nb::gil_scoped_release release;
+              self.seal(path, options);
+            } else {
+              const auto l = landmark_ids(ids);
+              const auto d = descriptors(array);
+              const nb::gil_scoped_release release;
+              self.seal(path, options, view(l), view(d));
+            }
             const nb::gil_scoped_release release;
-            self.seal(path, {bytes_per_landmark, position_bits});
             return SealedMap(path);
           },
-          "path"_a, nb::kw_only(), "bytes_per_landmark"_a = nb::none(), "position_bits"_a = 32,
-          nb::sig("def seal(self, path: str | os.PathLike[str], *, bytes_per_landmark: float | "
-                  "None = None, position_bits: int = 32) -> SealedMap"),
+          "path"_a, "landmark_ids"_a = nb::none(), "descriptors"_a = nb::none(), nb::kw_only(),
+          "bytes_per_landmark"_a = nb::none(), "position_bits"_a = 32, "tune"_a = true,
+          "threads"_a = 1,
+          nb::sig("def seal(self, path: str | os.PathLike[str], landmark_ids: ArrayLike | None = "
+                  "None, descriptors: NDArray[numpy.uint8] | None = None, *, bytes_per_landmark: "
+                  "float | None = None, position_bits: int = 32, tune: bool = True, threads: int = "
+                  "1) -> SealedMap"),
           R"(Write a sealed map, whole or not at all, and open it.
 
 Args:
     path: the file to write.
+    landmark_ids: (n,), of descriptors.
+    descriptors: (n, bits / 8) uint8, the observations that the map was built from, as far as they
+        are at hand. Prototypes are tuned by them, or else by the map's appearances.
     bytes_per_landmark: bytes that a landmark may take on average for its prototypes, their number
         and its count (not for position, id and index). None: the sealed map gives the answers of
         this one: 8 bits per number, every appearance (at most 255 per landmark). Otherwise
@@ -324,6 +343,11 @@ Args:
     position_bits: bits per coordinate. With 32, positions are floats relative to the middle of the
         map; with 16 they take half the bytes, as steps of a grid over their bounding box, 65534
         from end to end along each axis (position_error); with 0 they are left out.
+    tune: with bytes_per_landmark, whether prototypes are tuned against each other, so that a
+        landmark is less often mistaken for another: a prototype is drawn to observations of its
+        landmark that are near to others, and others are pushed off (learning vector quantization,
+        Sato and Yamada 1996). Equal maps and observations give equal files.
+    threads: CPU threads to tune on.
 
 Raises:
     FileError: the file cannot be written, or the journal beside it is in use or holds commits,

@@ -32,6 +32,10 @@ struct SealOptions {
   // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
   // bounding box, 65534 from end to end along each axis. 0: no positions.
   int position_bits = 32;
+  // With bytes_per_landmark, tunes prototypes against each other, so that a landmark is less often
+  // mistaken for another (docs/sealing.md). Equal maps and observations give equal files.
+  bool tune = true;
+  int threads = 1;
 };
 
 // The map keeps the integer sum of a landmark's codes and their number n, so that its prototype,
@@ -183,7 +187,11 @@ class PROTOMARK_API PrototypeMap {
   // most 255 appearances. Throws FileError, and std::invalid_argument for other options, for fewer
   // bytes_per_landmark than one 4-bit prototype takes, and for positions further than 3.4e38 from
   // the middle of the map.
-  void seal(const std::filesystem::path& path, const SealOptions& options = {}) const;
+  //
+  // Prototypes are tuned by the map's appearances, or better by observations: descriptor i (n x
+  // bytes) is of landmark ids[i]; those of landmarks that the map does not hold are ignored.
+  void seal(const std::filesystem::path& path, const SealOptions& options = {},
+            std::span<const int64_t> ids = {}, Descriptors descriptors = {}) const;
 
  private:
   friend struct MapState;

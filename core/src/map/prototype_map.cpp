@@ -11,15 +11,6 @@ constexpr char kRemedy[] = "call build_index first";
 // The recall table is measured again once this part of the rows has changed.
 constexpr size_t kStalePart = 10;
 
-// Learns from prototypes by id, so that centroids do not depend on the history of the map.
-CoarseQuantizer learn(const PrototypeStore& store, size_t nlist, int threads) {
-  const size_t rows = store.prototype_count();
-  std::vector<size_t> sample(std::min(rows, CoarseQuantizer::sample_size(nlist)));
-  for (size_t i = 0; i < sample.size(); ++i) sample[i] = i * rows / sample.size();
-  const std::vector<int8_t> codes = store.rounded(store.sorted_rows_at(sample));
-  return CoarseQuantizer::learn({codes.data(), sample.size(), store.dim()}, nlist, threads);
-}
-
 float mean(int64_t sum, int64_t n) {
   return static_cast<float>(static_cast<double>(sum) / static_cast<double>(n));
 }
@@ -169,7 +160,7 @@ void PrototypeMap::build_index(const IndexOptions& options, int threads) {
   if (nlist < 1 || nlist > limit) {
     invalid("nlist must be 1 to ", limit, " for this map, not ", nlist);
   }
-  change.set_quantizer(learn(store, nlist, threads), threads, options.in_place);
+  change.set_quantizer(store.learn_quantizer(nlist, threads), threads, options.in_place);
 }
 
 void PrototypeMap::drop_index() { MapChange(*state_).set_quantizer({}, 1, false); }

@@ -3,6 +3,7 @@
 #include "map/map_sections.h"
 #include "map/map_state.h"
 #include "map/sealed_store.h"
+#include "map/tuning.h"
 #include "search/scan.h"
 
 namespace protomark {
@@ -276,15 +277,25 @@ class SealedContent {
 
 }  // namespace
 
-void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& options) const {
+void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& options,
+                        std::span<const int64_t> ids, Descriptors descriptors) const {
   if (options.position_bits != 32 && options.position_bits != 16 && options.position_bits != 0) {
     invalid("position_bits must be 32, 16 or 0, not ", options.position_bits);
   }
+  check_pairs(ids.size(), descriptors.rows, "descriptors");
   const std::shared_lock lock(state_->changing);
   const PrototypeStore& map = state_->store;
   const SealFormat format = seal_format(map, options.bytes_per_landmark);
-  const auto merged = merge_appearances(map, format.row_limit);
-  const PrototypeStore& store = merged ? *merged : map;
+  auto changed = merge_appearances(map, format.row_limit);
+  if (options.tune && options.bytes_per_landmark && (map.several() || !ids.empty())) {
+    const PrototypeStore& untuned = changed ? *changed : map;
+    const TuningQueries queries =
+        ids.empty() ? TuningQueries(map, untuned.dim())
+                    : TuningQueries({ids.begin(), ids.end()},
+                                    encoder()->encode(descriptors, untuned.dim(), options.threads));
+    changed.emplace(tune_prototypes(untuned, queries, options.threads));
+  }
+  const PrototypeStore& store = changed ? *changed : map;
   std::optional<PositionCodec> codec;
   if (options.position_bits != 0) {
     if (const auto extent = map.summary().extent) codec.emplace(*extent, options.position_bits);

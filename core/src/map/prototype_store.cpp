@@ -302,6 +302,13 @@ void PrototypeStore::reassign(int threads) {
   to_reassign_.clear();
 }
 
+CoarseQuantizer PrototypeStore::learn_quantizer(size_t nlist, int threads) const {
+  std::vector<size_t> sample(std::min(prototype_count_, CoarseQuantizer::sample_size(nlist)));
+  for (size_t i = 0; i < sample.size(); ++i) sample[i] = i * prototype_count_ / sample.size();
+  const std::vector<int8_t> codes = rounded(sorted_rows_at(sample));
+  return CoarseQuantizer::learn({codes.data(), sample.size(), dim_}, nlist, threads);
+}
+
 PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, int threads) const {
   const size_t nlist = std::max<size_t>(quantizer.nlist(), 1);
   std::vector<Row> list_of_row(row_end(), kNoRow);

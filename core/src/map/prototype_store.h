@@ -240,6 +240,8 @@ class PrototypeStore : public RowTable {
     std::vector<Row> to;  // new row of each row; kNoRow for padding
   };
   Arrangement arrange(CoarseQuantizer quantizer, int threads) const;
+  // Learns centroids from prototypes by id, so that they do not depend on the history of the map.
+  CoarseQuantizer learn_quantizer(size_t nlist, int threads) const;
   // Moves rows and takes the arrangement's centroids. After make_room_for it cannot run out of
   // memory.
   void rearrange(Arrangement arrangement);

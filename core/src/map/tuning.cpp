@@ -1,0 +1,307 @@
+// Compiled without contraction of products and sums (core/CMakeLists.txt).
+#include "map/tuning.h"
+
+#include "base/parallel.h"
+#include "search/inverted_lists.h"
+
+namespace protomark {
+namespace {
+
+constexpr int kPasses = 6;
+constexpr double kStep = 0.35;
+// A prototype may be mistaken for the own one if exp(-d / T) is at least exp(-kReach) of its.
+constexpr int kReach = 8;
+// The nearest prototypes of a query that are looked at, and the lists in which they are searched.
+constexpr size_t kNearest = 10, kLists = 16;
+// Without an index, more prototypes get lists, as comparing all with all would take hours.
+constexpr size_t kManyRows = 1 << 16;
+constexpr size_t kPiece = 1 << 14;  // queries that are searched for at a time
+constexpr int kFraction = 7;        // bits of a number behind the point
+constexpr int kUnit = 1 << 15;      // of a probability
+
+// Returns 2^30 exp(-i / 64), equal on every machine.
+const std::vector<uint32_t>& exponentials() {
+  static const std::vector<uint32_t> table = [] {
+    constexpr uint64_t kFactor = 4228380000;  // 2^32 exp(-1 / 64)
+    std::vector<uint32_t> result{1u << 30};
+    while (result.back() >= 1u << 10) {
+      result.push_back(static_cast<uint32_t>(result.back() * kFactor >> 32));
+    }
+    return result;
+  }();
+  return table;
+}
+
+// A prototype that a query pulls or pushes.
+struct Force {
+  uint32_t query;
+  uint32_t rank;  // of the row
+};
+
+class Tuner {
+ public:
+  Tuner(const PrototypeStore& store, const TuningQueries& queries, int threads)
+      : tuned_(store),
+        indexed_(store.quantizer().nlist() != 0),
+        queries_(queries),
+        threads_(threads),
+        dim_(store.dim()) {
+    if (!indexed_ && tuned_.prototype_count() > kManyRows) {
+      const size_t nlist =
+          CoarseQuantizer::default_nlist(tuned_.prototype_count(), dim_, tuned_.row_bytes());
+      tuned_.rearrange(tuned_.arrange(tuned_.learn_quantizer(nlist, threads), threads));
+    }
+    rank_rows();
+    find_own();
+    find_rivals();
+  }
+
+  PrototypeStore run() {
+    std::vector<int16_t> numbers(means_.data.size());
+    std::ranges::transform(means_.data, numbers.begin(),
+                           [](int8_t x) { return static_cast<int16_t>(x * (1 << kFraction)); });
+    for (int pass = 0; pass < kPasses; ++pass) move(numbers);
+    for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      Sum sum{};
+      for (size_t d = 0; d < dim_; ++d) {
+        sum[d] = rounded_mean<int>(numbers[rank * dim_ + d], 1 << kFraction);
+      }
+      tuned_.set(rows_[rank], sum, 1);
+    }
+    if (indexed_) {
+      tuned_.reassign(threads_);
+    } else if (tuned_.quantizer().nlist() != 0) {
+      tuned_.rearrange(tuned_.arrange({}, threads_));
+    }
+    return std::move(tuned_);
+  }
+
+ private:
+  // Ranks rows by id and appearance, as their places in memory depend on the map's history.
+  void rank_rows() {
+    rank_of_row_.assign(tuned_.row_end(), -1);
+    tuned_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
+      for (const Row row : tuned_.sorted_rows(landmarks)) {
+        rank_of_row_[row.value] = static_cast<int64_t>(rows_.size());
+        rows_.push_back(row);
+      }
+    });
+    means_ = Matrix<int8_t>(rows_.size(), dim_);
+    for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      tuned_.rounded(rows_[rank], means_.row(rank));
+      counts_.push_back(static_cast<uint32_t>(tuned_.count(rows_[rank])));
+    }
+  }
+
+  // Finds the own prototype of each query, the nearest one of its landmark, and the temperature.
+  void find_own() {
+    const size_t n = queries_.landmarks.size();
+    own_.assign(n, UINT32_MAX);
+    std::vector<int32_t> distances(n, 0);
+    parallel_for(threads_, n, 64, [&](size_t begin, size_t end) {
+      for (size_t q = begin; q < end; ++q) {
+        const LandmarkIndex landmark = tuned_.find(queries_.landmarks[q]);
+        if (landmark == kNoLandmark) continue;
+        distances[q] = INT32_MAX;
+        tuned_.each_row_of(landmark, [&](Row row) {
+          const auto rank = static_cast<uint32_t>(rank_of_row_[row.value]);
+          const int32_t d = squared_distance(queries_.codes.row(q), means_.row(rank), dim_);
+          if (std::pair(d, rank) < std::pair(distances[q], own_[q])) {
+            distances[q] = d;
+            own_[q] = rank;
+          }
+        });
+      }
+    });
+    std::vector<uint32_t> observed(rows_.size(), 0);
+    for (size_t q = 0; q < n; ++q) {
+      if (own_[q] != UINT32_MAX) observed[own_[q]] += queries_.weights[q];
+    }
+    for (size_t i = 0; i < observed.size(); ++i) counts_[i] = std::max(counts_[i], observed[i]);
+    // Means of several observations are nearer to their prototypes than what they stand for.
+    uint64_t sum = 0, weight = 0;
+    for (const bool single : {true, false}) {
+      for (size_t q = 0; q < n && (single || weight == 0); ++q) {
+        if (own_[q] == UINT32_MAX || rest(q) == 0) continue;
+        if (single && queries_.weights[q] != 1) continue;
+        sum += uint64_t{queries_.weights[q]} * static_cast<uint64_t>(distances[q]);
+        weight += queries_.weights[q];
+      }
+    }
+    temperature_ =
+        std::max<int64_t>(1, static_cast<int64_t>(sum / std::max<uint64_t>(4 * weight, 1)));
+  }
+
+  // Returns how many other observations the own prototype of a query has.
+  uint32_t rest(size_t q) const { return counts_[own_[q]] - queries_.weights[q]; }
+
+  // Finds for each query the prototypes that it could be mistaken for. Most have none.
+  void find_rivals() {
+    PackedPrototypes view = tuned_.view();
+    view.landmarks = {};
+    view.landmarks.ids = rank_of_row_.data();
+    for (size_t first = 0; first < own_.size(); first += kPiece) {
+      const Codes piece{queries_.codes.row(first), std::min(kPiece, own_.size() - first), dim_};
+      SearchOptions options;
+      options.threads = threads_;
+      const Matches found =
+          tuned_.quantizer().nlist() == 0
+              ? search_exact(view, piece, kNearest, options)
+              : search_lists(view, InvertedLists(tuned_.lists()), tuned_.quantizer().packed(),
+                             kLists, piece, kNearest, options);
+      for (size_t i = 0; i < piece.rows; ++i) {
+        const size_t q = first + i;
+        if (own_[q] == UINT32_MAX || rest(q) == 0) continue;
+        const auto query = static_cast<uint32_t>(contested_.size());
+        const int64_t limit =
+            own_distance(q, &means_.data[own_[q] * dim_], 0) + kReach * temperature_;
+        for (size_t j = 0; j < kNearest && found.ids.row(i)[j] >= 0; ++j) {
+          const auto rank = static_cast<uint32_t>(found.ids.row(i)[j]);
+          if (found.distances.row(i)[j] > limit || owner_id(rank) == queries_.landmarks[q])
+            continue;
+          if (contested_.size() == query) {
+            contested_.push_back(static_cast<uint32_t>(q));
+            firsts_.push_back(forces_.size());
+            forces_.push_back({query, own_[q]});
+          }
+          forces_.push_back({query, rank});
+        }
+      }
+    }
+    firsts_.push_back(forces_.size());
+    // The forces on each row, by query.
+    first_on_row_.assign(rows_.size() + 1, 0);
+    for (const Force& force : forces_) ++first_on_row_[force.rank + 1];
+    for (size_t i = 0; i < rows_.size(); ++i) first_on_row_[i + 1] += first_on_row_[i];
+    on_row_.resize(forces_.size());
+    std::vector<size_t> next(first_on_row_.begin(), first_on_row_.end() - 1);
+    for (size_t f = 0; f < forces_.size(); ++f) on_row_[next[forces_[f].rank]++] = f;
+    weights_.resize(forces_.size());
+  }
+
+  int64_t owner_id(uint32_t rank) const { return tuned_.id(tuned_.owner(rows_[rank])); }
+
+  // Returns the squared distance of a query to its own prototype as if it had not been added: with
+  // s = w / (n - w) the difference is query - prototype + s (query - mean).
+  template <typename Number>
+  int64_t own_distance(size_t q, const Number* prototype, int fraction) const {
+    const int8_t* code = queries_.codes.row(q);
+    const int8_t* mean = means_.row(own_[q]);
+    int64_t a = 0, b = 0, c = 0;
+    for (size_t d = 0; d < dim_; ++d) {
+      const int64_t now = (code[d] << fraction) - prototype[d];
+      const int64_t before = (code[d] - mean[d]) << fraction;
+      a += now * now;
+      b += now * before;
+      c += before * before;
+    }
+    const double s = static_cast<double>(queries_.weights[q]) / static_cast<double>(rest(q));
+    const double distance =
+        static_cast<double>(a) + 2 * s * static_cast<double>(b) + s * s * static_cast<double>(c);
+    return static_cast<int64_t>(distance) >> (2 * fraction);
+  }
+
+  // Makes one pass over all queries, then moves all prototypes.
+  void move(std::vector<int16_t>& numbers) {
+    parallel_for(threads_, contested_.size(), 64, [&](size_t begin, size_t end) {
+      for (size_t query = begin; query < end; ++query) weigh(query, numbers);
+    });
+    parallel_for(threads_, rows_.size(), 64, [&](size_t begin, size_t end) {
+      std::vector<int64_t> sums(dim_);
+      for (size_t rank = begin; rank < end; ++rank) {
+        if (first_on_row_[rank] == first_on_row_[rank + 1]) continue;
+        std::ranges::fill(sums, 0);
+        int16_t* prototype = &numbers[rank * dim_];
+        for (size_t i = first_on_row_[rank]; i < first_on_row_[rank + 1]; ++i) {
+          const int64_t weight = weights_[on_row_[i]];
+          const int8_t* code = queries_.codes.row(contested_[forces_[on_row_[i]].query]);
+          for (size_t d = 0; d < dim_; ++d) {
+            sums[d] += weight * ((code[d] << kFraction) - prototype[d]);
+          }
+        }
+        const double step = kStep / (static_cast<double>(counts_[rank]) * kUnit);
+        for (size_t d = 0; d < dim_; ++d) {
+          const double moved = prototype[d] + step * static_cast<double>(sums[d]);
+          const double limit = 127 << kFraction;
+          prototype[d] = static_cast<int16_t>(std::floor(std::clamp(moved, -limit, limit) + 0.5));
+        }
+      }
+    });
+  }
+
+  // Computes the forces of a query.
+  void weigh(size_t query, const std::vector<int16_t>& numbers) {
+    const size_t q = contested_[query], first = firsts_[query], end = firsts_[query + 1];
+    std::array<int64_t, kNearest + 1> distances;
+    distances[0] = own_distance(q, &numbers[own_[q] * dim_], kFraction);
+    const int8_t* code = queries_.codes.row(q);
+    for (size_t f = first + 1; f < end; ++f) {
+      const int16_t* prototype = &numbers[forces_[f].rank * dim_];
+      int64_t sum = 0;
+      for (size_t d = 0; d < dim_; ++d) {
+        const int64_t difference = (code[d] << kFraction) - prototype[d];
+        sum += difference * difference;
+      }
+      distances[f - first] = sum >> (2 * kFraction);
+    }
+    const size_t n = end - first;
+    const int64_t nearest = *std::min_element(distances.begin(), distances.begin() + n);
+    const std::vector<uint32_t>& table = exponentials();
+    std::array<uint64_t, kNearest + 1> terms;
+    uint64_t sum = 0;
+    for (size_t i = 0; i < n; ++i) {
+      const auto at = static_cast<uint64_t>((distances[i] - nearest) * 64 / temperature_);
+      terms[i] = at < table.size() ? table[at] : 0;
+      sum += terms[i];
+    }
+    int32_t others = 0;
+    for (size_t i = 1; i < n; ++i) {
+      const auto probability = static_cast<int32_t>(terms[i] * kUnit / sum);
+      weights_[first + i] = -probability * queries_.weights[q];
+      others += probability;
+    }
+    weights_[first] = others * queries_.weights[q];
+  }
+
+  PrototypeStore tuned_;
+  bool indexed_;
+  const TuningQueries& queries_;
+  int threads_;
+  size_t dim_;
+
+  // By rank.
+  std::vector<Row> rows_;
+  Matrix<int8_t> means_;
+  std::vector<uint32_t> counts_;  // observations
+  std::vector<size_t> first_on_row_;
+  std::vector<int64_t> rank_of_row_;  // -1 for padding
+
+  std::vector<uint32_t> own_;  // the rank of each query's own prototype, or UINT32_MAX
+  int64_t temperature_ = 1;
+
+  std::vector<uint32_t> contested_;  // queries that have rivals
+  std::vector<size_t> firsts_;       // the first force of each, and the end
+  std::vector<Force> forces_;        // of each query on its own prototype, then on its rivals
+  std::vector<int32_t> weights_;     // of each force, in kUnit
+  std::vector<size_t> on_row_;       // forces by the rank that they are on
+};
+
+}  // namespace
+
+TuningQueries::TuningQueries(const PrototypeStore& map, size_t dim)
+    : codes(map.prototype_count(), dim) {
+  std::vector<int8_t> code(map.dim());
+  map.each_row([&](Row row) {
+    map.rounded(row, code.data());
+    std::copy_n(code.data(), dim, codes.row(landmarks.size()));
+    landmarks.push_back(map.id(map.owner(row)));
+    weights.push_back(static_cast<uint8_t>(map.count(row)));
+  });
+}
+
+PrototypeStore tune_prototypes(const PrototypeStore& store, const TuningQueries& queries,
+                               int threads) {
+  return Tuner(store, queries, threads).run();
+}
+
+}  // namespace protomark
