@@ -7,12 +7,13 @@
 namespace protomark {
 namespace {
 
-constexpr int kPasses = 6;
+// Prototypes move `kPasses` times by the prototypes that were nearest at the begin of a round.
+constexpr int kRounds = 6, kPasses = 2;
 constexpr double kStep = 0.35;
 // A prototype may be mistaken for the own one if exp(-d / T) is at least exp(-kReach) of its.
 constexpr int kReach = 8;
 // The nearest prototypes of a query that are looked at, and the lists in which they are searched.
-constexpr size_t kNearest = 10, kLists = 16;
+constexpr size_t kNearest = 16, kLists = 16;
 // Without an index, more prototypes get lists, as comparing all with all would take hours.
 constexpr size_t kManyRows = 1 << 16;
 constexpr size_t kPiece = 1 << 14;  // queries that are searched for at a time
@@ -46,6 +47,7 @@ class Tuner {
         queries_(queries),
         threads_(threads),
         dim_(store.dim()) {
+    tuned_.uncommitted = nullptr;  // the map does not change
     if (!indexed_ && tuned_.prototype_count() > kManyRows) {
       const size_t nlist =
           CoarseQuantizer::default_nlist(tuned_.prototype_count(), dim_, tuned_.row_bytes());
@@ -53,19 +55,20 @@ class Tuner {
     }
     rank_rows();
     find_own();
-    find_rivals();
   }
 
   PrototypeStore run() {
-    std::vector<int16_t> numbers(means_.data.size());
-    std::ranges::transform(means_.data, numbers.begin(),
-                           [](int8_t x) { return static_cast<int16_t>(x * (1 << kFraction)); });
-    for (int pass = 0; pass < kPasses; ++pass) move(numbers);
+    for (size_t q = 0; q < own_.size(); ++q) {
+      if (own_[q] != UINT32_MAX && rest(q) != 0) contested_.push_back(static_cast<uint32_t>(q));
+    }
+    for (int round = 0; round < kRounds; ++round) {
+      find_rivals();
+      for (int pass = 0; pass < kPasses; ++pass) move();
+      round_numbers();
+    }
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
       Sum sum{};
-      for (size_t d = 0; d < dim_; ++d) {
-        sum[d] = rounded_mean<int>(numbers[rank * dim_ + d], 1 << kFraction);
-      }
+      for (size_t d = 0; d < dim_; ++d) sum[d] = rounded(rank, d);
       tuned_.set(rows_[rank], sum, 1);
     }
     if (indexed_) {
@@ -91,6 +94,24 @@ class Tuner {
       tuned_.rounded(rows_[rank], means_.row(rank));
       counts_.push_back(static_cast<uint32_t>(tuned_.count(rows_[rank])));
     }
+    for (const int8_t x : means_.data) {
+      numbers_.push_back(static_cast<int16_t>(x * (1 << kFraction)));
+    }
+    packed_.resize(packed_size(tuned_.row_end(), dim_) / sizeof(CodeVector));
+    round_numbers();
+  }
+
+  // Rounds prototypes to what search reads.
+  void round_numbers() {
+    auto* packed = reinterpret_cast<int8_t*>(packed_.data());
+    for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      for (size_t d = 0; d < dim_; ++d) {
+        packed[packed_index(rows_[rank].value, d, dim_)] = rounded(rank, d);
+      }
+    }
+  }
+  int8_t rounded(size_t rank, size_t d) const {
+    return rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
   }
 
   // Finds the own prototype of each query, the nearest one of its landmark, and the temperature.
@@ -135,37 +156,31 @@ class Tuner {
   // Returns how many other observations the own prototype of a query has.
   uint32_t rest(size_t q) const { return counts_[own_[q]] - queries_.weights[q]; }
 
-  // Finds for each query the prototypes that it could be mistaken for. Most have none.
+  // Finds the prototypes that each contested query could be mistaken for. Queries without any, most
+  // of them, are contested no longer.
   void find_rivals() {
     PackedPrototypes view = tuned_.view();
+    view.data = packed_.data();
     view.landmarks = {};
     view.landmarks.ids = rank_of_row_.data();
-    for (size_t first = 0; first < own_.size(); first += kPiece) {
-      const Codes piece{queries_.codes.row(first), std::min(kPiece, own_.size() - first), dim_};
-      SearchOptions options;
-      options.threads = threads_;
+    SearchOptions options;
+    options.threads = threads_;
+    const std::vector<uint32_t> before = std::exchange(contested_, {});
+    firsts_.clear();
+    forces_.clear();
+    Matrix<int8_t> codes(std::min(kPiece, before.size()), dim_);
+    for (size_t first = 0; first < before.size(); first += kPiece) {
+      codes.rows = std::min(kPiece, before.size() - first);
+      for (size_t i = 0; i < codes.rows; ++i) {
+        std::copy_n(queries_.codes.row(before[first + i]), dim_, codes.row(i));
+      }
       const Matches found =
           tuned_.quantizer().nlist() == 0
-              ? search_exact(view, piece, kNearest, options)
+              ? search_exact(view, codes, kNearest, options)
               : search_lists(view, InvertedLists(tuned_.lists()), tuned_.quantizer().packed(),
-                             kLists, piece, kNearest, options);
-      for (size_t i = 0; i < piece.rows; ++i) {
-        const size_t q = first + i;
-        if (own_[q] == UINT32_MAX || rest(q) == 0) continue;
-        const auto query = static_cast<uint32_t>(contested_.size());
-        const int64_t limit =
-            own_distance(q, &means_.data[own_[q] * dim_], 0) + kReach * temperature_;
-        for (size_t j = 0; j < kNearest && found.ids.row(i)[j] >= 0; ++j) {
-          const auto rank = static_cast<uint32_t>(found.ids.row(i)[j]);
-          if (found.distances.row(i)[j] > limit || owner_id(rank) == queries_.landmarks[q])
-            continue;
-          if (contested_.size() == query) {
-            contested_.push_back(static_cast<uint32_t>(q));
-            firsts_.push_back(forces_.size());
-            forces_.push_back({query, own_[q]});
-          }
-          forces_.push_back({query, rank});
-        }
+                             kLists, codes, kNearest, options);
+      for (size_t i = 0; i < codes.rows; ++i) {
+        add_forces(before[first + i], found.ids.row(i), found.distances.row(i));
       }
     }
     firsts_.push_back(forces_.size());
@@ -179,18 +194,33 @@ class Tuner {
     weights_.resize(forces_.size());
   }
 
+  void add_forces(uint32_t q, const int64_t* ranks, const int32_t* distances) {
+    const auto query = static_cast<uint32_t>(contested_.size());
+    const int64_t limit = own_distance(q) + kReach * temperature_;
+    for (size_t j = 0; j < kNearest && ranks[j] >= 0; ++j) {
+      const auto rank = static_cast<uint32_t>(ranks[j]);
+      if (distances[j] > limit || owner_id(rank) == queries_.landmarks[q]) continue;
+      if (contested_.size() == query) {
+        contested_.push_back(q);
+        firsts_.push_back(forces_.size());
+        forces_.push_back({query, own_[q]});
+      }
+      forces_.push_back({query, rank});
+    }
+  }
+
   int64_t owner_id(uint32_t rank) const { return tuned_.id(tuned_.owner(rows_[rank])); }
 
   // Returns the squared distance of a query to its own prototype as if it had not been added: with
   // s = w / (n - w) the difference is query - prototype + s (query - mean).
-  template <typename Number>
-  int64_t own_distance(size_t q, const Number* prototype, int fraction) const {
+  int64_t own_distance(size_t q) const {
+    const int16_t* prototype = &numbers_[own_[q] * dim_];
     const int8_t* code = queries_.codes.row(q);
     const int8_t* mean = means_.row(own_[q]);
     int64_t a = 0, b = 0, c = 0;
     for (size_t d = 0; d < dim_; ++d) {
-      const int64_t now = (code[d] << fraction) - prototype[d];
-      const int64_t before = (code[d] - mean[d]) << fraction;
+      const int64_t now = (code[d] << kFraction) - prototype[d];
+      const int64_t before = (code[d] - mean[d]) << kFraction;
       a += now * now;
       b += now * before;
       c += before * before;
@@ -198,20 +228,20 @@ class Tuner {
     const double s = static_cast<double>(queries_.weights[q]) / static_cast<double>(rest(q));
     const double distance =
         static_cast<double>(a) + 2 * s * static_cast<double>(b) + s * s * static_cast<double>(c);
-    return static_cast<int64_t>(distance) >> (2 * fraction);
+    return static_cast<int64_t>(distance) >> (2 * kFraction);
   }
 
   // Makes one pass over all queries, then moves all prototypes.
-  void move(std::vector<int16_t>& numbers) {
+  void move() {
     parallel_for(threads_, contested_.size(), 64, [&](size_t begin, size_t end) {
-      for (size_t query = begin; query < end; ++query) weigh(query, numbers);
+      for (size_t query = begin; query < end; ++query) weigh(query);
     });
     parallel_for(threads_, rows_.size(), 64, [&](size_t begin, size_t end) {
       std::vector<int64_t> sums(dim_);
       for (size_t rank = begin; rank < end; ++rank) {
         if (first_on_row_[rank] == first_on_row_[rank + 1]) continue;
         std::ranges::fill(sums, 0);
-        int16_t* prototype = &numbers[rank * dim_];
+        int16_t* prototype = &numbers_[rank * dim_];
         for (size_t i = first_on_row_[rank]; i < first_on_row_[rank + 1]; ++i) {
           const int64_t weight = weights_[on_row_[i]];
           const int8_t* code = queries_.codes.row(contested_[forces_[on_row_[i]].query]);
@@ -230,13 +260,13 @@ class Tuner {
   }
 
   // Computes the forces of a query.
-  void weigh(size_t query, const std::vector<int16_t>& numbers) {
+  void weigh(size_t query) {
     const size_t q = contested_[query], first = firsts_[query], end = firsts_[query + 1];
     std::array<int64_t, kNearest + 1> distances;
-    distances[0] = own_distance(q, &numbers[own_[q] * dim_], kFraction);
+    distances[0] = own_distance(q);
     const int8_t* code = queries_.codes.row(q);
     for (size_t f = first + 1; f < end; ++f) {
-      const int16_t* prototype = &numbers[forces_[f].rank * dim_];
+      const int16_t* prototype = &numbers_[forces_[f].rank * dim_];
       int64_t sum = 0;
       for (size_t d = 0; d < dim_; ++d) {
         const int64_t difference = (code[d] << kFraction) - prototype[d];
@@ -272,9 +302,12 @@ class Tuner {
   // By rank.
   std::vector<Row> rows_;
   Matrix<int8_t> means_;
+  std::vector<int16_t> numbers_;  // prototypes, with kFraction bits behind the point
   std::vector<uint32_t> counts_;  // observations
   std::vector<size_t> first_on_row_;
   std::vector<int64_t> rank_of_row_;  // -1 for padding
+
+  std::vector<CodeVector> packed_;  // by row
 
   std::vector<uint32_t> own_;  // the rank of each query's own prototype, or UINT32_MAX
   int64_t temperature_ = 1;
