@@ -53,6 +53,29 @@ nb::dict from_layer(const Layer& layer, bool last) {
   return d;
 }
 
+std::vector<Codebook> to_codebooks(nb::handle codebooks) {
+  std::vector<Codebook> result;
+  for (nb::handle codebook : codebooks) {
+    const auto words = array_of<Array3<std::int8_t>>(
+        codebook, "int8", 3, "codebooks: each must be a (subspaces, 256, width) int8");
+    if (words.shape(1) != Codebook::kWords) {
+      throw nb::value_error("a codebook has 256 words for each subspace");
+    }
+    result.push_back({words.shape(2), {words.data(), words.data() + words.size()}});
+  }
+  return result;
+}
+
+nb::list from_codebooks(const std::vector<Codebook>& codebooks) {
+  nb::list result;
+  for (const auto& [width, words] : codebooks) {
+    Matrix<std::int8_t> numbers(words.size() / width, width);
+    numbers.data = words;
+    result.append(to_numpy(std::move(numbers)).attr("reshape")(-1, Codebook::kWords, width));
+  }
+  return result;
+}
+
 // A text of the encoder's info.
 auto info(std::string EncoderInfo::* text) {
   return [text](const Encoder& encoder) { return encoder.info().*text; };
@@ -68,7 +91,8 @@ void bind_encoder(nb::module_& m) {
           "__init__",
           [](Encoder* self, nb::list layers, std::vector<std::size_t> dims, std::string name,
              std::string descriptor, float scale, std::string data, std::string licence,
-             std::map<std::string, std::string> notes) {
+             std::map<std::string, std::string> notes, nb::object codebooks) {
+            std::vector<Codebook> words = to_codebooks(codebooks);
             std::vector<Layer> built;
             for (nb::handle layer : layers) {
               if (!nb::isinstance<nb::dict>(layer)) type_error("layers: each must be a dict");
@@ -81,14 +105,15 @@ void bind_encoder(nb::module_& m) {
                               std::move(licence),
                               {notes.begin(), notes.end()}};
             const nb::gil_scoped_release release;
-            new (self) Encoder(std::move(texts), std::move(built), std::move(dims), scale);
+            new (self) Encoder(std::move(texts), std::move(built), std::move(dims), scale,
+                               std::move(words));
           },
           "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
-          "licence"_a = "", "notes"_a = nb::dict(),
+          "licence"_a = "", "notes"_a = nb::dict(), "codebooks"_a = nb::tuple(),
           nb::sig(
               "def __init__(self, layers: list[dict[str, Any]], dims: Sequence[int], name: str, "
               "descriptor: str, scale: float, data: str = '', licence: str = '', "
-              "notes: dict[str, str] = {}) -> None"),
+              "notes: dict[str, str] = {}, codebooks: Sequence[NDArray[numpy.int8]] = ()) -> None"),
           R"(Build an encoder from integer layers.
 
 Args:
@@ -98,10 +123,23 @@ Args:
     name, descriptor, data, licence, notes: what the model says of itself. No note may have the key
         name, descriptor, data or licence.
     scale: real value of one code unit.
+    codebooks: each (subspaces, 256, width) int8, -127 to 127: the words by which sealed maps write
+        prototypes, a byte for each `width` numbers, 1 to 4 (product quantization, Jegou et al.
+        2011). Widths are distinct.
 
 Raises:
     TypeError: an array is of another type.
-    ValueError: layers do not fit together, or a note has such a key.)")
+    ValueError: layers or codebooks do not fit together, or a note has such a key.)")
+      .def(
+          "with_codebooks",
+          [](const Encoder& e, nb::object codebooks) {
+            return Encoder(e.info(), e.layers(), e.dims(), e.scale(), to_codebooks(codebooks));
+          },
+          "codebooks"_a,
+          nb::sig("def with_codebooks(self, codebooks: Sequence[NDArray[numpy.int8]]) -> Encoder"),
+          "This encoder with other codebooks, as the constructor takes them; its codes and "
+          "identity "
+          "stay.")
       .def_static("load", &Encoder::load, "path"_a, ReleaseGil(), "Load a model file.")
       .def("save", &Encoder::save, "path"_a, ReleaseGil(),
            nb::sig("def save(self, path: str | os.PathLike[str]) -> None"),
@@ -145,6 +183,11 @@ Raises:
       .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
       .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")
       .def_prop_ro("scale", &Encoder::scale, "Real value of one code unit.")
+      .def_prop_ro(
+          "codebooks", [](const Encoder& e) { return from_codebooks(e.codebooks()); },
+          nb::sig("def codebooks(self) -> list[NDArray[numpy.int8]]"),
+          "Words of prototypes in sealed maps, (subspaces, 256, width) each, as the constructor "
+          "takes them.")
       .def_prop_ro("identity", &Encoder::identity, "SHA-256 of the network, in hexadecimal.")
       .def_prop_ro("multiply_adds", &Encoder::multiply_adds, "Multiply-adds per descriptor.")
       .def_prop_ro("name", info(&EncoderInfo::name), "Name of the model.")

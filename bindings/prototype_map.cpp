@@ -336,10 +336,11 @@ Args:
         are at hand. Prototypes are tuned by them, or else by the map's appearances.
     bytes_per_landmark: bytes that a landmark may take on average for its prototypes, their number
         and its count (not for position, id and index). None: the sealed map gives the answers of
-        this one: 8 bits per number, every appearance (at most 255 per landmark). Otherwise
-        prototypes have 8 bits per number if all of them fit; else 4 bits, and appearances are
-        merged, over the whole map those first whose merging adds least to the squared distances of
-        observations to their prototypes (Ward's criterion), until they fit.
+        this one: int8 numbers, every appearance (at most 255 per landmark). Otherwise prototypes
+        are int8 numbers, too, if all of them fit; else words of one of the encoder's codebooks, as
+        many as fit, of as many numbers; and appearances are merged, over the whole map those first
+        whose merging adds least to the squared distances of observations to their prototypes
+        (Ward's criterion), until they fit.
     position_bits: bits per coordinate. With 32, positions are floats relative to the middle of the
         map; with 16 they take half the bytes, as steps of a grid over their bounding box, 65534
         from end to end along each axis (position_error); with 0 they are left out.
@@ -352,8 +353,9 @@ Args:
 Raises:
     FileError: the file cannot be written, or the journal beside it is in use or holds commits,
         which would be lost.
-    ValueError: bytes_per_landmark is less than one 4-bit prototype takes, position_bits is not 32,
-        16 or 0, or positions are further than 3.4e38 from their middle.)");
+    ValueError: bytes_per_landmark is less than the fewest words of a prototype take, or needs
+        codebooks, which the encoder does not have; position_bits is not 32, 16 or 0; or positions
+        are further than 3.4e38 from their middle.)");
 }
 
 }  // namespace

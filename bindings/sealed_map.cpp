@@ -31,7 +31,9 @@ void bind_sealed_map(nb::module_& m) {
           "metadata", [](const SealedMap& m) { return from_metadata(m.metadata()); },
           nb::sig("def metadata(self) -> MappingProxyType[str, str]"),
           "What the map says of itself: texts by name, as in the learning map that was sealed.")
-      .def_prop_ro("code_bits", &SealedMap::code_bits, "Bits per number of a prototype: 8 or 4.")
+      .def_prop_ro("words", &SealedMap::words,
+                   "Words of the encoder's codebook per prototype; 0: prototypes are int8 numbers, "
+                   "as in the learning map.")
       .def_prop_ro("bytes_per_landmark", &SealedMap::bytes_per_landmark,
                    "Bytes that a landmark takes on average for its prototypes, their number and "
                    "its count, as PrototypeMap.seal counts them.")
@@ -49,7 +51,7 @@ void bind_sealed_map(nb::module_& m) {
           "axis, (3,) float64. None otherwise: float32 are relative to the middle of the map.")
       .def("__repr__", [](const SealedMap& self) {
         return "<protomark.SealedMap: " + describe_map(self) +
-               (self.code_bits() == 8 ? ">" : ", 4 bits per number>");
+               (self.words() == 0 ? ">" : ", " + std::to_string(self.words()) + " words>");
       });
 }
 

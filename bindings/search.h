@@ -103,8 +103,8 @@ void bind_answers(nb::class_<Map>& map) {
       .def("prototypes", bind_of_landmarks<Map>(&Map::prototypes), "landmark_ids"_a,
            nb::sig("def prototypes(self, landmark_ids: ArrayLike) -> NDArray[numpy.float32]"),
            "Mean codes (Komorowski and Trzcinski, Eq. 1), (n, dim) float32, in code units, over "
-           "all appearances. A sealed map gives them rounded, to one of 16 levels if its code_bits "
-           "is 4, and the plain mean of several. Raises KeyError for an id that is not in the map.")
+           "all appearances. A sealed map gives them rounded, or the nearest words, and the plain "
+           "mean of several. Raises KeyError for an id that is not in the map.")
       .def("positions", bind_of_landmarks<Map>(&Map::positions), "landmark_ids"_a,
            nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
            "World coordinates, (n, 3) float64, NaN where a landmark has none. Raises KeyError for "

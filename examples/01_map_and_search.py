@@ -33,6 +33,6 @@ scene.add(ids[matched, 0][right], tracks.descriptors[frame][matched][right])
 
 scene.metadata = {"frame": "COLMAP, no scale", "source": "sample"}
 scene.save("scene.pmk")
-# Numbers get 4 bits, and appearances are merged until a landmark takes 33 bytes on average.
+# Prototypes become words, and appearances are merged until a landmark takes 33 bytes on average.
 sealed = scene.seal("scene.sealed.pmk", bytes_per_landmark=33)
 print(sealed, f"{matching_bytes(sealed):.0f} bytes per landmark")

@@ -94,7 +94,16 @@ class Encoder:
     """The integer network of a model; layers are (weights, bias, multipliers, shift, table)."""
 
     def __init__(self, data: bytes) -> None:
-        network = BytesIO(sections(data, ENCODER)["network"][4:])  # behind the scale
+        parts = sections(data, ENCODER)
+        network = BytesIO(parts["network"][4:])  # behind the scale
+        # The words of each width, (subspaces, 256, width).
+        self.codebooks, at = {}, 0
+        while at < len(parts.get("codebook", b"")):
+            width, subspaces = struct.unpack_from("<II", parts["codebook"], at)
+            size = subspaces * 256 * width
+            words = np.frombuffer(parts["codebook"], "i1", size, at + 8)
+            self.codebooks[width] = words.reshape(subspaces, 256, width).astype(np.int64)
+            at += 8 + size
 
         def take(dtype: str, count: int) -> Any:
             return np.frombuffer(network.read(count * np.dtype(dtype).itemsize), dtype)
@@ -145,7 +154,9 @@ class Map:
             count = self.counts[:, None].astype(np.int64)
             self.prototypes = np.sign(sums) * ((2 * abs(sums) + count) // (2 * count))
         else:
-            self.prototypes = sealed_prototypes(parts, n, k, len(self.landmarks))
+            self.prototypes = sealed_prototypes(
+                parts, self.encoder.codebooks, n, k, len(self.landmarks)
+            )
         self.positions = np.full((n, 3), np.nan)
         if "position" in parts:
             dtype, none, step = "<f8" if learning else "<f4", np.nan, np.ones(3)
@@ -162,16 +173,18 @@ class Map:
         return self.landmarks[nearest], squared.min(1).astype(np.int32)
 
 
-def sealed_prototypes(parts: dict[str, bytes], n: int, k: int, m: int) -> Any:
+def sealed_prototypes(
+    parts: dict[str, bytes], codebooks: dict[int, Any], n: int, k: int, m: int
+) -> Any:
     """Return the m prototypes of a sealed map by landmark, (m, k)."""
-    if "sq4scale" in parts:  # 4 bits per number
-        scale = int.from_bytes(parts["sq4scale"], "little")
-        b = np.frombuffer(parts["protos"], "u1").reshape(-1, -(-k // 8), 16, 4)
-        p = scale * (2 * np.concatenate([b & 15, b >> 4], axis=3).astype(np.int64) - 15)
+    if "width" in parts:  # words of a codebook
+        width = int.from_bytes(parts["width"], "little")
+        b = np.frombuffer(parts["protos"], "u1").reshape(-1, k // width, 16)
+        words = b.transpose(0, 2, 1).reshape(-1, k // width)
+        p = codebooks[width][np.arange(k // width), words].reshape(-1, k)
     else:
         b = np.frombuffer(parts["protos"], "i1").reshape(-1, -(-k // 4), 16, 4)
-        p = b.astype(np.int64)
-    p = p.transpose(0, 2, 1, 3).reshape(16 * len(b), -1)[:, :k]
+        p = b.transpose(0, 2, 1, 3).reshape(16 * len(b), -1)[:, :k].astype(np.int64)
     if "owners" not in parts:
         return p[:m]
     # With an index, prototypes are sorted by inverted list; rows that landmark n owns are padding.

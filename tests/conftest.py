@@ -56,6 +56,19 @@ def random_layers(
     return layers
 
 
+def random_codebooks(*shapes: tuple[int, int]) -> list[NDArray[np.int8]]:
+    """Codebooks of random words, each for (subspaces, width)."""
+    rng = np.random.default_rng(5)
+    return [
+        rng.integers(-127, 128, (subspaces, 256, width)).astype(np.int8)
+        for subspaces, width in shapes
+    ]
+
+
+# Prototypes of 12 numbers take 12 bytes, or 6 or 4 words; of 5 numbers, 8 bytes or 5 words.
+CODEBOOKS = random_codebooks((5, 1), (6, 2), (4, 3))
+
+
 def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8]) -> Any:
     """The definition in core/include/protomark/encoder.h, in NumPy."""
     x = np.unpackbits(descriptors, axis=1, bitorder="little")
@@ -87,14 +100,18 @@ def layers() -> list[dict[str, Any]]:
 @pytest.fixture(scope="session")
 def encoder(layers: list[dict[str, Any]]) -> pm.Encoder:
     """64 bits to 12 dimensions, prefix of 5: no length is a multiple of a vector register's."""
-    return pm.Encoder(layers, [5, 12], name="tiny", descriptor="test", scale=0.02)
+    return pm.Encoder(
+        layers, [5, 12], name="tiny", descriptor="test", scale=0.02, codebooks=CODEBOOKS
+    )
 
 
 def balanced_encoder() -> pm.Encoder:
     """64 bits to 12 dimensions, of which each is as often above zero as below."""
     layers = random_layers([64, 12])
     layers[0]["bias"] = (-layers[0]["weights"].sum(axis=1, dtype=np.int64) // 2).astype(np.int32)
-    return pm.Encoder(layers, [5, 12], name="balanced", descriptor="test", scale=0.02)
+    return pm.Encoder(
+        layers, [5, 12], name="balanced", descriptor="test", scale=0.02, codebooks=CODEBOOKS
+    )
 
 
 class _MallocInfo(ctypes.Structure):

@@ -1,8 +1,6 @@
-"""Helpers for sealed maps of 4 bits per number, written from docs/format.md."""
+"""Helpers for sealed maps whose prototypes are words, written from docs/format.md."""
 
 from __future__ import annotations
-
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,33 +8,31 @@ from numpy.typing import NDArray
 import protomark as pm
 
 
-def four_bits(scene: pm.PrototypeMap, prototypes: float | None = None) -> float:
-    """`bytes_per_landmark` for this number of prototypes per landmark; None: all."""
+def in_words(scene: pm.PrototypeMap, prototypes: float | None = None) -> float:
+    """`bytes_per_landmark` for words of all numbers, and prototypes per landmark (None: all).
+
+    Of several codebooks, it is for the one with the shortest words.
+    """
     existing = scene.prototype_count / max(len(scene), 1) if len(scene) else 1.0
     wanted = existing if prototypes is None else prototypes
     several = wanted > 1 and existing > 1
-    return wanted * (4 * -(-scene.dim // 8)) + (2 if several else 1)
+    widths = [
+        width
+        for subspaces, _, width in (codebook.shape for codebook in scene.encoder.codebooks)
+        if scene.dim % width == 0 and subspaces * width >= scene.dim
+    ]
+    return wanted * (scene.dim // min(widths)) + (2 if several else 1)
 
 
-def levels(scale: int) -> NDArray[np.int64]:
-    return scale * (2 * np.arange(16) - 15)
+def decoded(words: NDArray[np.integer], codebook: NDArray[np.int8]) -> NDArray[np.int64]:
+    """The numbers (n, dim) of words (n, dim / width)."""
+    subspaces = np.arange(words.shape[1])
+    return codebook[subspaces, words].reshape(len(words), -1).astype(np.int64)
 
 
-@cache
-def nearest_levels(scale: int) -> NDArray[np.int64]:
-    """The 4-bit level of each value from -128; ties go away from zero, zero goes up."""
-    return np.array(
-        [
-            min(levels(scale).tolist(), key=lambda level: (abs(level - v), -abs(level), -level))
-            for v in range(-128, 128)
-        ]
-    )
-
-
-def quantized(prototypes: NDArray[np.int64], scale: int) -> NDArray[np.int64]:
-    return nearest_levels(scale)[prototypes + 128]
-
-
-def best_scale(prototypes: NDArray[np.int64]) -> int:
-    errors = [((prototypes - quantized(prototypes, a)) ** 2).sum() for a in range(1, 9)]
-    return 1 + int(np.argmin(errors))
+def quantized(prototypes: NDArray[np.int64], codebook: NDArray[np.int8]) -> NDArray[np.int64]:
+    """The nearest words of rounded prototypes (n, dim), ties to the first, as numbers."""
+    width = codebook.shape[2]
+    parts = prototypes.reshape(len(prototypes), -1, 1, width)
+    squared = ((parts - codebook[: parts.shape[1]].astype(np.int64)) ** 2).sum(-1)
+    return decoded(squared.argmin(-1), codebook)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from conftest import NO_DISTANCE, balanced_encoder, random_descriptors
-from sealing import four_bits
+from sealing import in_words
 
 LANDMARKS = 300
 
@@ -36,7 +36,16 @@ def filtered(
 
 
 @pytest.mark.parametrize(
-    "kind", ["learning", "8", "4", "appearances", "sealed appearances", "appearances 4", "index"]
+    "kind",
+    [
+        "learning",
+        "int8",
+        "words",
+        "appearances",
+        "sealed appearances",
+        "appearances, words",
+        "index",
+    ],
 )
 @pytest.mark.parametrize("size", [0, 1, 2, 40, 250])
 def test_equals_the_answers_of_the_whole_map_without_the_others(
@@ -47,7 +56,7 @@ def test_equals_the_answers_of_the_whole_map_without_the_others(
     if kind == "index":
         scene.build_index(5)
     if kind not in ("learning", "appearances"):
-        smaller = four_bits(scene) if "4" in kind else None
+        smaller = in_words(scene) if "words" in kind else None
         scene = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=smaller)
     rng = np.random.default_rng(size)
     ids = rng.choice(scene.ids, size, replace=False)

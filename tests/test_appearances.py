@@ -26,7 +26,7 @@ from appearances import (
 )
 from conftest import balanced_encoder, random_descriptors, rounded
 from map_container import LEARNING_MAP, container, sections
-from sealing import four_bits
+from sealing import in_words
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_search_equals_sorting(
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
-    fewer = scene.seal(folder / "s.pmk", bytes_per_landmark=four_bits(scene, 1.5))
+    fewer = scene.seal(folder / "s.pmk", bytes_per_landmark=in_words(scene, 1.5))
     assert_search(fewer, queries, **options)
 
 
@@ -239,8 +239,8 @@ def test_wrong_calls_change_nothing(encoder: pm.Encoder, tmp_path: Path) -> None
         ),
         (
             ValueError,
-            "bytes_per_landmark must be at least 9 for this map",
-            lambda: scene.seal(tmp_path / "s.pmk", bytes_per_landmark=8.9),
+            "bytes_per_landmark must be at least 5 for this map",
+            lambda: scene.seal(tmp_path / "s.pmk", bytes_per_landmark=4.9),
         ),
     ]
     for error, message, call in calls:
@@ -257,7 +257,7 @@ def test_positions_are_the_landmarks(encoder: pm.Encoder, tmp_path: Path) -> Non
     scene.merge_landmarks(1, 5)
     scene.remove([0])
     file_bytes(scene, tmp_path)
-    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=four_bits(scene, 3))
+    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=in_words(scene, 3))
     for m in (scene, pm.open(tmp_path / "scene.pmk"), sealed):
         np.testing.assert_array_equal(m.positions([1, 4]), [[4, 5, 6], [1, 2, 3]])
         assert np.isnan(m.positions([2, 3])).all()
@@ -324,7 +324,7 @@ def test_every_flipped_byte_is_noticed(encoder: pm.Encoder, tmp_path: Path) -> N
     scene.add(np.arange(90) % 20, random_descriptors(90))
     paths = [tmp_path / "o.pmk", tmp_path / "s.pmk"]
     scene.save(paths[0])
-    scene.seal(paths[1], bytes_per_landmark=four_bits(scene, 2))
+    scene.seal(paths[1], bytes_per_landmark=in_words(scene, 2))
     rng = np.random.default_rng(5)
     for path in paths:
         data = path.read_bytes()
@@ -349,7 +349,7 @@ def test_plain_code_gives_the_same_file_and_answers(encoder: pm.Encoder, tmp_pat
     descriptors = random_descriptors(5000)
     scene.add(np.arange(5000) % 600, descriptors)
     scene.save(tmp_path / "o.pmk")
-    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=2.5 * 8 + 2)
+    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=2.5 * 6 + 2)
     np.save(tmp_path / "d.npy", descriptors)
     script = (
         "import sys, numpy as np, protomark as pm\n"
@@ -358,7 +358,7 @@ def test_plain_code_gives_the_same_file_and_answers(encoder: pm.Encoder, tmp_pat
         "scene = pm.PrototypeMap(pm.open(folder + '/o.pmk').encoder, appearance_bits=7)\n"
         "scene.add(np.arange(5000) % 600, d)\n"
         "scene.save(folder + '/o2.pmk')\n"
-        "sealed = scene.seal(folder + '/s2.pmk', bytes_per_landmark=22)\n"
+        "sealed = scene.seal(folder + '/s2.pmk', bytes_per_landmark=17)\n"
         "maps = {'learning': scene, 'sealed': sealed}\n"
         "found = {n: np.column_stack(m.search(d[:70], k=5)) for n, m in maps.items()}\n"
         "np.savez(folder + '/r.npz', **found)\n"

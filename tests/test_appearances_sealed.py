@@ -15,7 +15,7 @@ import protomark as pm
 from appearances import Reference, appearances_of, assert_search, observations
 from conftest import balanced_encoder, random_descriptors, rounded
 from map_container import container, sections
-from sealing import best_scale, four_bits, quantized
+from sealing import in_words, quantized
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_search_across_chunks(encoder: pm.Encoder, folder: Path) -> None:
     queries = rng.integers(-127, 128, (40, 12)).astype(np.int8)
     assert scene.prototype_count > 3000
     assert_search(scene, queries, k=3)
-    for size, kept in ((None, scene.prototype_count), (four_bits(scene, 4.3), 700 * 43 // 10)):
+    for size, kept in ((None, scene.prototype_count), (in_words(scene, 4.3), 700 * 43 // 10)):
         scene.seal(folder / "large.pmk", bytes_per_landmark=size)
         sealed = pm.open(folder / "large.pmk")
         assert f"{kept} prototypes" in repr(sealed)
@@ -93,21 +93,20 @@ def test_sealing_equals_plain_merging(
     scene, reference = pm.PrototypeMap(encoder, appearance_bits=bits), Reference(bits)
     scene.add_codes(ids, pool[rows])
     reference.add(ids, pool[rows])
-    size = four_bits(scene, prototypes)
+    size = in_words(scene, prototypes)
     sealed = scene.seal(folder / "w.pmk", bytes_per_landmark=size)
     pm.verify_file(folder / "w.pmk")
     known = reference.ids()
     n, m = len(known), len(reference.rows)
-    # 12 numbers take 12 bytes or, of 4 bits, 8.
+    # 12 numbers take 12 bytes, or 6 as words.
     lossless = 12 * m + (2 if m > n else 1) * n <= size * n
-    assert sealed.code_bits == (8 if lossless else 4)
+    assert (sealed.dim, sealed.words) == (12, 0 if lossless else 6)
     expected = merged_rows(reference, m if lossless else int(prototypes * n))
     np.testing.assert_array_equal(sealed.ids, known)
     assert sealed.prototype_count == sum(map(len, expected.values()))
     means = {i: rounded(np.array([s / c for s, c in expected[i]])) for i in known}
-    scale = best_scale(np.concatenate(list(means.values()))) if not lossless else 0
     for i in known:
-        exact = means[i] if lossless else quantized(means[i], scale)
+        exact = means[i] if lossless else quantized(means[i], encoder.codebooks[1])
         np.testing.assert_array_equal(sealed.appearances(i), exact)
         assert sealed.counts([i])[0] == sum(c for _, c in expected[i])
 
@@ -119,19 +118,19 @@ def test_bytes_per_landmark(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene.add_codes(np.arange(8000) % 1600, codes)
     path = tmp_path / "s.pmk"
     # Sealed to one prototype per landmark, the file is one without appearances.
-    scene.seal(path, bytes_per_landmark=9)
+    scene.seal(path, bytes_per_landmark=7)
     sizes = dict(pm.file_sections(path))
-    assert set(sizes) == {"encoder", "shape", "counts", "sq4scale", "protos"}
+    assert set(sizes) == {"encoder", "shape", "counts", "width", "protos"}
     plain = pm.PrototypeMap(encoder)
     plain.add_codes(np.arange(8000) % 1600, codes)
-    plain.seal(tmp_path / "plain.pmk", bytes_per_landmark=9)
+    plain.seal(tmp_path / "plain.pmk", bytes_per_landmark=7)
     assert path.read_bytes() == (tmp_path / "plain.pmk").read_bytes()
 
-    sealed = scene.seal(path, bytes_per_landmark=2 * 8 + 2)
+    sealed = scene.seal(path, bytes_per_landmark=2 * 6 + 2)
     sizes = dict(pm.file_sections(path))
-    assert set(sizes) == {"encoder", "shape", "counts", "rows", "sq4scale", "protos"}
+    assert set(sizes) == {"encoder", "shape", "counts", "rows", "width", "protos"}
     assert sealed.prototype_count == 3200
-    assert sizes["counts"] + sizes["rows"] + sizes["protos"] == 1600 * (2 * 8 + 2)
+    assert sizes["counts"] + sizes["rows"] + sizes["protos"] == 1600 * (2 * 6 + 2)
 
 
 def test_a_landmark_with_very_many_appearances(encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -142,16 +141,16 @@ def test_a_landmark_with_very_many_appearances(encoder: pm.Encoder, tmp_path: Pa
     rows = scene.prototype_count
     assert len(scene.appearances(5)) == rows - 1 > 300
     assert scene.counts([5, 6]).tolist() == [900, 1]
-    for size in (None, 1e9, 12 * 128 + 2, 12 * 128 + 1, 8 * 128 + 2):
+    for size in (None, 1e9, 12 * 128 + 2, 12 * 128 + 1, 6 * 128 + 2):
         sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
         assert (len(sealed.appearances(5)), sealed.prototype_count) == (255, 256)
-        assert sealed.code_bits == (4 if size in (12 * 128 + 1, 8 * 128 + 2) else 8)
+        assert sealed.words == (6 if size in (12 * 128 + 1, 6 * 128 + 2) else 0)
         assert sealed.counts([5, 6]).tolist() == [255, 1]
-    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=8 * 50 + 2)
+    sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=6 * 50 + 2)
     assert (len(sealed.appearances(5)), len(sealed.appearances(6))) == (99, 1)
 
 
-@pytest.mark.parametrize("bits", [8, 4])
+@pytest.mark.parametrize("kind", ["int8", "words"])
 @pytest.mark.parametrize(
     ("section", "content", "message"),
     [
@@ -164,7 +163,7 @@ def test_a_landmark_with_very_many_appearances(encoder: pm.Encoder, tmp_path: Pa
     ],
 )
 def test_hostile_sealed_maps_are_refused(
-    bits: int,
+    kind: str,
     section: str,
     content: bytes | None,
     message: str | None,
@@ -178,7 +177,7 @@ def test_hostile_sealed_maps_are_refused(
     scene.merge_landmarks(9, 8)
     scene.add_codes([8], codes[:1])
     path = tmp_path / "s.pmk"
-    scene.seal(path, bytes_per_landmark=four_bits(scene) if bits == 4 else None)
+    scene.seal(path, bytes_per_landmark=in_words(scene) if kind == "words" else None)
     assert scene.prototype_count == 5
     parts = sections(path.read_bytes())
     assert container(parts) == path.read_bytes()

@@ -149,10 +149,10 @@ def test_seal_to_a_size(tracks: Tracks, model: Path, tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         return dict(json.loads(facts_file.read_text()))
 
-    # 12 dimensions in two words of 8, a count, and ids, which are 0, 1, 2 and 7: a block of 16
-    # bytes and a word of 8 for all four.
-    facts = facts_of("--bytes", 9)
-    assert (facts["code_bits"], facts["bytes_per_landmark_for_matching"]) == (4, 8 + 1 + 24 / 4)
+    # 12 dimensions in 6 words, a count, and ids, which are 0, 1, 2 and 7: a block of 16 bytes and
+    # 8 bytes for all four.
+    facts = facts_of("--bytes", 7)
+    assert (facts["words"], facts["bytes_per_landmark_for_matching"]) == (6, 6 + 1 + 24 / 4)
     assert (facts["position_bits"], facts["landmarks"], facts["chosen_by"]) == (16, 4, None)
     learning = pm.open(scene)
     assert learning.prototype_count > len(learning)
@@ -162,7 +162,7 @@ def test_seal_to_a_size(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert (facts["position_bits"], facts["nlist"]) == (32, 1)
     assert facts_of("--no-positions")["position_bits"] is None
     for options, message in (
-        (["--bytes", 5], "bytes_per_landmark must be at least 9"),
+        (["--bytes", 4], "bytes_per_landmark must be at least 5"),
         (["--landmarks", 5], "5 landmarks cannot be kept: the map has 4"),
         (["--megabytes", 0.001], "0.001 MB are too few: 4 landmarks and the encoder take 0.0"),
     ):

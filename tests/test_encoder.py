@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import random_descriptors, random_layers, reference_encode
+from conftest import CODEBOOKS, random_descriptors, random_layers, reference_encode
 
 
 @settings(max_examples=40, deadline=None)
@@ -136,6 +137,7 @@ def test_model_file_round_trip(
         data="nothing",
         licence="CC0-1.0",
         notes={"time": "1 s", "ümlaut": "a\nb: c"},
+        codebooks=CODEBOOKS[1:],
     )
     made.save(tmp_path / "tiny.pme")
     read = pm.Encoder.load(tmp_path / "tiny.pme")
@@ -149,6 +151,7 @@ def test_model_file_round_trip(
     assert read.scale == np.float32(0.02)
     assert read.bits == 64
     assert read.dims == [5, 12]
+    assert_codebooks(read, CODEBOOKS[1:])
     # What a model says of itself does not change which codes it gives.
     assert read.identity == made.identity == encoder.identity
     descriptors = random_descriptors(20)
@@ -179,6 +182,36 @@ def test_layers_that_do_not_fit(change: Any, message: str) -> None:
     change(layers)
     with pytest.raises(ValueError, match=message):
         pm.Encoder(layers, [12], name="x", descriptor="x", scale=1.0)
+
+
+def assert_codebooks(encoder: pm.Encoder, expected: list[NDArray[np.int8]]) -> None:
+    assert [c.dtype for c in encoder.codebooks] == [np.int8] * len(expected)
+    for a, b in zip(encoder.codebooks, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_codebooks(encoder: pm.Encoder) -> None:
+    assert_codebooks(encoder, CODEBOOKS)
+    other = encoder.with_codebooks(CODEBOOKS[:1])
+    assert_codebooks(other, CODEBOOKS[:1])
+    assert_codebooks(encoder, CODEBOOKS)
+    assert (other.identity, other.name, other.dims) == (encoder.identity, "tiny", [5, 12])
+    assert_codebooks(encoder.with_codebooks(()), [])
+    for shape, dtype, error, message in (
+        ((6, 256), np.int8, TypeError, "codebooks: each must be a"),
+        ((6, 256, 2), np.int16, TypeError, "codebooks: each must be a"),
+        ((6, 255, 2), np.int8, ValueError, "256 words for each subspace"),
+        ((7, 256, 2), np.int8, ValueError, "256 words for each 2 numbers of a code"),
+        ((2, 256, 5), np.int8, ValueError, "have 1 to 4 numbers, not 5"),
+        ((2, 256, 0), np.int8, ValueError, "have 1 to 4 numbers, not 0"),
+        ((0, 256, 2), np.int8, ValueError, "256 words for each 2 numbers of a code"),
+    ):
+        with pytest.raises(error, match=message):
+            encoder.with_codebooks([np.zeros(shape, dtype)])
+    with pytest.raises(ValueError, match="two codebooks have words of 2 numbers"):
+        encoder.with_codebooks([CODEBOOKS[1], CODEBOOKS[1][:3]])
+    with pytest.raises(ValueError, match="must be -127 to 127"):
+        encoder.with_codebooks([np.full((6, 256, 2), -128, np.int8)])
 
 
 @pytest.mark.parametrize("dims", [[], [0, 12], [12, 5], [5, 5, 12], [5]])

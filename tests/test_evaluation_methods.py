@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import random_descriptors, random_layers
+from conftest import random_codebooks, random_descriptors, random_layers
 from evaluation_scene import observations
 from protomark.baselines.binary import (
     HammingMap,
@@ -273,7 +273,12 @@ def test_prototypes_are_the_cores_map(encoder: pm.Encoder) -> None:
 
 def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
     coder = pm.Encoder(
-        random_layers([64, 40, 32]), [8, 16, 32], name="w", descriptor="test", scale=0.02
+        random_layers([64, 40, 32]),
+        [8, 16, 32],
+        name="w",
+        descriptor="test",
+        scale=0.02,
+        codebooks=random_codebooks((16, 2)),
     )
     landmarks, descriptors = structured()
     support = Support(landmarks, descriptors)
@@ -291,7 +296,7 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
         assert built.bytes_per_landmark == dim // 2 + 1
         sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=dim // 2 + 1)
         assert_same_matches(built, sealed, queries)
-        # Rounding to 16 levels shows.
+        # That they are words shows.
         assert not np.array_equal(sealed.search(queries)[1], scene.search(queries)[1])
     several = [c.name for c in method_choices([coder, coder]) if c.family == "protomark-4bit@w"]
     assert several[0] == "protomark-16x4@w"
@@ -299,7 +304,12 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
 
 def test_appearances_take_the_bytes_of_one_prototype(tmp_path: Path) -> None:
     coder = pm.Encoder(
-        random_layers([64, 40, 48]), [8, 24, 48], name="w", descriptor="test", scale=0.02
+        random_layers([64, 40, 48]),
+        [8, 24, 48],
+        name="w",
+        descriptor="test",
+        scale=0.02,
+        codebooks=random_codebooks((24, 2)),
     )
     landmarks, descriptors = structured()
     support = Support(landmarks, descriptors)

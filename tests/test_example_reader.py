@@ -11,7 +11,7 @@ import pytest
 import protomark as pm
 from conftest import random_descriptors, rounded
 from map_container import READER
-from sealing import four_bits
+from sealing import in_words
 
 
 def scene(encoder: pm.Encoder, dim: int, appearance_bits: int, step: int) -> pm.PrototypeMap:
@@ -38,7 +38,7 @@ def test_the_same_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
 @pytest.mark.parametrize("appearance_bits", [0, 4])
 @pytest.mark.parametrize("dim", [5, 12])
 @pytest.mark.parametrize(
-    "kind", ["learning", "sealed", "4 bits", "merged", "16-bit positions", "index", "index, 4 bits"]
+    "kind", ["learning", "sealed", "words", "merged", "16-bit positions", "index", "index, words"]
 )
 def test_the_same_answers(
     kind: str, dim: int, appearance_bits: int, encoder: pm.Encoder, tmp_path: Path
@@ -50,11 +50,11 @@ def test_the_same_answers(
     {
         "learning": built.save,
         "sealed": built.seal,
-        "4 bits": partial(built.seal, bytes_per_landmark=four_bits(built)),
-        "merged": partial(built.seal, bytes_per_landmark=four_bits(built, 1.5)),
+        "words": partial(built.seal, bytes_per_landmark=in_words(built)),
+        "merged": partial(built.seal, bytes_per_landmark=in_words(built, 1.5)),
         "16-bit positions": partial(built.seal, position_bits=16),
         "index": built.seal,
-        "index, 4 bits": partial(built.seal, bytes_per_landmark=four_bits(built)),
+        "index, words": partial(built.seal, bytes_per_landmark=in_words(built)),
     }[kind](path)
     ours, theirs = pm.open(path), READER["Map"](path.read_bytes())
     ids = ours.ids

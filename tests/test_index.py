@@ -23,7 +23,7 @@ from protomark import sample
 from protomark.evaluation.protocol import split
 from protomark.maps.build import build_map
 from protomark.maps.info import describe
-from sealing import four_bits
+from sealing import in_words
 
 DIM = 12
 
@@ -189,15 +189,17 @@ def test_equal_maps_get_as_many_lists(coder: pm.Encoder, tmp_path: Path) -> None
     assert a.nlist == b.nlist == again.nlist
 
 
-@pytest.mark.parametrize(("bits", "prototypes"), [(8, None), (4, None), (4, 1.5), (4, 2.0)])
+@pytest.mark.parametrize(
+    ("kind", "prototypes"), [("int8", None), *(("words", n) for n in (None, 1.5, 2.0))]
+)
 @pytest.mark.parametrize("appearance_bits", [0, 4])
 def test_a_sealed_map_keeps_the_index(
-    coder: pm.Encoder, tmp_path: Path, bits: int, prototypes: float | None, appearance_bits: int
+    coder: pm.Encoder, tmp_path: Path, kind: str, prototypes: float | None, appearance_bits: int
 ) -> None:
     scene = filled(coder, 800, appearance_bits)
-    size = None if bits == 8 else four_bits(scene, prototypes)
+    size = None if kind == "int8" else in_words(scene, prototypes)
     plain = scene.seal(tmp_path / "plain.pmk", bytes_per_landmark=size)
-    assert plain.code_bits == (8 if prototypes and not appearance_bits else bits)
+    assert (plain.words == 0) == (kind == "int8" or (prototypes == 2 and not appearance_bits))
     assert plain.nlist == 0
     scene.build_index(20)
     sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
@@ -384,11 +386,11 @@ def test_all_instruction_sets_learn_the_same_lists(coder: pm.Encoder, tmp_path: 
     assert (tmp_path / "here.pmk").read_bytes() == (tmp_path / "there.pmk").read_bytes()
 
 
-@pytest.mark.parametrize("bits", [8, 4])
-def test_info_shows_the_index(tmp_path: Path, bits: int) -> None:
+@pytest.mark.parametrize("kind", ["int8", "words"])
+def test_info_shows_the_index(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "s.pmk"
     scene = build_map(sample.load(), pm.Encoder.load("freak"), 32, appearance_bits=0)
-    size = None if bits == 8 else four_bits(scene)
+    size = None if kind == "int8" else in_words(scene)
     scene.seal(path, bytes_per_landmark=size)
     assert describe(path)["nlist"] is None
     scene.build_index()

@@ -11,7 +11,7 @@ import pytest
 import protomark as pm
 from conftest import random_descriptors, rounded
 from map_container import LEARNING_MAP, container, sections
-from sealing import four_bits
+from sealing import in_words
 
 
 @pytest.fixture
@@ -127,14 +127,14 @@ def section_bytes(data: bytes) -> set[int]:
     return covered
 
 
-@pytest.mark.parametrize("kind", ["model", "learning", "sealed", "sealed with 4 bits"])
+@pytest.mark.parametrize("kind", ["model", "learning", "sealed", "sealed, words"])
 def test_every_flipped_byte_is_noticed(kind: str, scene: pm.PrototypeMap, tmp_path: Path) -> None:
     path = tmp_path / "file"
     {
         "model": scene.encoder.save,
         "learning": scene.save,
         "sealed": scene.seal,
-        "sealed with 4 bits": partial(scene.seal, bytes_per_landmark=four_bits(scene)),
+        "sealed, words": partial(scene.seal, bytes_per_landmark=in_words(scene)),
     }[kind](path)
     data = path.read_bytes()
     covered = section_bytes(data)

@@ -14,7 +14,7 @@ import protomark as pm
 from conftest import random_descriptors
 from map_container import container, sections
 from mutation import FILES, SEED, bounded, mutated_container
-from sealing import four_bits
+from sealing import in_words
 
 
 def scene(encoder: pm.Encoder, appearance_bits: int, nlist: int = 0) -> pm.PrototypeMap:
@@ -74,7 +74,7 @@ def read_model(path: Path) -> None:
         "model",
         *("learning", "appearances", "learning with an index"),
         *("sealed", "sealed, 16-bit positions", "sealed with an index"),
-        *("sealed with an index, owners repaired", "sealed, 4 bits, several prototypes"),
+        *("sealed with an index, owners repaired", "sealed, words, several prototypes"),
     ],
 )
 def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_path: Path) -> None:
@@ -90,8 +90,8 @@ def test_broken_files_are_refused_or_read(kind: str, encoder: pm.Encoder, tmp_pa
         "sealed, 16-bit positions": partial(scene(encoder, 0).seal, position_bits=16),
         "sealed with an index": scene(encoder, 3, nlist=5).seal,
         "sealed with an index, owners repaired": scene(encoder, 3, nlist=5).seal,
-        "sealed, 4 bits, several prototypes": partial(
-            scene(encoder, 3).seal, bytes_per_landmark=four_bits(scene(encoder, 3))
+        "sealed, words, several prototypes": partial(
+            scene(encoder, 3).seal, bytes_per_landmark=in_words(scene(encoder, 3))
         ),
     }[kind](path)
     whole = path.read_bytes()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import protomark as pm
 from conftest import balanced_encoder, protomark, random_descriptors
 from map_container import container, sections
-from sealing import four_bits
+from sealing import in_words
 
 MOST = 2**63 - 1
 
@@ -124,7 +124,7 @@ def test_summary(encoder: pm.Encoder, tmp_path: Path) -> None:
         for m in (
             built,
             built.seal(tmp_path / "s.pmk"),
-            built.seal(tmp_path / "t.pmk", bytes_per_landmark=four_bits(built)),
+            built.seal(tmp_path / "t.pmk", bytes_per_landmark=in_words(built)),
         ):
             summary = m.summary()
             assert summary["observations"] == 5000

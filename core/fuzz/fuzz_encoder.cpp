@@ -55,7 +55,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
       }
     }
     const auto written = encoder.serialize();
-    EXPECT(Encoder::parse(written, "written").identity() == encoder.identity());
+    const Encoder again = Encoder::parse(written, "written");
+    EXPECT(again.identity() == encoder.identity() && again.codebooks() == encoder.codebooks());
   } catch (const FileError&) {
   }
   return 0;

@@ -27,7 +27,12 @@ std::shared_ptr<const Encoder> small_encoder(std::size_t dim, std::size_t layers
   built.push_back(test::random_layer(random, width, dim));
   return std::make_shared<const Encoder>(Encoder(
       {"seed", "test", "none", "none", {{"key", "value"}}}, std::move(built),
-      dim > 1 ? std::vector<std::size_t>{dim / 2, dim} : std::vector<std::size_t>{dim}, 0.5f));
+      dim > 1 ? std::vector<std::size_t>{dim / 2, dim} : std::vector<std::size_t>{dim}, 0.5f,
+      {test::random_codebook(random,
+                             dim % 3 == 0 ? 3
+                             : dim > 1    ? 2
+                                          : 1,
+                             dim)}));
 }
 
 void fill(PrototypeMap& map, std::size_t landmarks, std::int64_t step, bool positions) {
@@ -106,13 +111,13 @@ int main(int argc, char** argv) try {
         map.save(folder / "learning_map" / name);
         map.seal(folder / "sealed_map" / name);
         map.seal(folder / "sealed_map" / (name + ".16"), {.position_bits = 16});
-        map.seal(folder / "sealed_map" / (name + ".4"), test::four_bits(map));
-        map.seal(folder / "sealed_map" / (name + ".merged"), test::four_bits(map, 1.5));
+        map.seal(folder / "sealed_map" / (name + ".words"), test::in_words(map));
+        map.seal(folder / "sealed_map" / (name + ".merged"), test::in_words(map, 1.5));
         if (landmarks == 0) continue;
         map.build_index({std::min<std::size_t>(landmarks, 4)});
         map.save(folder / "learning_map" / (name + ".index"));
         map.seal(folder / "sealed_map" / (name + ".index"));
-        map.seal(folder / "sealed_map" / (name + ".4.index"), test::four_bits(map));
+        map.seal(folder / "sealed_map" / (name + ".words.index"), test::in_words(map));
       }
     }
   }

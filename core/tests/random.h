@@ -43,12 +43,20 @@ inline Layer random_layer(Random& random, std::size_t inputs, std::size_t output
   return layer;
 }
 
+inline Codebook random_codebook(Random& random, std::size_t width, std::size_t dim,
+                                std::int8_t span = 127) {
+  return {width, random.integers<std::int8_t>(dim / width * 256 * width, -span, span)};
+}
+
+// With codebooks of words of two and three numbers.
 inline std::shared_ptr<const Encoder> random_encoder(std::size_t bits = 64, std::size_t dim = 12,
                                                      std::uint32_t seed = 1) {
   Random random(seed);
   std::vector<Layer> layers = {random_layer(random, bits, 40), random_layer(random, 40, dim)};
-  return std::make_shared<const Encoder>(
-      Encoder({"tiny", "test", "", "", {}}, std::move(layers), {dim / 2, dim}, 1.0f));
+  std::vector<Codebook> codebooks = {random_codebook(random, 2, dim),
+                                     random_codebook(random, 3, dim)};
+  return std::make_shared<const Encoder>(Encoder({"tiny", "test", "", "", {}}, std::move(layers),
+                                                 {dim / 2, dim}, 1.0f, std::move(codebooks)));
 }
 
 }  // namespace protomark::test

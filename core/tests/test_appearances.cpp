@@ -128,12 +128,11 @@ int main() {
   CHECK(sealed.size() == map.size() && sealed.prototype_count() == prototypes);
   CHECK(sealed.ids() == map.ids() && sealed.counts(sealed.ids()) == map.counts(map.ids()));
   check_search(sealed, means, queries);
-  // 8 dimensions of 4 bits take 4 bytes, and 12 as many as 16.
-  map.seal(folder / "merged.pmk", test::four_bits(map, 2.25));
+  map.seal(folder / "merged.pmk", test::in_words(map, 2.25));
   verify_file(folder / "merged.pmk");
   const SealedMap merged(folder / "merged.pmk");
   CHECK(merged.prototype_count() == map.size() * 9 / 4);
-  CHECK(merged.bytes_per_landmark() == 2.25 * 8 + 2);
+  CHECK(merged.bytes_per_landmark() == 2.25 * 6 + 2);
   std::map<std::int64_t, Rows> rows;
   for (const std::int64_t id : merged.ids()) rows[id] = rows_of(merged.appearances(id));
   check_search(merged, rows, queries);

@@ -211,27 +211,24 @@ void compare_codes(const Kernels& set, test::Random& random, std::size_t dim, st
   }
 }
 
-// Lengths that are not multiples of a vector, with garbage as padding.
-void compare_unpack4(const Kernels& set, test::Random& random, std::size_t dim,
-                     std::size_t blocks) {
-  const std::size_t stride = (dim + 3) / 4 * 4;
-  const auto packed = random.integers<std::uint8_t>(blocks * 16 * ((dim + 7) / 8 * 4), 0, 255);
-  for (int half_step = 1; half_step <= 8; ++half_step) {
-    // One more block, which must stay as it is.
-    std::vector<std::int8_t> expected((blocks + 1) * 16 * stride, 99), codes = expected;
-    for (std::size_t row = 0; row < 16 * blocks; ++row) {
-      const std::size_t block = row / 16, lane = row % 16;
-      for (std::size_t d = 0; d < stride; ++d) {
-        const std::uint8_t byte =
-            packed[block * 16 * ((dim + 7) / 8 * 4) + d / 8 * 64 + lane * 4 + d % 4];
-        const int u = d % 8 < 4 ? byte % 16 : byte / 16;
-        expected[block * 16 * stride + d / 4 * 64 + lane * 4 + d % 4] =
-            static_cast<std::int8_t>(d < dim ? half_step * (2 * u - 15) : 0);
-      }
+void compare_decode(const Kernels& set, test::Random& random, std::size_t width, std::size_t words,
+                    std::size_t blocks) {
+  const std::size_t dim = width * words, stride = (dim + 3) / 4 * 4;
+  const auto packed = random.integers<std::uint8_t>(blocks * 16 * words, 0, 255);
+  auto table = random.integers<std::int8_t>(stride * 256, -127, 127);
+  std::fill(table.begin() + static_cast<std::ptrdiff_t>(dim * 256), table.end(), 0);
+  // One more block, which must stay as it is.
+  std::vector<std::int8_t> expected((blocks + 1) * 16 * stride, 99), codes = expected;
+  for (std::size_t row = 0; row < 16 * blocks; ++row) {
+    const std::size_t block = row / 16, lane = row % 16;
+    for (std::size_t d = 0; d < stride; ++d) {
+      const std::size_t word = std::min(d / width, words - 1);
+      expected[block * 16 * stride + d / 4 * 64 + lane * 4 + d % 4] =
+          table[d * 256 + packed[(block * words + word) * 16 + lane]];
     }
-    set.code_unpack4(packed.data(), blocks, dim, half_step, codes.data());
-    CHECK(codes == expected);
   }
+  set.code_decode(packed.data(), blocks, dim, width, table.data(), codes.data());
+  CHECK(codes == expected);
 }
 
 void compare_hamming(const Kernels& set, test::Random& random, std::size_t words,
@@ -299,8 +296,13 @@ int main() {
           compare_activation(set->activate32, random, shift, n, style);
         }
       }
-      for (std::size_t dim = 1; dim <= 33; ++dim) compare_unpack4(*set, random, dim, 3);
-      for (const std::size_t blocks : {0, 1}) compare_unpack4(*set, random, 256, blocks);
+      for (const std::size_t width : {1, 2, 3, 4}) {
+        for (const std::size_t words : {1, 2, 5, 9, 64}) {
+          for (std::size_t blocks = 0; blocks <= 9; ++blocks) {
+            compare_decode(*set, random, width, words, blocks);
+          }
+        }
+      }
       for (const std::size_t words : {1, 4, 8, 31, 70, 512}) {
         for (const std::size_t n : {1, 7, 8, 16}) {
           const auto blocks = static_cast<std::size_t>(random.integer(0, 9));

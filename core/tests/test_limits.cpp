@@ -49,6 +49,7 @@ struct Parts {
   std::vector<Layer> layers;
   std::vector<std::size_t> dims{6, 12};
   float scale = 1;
+  std::vector<Codebook> codebooks;
 
   Parts() {
     test::Random random(1);
@@ -60,7 +61,7 @@ void test_encoder() {
   const auto bad = [](const auto& change, const std::string& message) {
     Parts p;
     change(p);
-    CHECK(refused([&] { Encoder(p.info, p.layers, p.dims, p.scale); }, message));
+    CHECK(refused([&] { Encoder(p.info, p.layers, p.dims, p.scale, p.codebooks); }, message));
   };
   test::Random random(2);
   const auto layer = [&](std::size_t inputs, std::size_t outputs) {
@@ -95,6 +96,20 @@ void test_encoder() {
   for (const float scale : {0.0f, -1.0f, NAN, INFINITY}) {
     bad([&](Parts& p) { p.scale = scale; }, "scale must be positive");
   }
+  const auto codebook = [&](std::size_t width, std::size_t numbers) {
+    return Codebook{width, std::vector<std::int8_t>(numbers, 1)};
+  };
+  for (const std::size_t width : {0, 5}) {
+    bad([&](Parts& p) { p.codebooks = {codebook(width, 2560)}; },
+        "words of a codebook have 1 to 4");
+  }
+  for (const std::size_t numbers : {0, 256, 513, 14 * 256}) {
+    bad([&](Parts& p) { p.codebooks = {codebook(2, numbers)}; }, "256 words for each 2 numbers");
+  }
+  bad([&](Parts& p) { p.codebooks = {codebook(2, 512), codebook(3, 768), codebook(2, 1024)}; },
+      "two codebooks have words of 2 numbers");
+  bad([&](Parts& p) { p.codebooks = {codebook(2, 512)}, p.codebooks[0].words[9] = -128; },
+      "numbers of words must be -127 to 127");
 
   // The largest shift and sums that just fit.
   Parts p;
@@ -283,7 +298,7 @@ void test_small_maps(const std::shared_ptr<const Encoder>& encoder, const fs::pa
       }
       const PrototypeMap read = PrototypeMap::load(folder / "open");
       CHECK(read.ids() == ids && search(read, queries, 2) == expected);
-      for (const SealOptions& options : {SealOptions(), test::four_bits(map)}) {
+      for (const SealOptions& options : {SealOptions(), test::in_words(map)}) {
         map.seal(folder / "sealed", options);
         verify_file(folder / "sealed");
         const SealedMap sealed(folder / "sealed");
@@ -291,9 +306,9 @@ void test_small_maps(const std::shared_ptr<const Encoder>& encoder, const fs::pa
         CHECK(sealed.counts(ids).size() == n && sealed.positions(ids).size() == n);
       }
       CHECK(search(map, {}, 2).empty());
-      for (const double bytes : {8.99, kNaN}) {
+      for (const double bytes : {2.99, kNaN}) {
         CHECK(refused([&] { map.seal(folder / "sealed", {.bytes_per_landmark = bytes}); },
-                      "bytes_per_landmark must be at least 9"));
+                      "bytes_per_landmark must be at least 3"));
       }
       map.subtract_codes(ids, view(codes));
       CHECK(map.size() == 0);
@@ -387,7 +402,7 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   const Position p = {1, 2, 3};
   map.set_positions(Ids{0}, std::span(&p, 1));
   map.save(learning);
-  map.seal(sealed, test::four_bits(map));
+  map.seal(sealed, test::in_words(map));
   encoder->save(model);
   CHECK(File(learning).error().empty() && File(sealed).error().empty() &&
         File(model).error().empty());
@@ -431,10 +446,11 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(File(learning).set("position", 0, kNaN), "no finite position"));
   CHECK(says(File(learning).set("position", 8, kInfinity), "no finite position"));
   CHECK(says(File(sealed).set("rows", 0, std::uint8_t{0}), "landmark without prototypes"));
-  for (const std::uint32_t scale : {0, 9}) {
-    CHECK(says(File(sealed).set("sq4scale", 0, scale), "scale of its prototypes is"));
+  for (const std::uint32_t width : {0, 1, 4}) {
+    CHECK(says(File(sealed).set("width", 0, width), "its encoder has no codebook for words of"));
   }
-  CHECK(says(File(sealed).resize("sq4scale", 8), "'sq4scale' is longer"));
+  CHECK(says(File(sealed).set("width", 0, std::uint32_t{3}), "'protos' has the wrong size"));
+  CHECK(says(File(sealed).resize("width", 8), "'width' is longer"));
   CHECK(says(File(sealed).resize("protos", 64), "'protos' has the wrong size"));
   CHECK(says(File(sealed).resize("position", 13), "'position' has the wrong size"));
   CHECK(says(File(sealed).drop("protos"), "lacks the section 'protos'"));
@@ -448,6 +464,12 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(says(File(model).set("network", 16, std::uint32_t{17}), "too many layers"));
   CHECK(says(File(model).set("network", 20, std::uint32_t{4097}), "a layer is too wide"));
   CHECK(says(File(model).set("info", 0, UINT32_MAX), "'info' is shorter"));
+  CHECK(says(File(model).set("codebook", 0, std::uint32_t{5}), "a codebook is too large"));
+  CHECK(says(File(model).set("codebook", 4, std::uint32_t{257}), "a codebook is too large"));
+  CHECK(says(File(model).resize("codebook", 8 + 7 * 512).set("codebook", 4, std::uint32_t{7}),
+             "256 words for each 2 numbers"));
+  CHECK(says(File(model).set("codebook", 8, std::uint8_t{0x80}), "must be -127 to 127"));
+  CHECK(says(File(model).resize("codebook", 4), "'codebook' is shorter"));
   for (const float x : {INFINITY, NAN}) {
     File(sealed).set("position", 4, x).with_bytes([](Bytes bytes) {
       const Position read = SealedMap(bytes, "file").positions(Ids{0})[0];
@@ -459,7 +481,7 @@ void test_claims(const std::shared_ptr<const Encoder>& encoder, const fs::path& 
   CHECK(File(sealed).resize("later", 100).error().empty());
 
   CHECK(check::throws<FileError>([&] { map_kind(model); }, "it holds an encoder"));
-  CHECK(file_sections(model).size() == 2 && file_sections(model)[0].first == "info");
+  CHECK(file_sections(model).size() == 3 && file_sections(model)[0].first == "info");
   std::vector<std::byte> bytes(65);
   CHECK(refused([&] { SealedMap(std::span(bytes).subspan(1), "x"); }, "multiple of 64"));
 }

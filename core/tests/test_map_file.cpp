@@ -18,29 +18,30 @@ namespace fs = std::filesystem;
 
 namespace {
 
-// A map of 4 bits answers by the numbers that it returns, which are the levels nearest to the
-// rounded means.
-void test_four_bits(const PrototypeMap& map, Codes queries, const fs::path& path) {
-  map.seal(path, test::four_bits(map));
+// A map of words answers by the numbers that it returns, which are the words nearest to the rounded
+// means.
+void test_words(const PrototypeMap& map, Codes queries, const fs::path& path) {
+  map.seal(path, test::in_words(map));
   verify_file(path);
   const SealedMap mapped(path);
-  CHECK(mapped.code_bits() == 4);
+  const std::size_t dim = map.dim();
+  CHECK(mapped.dim() == dim && mapped.words() == dim / 2);
   CHECK(mapped.ids() == map.ids());
   const auto ids = map.ids();
   CHECK(mapped.counts(ids) == map.counts(ids));
-  const Matrix<float> means = map.prototypes(ids), levels = mapped.prototypes(ids);
-  const float scale = std::abs(*std::ranges::min_element(
-      levels.data, [](float a, float b) { return std::abs(a) < std::abs(b); }));
-  for (std::size_t i = 0; i < means.data.size(); ++i) {
-    const float rounded = std::round(means.data[i]);
-    for (int u = 0; u < 16; ++u) {
-      const float level = scale * static_cast<float>(2 * u - 15);
-      CHECK(std::abs(rounded - levels.data[i]) <= std::abs(rounded - level));
+  const Matrix<float> means = map.prototypes(ids), stored = mapped.prototypes(ids);
+  const std::vector<std::int8_t>& words = map.encoder()->codebooks()[0].words;
+  for (std::size_t i = 0; i < means.data.size(); i += 2) {
+    const float x = std::round(means.data[i]), y = std::round(means.data[i + 1]);
+    const auto distance = [&](float a, float b) { return (a - x) * (a - x) + (b - y) * (b - y); };
+    for (std::size_t word = 0; word < 256; ++word) {
+      const std::size_t at = (i % dim / 2 * 256 + word) * 2;
+      CHECK(distance(stored.data[i], stored.data[i + 1]) <= distance(words[at], words[at + 1]));
     }
   }
 
   PrototypeMap expanded(map.encoder());
-  const std::vector<std::int8_t> codes(levels.data.begin(), levels.data.end());
+  const std::vector<std::int8_t> codes(stored.data.begin(), stored.data.end());
   expanded.add_codes(ids, {codes.data(), ids.size(), map.dim()});
   for (const std::size_t k : {1, 3}) {
     SearchOptions options;
@@ -67,26 +68,58 @@ void test_bytes_per_landmark(const fs::path& path) {
     const double counts = appearance_bits == 0 ? 1 : 2, all8 = 12 * m / n + counts;
     for (const auto& bytes : {std::optional<double>(), {all8}, {1e9}}) {
       const SealedMap lossless = sealed(bytes);
-      CHECK(lossless.code_bits() == 8 && lossless.prototype_count() == map.prototype_count());
+      CHECK(lossless.words() == 0 && lossless.prototype_count() == map.prototype_count());
       CHECK(lossless.search_codes({codes.data(), 50, 12}) ==
             map.search_codes({codes.data(), 50, 12}));
     }
-    const double all4 = 8 * m / n + counts;
-    CHECK(sealed(all8 - 1 / n).code_bits() == 4);
-    CHECK(sealed(all4).prototype_count() == map.prototype_count());
-    for (const double bytes : {9.0, 9.5, 10.0, 10.5, 13.0, 18.0, 25.3}) {
+    CHECK(sealed(6 * m / n + counts).prototype_count() == map.prototype_count());
+    // As many words as fit: 12 numbers by two or three, 6 numbers by two or three.
+    const std::pair<double, std::pair<std::size_t, std::size_t>> formats[] = {
+        {3, {6, 2}},  {3.99, {6, 2}}, {4, {6, 3}},   {5, {12, 4}},           {6.5, {12, 4}},
+        {7, {12, 6}}, {9, {12, 6}},   {20, {12, 6}}, {all8 - 1 / n, {12, 6}}};
+    for (const auto& [bytes, format] : formats) {
       const SealedMap one = sealed(bytes);
+      if (bytes >= all8) continue;
+      CHECK(std::pair(one.dim(), one.words()) == format);
       CHECK(one.bytes_per_landmark() <= bytes * (1 + 1e-12));
-      if (bytes >= all4) continue;
-      // One prototype more would not fit.
       const auto rows = static_cast<double>(one.prototype_count());
-      CHECK((8 * (rows + 1) + 2 * n) / n > bytes);
+      const auto words = static_cast<double>(one.words());
+      // One prototype more would not fit.
+      CHECK(rows == m || (words * (rows + 1) + 2 * n) / n > bytes);
+      if (appearance_bits != 0) continue;
+      // Prototypes of fewer numbers begin those of all.
+      PrototypeMap shorter(encoder, one.dim());
+      std::vector<std::int8_t> prefixes;
+      for (std::size_t i = 0; i < 4000; ++i) {
+        prefixes.insert(prefixes.end(), &codes[i * 12], &codes[i * 12] + one.dim());
+      }
+      shorter.add_codes(landmarks, {prefixes.data(), 4000, one.dim()});
+      const fs::path other = path.string() + ".shorter";
+      shorter.seal(other, {.bytes_per_landmark = bytes});
+      const Codes queries{prefixes.data(), 50, one.dim()};
+      CHECK(SealedMap(other).prototypes(map.ids()) == one.prototypes(map.ids()));
+      CHECK(SealedMap(other).search_codes(queries) == one.search_codes(queries));
     }
-    for (const double bytes : {8.999, 0.0, -1.0, std::nan("")}) {
+    for (const double bytes : {2.999, 0.0, -1.0, std::nan("")}) {
       CHECK(check::throws<std::invalid_argument>([&] { sealed(bytes); },
-                                                 "bytes_per_landmark must be at least 9"));
+                                                 "bytes_per_landmark must be at least 3"));
     }
   }
+}
+
+// Encoders without codebooks seal maps as they are.
+void test_without_codebooks(const fs::path& path) {
+  const auto with = test::random_encoder();
+  const auto without = std::make_shared<const Encoder>(
+      Encoder(with->info(), with->layers(), with->dims(), with->scale()));
+  PrototypeMap map(without);
+  const std::vector<std::int8_t> code(12, 5);
+  map.add_codes(std::vector<std::int64_t>{3}, {code.data(), 1, 12});
+  map.seal(path, {.bytes_per_landmark = 13});
+  CHECK(SealedMap(path).words() == 0);
+  CHECK(check::throws<std::invalid_argument>(
+      [&] { map.seal(path, {.bytes_per_landmark = 12.9}); },
+      "bytes_per_landmark needs codebooks, which encoder 'tiny' does not have"));
 }
 
 }  // namespace
@@ -116,15 +149,15 @@ int main() {
   const SealedMap mapped(sealed);
   CHECK(read.ids() == map.ids());
   CHECK(mapped.ids() == map.ids());
-  CHECK(mapped.code_bits() == 8);
+  CHECK(mapped.words() == 0);
   CHECK(mapped.positions(std::span(ids).first(1))[0] == here);
 
   const Codes queries{codes.data(), n, dim};
   CHECK(read.search_codes(queries, 3) == map.search_codes(queries, 3));
   CHECK(mapped.search_codes(queries, 3) == map.search_codes(queries, 3));
 
-  test_four_bits(map, queries, folder / "map.4.pmk");
-  CHECK(SealedMap(folder / "map.4.pmk").positions(std::span(ids).first(1))[0] == here);
+  test_words(map, queries, folder / "map.words.pmk");
+  CHECK(SealedMap(folder / "map.words.pmk").positions(std::span(ids).first(1))[0] == here);
 
   for (const std::string name : {"\xff\xfe", "\x1b[2J", "a\tb", "caf\xc3\xa9"}) {
     ContainerWriter named(FileKind::learning_map);
@@ -144,6 +177,7 @@ int main() {
     CHECK(check::throws<FileError>(f, "it holds an encoder, not a map"));
   }
   test_bytes_per_landmark(folder / "bytes.pmk");
+  test_without_codebooks(folder / "bytes.pmk");
   fs::resize_file(sealed, fs::file_size(sealed) - 1);
   CHECK(check::throws<FileError>([&] { SealedMap{sealed}; }, "cut off"));
   fs::remove_all(folder);

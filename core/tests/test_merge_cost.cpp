@@ -59,13 +59,12 @@ std::vector<AppearanceMerge> plain_merges(const std::vector<std::int16_t>& sums,
 // Merges the pair of least cost over the whole map, ties to the first rows of the smallest id,
 // until there are at most `limit` rows.
 std::map<std::int64_t, std::vector<Cluster>> plain_store(const PrototypeStore& store,
-                                                         std::size_t limit) {
+                                                         std::size_t dim, std::size_t limit) {
   std::map<std::int64_t, std::vector<Cluster>> landmarks;
   for (const LandmarkIndex landmark : store.sorted_landmarks()) {
     for (const Row row : store.sorted_rows(landmark)) {
       const Sum sum = store.sum(row);
-      landmarks[store.id(landmark)].push_back(
-          {{sum.begin(), sum.begin() + store.dim()}, store.count(row)});
+      landmarks[store.id(landmark)].push_back({{sum.begin(), sum.begin() + dim}, store.count(row)});
     }
   }
   for (std::size_t rows = store.prototype_count(); rows > limit; --rows) {
@@ -83,7 +82,7 @@ std::map<std::int64_t, std::vector<Cluster>> plain_store(const PrototypeStore& s
     }
     if (best == nullptr) break;
     Cluster& into = (*best)[best_i];
-    for (std::size_t d = 0; d < store.dim(); ++d) into.sum[d] += (*best)[best_j].sum[d];
+    for (std::size_t d = 0; d < dim; ++d) into.sum[d] += (*best)[best_j].sum[d];
     into.n += (*best)[best_j].n;
     best->erase(best->begin() + static_cast<std::ptrdiff_t>(best_j));
   }
@@ -107,10 +106,12 @@ void merged_stores_equal_plain_ones() {
       store.merge(test::find_or_create_row(store, random.integer(0, 9) * 7, appearance), sum, n);
     }
     for (const std::size_t wanted : {0, 10, 20, 35, 50}) {
-      const auto merged = merge_appearances(store, wanted);
-      CHECK(merged.has_value() == (wanted < store.prototype_count()));
+      const auto length = static_cast<std::size_t>(random.integer(1, static_cast<int>(dim)));
+      const auto merged = merge_appearances(store, length, wanted);
+      CHECK(merged.has_value() == (wanted < store.prototype_count() || length < dim));
       if (!merged) continue;
-      const auto expected = plain_store(store, wanted);
+      CHECK(merged->dim() == length);
+      const auto expected = plain_store(store, length, wanted);
       CHECK(merged->landmark_count() == expected.size());
       bool equal = true;
       for (const auto& [id, clusters] : expected) {

@@ -28,7 +28,8 @@ PrototypeMap map_of(std::size_t dim, std::size_t n, Ids kind, std::size_t appear
   test::Random random(5);
   std::vector<Layer> layers{test::random_layer(random, 64, dim)};
   PrototypeMap map(std::make_shared<const Encoder>(
-                       Encoder({"x", "test", "none", "none", {}}, std::move(layers), {dim}, 1.0f)),
+                       Encoder({"x", "test", "none", "none", {}}, std::move(layers), {dim}, 1.0f,
+                               {test::random_codebook(random, 2, dim)})),
                    dim, appearance_bits);
   std::vector<std::int64_t> ids(n);
   std::iota(ids.begin(), ids.end(), std::int64_t{0});
@@ -99,7 +100,7 @@ int main(int argc, char** argv) {
     const PrototypeMap opened = PrototypeMap::load(path);
     CHECK(test::held - closed < own + own / 4 + kBuffers);
     check_save(what + ": seal", own, [&] { map.seal(path); });
-    check_save(what + ": seal, 4 bits", own, [&] { map.seal(path, test::four_bits(map)); });
+    check_save(what + ": seal, words", own, [&] { map.seal(path, test::in_words(map)); });
   }
   fs::remove(path);
   return check::result();

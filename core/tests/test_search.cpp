@@ -5,8 +5,8 @@
 #include <bit>
 #include <map>
 
-#include "base/quantize.h"
 #include "check.h"
+#include "encoder/codebooks.h"
 #include "protomark/hamming.h"
 #include "random.h"
 #include "search/scan.h"
@@ -156,18 +156,19 @@ void check_prefixes(test::Random& random) {
   }
 }
 
-void check_sq4(test::Random& random, std::size_t rows, std::size_t dim, std::size_t n) {
+void check_words(test::Random& random, std::size_t rows, std::size_t width, std::size_t words,
+                 std::size_t n) {
+  const std::size_t dim = width * words;
   Map map = random_map(random, rows, dim, true, 127);
-  const int scale = static_cast<int>(random.integer(1, kMaxScale));
-  std::vector<std::uint8_t> packed(packed_size(rows, dim, 1), 0);
+  const Codebook codebook = test::random_codebook(random, width, dim);
+  auto packed = random.integers<std::uint8_t>(packed_size(rows, dim, width), 0, 255);
   for (std::size_t i = 0; i < rows * dim; ++i) {
-    const std::uint8_t u = sq4_quantize(map.codes[i], scale);
-    map.codes[i] = static_cast<std::int8_t>(sq4_level(u, scale));
-    const std::size_t d = i % dim;
-    packed[packed4_index(i / dim, d, dim)] |=
-        static_cast<std::uint8_t>(packed4_high(d) ? u << 4 : u);
+    const std::size_t word = i % dim / width;
+    map.codes[i] =
+        codebook.words[(word * 256 + packed[word_index(i / dim, word, words)]) * width + i % width];
   }
-  PackedPrototypes prototypes{packed.data(), rows, dim, scale};
+  const std::vector<std::int8_t> table = decode_table(codebook, dim);
+  PackedPrototypes prototypes{packed.data(), rows, dim, width, table.data()};
   prototypes.landmarks.ids = map.landmark_ids.data();
   prototypes.landmarks.row_counts = map.row_counts.data();
   const auto queries = random.integers<std::int8_t>(n * dim, -127, 127);
@@ -248,13 +249,13 @@ int main() {
     for (const std::size_t n : {0, 1, 3, 16, 21}) {
       for (const std::size_t dim : {1, 12, 32, 65}) check_codes(random, rows, dim, n, 3);
       for (const std::size_t bytes : {1, 32, 61}) check_hamming(random, rows, bytes, n);
-      check_sq4(random, rows, 19, n);
+      for (const std::size_t width : {1, 2, 3, 4}) check_words(random, rows, width, 5, n);
     }
   }
   // Rows are divided among threads, and queries as well.
   check_codes(random, 9000, 8, 2, 2);
   check_codes(random, 900, 8, 150, 127);
-  check_sq4(random, 9000, 9, 3);
+  check_words(random, 9000, 3, 3, 3);
   check_hamming(random, 9000, 9, 3);
   check_hamming(random, 900, 8, 150);
   check_prefixes<270'000, 7>(random);

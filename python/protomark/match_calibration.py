@@ -48,6 +48,7 @@ def with_calibration(
         encoder.data,
         encoder.licence,
         {**encoder.notes, KEY: "\n".join(lines), SOURCE_KEY: source},
+        encoder.codebooks,
     )
 
 

@@ -207,8 +207,8 @@ def cases(large: int, seed: int) -> list[Case]:
         Case("learning map, 20,000 landmarks with appearances", [m.save for m in middle]),
         Case("sealed map, 100 landmarks", [m.seal for m in small]),
         Case(
-            "sealed map, 20,000 landmarks, 4 bits, appearances merged",
-            [partial(m.seal, bytes_per_landmark=1.5 * 8 + 2) for m in middle],
+            "sealed map, 20,000 landmarks, words, appearances merged",
+            [partial(m.seal, bytes_per_landmark=1.5 * 16 + 2) for m in middle],
         ),
         Journal("journal, map of 100 landmarks", scene(100, 0, rng), seed),
         Journal("journal, map of 20,000 landmarks with appearances", scene(20_000, 4, rng), seed),

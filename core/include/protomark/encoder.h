@@ -26,6 +26,19 @@ struct Layer {
   std::array<uint8_t, 256> table{};
 };
 
+// The words of a product quantizer (Jegou et al. 2011, doi:10.1109/TPAMI.2010.57), by which sealed
+// maps write prototypes: in a code, a byte names one of 256 words for each `width` numbers.
+struct Codebook {
+  static constexpr size_t kWords = 256;
+
+  size_t width = 0;           // numbers per word, 1 to 4
+  std::vector<int8_t> words;  // subspaces x kWords x width, -127 to 127
+
+  // Returns whether codes of `dim` numbers are whole words of this codebook.
+  bool covers(size_t dim) const { return dim % width == 0 && dim * kWords <= words.size(); }
+  bool operator==(const Codebook&) const = default;
+};
+
 struct EncoderInfo {
   std::string name;        // of the model, not empty
   std::string descriptor;  // that it takes, as in "freak", not empty
@@ -37,9 +50,11 @@ struct EncoderInfo {
 class PROTOMARK_API Encoder {
  public:
   // `dims` are the lengths at which a code may be cut, ascending, the last one the number of
-  // outputs; a code times `scale` is the real value. Throws std::invalid_argument if layers do not
-  // fit together, a sum could exceed 32 bits, or a note is named like a field of EncoderInfo.
-  Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale);
+  // outputs; a code times `scale` is the real value; `codebooks` are of distinct widths. Throws
+  // std::invalid_argument if layers or codebooks do not fit together, a sum could exceed 32 bits,
+  // or a note is named like a field of EncoderInfo.
+  Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale,
+          std::vector<Codebook> codebooks = {});
 
   // Reads and checks a model file. Throws FileError.
   static Encoder load(const std::filesystem::path& path);
@@ -57,6 +72,7 @@ class PROTOMARK_API Encoder {
   size_t dim() const { return dims_.back(); }
   const std::vector<size_t>& dims() const { return dims_; }
   float scale() const { return scale_; }
+  const std::vector<Codebook>& codebooks() const { return codebooks_; }
   // The SHA-256 of the network, in hexadecimal; encoders of equal identity give equal codes.
   const std::string& identity() const { return identity_; }
   // Multiply-adds per descriptor.
@@ -77,6 +93,7 @@ class PROTOMARK_API Encoder {
   std::vector<Layer> layers_;
   std::vector<size_t> dims_;
   float scale_;
+  std::vector<Codebook> codebooks_;
   std::string identity_;
   std::shared_ptr<const Packed> packed_;
 };

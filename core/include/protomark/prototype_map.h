@@ -23,11 +23,12 @@ struct IndexOptions {
 
 struct SealOptions {
   // Bytes that a landmark may take on average for its prototypes, their number and its count (not
-  // for position, id and index). By default prototypes have 8 bits per number and every appearance
-  // is kept, so that the sealed map gives the answers of the learning map. Otherwise they have 8
-  // bits per number if all of them fit; else 4 bits, and appearances are merged, those of least
-  // merge cost first (Ward's criterion: what merging adds to the squared distances of all
-  // observations to their prototypes), until they fit.
+  // for position, id and index). By default prototypes are int8 numbers and every appearance is
+  // kept, so that the sealed map gives the answers of the learning map. Otherwise they are, too, if
+  // all of them fit. Else they are words of one of the encoder's codebooks, as many as fit, of as
+  // many numbers; and appearances are merged, those of least merge cost first (Ward's criterion:
+  // what merging adds to the squared distances of all observations to their prototypes), until they
+  // fit.
   std::optional<double> bytes_per_landmark = std::nullopt;
   // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
   // bounding box, 65534 from end to end along each axis. 0: no positions.
@@ -185,8 +186,8 @@ class PROTOMARK_API PrototypeMap {
 
   // Writes a sealed map (protomark/sealed_map.h), with the index and metadata. A landmark keeps at
   // most 255 appearances. Throws FileError, and std::invalid_argument for other options, for fewer
-  // bytes_per_landmark than one 4-bit prototype takes, and for positions further than 3.4e38 from
-  // the middle of the map.
+  // bytes_per_landmark than the fewest words of a prototype take, if they need codebooks and the
+  // encoder has none, and for positions further than 3.4e38 from the middle of the map.
   //
   // Prototypes are tuned by the map's appearances, or better by observations: descriptor i (n x
   // bytes) is of landmark ids[i]; those of landmarks that the map does not hold are ignored.

@@ -10,10 +10,10 @@
 
 namespace protomark {
 
-// Bytes per landmark: dim per prototype (dimensions padded to a multiple of 4), or dim / 2 with 4
-// bits per number (padded to a multiple of 8); one for its count; another one if landmarks have
-// several prototypes; 12 or 6 for its position, if the map has positions; an eighth and the bits of
-// the gaps between ids, unless ids are 0 ... n - 1. Any number of threads may use a sealed map.
+// Bytes per landmark: dim per prototype (dimensions padded to a multiple of 4), or one for each
+// word of a codebook; one for its count; another one if landmarks have several prototypes; 12 or 6
+// for its position, if the map has positions; an eighth and the bits of the gaps between ids,
+// unless ids are 0 ... n - 1. Any number of threads may use a sealed map.
 class PROTOMARK_API SealedMap {
  public:
   // Maps a file. Does not read the large sections, which verify_file checks. Throws FileError.
@@ -26,11 +26,12 @@ class PROTOMARK_API SealedMap {
 
   const std::shared_ptr<const Encoder>& encoder() const;
   const Metadata& metadata() const;
+  // Numbers of a prototype, which may be fewer than those of the learning map.
   size_t dim() const;
   size_t size() const;  // number of landmarks
   size_t prototype_count() const;
-  // Bits per number of a prototype: 8 or 4.
-  int code_bits() const;
+  // Words of the encoder's codebook per prototype; 0: numbers are int8, as in the learning map.
+  size_t words() const;
   // Bytes that a landmark takes on average for its prototypes, their number and its count, as
   // SealOptions counts them; 0 for an empty map.
   double bytes_per_landmark() const;

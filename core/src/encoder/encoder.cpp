@@ -15,6 +15,7 @@ constexpr size_t kMaxBits = 1024;
 constexpr size_t kMaxDim = 256;
 constexpr size_t kMaxWidth = 4096;
 constexpr size_t kMaxLayers = 16;
+constexpr size_t kMaxWordWidth = 4;
 
 // Descriptors that go through the network together, at most: activations stay in the L2 cache.
 constexpr size_t kBatch = 512;
@@ -55,10 +56,32 @@ void check_layer(const Layer& layer, size_t inputs, size_t index) {
   }
 }
 
+void check_codebooks(const std::vector<Codebook>& codebooks, size_t dim) {
+  std::vector<size_t> widths;
+  for (const Codebook& codebook : codebooks) {
+    const auto& [width, words] = codebook;
+    if (width < 1 || width > kMaxWordWidth) {
+      invalid("encoder: words of a codebook have 1 to ", kMaxWordWidth, " numbers, not ", width);
+    }
+    if (words.empty() || words.size() % (Codebook::kWords * width) != 0 ||
+        words.size() > Codebook::kWords * dim) {
+      invalid("encoder: a codebook has 256 words for each ", width, " numbers of a code");
+    }
+    if (std::ranges::find(words, -128) != words.end()) {
+      invalid("encoder: numbers of words must be -127 to 127");
+    }
+    if (std::ranges::find(widths, width) != widths.end()) {
+      invalid("encoder: two codebooks have words of ", width, " numbers");
+    }
+    widths.push_back(width);
+  }
+}
+
 // Returns the field of a key, or the end of kFields for a note.
 const Field* field_of(std::string_view key) { return std::ranges::find(kFields, key, &Field::key); }
 
-ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network) {
+ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network,
+                        const std::vector<Codebook>& codebooks) {
   SectionWriter texts;
   for (const Field& field : kFields) {
     texts.text(std::string(field.key));
@@ -71,6 +94,14 @@ ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network)
   ContainerWriter file(FileKind::encoder);
   texts.add_to(file, section::kInfo);
   file.add(section::kNetwork, std::move(network));
+  if (codebooks.empty()) return file;
+  SectionWriter out;
+  for (const auto& [width, words] : codebooks) {
+    out.value(static_cast<uint32_t>(width));
+    out.value(static_cast<uint32_t>(words.size() / (Codebook::kWords * width)));
+    out.values(words.data(), words.size());
+  }
+  out.add_to(file, section::kCodebooks);
   return file;
 }
 
@@ -90,8 +121,13 @@ struct Encoder::Packed {
   }
 };
 
-Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale)
-    : info_(std::move(info)), layers_(std::move(layers)), dims_(std::move(dims)), scale_(scale) {
+Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale,
+                 std::vector<Codebook> codebooks)
+    : info_(std::move(info)),
+      layers_(std::move(layers)),
+      dims_(std::move(dims)),
+      scale_(scale),
+      codebooks_(std::move(codebooks)) {
   const auto check = [](bool ok, const auto&... what) {
     if (!ok) invalid("encoder: ", what...);
   };
@@ -116,6 +152,7 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t
         "dims must ascend and end with the number of outputs");
   check(dim() <= kMaxDim, "a code has at most 256 dimensions");
   check(scale_ > 0 && std::isfinite(scale_), "scale must be positive");
+  check_codebooks(codebooks_, dim());
   identity_ = sha256(network_bytes());
   packed_ = std::make_shared<const Packed>(layers_);
 }
@@ -193,11 +230,11 @@ std::vector<std::byte> Encoder::network_bytes() const {
 }
 
 std::vector<std::byte> Encoder::serialize() const {
-  return file_of(info_, network_bytes()).serialize();
+  return file_of(info_, network_bytes(), codebooks_).serialize();
 }
 
 void Encoder::save(const std::filesystem::path& path) const {
-  write_guarded(file_of(info_, network_bytes()), path);
+  write_guarded(file_of(info_, network_bytes(), codebooks_), path);
 }
 
 Encoder Encoder::load(const std::filesystem::path& path) {
@@ -240,8 +277,17 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
     layer.weights = in.values<int8_t>(layer.inputs * layer.outputs);
   }
   in.finish();
+  std::vector<Codebook> codebooks;
+  if (file.has(section::kCodebooks)) {
+    for (SectionReader words(file, section::kCodebooks); !words.empty();) {
+      const size_t width = words.value<uint32_t>(), subspaces = words.value<uint32_t>();
+      if (width > kMaxWordWidth || subspaces > kMaxDim) file.fail("a codebook is too large");
+      codebooks.push_back({width, words.values<int8_t>(subspaces * Codebook::kWords * width)});
+    }
+  }
   try {
-    return Encoder(std::move(info), std::move(layers), std::move(dims), scale);
+    return Encoder(std::move(info), std::move(layers), std::move(dims), scale,
+                   std::move(codebooks));
   } catch (const std::invalid_argument& error) {
     file.fail(error.what());
   }

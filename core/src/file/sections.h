@@ -11,6 +11,7 @@ namespace section {
 // Encoders.
 inline constexpr char kInfo[] = "info";
 inline constexpr char kNetwork[] = "network";
+inline constexpr char kCodebooks[] = "codebook";
 // Maps of both kinds, and commits.
 inline constexpr char kEncoder[] = "encoder";
 inline constexpr char kShape[] = "shape";
@@ -28,7 +29,7 @@ inline constexpr char kSpareBits[] = "spare";
 // Sealed maps.
 inline constexpr char kRows[] = "rows";
 inline constexpr char kPrototypes[] = "protos";
-inline constexpr char kScale[] = "sq4scale";
+inline constexpr char kWidth[] = "width";
 inline constexpr char kSteps[] = "steps";
 inline constexpr char kListRows[] = "listrows";
 inline constexpr char kOwners[] = "owners";

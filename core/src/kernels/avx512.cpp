@@ -85,6 +85,46 @@ struct Avx512 {
   static Flags above(const Sums& sums, int32_t threshold) { return near_rows(sums, threshold); }
   static bool any(Flags flags) { return flags != 0; }
 
+  // Looks up 64 rows at a time by permutations of bytes.
+  static constexpr size_t kDecodeBlocks = 4;
+  static void decode(const WordsOf4& words, size_t blocks, const int8_t* table, int8_t* codes,
+                     size_t codes_block) {
+    // The last block stands for those that there are not.
+    const size_t second = blocks < 2 ? 0 : 1, third = blocks < 3 ? second : 2;
+    const size_t fourth = blocks - 1;
+    __m512i numbers[4];
+#pragma GCC unroll 4
+    for (int j = 0; j < 4; ++j) {
+      const auto of_block = [&](size_t block) {
+        return load<__m128i>(words.of_number[j] + block * words.words_block);
+      };
+      __m512i w = _mm512_castsi128_si512(of_block(0));
+      w = _mm512_inserti32x4(w, of_block(second), 1);
+      w = _mm512_inserti32x4(w, of_block(third), 2);
+      w = _mm512_inserti32x4(w, of_block(fourth), 3);
+      const auto quarter = [&](int q) { return load<__m512i>(table + 256 * j + 64 * q); };
+      const __m512i below = _mm512_permutex2var_epi8(quarter(0), w, quarter(1));
+      const __m512i above = _mm512_permutex2var_epi8(quarter(2), w, quarter(3));
+      numbers[j] = _mm512_mask_mov_epi8(below, _mm512_movepi8_mask(w), above);
+    }
+    // Unpacking works within each 128 bits, which hold a block: rows 0 to 3, 4 to 7, ... of each.
+    const __m512i low01 = _mm512_unpacklo_epi8(numbers[0], numbers[1]);
+    const __m512i low23 = _mm512_unpacklo_epi8(numbers[2], numbers[3]);
+    const __m512i high01 = _mm512_unpackhi_epi8(numbers[0], numbers[1]);
+    const __m512i high23 = _mm512_unpackhi_epi8(numbers[2], numbers[3]);
+    const __m512i rows[4] = {
+        _mm512_unpacklo_epi16(low01, low23), _mm512_unpackhi_epi16(low01, low23),
+        _mm512_unpacklo_epi16(high01, high23), _mm512_unpackhi_epi16(high01, high23)};
+#pragma GCC unroll 4
+    for (int i = 0; i < 4; ++i) {
+      int8_t* to = codes + 16 * i;
+      store(to + fourth * codes_block, _mm512_extracti32x4_epi32(rows[i], 3));
+      store(to + third * codes_block, _mm512_extracti32x4_epi32(rows[i], 2));
+      store(to + second * codes_block, _mm512_extracti32x4_epi32(rows[i], 1));
+      store(to, _mm512_castsi512_si128(rows[i]));
+    }
+  }
+
   static constexpr int kWordQueries = 8;
   using Words = Pack<Vector<uint64_t, 64>, 1>;
   static void add_bits(Words& counts, uint64_t query, const Words& row) {

@@ -296,30 +296,41 @@ void code_biases(const int8_t* packed, size_t blocks, size_t dim, size_t prefix,
   }
 }
 
+// The words of 4 numbers in consecutive blocks, `words_block` bytes apart.
+struct WordsOf4 {
+  const uint8_t* of_number[4];
+  size_t words_block;
+};
+
+//   S::decode(words, blocks, table, codes, codes_block)  where S has something faster, for up to
+//                         S::kDecodeBlocks blocks
 template <typename S>
-void code_unpack4(const uint8_t* packed, size_t blocks, size_t dim, int scale, int8_t* codes) {
-  constexpr size_t kBytes = sizeof(S::Sums::v[0]), kStep = 4 * kCodeRows;
-  using Bytes = Vector<uint8_t, kBytes>;
-  using Shorts = Vector<uint16_t, kBytes>;
-  const auto twice = static_cast<uint16_t>(2 * scale);
-  const auto offset = static_cast<uint8_t>(15 * scale);
-  // Two bytes at a time, whose products stay within them.
-  const auto level = [&](Bytes u) { return (Bytes)((Shorts)u * twice) - offset; };
-  // Which of the last 4 dimensions there are.
-  const uint32_t last = 0xffffffffu >> (dim % 4 == 0 ? 0 : 32 - 8 * (dim % 4));
-  const size_t steps = (dim + 3) / 4;
-  for (size_t b = 0; b < blocks; ++b) {
-    for (size_t s = 0; s < steps; s += 2, packed += kStep) {
-      const bool two = s + 1 < steps;
-      for (size_t i = 0; i < kStep; i += kBytes) {
-        const auto bytes = load<Bytes>(packed + i);
-        store(codes + i, level(bytes & 15));
-        if (two) store(codes + kStep + i, level(bytes >> 4));
+void code_decode(const uint8_t* packed, size_t blocks, size_t dim, size_t width,
+                 const int8_t* table, int8_t* codes) {
+  constexpr bool kFaster = requires { S::kDecodeBlocks; };
+  WordsOf4 words{{}, dim / width * kCodeRows};
+  const size_t codes_block = (dim + 3) / 4 * 4 * kCodeRows;
+  size_t n = 1;
+  for (size_t b = 0; b < blocks; b += n, packed += n * words.words_block) {
+    if constexpr (kFaster) n = blocks - b < S::kDecodeBlocks ? blocks - b : S::kDecodeBlocks;
+    int8_t* to = codes + b * codes_block;
+    for (size_t d = 0; d < dim; d += 4, to += 4 * kCodeRows) {
+      for (size_t j = 0; j < 4; ++j) {
+        // Numbers that there are not are zeros by any word.
+        words.of_number[j] = packed + (d + j < dim ? d + j : dim - 1) / width * kCodeRows;
       }
-      codes += two ? 2 * kStep : kStep;
-    }
-    for (size_t i = kStep; last != ~0u && i > 0; i -= 4) {
-      store(codes - i, load<uint32_t>(codes - i) & last);
+      const int8_t* numbers = table + 256 * d;
+      if constexpr (kFaster) {
+        S::decode(words, n, numbers, to, codes_block);
+      } else {
+        const auto* values = reinterpret_cast<const uint8_t*>(numbers);
+        for (size_t r = 0; r < kCodeRows; ++r) {
+          const auto value = [&](size_t j) {
+            return uint32_t{values[256 * j + words.of_number[j][r]]};
+          };
+          store(to + 4 * r, value(0) | value(1) << 8 | value(2) << 16 | value(3) << 24);
+        }
+      }
     }
   }
 }
@@ -402,7 +413,7 @@ constexpr Kernels kernels_of(const char* name) {
           .activate16 = activation_of<S, int16_t>(),
           .activate32 = activation_of<S, int32_t>(),
           .code_biases = code_biases<S>,
-          .code_unpack4 = code_unpack4<S>,
+          .code_decode = code_decode<S>,
           .code_scan = code_scan<S>,
           .hamming_scan = hamming_scan<S>};
 }

@@ -110,12 +110,11 @@ struct Kernels {
   void (*code_biases)(const int8_t* packed, size_t blocks, size_t dim, size_t prefix,
                       int32_t* biases, int32_t* prefix_biases) = nullptr;
 
-  // Unpacks sq4 numbers u to codes scale * (2 u - 15), packed as code_scan takes them, with zeros
-  // up to a multiple of 4 dimensions. They come in blocks of 16 rows: for every 8 dimensions, 16
-  // rows x 4 bytes; byte j holds dimension j in its low four bits, 4 + j in its high ones. `scale`
-  // is 1 to 8.
-  void (*code_unpack4)(const uint8_t* packed, size_t blocks, size_t dim, int scale,
-                       int8_t* codes) = nullptr;
+  // Decodes rows of words, a byte for each `width` numbers, to codes as code_scan takes them. They
+  // come in blocks of 16 rows: for every word, 16 rows. `width` divides dim. `table` has for every
+  // number of a code its 256 values by word, and zeros up to a multiple of 4 numbers.
+  void (*code_decode)(const uint8_t* packed, size_t blocks, size_t dim, size_t width,
+                      const int8_t* table, int8_t* codes) = nullptr;
 
   // Finds the rows with |p|^2 - 2 p . q <= limits[q], and that value as their distance, from block
   // *block on. Stops at the end, or after a step that reaches kHitsEnough hits, and sets *block to

@@ -60,10 +60,10 @@ inline void check_pairs(size_t ids, size_t others, const char* what) {
 // Reads a map file and the commits to it. Throws FileError.
 std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal);
 
-// Measures the recall table of a store whose rounded prototypes are searched with value(v) in place
-// of each number v, where `search` finds the nearest landmarks of queries.
+// Measures the recall table of a store whose rounded prototypes are searched as stored(prototype)
+// leaves them, where `search` finds the nearest landmarks of queries.
 RecallTable measure_recall_of(const PrototypeStore& store,
-                              const std::function<int8_t(int8_t)>& value,
+                              const std::function<void(int8_t*)>& stored,
                               const ExactSearch& search);
 
 // A change of a map: while it exists no other one begins, and all that read the map for long wait.

@@ -209,7 +209,7 @@ Matches PrototypeMap::search_codes(Codes queries, size_t k, const SearchOptions&
 }
 
 RecallTable measure_recall_of(const PrototypeStore& store,
-                              const std::function<int8_t(int8_t)>& value,
+                              const std::function<void(int8_t*)>& stored,
                               const ExactSearch& search) {
   const std::vector<Row> rows = store.sorted_rows_at(test_rows(store.prototype_count()));
   std::vector<int64_t> owners;
@@ -223,7 +223,7 @@ RecallTable measure_recall_of(const PrototypeStore& store,
     if (std::exchange(last, id) != id) {
       own_rows = store.sorted_rows(store.at(id));
       prototypes = store.rounded(own_rows);
-      std::ranges::transform(prototypes, prototypes.begin(), value);
+      for (size_t i = 0; i < own_rows.size(); ++i) stored(&prototypes[i * store.dim()]);
     }
     uint32_t list = 0;
     int32_t least = INT32_MAX;
@@ -276,9 +276,11 @@ void MapState::measure(int threads, bool wait) {
   }
   if (store.quantizer().nlist() == 0 || (recall_table && !is_stale(*recall_table))) return;
   auto measured = std::make_shared<MeasuredRecall>();
-  measured->table = measure_recall_of(store, std::identity(), [&](Codes queries, size_t k) {
-    return search_exact(store.view(), queries, k, {.threads = threads});
-  });
+  measured->table = measure_recall_of(
+      store, [](int8_t*) {},
+      [&](Codes queries, size_t k) {
+        return search_exact(store.view(), queries, k, {.threads = threads});
+      });
   measured->lists_version = store.lists_version();
   measured->changes = store.changes();
   const std::scoped_lock writing(recall_mutex);

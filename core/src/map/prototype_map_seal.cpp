@@ -1,4 +1,5 @@
 // Seals a learning map, producing sections while they are written, in little memory.
+#include "encoder/codebooks.h"
 #include "file/ids.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
@@ -15,19 +16,31 @@ using Sinks = std::span<const Sink>;
 // Packs blocks of kPackedRows rows as search reads them.
 class BlockPacker {
  public:
-  // Numbers have 4 bits, or 8 if `scale` is 0.
-  BlockPacker(const PrototypeStore& store, int scale) : store_(&store), scale_(scale) {
-    for (size_t i = 0; i < quantized_.size() && scale_ != 0; ++i) {
-      quantized_[i] = sq4_quantize(static_cast<int>(i) - 128, scale_);
-    }
+  // Rows are words of the codebook, or int8 numbers if there is none.
+  BlockPacker(const PrototypeStore& store, const Codebook* codebook) : store_(&store) {
+    if (codebook == nullptr) return;
+    width_ = codebook->width;
+    nearest_.emplace(*codebook, store.dim());
+    table_ = decode_table(*codebook, store.dim());
   }
 
-  int scale() const { return scale_; }
   // Bytes per block.
-  size_t size() const { return packed_size(kPackedRows, store_->dim(), scale_); }
-  // Returns the number that a code is stored as.
-  int8_t value(int8_t code) const {
-    return scale_ == 0 ? code : static_cast<int8_t>(sq4_level(u(code), scale_));
+  size_t size() const { return packed_size(kPackedRows, store_->dim(), width_); }
+  // Returns how packed rows are read, but for which they are.
+  PackedPrototypes view() const {
+    PackedPrototypes result = store_->view();
+    result.width = width_;
+    result.table = table_.data();
+    return result;
+  }
+  // Replaces a code by the one that it is stored as.
+  void store(int8_t* code) const {
+    if (!nearest_) return;
+    std::array<uint8_t, 256> words;
+    nearest_->find(code, words.data(), 1);
+    for (size_t d = 0; d < store_->dim(); ++d) {
+      code[d] = table_[d * Codebook::kWords + words[d / width_]];
+    }
   }
 
   // `rows` are kPackedRows, kNoRow for padding.
@@ -38,22 +51,21 @@ class BlockPacker {
     for (size_t i = 0; i < kPackedRows; ++i) {
       if (rows[i] == kNoRow) continue;
       store_->rounded(rows[i], code.data());
-      for (size_t d = 0; d < dim && scale_ == 0; d += 4) {
-        std::memcpy(to + packed_index(i, d, dim), &code[d], std::min<size_t>(4, dim - d));
+      if (nearest_) {
+        nearest_->find(code.data(), to + i, kPackedRows);
+        continue;
       }
-      for (size_t d = 0; d < dim && scale_ != 0; ++d) {
-        uint8_t& byte = to[packed4_index(i, d, dim)];
-        byte |= static_cast<uint8_t>(packed4_high(d) ? u(code[d]) << 4 : u(code[d]));
+      for (size_t d = 0; d < dim; d += 4) {
+        std::memcpy(to + packed_index(i, d, dim), &code[d], std::min<size_t>(4, dim - d));
       }
     }
   }
 
  private:
-  uint8_t u(int8_t code) const { return quantized_[static_cast<size_t>(code + 128)]; }
-
   const PrototypeStore* store_;
-  int scale_;
-  std::array<uint8_t, 256> quantized_{};
+  size_t width_ = 0;
+  std::optional<NearestWords> nearest_;
+  std::vector<int8_t> table_;
 };
 
 // Maps landmarks of a store to those of a sealed map, in little more than a byte per landmark: the
@@ -126,13 +138,12 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
                       size_t k) {
   // A piece is small compared with the map.
   const size_t size = std::max<size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
-  std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector));
+  std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector) + 1);
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
   Neighbours nearest = prepared.neighbours(k, {});
-  PackedPrototypes piece = store.view();
+  PackedPrototypes piece = packer.view();
   piece.data = packed.data();
-  piece.scale = packer.scale();
   for (size_t first = 0; first < store.row_end(); first += piece.rows) {
     piece.rows = std::min(size, store.row_end() - first);
     auto* to = reinterpret_cast<uint8_t*>(packed.data());
@@ -190,7 +201,7 @@ class SealedContent {
     });
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
-          store_, [this](int8_t code) { return packer_.value(code); },
+          store_, [this](int8_t* code) { packer_.store(code); },
           [this](Codes queries, size_t k) { return search_packed(store_, packer_, queries, k); });
       sink(std::as_bytes(std::span(table)));
     });
@@ -285,40 +296,31 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
   check_pairs(ids.size(), descriptors.rows, "descriptors");
   const std::shared_lock lock(state_->changing);
   const PrototypeStore& map = state_->store;
-  const SealFormat format = seal_format(map, options.bytes_per_landmark);
-  auto changed = merge_appearances(map, format.row_limit);
+  const SealFormat format = seal_format(map, *encoder(), options.bytes_per_landmark);
+  auto changed = merge_appearances(map, format.dim, format.row_limit);
   if (options.tune && options.bytes_per_landmark && (map.several() || !ids.empty())) {
-    const PrototypeStore& untuned = changed ? *changed : map;
     const TuningQueries queries =
-        ids.empty() ? TuningQueries(map, untuned.dim())
+        ids.empty() ? TuningQueries(map, format.dim)
                     : TuningQueries({ids.begin(), ids.end()},
-                                    encoder()->encode(descriptors, untuned.dim(), options.threads));
-    changed.emplace(tune_prototypes(untuned, queries, options.threads));
+                                    encoder()->encode(descriptors, format.dim, options.threads));
+    changed.emplace(tune_prototypes(changed ? *changed : map, queries, options.threads));
   }
   const PrototypeStore& store = changed ? *changed : map;
   std::optional<PositionCodec> codec;
   if (options.position_bits != 0) {
     if (const auto extent = map.summary().extent) codec.emplace(*extent, options.position_bits);
   }
-  int scale = 0;
-  if (format.bits == 4) {
-    Histogram histogram{};
-    std::vector<int8_t> code(dim());
-    store.each_row([&](Row row) {
-      store.rounded(row, code.data());
-      for (const int8_t value : code) ++histogram[static_cast<size_t>(value + 128)];
-    });
-    scale = sq4_best_scale(histogram);
-  }
 
   ContainerWriter file(FileKind::sealed_map);
   file.add(section::kEncoder, encoder()->serialize());
   add_value(file, section::kShape,
-            MapShape{map.landmark_count(), dim(), codec ? codec->origin() : Position{}});
+            MapShape{map.landmark_count(), format.dim, codec ? codec->origin() : Position{}});
   add_metadata(file, state_->metadata);
-  if (scale != 0) add_value(file, section::kScale, static_cast<uint32_t>(scale));
+  if (format.codebook != nullptr) {
+    add_value(file, section::kWidth, static_cast<uint32_t>(format.codebook->width));
+  }
   if (codec && codec->bits() == 16) add_value(file, section::kSteps, codec->step());
-  const BlockPacker packer(store, scale);
+  const BlockPacker packer(store, format.codebook);
   SealedContent content(store, map, packer, codec);
   content.add_to(file);
   write_guarded(file, path);

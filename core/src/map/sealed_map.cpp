@@ -1,5 +1,6 @@
 #include "protomark/sealed_map.h"
 
+#include "encoder/codebooks.h"
 #include "file/ids.h"
 #include "file/journal.h"
 #include "map/map_sections.h"
@@ -30,20 +31,26 @@ struct SealedMap::Content {
     } else {
       prototypes.landmarks.row_counts = row_counts.empty() ? nullptr : row_counts.data();
     }
-    if (file.has(section::kScale)) {
-      const auto scale = read_value<uint32_t>(file, section::kScale);
-      if (scale < 1 || scale > kMaxScale) {
-        file.fail("the scale of its prototypes is ", scale, ", not 1 to ", kMaxScale);
-      }
-      prototypes.scale = static_cast<int>(scale);
-    }
-    const size_t size = packed_size(prototypes.rows, shape.dim, prototypes.scale);
+    if (file.has(section::kWidth)) read_codebook();
+    const size_t size = packed_size(prototypes.rows, shape.dim, prototypes.width);
     prototypes.data = file.map<std::byte>(section::kPrototypes, size).data();
     counts = file.map<uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
     if (!file.has(section::kPositions)) return;
     codec.emplace(file, shape.origin);
     positions = file.map<std::byte>(section::kPositions, n * codec->size());
+  }
+
+  void read_codebook() {
+    const size_t width = read_value<uint32_t>(file, section::kWidth);
+    const auto& codebooks = encoder->codebooks();
+    const auto codebook = std::ranges::find(codebooks, width, &Codebook::width);
+    if (codebook == codebooks.end() || !codebook->covers(shape.dim)) {
+      file.fail("its encoder has no codebook for words of ", width, " numbers of ", shape.dim);
+    }
+    table = decode_table(*codebook, shape.dim);
+    prototypes.width = width;
+    prototypes.table = table.data();
   }
 
   void read_row_counts() {
@@ -86,7 +93,7 @@ struct SealedMap::Content {
     }
   }
 
-  int code_bits() const { return prototypes.scale == 0 ? 8 : 4; }
+  size_t words() const { return prototypes.width == 0 ? 0 : shape.dim / prototypes.width; }
   // Only with an index. Throws FileError if the owners are broken.
   LandmarkIndex owner(Row row) const { return landmark_at((*owners)[row.value]); }
 
@@ -132,9 +139,9 @@ struct SealedMap::Content {
 
   int value(Row row, size_t d) const {
     const auto* data = static_cast<const int8_t*>(prototypes.data);
-    if (code_bits() == 8) return data[packed_index(row.value, d, shape.dim)];
-    const auto byte = static_cast<uint8_t>(data[packed4_index(row.value, d, shape.dim)]);
-    return sq4_level(packed4_high(d) ? byte >> 4 : byte & 15, prototypes.scale);
+    if (words() == 0) return data[packed_index(row.value, d, shape.dim)];
+    const int8_t word = data[word_index(row.value, d / prototypes.width, words())];
+    return table[d * Codebook::kWords + static_cast<uint8_t>(word)];
   }
 
   static constexpr size_t kFirstRowStep = 64;  // landmarks
@@ -148,6 +155,7 @@ struct SealedMap::Content {
   std::span<const uint8_t> row_counts;  // empty if each landmark has one row
   std::vector<uint32_t> first_rows;     // of every kFirstRowStep-th landmark
   PackedPrototypes prototypes;
+  std::vector<int8_t> table;  // of a codebook, if there are words
   // With an index.
   std::vector<int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
@@ -196,13 +204,14 @@ const Metadata& SealedMap::metadata() const { return content_->metadata; }
 size_t SealedMap::dim() const { return content_->shape.dim; }
 size_t SealedMap::size() const { return content_->shape.landmarks; }
 size_t SealedMap::prototype_count() const { return content_->prototype_count; }
-int SealedMap::code_bits() const { return content_->code_bits(); }
+size_t SealedMap::words() const { return content_->words(); }
 size_t SealedMap::nlist() const { return content_->nlist(); }
 std::vector<int64_t> SealedMap::ids() const { return unchanged().ids.all(); }
 
 double SealedMap::bytes_per_landmark() const {
   if (size() == 0) return 0;
-  return static_cast<double>(sealed_bytes(size(), prototype_count(), dim(), code_bits())) /
+  const size_t row_bytes = words() == 0 ? packed_dim(dim()) : words();
+  return static_cast<double>(sealed_bytes(size(), prototype_count(), row_bytes)) /
          static_cast<double>(size());
 }
 

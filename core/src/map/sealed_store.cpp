@@ -12,16 +12,12 @@ namespace {
 // A sealed map stores the number of a landmark's prototypes in a byte.
 constexpr size_t kMaxRows = 255;
 
-size_t prototype_bytes(size_t dim, int bits) {
-  return packed_size(kPackedRows, dim, bits == 8 ? 0 : 1) / kPackedRows;
-}
-
-// Sums and counts of one landmark's rows.
+// Sums of the first `dim` numbers and counts of one landmark's rows.
 struct LandmarkSums {
-  LandmarkSums(const PrototypeStore& store, LandmarkIndex landmark) {
+  LandmarkSums(const PrototypeStore& store, LandmarkIndex landmark, size_t dim) {
     for (const Row row : store.sorted_rows(landmark)) {
       const Sum sum = store.sum(row);
-      sums.insert(sums.end(), sum.begin(), sum.begin() + store.dim());
+      sums.insert(sums.end(), sum.begin(), sum.begin() + dim);
       counts.push_back(static_cast<uint8_t>(store.count(row)));
     }
   }
@@ -34,14 +30,15 @@ class Merges {
  public:
   // Makes those of least cost over the whole map, ties to the first landmark, until there are at
   // most `limit` rows.
-  Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, size_t limit)
+  Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, size_t dim,
+         size_t limit)
       : ends_(landmarks.size()), made_(landmarks.size()) {
     size_t rows = store.prototype_count();
     using Next = std::pair<double, size_t>;  // cost, index in landmarks
     std::vector<Next> first;
     for (size_t i = 0; i < landmarks.size(); ++i) {
-      const LandmarkSums of_landmark(store, landmarks[i]);
-      const auto merges = appearance_merges(of_landmark.sums, of_landmark.counts, store.dim());
+      const LandmarkSums of_landmark(store, landmarks[i], dim);
+      const auto merges = appearance_merges(of_landmark.sums, of_landmark.counts, dim);
       merges_.insert(merges_.end(), merges.begin(), merges.end());
       ends_[i] = merges_.size();
       if (merges.size() >= kMaxRows) made_[i] = merges.size() + 1 - kMaxRows;
@@ -190,45 +187,66 @@ std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
   return result;
 }
 
-size_t sealed_bytes(size_t landmarks, size_t rows, size_t dim, int bits) {
-  return rows * prototype_bytes(dim, bits) + landmarks * (rows > landmarks ? 2 : 1);
+size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes) {
+  return rows * row_bytes + landmarks * (rows > landmarks ? 2 : 1);
 }
 
 int owner_bits(size_t landmarks) {
   return static_cast<int>(std::bit_width(std::max<size_t>(landmarks, 1)));
 }
 
-SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark) {
+SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
+                       std::optional<double> bytes_per_landmark) {
   const size_t n = store.landmark_count(), dim = store.dim();
   size_t rows = store.prototype_count();
   store.each_landmark([&](LandmarkIndex l) {
     if (store.several()) rows -= store.row_count(l) - std::min(store.row_count(l), kMaxRows);
   });
-  if (!bytes_per_landmark) return {8, rows};
-  const size_t smallest = sealed_bytes(1, 1, dim, 4);
-  if (!(*bytes_per_landmark >= static_cast<double>(smallest))) {
-    invalid("bytes_per_landmark must be at least ", smallest,
-            " for this map, which one prototype of 4 bits per number takes");
+  const SealFormat lossless{dim, nullptr, rows};
+  if (!bytes_per_landmark) return lossless;
+  // The rounding of products must not cost a prototype.
+  const double limit = *bytes_per_landmark * (1 + 1e-12), budget = limit * static_cast<double>(n);
+  const auto fits = [&](size_t row_bytes) {
+    return !(static_cast<double>(sealed_bytes(n, rows, row_bytes)) > budget);
+  };
+  size_t smallest = SIZE_MAX, words = 0;
+  SealFormat best = lossless;
+  for (const size_t of_codes : encoder.dims()) {
+    for (const Codebook& codebook : encoder.codebooks()) {
+      if (of_codes > dim || !codebook.covers(of_codes)) continue;
+      const size_t own_words = of_codes / codebook.width;
+      smallest = std::min(smallest, own_words);
+      if (own_words < words || static_cast<double>(own_words + 1) > limit) continue;
+      words = own_words;
+      best = {of_codes, &codebook, rows};
+    }
   }
-  // The rounding of the product must not cost a prototype.
-  const double budget = *bytes_per_landmark * static_cast<double>(n) * (1 + 1e-12);
-  for (const int bits : {8, 4}) {
-    if (static_cast<double>(sealed_bytes(n, rows, dim, bits)) <= budget) return {bits, rows};
+  const bool enough = limit >= static_cast<double>(std::min(smallest, packed_dim(dim)) + 1);
+  if (enough && fits(packed_dim(dim))) return lossless;
+  if (smallest == SIZE_MAX) {
+    invalid("bytes_per_landmark needs codebooks, which encoder '", encoder.info().name,
+            "' does not have for this map: give it some, or seal the map as it is, without "
+            "bytes_per_landmark");
   }
-  const double limit =
-      (budget - 2 * static_cast<double>(n)) / static_cast<double>(prototype_bytes(dim, 4));
-  return {4, std::max(n, static_cast<size_t>(std::max(limit, 0.0)))};
+  if (!enough) {
+    invalid("bytes_per_landmark must be at least ", smallest + 1,
+            " for this map, which one prototype of ", smallest, " words takes");
+  }
+  if (fits(words)) return best;
+  const double row_limit = (budget - 2 * static_cast<double>(n)) / static_cast<double>(words);
+  best.row_limit = std::max(n, static_cast<size_t>(std::max(0.0, row_limit)));
+  return best;
 }
 
-std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t limit) {
-  if (store.prototype_count() <= limit) return std::nullopt;
+std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t dim,
+                                                size_t limit) {
+  if (store.prototype_count() <= limit && dim == store.dim()) return std::nullopt;
   const std::vector<LandmarkIndex> landmarks = store.sorted_landmarks();
-  const Merges merges(store, landmarks, limit);
-  const size_t dim = store.dim();
+  const Merges merges(store, landmarks, dim, limit);
   PrototypeStore result(dim, store.appearance_bits());
   result.reserve(landmarks.size(), std::min(limit, store.prototype_count()));
   for (size_t i = 0; i < landmarks.size(); ++i) {
-    const LandmarkSums before(store, landmarks[i]);
+    const LandmarkSums before(store, landmarks[i], dim);
     std::vector<int64_t> sums(before.sums.begin(), before.sums.end());
     std::vector<int64_t> counts(before.counts.begin(), before.counts.end());
     for (const AppearanceMerge& m : merges.made(i)) {
@@ -249,7 +267,8 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, siz
       result.set(row, own_sum, fits_row ? static_cast<int>(counts[from]) : 1);
     }
   }
-  if (store.quantizer().nlist() != 0) result.rearrange(result.arrange(store.quantizer(), 1));
+  if (store.quantizer().nlist() != 0)
+    result.rearrange(result.arrange(store.quantizer().cut(dim), 1));
   return result;
 }
 

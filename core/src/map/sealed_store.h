@@ -1,21 +1,24 @@
-// Chooses how a map is sealed: bits per number of a prototype, and which prototypes.
+// Chooses how a map is sealed: numbers of a prototype, their words, and which prototypes.
 #pragma once
 
 #include "map/prototype_store.h"
+#include "protomark/encoder.h"
 
 namespace protomark {
 
 struct SealFormat {
-  int bits;          // per number of a prototype, 8 or 4
-  size_t row_limit;  // prototypes in all
+  size_t dim;                // numbers of a prototype
+  const Codebook* codebook;  // of its words; nullptr: numbers are int8
+  size_t row_limit;          // prototypes in all
 };
 
 // Chooses the format for a number of bytes per landmark (SealOptions). Throws
 // std::invalid_argument, which names the smallest possible number, if that is too small.
-SealFormat seal_format(const PrototypeStore& store, std::optional<double> bytes_per_landmark);
+SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
+                       std::optional<double> bytes_per_landmark);
 
-// Returns the bytes that prototypes, their number and the counts of landmarks take.
-size_t sealed_bytes(size_t landmarks, size_t rows, size_t dim, int bits);
+// Returns the bytes that prototypes of `row_bytes`, their number and the counts of landmarks take.
+size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes);
 
 // Returns the bits of a row's owner, which is a landmark or, for padding, the number of landmarks.
 int owner_bits(size_t landmarks);
@@ -37,10 +40,11 @@ struct AppearanceMerge {
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
                                                std::span<const uint8_t> counts, size_t dim);
 
-// Merges appearances until there are at most `limit` rows (SealFormat), and 255 of any landmark.
-// Returns a store of the prototypes, in lists of the same centroids, or nullopt if nothing has to
-// be merged. A prototype of more than 255 observations has its rounded mean as sum, and a count of
-// one.
-std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t limit);
+// Merges appearances until there are at most `limit` rows (SealFormat), and 255 of any landmark, by
+// the first `dim` numbers. Returns a store of these numbers of the prototypes, in lists of the
+// centroids cut to `dim`, or nullopt if the store is that already. A prototype of more than 255
+// observations has its rounded mean as sum, and a count of one.
+std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t dim,
+                                                size_t limit);
 
 }  // namespace protomark

@@ -25,12 +25,25 @@ class PackedPiece {
       const int64_t* ids = from.landmarks.ids;
       ids_.push_back(ids != nullptr ? ids[landmark.value] : int64_t{landmark.value});
     }
-    const size_t block = packed_size(kPackedRows, from.dim, from.scale);
-    packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector));
+    // What a row has in one place: 4 numbers or a word.
+    from.width == 0 ? copy_rows<4>(from) : copy_rows<1>(from);
+    view_ = {packed_.data(), rows_.size(), from.dim, from.width, from.table, {}};
+    view_.landmarks.of_row = owners_.data();
+    view_.landmarks.ids = ids_.data();
+  }
+
+  const PackedPrototypes& view() const { return view_; }
+
+ private:
+  template <size_t kBytes>
+  void copy_rows(const PackedPrototypes& from) {
+    constexpr size_t kAhead = 8;
+    const size_t block = packed_size(kPackedRows, from.dim, from.width);
+    packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector) + 1);
     const auto* source = static_cast<const std::byte*>(from.data);
     auto* to = reinterpret_cast<std::byte*>(packed_.data());
     const auto start = [&](size_t row) {
-      return row / kPackedRows * block + row % kPackedRows * kWord;
+      return row / kPackedRows * block + row % kPackedRows * kBytes;
     };
     for (size_t i = 0; i < rows_.size(); ++i) {
       if (i + kAhead < rows_.size()) {
@@ -41,19 +54,11 @@ class PackedPiece {
       }
       const std::byte* row = source + start(rows_[i].value);
       std::byte* packed = to + start(i);
-      for (size_t at = 0; at < block; at += sizeof(CodeVector)) {
-        std::memcpy(packed + at, row + at, kWord);
+      for (size_t at = 0; at < block; at += kPackedRows * kBytes) {
+        std::memcpy(packed + at, row + at, kBytes);
       }
     }
-    view_ = {packed_.data(), rows_.size(), from.dim, from.scale, {}};
-    view_.landmarks.of_row = owners_.data();
-    view_.landmarks.ids = ids_.data();
   }
-
-  const PackedPrototypes& view() const { return view_; }
-
- private:
-  static constexpr size_t kWord = 4, kAhead = 8;
 
   std::vector<Row> rows_;
   std::vector<LandmarkIndex> owners_;

@@ -184,6 +184,16 @@ size_t CoarseQuantizer::default_nlist(size_t prototypes, size_t dim, size_t row_
   return static_cast<size_t>(std::clamp(nlist, 1.0, static_cast<double>(kMaxLists)));
 }
 
+CoarseQuantizer CoarseQuantizer::cut(size_t dim) const {
+  if (dim == dim_ || nlist() == 0) return *this;
+  std::vector<int8_t> centroids;
+  for (auto from = centroids_.begin(); from != centroids_.end();
+       from += static_cast<std::ptrdiff_t>(dim_)) {
+    centroids.insert(centroids.end(), from, from + static_cast<std::ptrdiff_t>(dim));
+  }
+  return {std::move(centroids), dim};
+}
+
 std::vector<uint32_t> CoarseQuantizer::assign(Codes codes, int threads) const {
   PackedPrototypes grouped = packed_view(grouped_, list_of_.size());
   grouped.landmarks.of_row = list_of_.data();

@@ -28,6 +28,9 @@ class CoarseQuantizer {
   const std::vector<int8_t>& centroids() const { return centroids_; }
   PackedPrototypes packed() const { return packed_view(packed_, nlist()); }
 
+  // Returns the quantizer of the first `dim` numbers of codes, with as many lists.
+  CoarseQuantizer cut(size_t dim) const;
+
   // Returns the list of each code.
   std::vector<uint32_t> assign(Codes codes, int threads) const;
 

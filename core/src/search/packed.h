@@ -16,10 +16,9 @@ constexpr size_t packed_dim(size_t dim) { return (dim + 3) / 4 * 4; }
 
 constexpr size_t packed_blocks(size_t rows) { return (rows + kPackedRows - 1) / kPackedRows; }
 
-// Bytes of rows; with a `scale`, of sq4 numbers.
-constexpr size_t packed_size(size_t rows, size_t dim, int scale = 0) {
-  const size_t row = scale == 0 ? packed_dim(dim) : (dim + 7) / 8 * 4;
-  return packed_blocks(rows) * kPackedRows * row;
+// Bytes of rows; with a `width`, of rows of words of that many numbers.
+constexpr size_t packed_size(size_t rows, size_t dim, size_t width = 0) {
+  return packed_blocks(rows) * kPackedRows * (width == 0 ? packed_dim(dim) : dim / width);
 }
 
 constexpr size_t packed_index(size_t row, size_t d, size_t dim) {
@@ -27,14 +26,10 @@ constexpr size_t packed_index(size_t row, size_t d, size_t dim) {
          row % kPackedRows * 4 + d % 4;
 }
 
-// The same with sq4 numbers (base/quantize.h): for every 8 dimensions, 16 rows x 4 bytes, of which
-// byte j holds dimension j in its low bits and dimension 4 + j in its high ones.
-constexpr size_t packed4_index(size_t row, size_t d, size_t dim) {
-  return row / kPackedRows * packed_size(kPackedRows, dim, 1) + d / 8 * 4 * kPackedRows +
-         row % kPackedRows * 4 + d % 4;
+// The same for word `word` of a row; within a block, there are 16 rows for every word.
+constexpr size_t word_index(size_t row, size_t word, size_t words) {
+  return (row / kPackedRows * words + word) * kPackedRows + row % kPackedRows;
 }
-
-constexpr bool packed4_high(size_t d) { return d % 8 >= 4; }
 
 // Codes of 16 rows x 4 dimensions. Aligned, as a scan whose loads cross cache lines takes a quarter
 // longer.
@@ -63,7 +58,8 @@ struct PackedPrototypes {
   const void* data = nullptr;
   size_t rows = 0;
   size_t dim = 0;
-  int scale = 0;  // of sq4 numbers; 0: numbers are int8
+  size_t width = 0;               // numbers per word of a codebook; 0: rows are int8 numbers
+  const int8_t* table = nullptr;  // as kernels::Kernels::code_decode takes it
   RowLandmarks landmarks = {};
 };
 

@@ -144,37 +144,37 @@ class BlockReader {
   explicit BlockReader(const PackedPrototypes& prototypes)
       : data_(static_cast<const uint8_t*>(prototypes.data)),
         dim_(prototypes.dim),
-        scale_(prototypes.scale),
-        block_bytes_(packed_size(kPackedRows, dim_, scale_)),
+        width_(prototypes.width),
+        table_(prototypes.table),
+        block_bytes_(packed_size(kPackedRows, dim_, width_)),
         code_bytes_(packed_size(kPackedRows, dim_)) {}
 
-  // Returns the codes of these blocks, one after the other, valid until the next call. sq4 numbers
-  // are unpacked into the cache, once for all queries.
+  // Returns the codes of these blocks, one after the other, valid until the next call. Words are
+  // decoded into the cache, once for all queries.
   const int8_t* read(size_t first_block, size_t n) {
     const uint8_t* stored = data_ + first_block * block_bytes_;
-    if (scale_ == 0) return reinterpret_cast<const int8_t*>(stored);
+    if (width_ == 0) return reinterpret_cast<const int8_t*>(stored);
     int8_t* codes = room(n);
     copy(first_block, n, codes);
     return codes;
   }
   const int8_t* read(std::span<const uint32_t> blocks) {
-    bool consecutive = true;
-    for (size_t i = 1; i < blocks.size(); ++i) {
-      consecutive = consecutive && blocks[i] == blocks[i - 1] + 1;
-    }
-    if (consecutive) return read(blocks[0], blocks.size());
     int8_t* codes = room(blocks.size());
-    for (size_t i = 0; i < blocks.size(); ++i) copy(blocks[i], 1, codes + i * code_bytes_);
+    for (size_t i = 0, n = 0; i < blocks.size(); i += n) {
+      for (n = 1; i + n < blocks.size() && blocks[i + n] == blocks[i] + n;) ++n;
+      if (n == blocks.size()) return read(blocks[0], n);
+      copy(blocks[i], n, codes + i * code_bytes_);
+    }
     return codes;
   }
 
  private:
   void copy(size_t first_block, size_t n, int8_t* codes) const {
     const uint8_t* stored = data_ + first_block * block_bytes_;
-    if (scale_ == 0) {
+    if (width_ == 0) {
       std::memcpy(codes, stored, n * block_bytes_);
     } else {
-      kernels::active().code_unpack4(stored, n, dim_, scale_, codes);
+      kernels::active().code_decode(stored, n, dim_, width_, table_, codes);
     }
   }
   int8_t* room(size_t blocks) {
@@ -184,7 +184,8 @@ class BlockReader {
 
   const uint8_t* data_;
   size_t dim_;
-  int scale_;
+  size_t width_;
+  const int8_t* table_;
   size_t block_bytes_;  // as stored
   size_t code_bytes_;   // of a block as int8 codes
   std::vector<CodeVector> room_;

@@ -38,7 +38,7 @@ def seal(
     ] = 33.0,
     megabytes: Annotated[
         float | None,
-        typer.Option(help="Limit on the file, in MB (10^6 bytes), the encoder's 0.45 included."),
+        typer.Option(help="Limit on the file, in MB (10^6 bytes), the encoder's 0.48 included."),
     ] = None,
     landmarks: Annotated[int | None, typer.Option(min=1, help="Limit on landmarks.")] = None,
     index: Annotated[

@@ -76,9 +76,9 @@ def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
     multiple of 4 bytes counts; the up to 15 rows that pad the whole section do not, as they do not
     grow with the map.
     """
-    bits = scene.code_bits if isinstance(scene, pm.SealedMap) else 8
-    in_a_word = 32 // bits
-    prototype = 4 * -(-scene.dim // in_a_word)
+    if isinstance(scene, pm.SealedMap):
+        return scene.bytes_per_landmark
+    prototype = 4 * -(-scene.dim // 4)
     if scene.prototype_count == len(scene):
         return prototype + 1
     # One more byte says how many prototypes a landmark has.
@@ -89,9 +89,8 @@ def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]
     """Bytes per landmark of a sealed map's index, including the rows that pad its blocks."""
     if not isinstance(scene, pm.SealedMap) or scene.nlist == 0:
         return None
-    width = {8: 4, 4: 8}[scene.code_bits]  # dimensions in 4 bytes
     blocks = -(-scene.prototype_count // 16)
-    packed = blocks * 16 * -(-scene.dim // width) * 4
+    packed = blocks * 16 * (scene.words or 4 * -(-scene.dim // 4))
     sections_bytes = sum(
         sections.get(name, 0) for name in ("centroid", "listrows", "owners", "ownercrc", "recall")
     )
@@ -114,7 +113,7 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "prototypes_per_landmark": scene.prototype_count / landmarks if several else None,
         "appearance_bits": appearance_bits or None,
         "dim": scene.dim,
-        "code_bits": None if sealed is None else sealed.code_bits,
+        "words": None if sealed is None else sealed.words or None,
         "nlist": scene.nlist or None,
         "index_bytes_per_landmark": _index_bytes(scene, sections),
         "observations": summary["observations"],
