@@ -271,7 +271,7 @@ def test_prototypes_are_the_cores_map(encoder: pm.Encoder) -> None:
     assert_same_matches(built, scene, queries)
 
 
-def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
+def test_sealed_maps_of_a_size(tmp_path: Path) -> None:
     coder = pm.Encoder(
         random_layers([64, 40, 32]),
         [8, 16, 32],
@@ -281,55 +281,34 @@ def test_four_bits_are_a_sealed_map_of_four_bits(tmp_path: Path) -> None:
         codebooks=random_codebooks((16, 2)),
     )
     landmarks, descriptors = structured()
-    support = Support(landmarks, descriptors)
     listed = method_choices([coder])
-    chosen = choose_methods(listed, ["protomark-4bit"])
-    assert [c.name for c in chosen] == ["protomark-16x4", "protomark-32x4"]
     names = [c.name for c in choose_methods(listed, None)]
-    assert names[-2:] == [c.name for c in chosen]
-    assert chosen[1].label == "Protomark, 32 x 4 bits"
+    assert names[-5:] == ["sealed-9", "sealed-17", "sealed-25", "sealed-33", "sealed-65"]
+    scene = pm.PrototypeMap(coder, appearance_bits=5)
+    scene.add(landmarks, descriptors)
     queries = random_descriptors(30)
-    for choice, dim in zip(chosen, (16, 32), strict=True):
-        scene = pm.PrototypeMap(coder, dim=dim)
-        scene.add(landmarks, descriptors)
-        built = choice.build(support)
-        assert built.bytes_per_landmark == dim // 2 + 1
-        sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=dim // 2 + 1)
-        assert_same_matches(built, sealed, queries)
-        # That they are words shows.
-        assert not np.array_equal(sealed.search(queries)[1], scene.search(queries)[1])
-    several = [c.name for c in method_choices([coder, coder]) if c.family == "protomark-4bit@w"]
-    assert several[0] == "protomark-16x4@w"
-
-
-def test_appearances_take_the_bytes_of_one_prototype(tmp_path: Path) -> None:
-    coder = pm.Encoder(
-        random_layers([64, 40, 48]),
-        [8, 24, 48],
-        name="w",
-        descriptor="test",
-        scale=0.02,
-        codebooks=random_codebooks((24, 2)),
-    )
-    landmarks, descriptors = structured()
-    support = Support(landmarks, descriptors)
-    chosen = choose_methods(method_choices([coder]), ["protomark-appearances"])
-    assert [c.name for c in chosen] == ["appearances-17", "appearances-33"]
-    assert chosen[1].label == "Appearances, 48 x 4 bits"
-    queries = random_descriptors(30)
-    for choice, dim, size in zip(chosen, (24, 48), (17, 33), strict=True):
-        scene = pm.PrototypeMap(coder, dim=dim, appearance_bits=10)
-        scene.add(landmarks, descriptors)
-        sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
-        built = choice.build(support)
-        # What the file really holds; 300 landmarks and their prototypes fill no block of 16.
-        held = sealed.prototype_count * dim / 2 + 2 * 300
-        assert built.bytes_per_landmark == pytest.approx(held / 300)
-        assert size - 1 < built.bytes_per_landmark <= size
-        sizes = dict(pm.file_sections(tmp_path / "s.pmk"))
-        assert 0 <= sum(sizes[n] for n in ("counts", "rows", "protos")) - held < 16 * dim / 2
-        assert_same_matches(built, sealed, queries)
-    assert "appearances-17@w" in [c.name for c in method_choices([coder, coder])]
+    answers = []
+    for family, observed, tune in (
+        ("sealed", (landmarks, descriptors), True),
+        ("appearances", (None, None), True),
+        ("untuned", (None, None), False),
+    ):
+        chosen = choose_methods(listed, [f"protomark-{family}"])
+        for choice, size in zip(chosen, (9, 17, 25, 33, 65), strict=True):
+            built = choice.build(Support(landmarks, descriptors))
+            sealed = scene.seal(
+                tmp_path / "s.pmk", *observed, bytes_per_landmark=size, tune=tune
+            )
+            # What the file really holds, but for the last block of 16 prototypes.
+            sizes = dict(pm.file_sections(tmp_path / "s.pmk"))
+            held = sum(sizes.get(n, 0) for n in ("counts", "rows", "protos")) / len(scene)
+            assert held - 16 * 32 / len(scene) <= built.bytes_per_landmark <= min(held, size)
+            assert_same_matches(built, sealed, queries)
+            if size == 17:
+                answers.append(sealed.search(queries)[1])
+    assert not np.array_equal(answers[0], answers[1])
+    assert not np.array_equal(answers[1], answers[2])
+    assert "sealed-17@w" in [c.name for c in method_choices([coder, coder])]
 
 
 def test_choosing_methods(encoder: pm.Encoder) -> None:

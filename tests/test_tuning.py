@@ -85,7 +85,7 @@ def model(
                 for r, push in zip(rivals[q], pushes, strict=True):
                     sums[r] -= push * (queries[q] * 128 - numbers[r])
                 sums[own[q]] += sum(pushes) * (queries[q] * 128 - numbers[own[q]])
-            step = 0.35 / (counts * 32768.0)
+            step = 0.35 / ((counts + 2.0) * 32768.0)
             moved = np.clip(numbers + step[:, None] * sums, -127 * 128, 127 * 128)
             numbers = np.where(sums.any(1)[:, None], np.floor(moved + 0.5), numbers).astype(
                 np.int64

@@ -30,6 +30,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 DOCUMENT = ROOT / "docs" / "results" / "evaluation.md"
 MODELS = ROOT / "python" / "protomark" / "models"
 DIMS = (8, 16, 32, 64)
+SIZES = (9, 17, 25, 33, 65)
 SPLITS = {
     "train": ("hololens", "desk_rpy", "viking", "conch", "seneca"),
     "validation": ("caliterra",),
@@ -41,15 +42,13 @@ COLUMNS = {
     "majority": "majority",
     **{f"pca-{dim}": f"PCA {dim}" for dim in (16, 32, 64)},
     **{f"protomark-{dim}": f"**{dim}**" for dim in DIMS},
-    **{f"protomark-{dim}x4": f"**{dim} x 4 bits**" for dim in (16, 32, 64)},
-    **{f"appearances-{size}": f"**appearances, {size} B**" for size in (17, 33, 65)},
+    **{f"sealed-{size}": f"**{size} B**" for size in SIZES},
+    **{f"appearances-{size}": f"**by appearances, {size} B**" for size in SIZES},
 }
-# Bytes per landmark -> methods of that size: int8, 4 bits, 4 bits and several appearances.
+# Bytes per landmark -> methods of that size: int8 means; sealed maps, and what their parts bring.
 BUDGETS = {
-    9: ("protomark-8", "protomark-16x4", None),
-    17: ("protomark-16", "protomark-32x4", "appearances-17"),
-    33: ("protomark-32", "protomark-64x4", "appearances-33"),
-    65: ("protomark-64", None, "appearances-65"),
+    size: (f"protomark-{size - 1}", f"untuned-{size}", f"appearances-{size}", f"sealed-{size}")
+    for size in SIZES
 }
 PAPER = {65: 0.849}  # Komorowski and Trzcinski, 16 float32 numbers and the count: 0.676 of 0.796
 
@@ -87,7 +86,7 @@ def joined(results: Sequence[SequenceResult]) -> list[SequenceResult]:
         ValueError: two files measured a sequence on other queries.
     """
     families = [choice.family for choice in method_choices()]
-    families += ["protomark", "protomark-4bit", "protomark-appearances"]
+    families += ["protomark", "protomark-sealed", "protomark-appearances", "protomark-untuned"]
     whole: dict[tuple[str, str], SequenceResult] = {}
     for result in results:
         first = whole.setdefault((result.descriptor, result.sequence), result)
@@ -126,7 +125,8 @@ def ratio_table(results: Sequence[SequenceResult]) -> str:
         [f"{size}", number(paper.get(size)), *(number(mean_ratio(name)) for name in kept)]
         for size, kept in BUDGETS.items()
     ]
-    heads = ["bytes per landmark", "paper", "int8", "4 bits", "4 bits, several appearances"]
+    heads = ["bytes per landmark", "paper", "int8 means"]
+    heads += ["sealed, untuned", "tuned by appearances", "tuned by observations"]
     names = ", ".join(result.sequence for result in results)
     title = f"Mean ratio to the unaggregated precision ({names}):"
     return f"{title}\n\n{ReportTable(heads, rows, words=0).markdown()}"
@@ -142,10 +142,8 @@ def card_text(results: Sequence[SequenceResult]) -> str:
         "prototypes, mean of three splits, as `protomark evaluate` measures.",
         precision_table(results, names).markdown(),
         f"Not measured: {', '.join(missing)}." if missing else "",
-        "With 4 bits a number, and with several appearances per landmark:",
-        precision_table(
-            results, [n for kept in BUDGETS.values() for n in kept[1:] if n]
-        ).markdown(),
+        "Sealed maps, by bytes per landmark:",
+        precision_table(results, [f"sealed-{size}" for size in SIZES]).markdown(),
         ratio_table(results),
     ]
     return "\n\n".join(part for part in parts if part)
@@ -153,7 +151,7 @@ def card_text(results: Sequence[SequenceResult]) -> str:
 
 def upright_table(plain: Sequence[SequenceResult], upright: Sequence[SequenceResult]) -> str:
     """Precision without and with angle and size of the keypoint, a row per sequence."""
-    names = ["protomark-32", "protomark-32x4", "appearances-17", "appearances-33", "appearances-65"]
+    names = ["protomark-32", *(f"sealed-{size}" for size in SIZES)]
     others = {result.sequence: result for result in upright}
     rows = []
     for result in plain:

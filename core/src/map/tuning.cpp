@@ -249,7 +249,7 @@ class Tuner {
             sums[d] += weight * ((code[d] << kFraction) - prototype[d]);
           }
         }
-        const double step = kStep / (static_cast<double>(counts_[rank]) * kUnit);
+        const double step = kStep / (static_cast<double>(counts_[rank] + 2) * kUnit);
         for (size_t d = 0; d < dim_; ++d) {
           const double moved = prototype[d] + step * static_cast<double>(sums[d]);
           const double limit = 127 << kFraction;

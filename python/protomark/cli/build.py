@@ -48,10 +48,10 @@ def build(
     from protomark.cli.terminal import progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.maps import cameras
-    from protomark.maps.build import build_map
+    from protomark.maps.build import build_map, tracks_for
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
-    from protomark.maps.seal import SealRequest, seal_map, sealed_path
+    from protomark.maps.seal import SealRequest, observed, seal_map, sealed_path
     from protomark.maps.selection import Views
     from protomark.tracks.file import Tracks
 
@@ -60,21 +60,25 @@ def build(
     texts = command_metadata(frame, metadata or [])
     with progress_bar() as progress:
         progress("read tracks", 0, 0)
-        observed = Tracks.load(tracks)
+        seen = Tracks.load(tracks)
+        network = Encoder.load(encoder or seen.descriptor)
+        seen = tracks_for(network, seen)
         progress("build the map", 0, 0)
         scene = build_map(
-            observed,
-            Encoder.load(encoder or observed.descriptor),
+            seen,
+            network,
             dim,
             min_observations=min_observations,
             threads=threads,
         )
-        scene.metadata = {cameras.KEY: cameras.cameras_text(observed.cameras.values()), **texts}
+        scene.metadata = {cameras.KEY: cameras.cameras_text(seen.cameras.values()), **texts}
         progress("write the map", 0, 0)
         scene.save(output)
         if sealed:
             request = SealRequest(threads=threads)
-            seal_map(scene, sealed, request, lambda: Views.of_tracks(observed), progress)
+            seal_map(
+                scene, sealed, request, lambda: Views.of_tracks(seen), observed(seen), progress
+            )
         facts = describe(output)
         if sealed:
             facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}

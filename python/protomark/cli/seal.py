@@ -57,6 +57,15 @@ def seal(
     no_positions: Annotated[
         bool, typer.Option("--no-positions", help="Leave positions out: a map for matching only.")
     ] = False,
+    no_tune: Annotated[
+        bool,
+        typer.Option(
+            "--no-tune",
+            help="Keep the plain means. By default prototypes are tuned against each other, so that "
+            "a landmark is less often mistaken for another: best from tracks, whose observations "
+            "say which are.",
+        ),
+    ] = False,
     threads: Threads = 0,
     json_file: JsonFile = None,
 ) -> None:
@@ -82,6 +91,7 @@ def seal(
         landmarks=landmarks,
         index=index.value,
         position_bits=0 if no_positions else position_bits,
+        tune=not no_tune,
         threads=threads,
     )
     with progress_bar() as progress:

@@ -20,7 +20,6 @@ from protomark.evaluation.frames import (
 )
 from protomark.evaluation.methods import (
     APPEARANCE_BITS,
-    APPEARANCE_DIMS,
     PrototypeMethod,
     choose_methods,
     method_choices,
@@ -38,8 +37,7 @@ PICTURE, LEARNING_MAP, SEALED_MAP = "protomark_demo.png", "toy.pmk", "toy.sealed
 BASELINES = ("unaggregated", "random", "majority", "medoid", "mean", "pca-16", "pca-32", "pca-64")
 OURS = (
     *("protomark-16", "protomark-32", "protomark-64"),
-    *("protomark-32x4", "protomark-64x4"),
-    *("appearances-17", "appearances-33", "appearances-65"),
+    *("sealed-9", "sealed-17", "sealed-33", "sealed-65"),
 )
 # Metadata of the picture, by which a later run recognises its own files.
 _MADE_BY = "protomark demo"
@@ -124,20 +122,18 @@ def _write_maps(
 ) -> tuple[pm.PrototypeMap | pm.SealedMap, str]:
     """Build, save and seal the map of the support; returns the sealed map and its method's name.
 
-    If the encoder has the dimensions for it, the map keeps several appearances in 33 bytes per
-    landmark, otherwise one int8 prototype.
+    An encoder without codebooks gives a map of one int8 prototype per landmark.
     """
-    dim = APPEARANCE_DIMS[_SIZE]
-    several = dim in encoder.dims
-    if several:
-        scene = pm.PrototypeMap(encoder, dim=dim, appearance_bits=APPEARANCE_BITS)
-    else:
-        scene = pm.PrototypeMap(encoder)
-    scene.add(tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows])
+    compact = bool(encoder.codebooks)
+    scene = pm.PrototypeMap(encoder, appearance_bits=APPEARANCE_BITS if compact else 0)
+    observed = tracks.landmark_of_keypoint[part.support_rows], tracks.descriptors[part.support_rows]
+    scene.add(*observed)
     scene.set_positions(scene.ids, tracks.positions_of(scene.ids))
     scene.save(output / LEARNING_MAP)
-    sealed = scene.seal(output / SEALED_MAP, bytes_per_landmark=_SIZE if several else None)
-    return sealed, f"appearances-{_SIZE}" if several else f"protomark-{encoder.dim}"
+    sealed = scene.seal(
+        output / SEALED_MAP, *observed, bytes_per_landmark=_SIZE if compact else None
+    )
+    return sealed, f"sealed-{_SIZE}" if compact else f"protomark-{encoder.dim}"
 
 
 def _draw(rows: Sequence[MethodSummary], name: str, scene: ScenePicture, path: Path) -> None:

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +31,10 @@ from protomark.baselines.support import Moments, Support
 from protomark.features.upright import SUFFIX
 from protomark.maps.info import matching_bytes
 
-# Codes of at least this length are compared at 4 bits per number, too.
-MIN_4_BIT_DIM = 16
-# Code lengths by bytes per landmark, for several appearances at 4 bits per number. Of lengths 16 to
-# 64 these were the most precise on the validation sequence.
-APPEARANCE_DIMS = {17: 24, 33: 48, 65: 64}
-APPEARANCE_BITS = 10
+# Bytes per landmark of the sealed maps that are compared.
+SEALED_BYTES = (9, 17, 25, 33, 65)
+# Signs that tell appearances apart in the learning maps that are sealed, as `protomark map` has.
+APPEARANCE_BITS = 5
 PROJECTED_DIMS = (8, 16, 32, 64)
 
 
@@ -52,11 +51,7 @@ class MethodChoice:
 
 
 class PrototypeMethod(Method):
-    """A learning or a sealed map of prototypes.
-
-    A prototype has k numbers of 8 or 4 bits. A landmark has one byte for the count, and one for the
-    number of its prototypes if there may be several.
-    """
+    """A learning or a sealed map of prototypes, with a byte for each landmark's count."""
 
     def __init__(self, scene: pm.PrototypeMap | pm.SealedMap) -> None:
         self.map = scene
@@ -74,23 +69,32 @@ class PrototypeMethod(Method):
 def prototype_map(
     support: Support,
     encoder: pm.Encoder,
-    dim: int,
+    dim: int | None = None,
     bytes_per_landmark: float | None = None,
-    appearance_bits: int = 0,
+    tuned_by: Literal["observations", "appearances", "nothing"] = "observations",
     threads: int = 1,
 ) -> PrototypeMethod:
     """Protomark itself: means of an encoder's codes (Komorowski and Trzcinski, Eq. 1).
 
-    `bytes_per_landmark` and `appearance_bits` are those of `PrototypeMap` and its `seal`.
+    The learning map of `dim` int8 numbers per landmark, or a map sealed to `bytes_per_landmark`.
     """
-    scene = pm.PrototypeMap(encoder, dim, appearance_bits)
+    bits = 0 if bytes_per_landmark is None else min(APPEARANCE_BITS, encoder.dim)
+    scene = pm.PrototypeMap(encoder, dim, bits)
     scene.add(support.landmarks, support.descriptors, threads=threads)
     if bytes_per_landmark is None:
         return PrototypeMethod(scene)
+    observed = tuned_by == "observations"
     with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
-        # A mapped file stays readable after it is deleted.
-        path = Path(folder) / "scene.sealed.pmk"
-        return PrototypeMethod(scene.seal(path, bytes_per_landmark=bytes_per_landmark))
+        sealed = scene.seal(
+            # A mapped file stays readable after it is deleted.
+            Path(folder) / "scene.sealed.pmk",
+            support.landmarks if observed else None,
+            support.descriptors if observed else None,
+            bytes_per_landmark=bytes_per_landmark,
+            tune=tuned_by != "nothing",
+            threads=threads,
+        )
+    return PrototypeMethod(sealed)
 
 
 def method_choices(
@@ -133,35 +137,38 @@ def _prototype_choices(encoder: pm.Encoder, named: bool, threads: int) -> list[M
     mark = f" ({encoder.name})" if named else ""
     tail = f"@{encoder.name}" if named else ""
     upright = encoder.descriptor.endswith(SUFFIX)
-    dims = sorted(encoder.dims)
 
-    def choice(
-        name: str, label: str, family: str, dim: int, size: float | None = None, bits: int = 0
-    ) -> MethodChoice:
+    def choice(name: str, label: str, family: str, default: bool, *wanted: Any) -> MethodChoice:
         def build(support: Support) -> Method:
-            return prototype_map(support, encoder, dim, size, bits, threads)
+            return prototype_map(support, encoder, *wanted, threads=threads)
 
-        return MethodChoice(name + tail, label + mark, family + tail, build, upright=upright)
+        return MethodChoice(name + tail, label + mark, family + tail, build, default, upright)
 
-    listed = [choice(f"protomark-{d}", f"Protomark, {d}", "protomark", d) for d in dims]
-    for d in dims:
-        if d >= MIN_4_BIT_DIM:
-            size = 4 * -(-d // 8) + 1
-            label = f"Protomark, {d} x 4 bits"
-            listed.append(choice(f"protomark-{d}x4", label, "protomark-4bit", d, size))
-    for size, d in APPEARANCE_DIMS.items():
-        if d in dims:
-            label = f"Appearances, {d} x 4 bits"
-            listed.append(
-                choice(
-                    f"appearances-{size}",
-                    label,
-                    "protomark-appearances",
-                    d,
-                    size,
-                    APPEARANCE_BITS,
-                )
+    listed = [
+        choice(f"protomark-{d}", f"Protomark, {d}", "protomark", True, d)
+        for d in sorted(encoder.dims)
+    ]
+    smallest = min(
+        (d // book.shape[2] + 1 for d in encoder.dims for book in encoder.codebooks), default=None
+    )
+    for family, label, tuned_by in (
+        ("sealed", "Sealed", "observations"),
+        ("appearances", "Sealed, tuned by appearances", "appearances"),
+        ("untuned", "Sealed, untuned", "nothing"),
+    ):
+        listed += [
+            choice(
+                f"{family}-{size}",
+                f"{label}, {size} B",
+                f"protomark-{family}",
+                family == "sealed",
+                None,
+                size,
+                tuned_by,
             )
+            for size in SEALED_BYTES
+            if smallest is not None and smallest <= size
+        ]
     return listed
 
 

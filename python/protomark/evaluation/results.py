@@ -41,8 +41,9 @@ _CURVE_LABELS = {
     "pca": "PCA",
     "discriminant": "discriminant",
     "protomark": "Protomark",
-    "protomark-4bit": "Protomark x4",
-    "protomark-appearances": "Protomark appearances",
+    "protomark-sealed": "Protomark, sealed",
+    "protomark-appearances": "sealed, tuned by appearances",
+    "protomark-untuned": "sealed, untuned",
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,8 @@ from protomark.progress import Progress, silent
 from protomark.tracks.file import Tracks
 
 Index = Literal["auto", "yes", "no"]
+# Landmark ids (n,), and their descriptors (n, bits / 8) uint8.
+Observations = tuple[NDArray[np.int64], NDArray[np.uint8]]
 
 BYTES_PER_LANDMARK = 33.0
 # An exact search of fewer prototypes is as fast (docs/large-maps.md).
@@ -40,7 +42,8 @@ class SealRequest:
     landmarks: int | None = None  # how many to keep at most; None: all
     index: Index = "auto"  # whether to build one: "auto" from `INDEX_FROM` prototypes on
     position_bits: int = 16  # per coordinate: 32, 16, or 0 for no positions
-    threads: int = 1  # threads to encode and build the index on
+    tune: bool = True  # whether prototypes are tuned against each other
+    threads: int = 1  # threads to encode, build the index and tune on
 
 
 def sealed_path(path: Path) -> Path:
@@ -56,13 +59,22 @@ def seal(
     progress("read the map", 0, 0)
     if is_tracks(source):
         tracks = Tracks.load(source)
-        scene = build_map(tracks, pm.Encoder.load(tracks.descriptor), threads=request.threads)
+        encoder = pm.Encoder.load(tracks.descriptor)
+        scene = build_map(tracks, encoder, encoder.dim, threads=request.threads)
         scene.metadata = {KEY: cameras_text(tracks.cameras.values())}
-        return seal_map(scene, output, request, lambda: Views.of_tracks(tracks), progress)
+        return seal_map(
+            scene, output, request, lambda: Views.of_tracks(tracks), observed(tracks), progress
+        )
     scene = open_learning_map(source)
     model = source / MODEL
     views = (lambda: Views.of_model(model)) if model.is_dir() else None
-    return seal_map(scene, output, request, views, progress)
+    return seal_map(scene, output, request, views, None, progress)
+
+
+def observed(tracks: Tracks) -> Observations:
+    """The observations of tracks."""
+    rows = tracks.observations
+    return tracks.landmark_of_keypoint[rows], tracks.descriptors[rows]
 
 
 def seal_map(
@@ -72,6 +84,8 @@ def seal_map(
     # Gives the images that saw its landmarks, if landmarks have to be chosen; None: they are chosen
     # by where they are in space.
     views: Callable[[], Views] | None = None,
+    # The observations to tune prototypes by; None: the map's appearances.
+    observations: Observations | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Seal a learning map, which stays as it is but for its index.
@@ -105,9 +119,10 @@ def seal_map(
     if request.megabytes is not None:
         with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
             path = Path(folder) / "map.pmk"
-            while _seal_once(best(count), path, request) > request.megabytes * 1e6:
+            untuned = replace(request, tune=False)
+            while _seal_once(best(count), path, untuned) > request.megabytes * 1e6:
                 count = _fitting_count(path, count, request.megabytes * 1e6)
-    size = _seal_once(best(count), output, request)
+    size = _seal_once(best(count), output, request, observations)
     by = "images" if views else "space"
     return {
         "landmarks": count,
@@ -117,7 +132,12 @@ def seal_map(
     }
 
 
-def _seal_once(scene: pm.PrototypeMap, path: Path, request: SealRequest) -> int:
+def _seal_once(
+    scene: pm.PrototypeMap,
+    path: Path,
+    request: SealRequest,
+    observations: Observations | None = None,
+) -> int:
     """Seal a whole map; returns the bytes of the file."""
     wanted = request.index == "yes" or (
         request.index == "auto" and scene.prototype_count >= INDEX_FROM
@@ -127,7 +147,12 @@ def _seal_once(scene: pm.PrototypeMap, path: Path, request: SealRequest) -> int:
     elif request.index == "no":
         scene.drop_index()
     scene.seal(
-        path, bytes_per_landmark=request.bytes_per_landmark, position_bits=request.position_bits
+        path,
+        *(observations or (None, None)),
+        bytes_per_landmark=request.bytes_per_landmark,
+        position_bits=request.position_bits,
+        tune=request.tune,
+        threads=request.threads,
     )
     return path.stat().st_size
 
