@@ -33,7 +33,7 @@ class BlockPacker {
     return result;
   }
   // Replaces a code by the one that it is stored as.
-  void store(int8_t* code) const {
+  void quantize(int8_t* code) const {
     if (!nearest_) return;
     std::array<uint8_t, 256> words;
     nearest_->find(code, 0, 1, words.data());
@@ -45,13 +45,9 @@ class BlockPacker {
   // `rows` are kPackedRows, kNoRow for padding.
   void pack(const Row* rows, uint8_t* to) const {
     const size_t dim = store_->dim();
-    std::array<int8_t, 256 * kPackedRows> codes;
+    std::array<int8_t, 256 * kPackedRows> codes{};
     for (size_t i = 0; i < kPackedRows; ++i) {
-      if (rows[i] == kNoRow) {
-        std::fill_n(&codes[i * dim], dim, int8_t{0});
-      } else {
-        store_->rounded(rows[i], &codes[i * dim]);
-      }
+      if (rows[i] != kNoRow) store_->rounded(rows[i], &codes[i * dim]);
     }
     if (nearest_) {
       nearest_->find(codes.data(), dim, kPackedRows, to);
@@ -209,7 +205,7 @@ class SealedContent {
     });
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
-          store_, [this](int8_t* code) { packer_.store(code); },
+          store_, [this](int8_t* code) { packer_.quantize(code); },
           [this](Codes queries, size_t k) { return search_packed(store_, packer_, queries, k); });
       sink(std::as_bytes(std::span(table)));
     });
