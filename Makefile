@@ -76,8 +76,8 @@ comma := ,
 sanitizers = -g -O1 -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$(1)
 memory := $(call sanitizers,address$(comma)undefined)
 threads := $(call sanitizers,thread)
-CORE_TESTS := $(addprefix tests/test_,among.py appearances.py appearances_sealed.py cli.py encoder.py evaluation_protocol.py example_reader.py \
-  features.py files.py four_bit_maps.py hamming.py index.py journal.py limits.py map_file.py \
+CORE_TESTS := $(addprefix tests/test_,among.py appearances.py appearances_sealed.py cli.py compact_maps.py encoder.py evaluation_protocol.py example_reader.py \
+  features.py files.py hamming.py index.py journal.py limits.py map_file.py \
   metadata.py mutated_maps.py mutated_tracks.py prototypes.py sealed_sections.py sharing.py \
   tracks_file.py training_sampling.py)
 sanitize: sanitize-memory sanitize-threads sanitize-python-memory sanitize-python-threads

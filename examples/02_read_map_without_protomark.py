@@ -183,8 +183,8 @@ def sealed_prototypes(
         words = b.transpose(0, 2, 1).reshape(-1, k // width)
         p = codebooks[width][np.arange(k // width), words].reshape(-1, k)
     else:
-        b = np.frombuffer(parts["protos"], "i1").reshape(-1, -(-k // 4), 16, 4)
-        p = b.transpose(0, 2, 1, 3).reshape(16 * len(b), -1)[:, :k].astype(np.int64)
+        p = np.frombuffer(parts["protos"], "i1").astype(np.int64).reshape(-1, -(-k // 4), 16, 4)
+        p = p.transpose(0, 2, 1, 3).reshape(16 * len(p), -1)[:, :k]
     if "owners" not in parts:
         return p[:m]
     # With an index, prototypes are sorted by inverted list; rows that landmark n owns are padding.

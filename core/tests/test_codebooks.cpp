@@ -1,5 +1,8 @@
 #include "encoder/codebooks.h"
 
+#include <climits>
+
+#include "base/quantize.h"
 #include "check.h"
 #include "random.h"
 
@@ -12,23 +15,25 @@ void test_words(test::Random& random, std::size_t width, std::int8_t span) {
   const std::size_t dim = 5 * width;
   const Codebook codebook = test::random_codebook(random, width, dim + 2 * width, span);
   const NearestWords nearest(codebook, dim);
+  CHECK(nearest.words() == 5);
   const std::vector<std::int8_t> table = decode_table(codebook, dim);
   CHECK(table.size() == (dim + 3) / 4 * 4 * 256);
-  for (int i = 0; i < 200; ++i) {
-    const auto code = random.integers<std::int8_t>(dim, -span - 1, span);
-    std::vector<std::uint8_t> words(5 * 3, 99);
-    nearest.find(code.data(), words.data(), 3);
-    for (std::size_t s = 0; s < 5; ++s) {
+  for (std::size_t n = 1; n <= 16; ++n) {
+    const auto codes = random.integers<std::int8_t>(n * dim, -span - 1, span);
+    std::vector<std::uint8_t> words(5 * n);
+    nearest.find(codes.data(), dim, n, words.data());
+    for (std::size_t at = 0; at < words.size(); ++at) {
+      const std::size_t s = at / n, i = at % n;
       int best = INT_MAX;
       std::size_t expected = 0;
       for (std::size_t word = 0; word < 256; ++word) {
-        const int distance =
-            squared_distance(&codebook.words[(s * 256 + word) * width], &code[s * width], width);
+        const int distance = squared_distance(&codebook.words[(s * 256 + word) * width],
+                                              &codes[i * dim + s * width], width);
         if (distance >= best) continue;
         best = distance;
         expected = word;
       }
-      CHECK(words[3 * s] == expected && words[3 * s + 1] == 99);
+      CHECK(words[at] == expected);
       for (std::size_t j = 0; j < width; ++j) {
         CHECK(table[(s * width + j) * 256 + expected] ==
               codebook.words[(s * 256 + expected) * width + j]);

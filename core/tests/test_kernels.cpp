@@ -231,6 +231,31 @@ void compare_decode(const Kernels& set, test::Random& random, std::size_t width,
   CHECK(codes == expected);
 }
 
+// Few values give many ties.
+void compare_nearest_words(const Kernels& set, test::Random& random, std::size_t n, int span) {
+  const auto words = random.integers<std::int8_t>(256 * 4, -span, span);
+  const auto numbers = random.integers<std::uint8_t>(4 * n, 128 - span, 128 + span);
+  std::vector<std::int32_t> keys(256);
+  set.code_biases(words.data(), 16, 4, 4, keys.data(), nullptr);
+  for (int w = 0; w < 256; ++w) keys[w] = keys[w] * 256 + 255 - w;
+  std::vector<std::uint8_t> expected(n + 1, 99), nearest = expected;
+  for (std::size_t i = 0; i < n; ++i) {
+    std::int32_t best = INT32_MAX;
+    for (std::size_t w = 0; w < 256; ++w) {
+      std::int32_t distance = 0;
+      for (std::size_t j = 0; j < 4; ++j) {
+        const int apart = words[4 * w + j] - (numbers[4 * i + j] - 128);
+        distance += apart * apart;
+      }
+      if (distance >= best) continue;
+      best = distance;
+      expected[i] = static_cast<std::uint8_t>(w);
+    }
+  }
+  set.nearest_words(words.data(), keys.data(), numbers.data(), n, nearest.data());
+  CHECK(nearest == expected);
+}
+
 void compare_hamming(const Kernels& set, test::Random& random, std::size_t words,
                      std::size_t blocks, std::size_t n, int style) {
   const std::size_t rows = 8 * blocks;
@@ -302,6 +327,9 @@ int main() {
             compare_decode(*set, random, width, words, blocks);
           }
         }
+      }
+      for (const int span : {0, 1, 5, 127}) {
+        for (const std::size_t n : {0, 1, 16, 100}) compare_nearest_words(*set, random, n, span);
       }
       for (const std::size_t words : {1, 4, 8, 31, 70, 512}) {
         for (const std::size_t n : {1, 7, 8, 16}) {

@@ -296,6 +296,34 @@ void code_biases(const int8_t* packed, size_t blocks, size_t dim, size_t prefix,
   }
 }
 
+template <typename S>
+void nearest_words(const int8_t* words, const int32_t* keys, const uint8_t* numbers, size_t n,
+                   uint8_t* nearest) {
+  constexpr int kVectors = static_cast<int>(64 / sizeof(S::Sums::v[0]));
+  using Ints = Vector<int32_t, sizeof(S::Sums::v[0])>;
+  for (size_t i = 0; i < n; ++i, numbers += 4) {
+    const auto four = S::query(numbers);
+    // Negated distances, and then what makes the first of equals the largest.
+    Ints best[kVectors];
+    for (Ints& v : best) v = Ints{} + INT32_MIN;
+    for (size_t row = 0; row < 256; row += kCodeRows) {
+      typename S::Sums sums{};
+      S::dot(sums, four, S::load_codes(words + 4 * row));
+      for (int v = 0; v < kVectors; ++v) {
+        const Ints key = ((Ints)sums.v[v] << 9) + load<Ints>(keys + row + v * kCodeRows / kVectors);
+        best[v] = key > best[v] ? key : best[v];
+      }
+    }
+    int32_t largest = INT32_MIN;
+    for (const Ints& v : best) {
+      for (size_t lane = 0; lane < kCodeRows / kVectors; ++lane) {
+        largest = v[lane] > largest ? v[lane] : largest;
+      }
+    }
+    nearest[i] = static_cast<uint8_t>(255 - (largest & 255));
+  }
+}
+
 // The words of 4 numbers in consecutive blocks, `words_block` bytes apart.
 struct WordsOf4 {
   const uint8_t* of_number[4];
@@ -414,6 +442,7 @@ constexpr Kernels kernels_of(const char* name) {
           .activate32 = activation_of<S, int32_t>(),
           .code_biases = code_biases<S>,
           .code_decode = code_decode<S>,
+          .nearest_words = nearest_words<S>,
           .code_scan = code_scan<S>,
           .hamming_scan = hamming_scan<S>};
 }

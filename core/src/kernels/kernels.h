@@ -116,6 +116,12 @@ struct Kernels {
   void (*code_decode)(const uint8_t* packed, size_t blocks, size_t dim, size_t width,
                       const int8_t* table, int8_t* codes) = nullptr;
 
+  // Finds, for each of n times 4 numbers, as unsigned bytes of numbers + 128, the nearest of 256
+  // words of 4 numbers, packed as rows are, ties to the smaller. keys[w] are 256 times the biases
+  // of the words, plus 255 - w.
+  void (*nearest_words)(const int8_t* words, const int32_t* keys, const uint8_t* numbers, size_t n,
+                        uint8_t* nearest) = nullptr;
+
   // Finds the rows with |p|^2 - 2 p . q <= limits[q], and that value as their distance, from block
   // *block on. Stops at the end, or after a step that reaches kHitsEnough hits, and sets *block to
   // where to continue. Returns the number of hits, which are in no order.

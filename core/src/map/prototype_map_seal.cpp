@@ -34,10 +34,10 @@ class BlockPacker {
     return result;
   }
   // Replaces a code by the one that it is stored as.
-  void store(int8_t* code) const {
+  void quantize(int8_t* code) const {
     if (!nearest_) return;
     std::array<uint8_t, 256> words;
-    nearest_->find(code, words.data(), 1);
+    nearest_->find(code, 0, 1, words.data());
     for (size_t d = 0; d < store_->dim(); ++d) {
       code[d] = table_[d * Codebook::kWords + words[d / width_]];
     }
@@ -46,17 +46,22 @@ class BlockPacker {
   // `rows` are kPackedRows, kNoRow for padding.
   void pack(const Row* rows, uint8_t* to) const {
     const size_t dim = store_->dim();
-    std::array<int8_t, 256> code;
+    std::array<int8_t, 256 * kPackedRows> codes{};
+    for (size_t i = 0; i < kPackedRows; ++i) {
+      if (rows[i] != kNoRow) store_->rounded(rows[i], &codes[i * dim]);
+    }
+    if (nearest_) {
+      nearest_->find(codes.data(), dim, kPackedRows, to);
+      for (size_t i = 0; i < size(); ++i) {
+        if (rows[i % kPackedRows] == kNoRow) to[i] = 0;
+      }
+      return;
+    }
     std::fill_n(to, size(), uint8_t{0});
     for (size_t i = 0; i < kPackedRows; ++i) {
-      if (rows[i] == kNoRow) continue;
-      store_->rounded(rows[i], code.data());
-      if (nearest_) {
-        nearest_->find(code.data(), to + i, kPackedRows);
-        continue;
-      }
       for (size_t d = 0; d < dim; d += 4) {
-        std::memcpy(to + packed_index(i, d, dim), &code[d], std::min<size_t>(4, dim - d));
+        std::memcpy(to + packed_index(i, d, dim), &codes[i * dim + d],
+                    std::min<size_t>(4, dim - d));
       }
     }
   }
@@ -201,7 +206,7 @@ class SealedContent {
     });
     file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
       const RecallTable table = measure_recall_of(
-          store_, [this](int8_t* code) { packer_.store(code); },
+          store_, [this](int8_t* code) { packer_.quantize(code); },
           [this](Codes queries, size_t k) { return search_packed(store_, packer_, queries, k); });
       sink(std::as_bytes(std::span(table)));
     });

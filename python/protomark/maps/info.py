@@ -56,6 +56,7 @@ def _encoder_facts(encoder: pm.Encoder) -> dict[str, Any]:
         "descriptor": encoder.descriptor,
         "bits": encoder.bits,
         "dims": encoder.dims,
+        "word_widths": [codebook.shape[2] for codebook in encoder.codebooks],
         "multiply_adds": encoder.multiply_adds,
         "identity": encoder.identity,
         "data": encoder.data,
