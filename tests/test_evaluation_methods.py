@@ -296,9 +296,7 @@ def test_sealed_maps_of_a_size(tmp_path: Path) -> None:
         chosen = choose_methods(listed, [f"protomark-{family}"])
         for choice, size in zip(chosen, (9, 17, 25, 33, 65), strict=True):
             built = choice.build(Support(landmarks, descriptors))
-            sealed = scene.seal(
-                tmp_path / "s.pmk", *observed, bytes_per_landmark=size, tune=tune
-            )
+            sealed = scene.seal(tmp_path / "s.pmk", *observed, bytes_per_landmark=size, tune=tune)
             # What the file really holds, but for the last block of 16 prototypes.
             sizes = dict(pm.file_sections(tmp_path / "s.pmk"))
             held = sum(sizes.get(n, 0) for n in ("counts", "rows", "protos")) / len(scene)
@@ -315,7 +313,7 @@ def test_choosing_methods(encoder: pm.Encoder) -> None:
     listed = method_choices([encoder])
     names = [c.name for c in choose_methods(listed, None)]
     assert names[0] == "unaggregated"
-    assert names[-2:] == ["protomark-5", "protomark-12"]
+    assert [n for n in names if n.startswith("protomark")] == ["protomark-5", "protomark-12"]
     assert not any(name.endswith("float") for name in names)
     # In the order of the table, whatever the order they are asked for.
     some = [c.name for c in choose_methods(listed, ["pca", "medoid", "pca-8-float"])]

@@ -61,9 +61,8 @@ def seal(
         bool,
         typer.Option(
             "--no-tune",
-            help="Keep the plain means. By default prototypes are tuned against each other, so that "
-            "a landmark is less often mistaken for another: best from tracks, whose observations "
-            "say which are.",
+            help="Keep plain means. By default prototypes are tuned, so that a landmark is less "
+            "often mistaken for another; best where SCENE is tracks, which have all observations.",
         ),
     ] = False,
     threads: Threads = 0,

@@ -75,6 +75,7 @@ class EncoderCard:
             f"- licence: {self.licence or 'none stated'}",
             f"- trained in {_duration(self.seconds)} on {self.machine}; {self.steps} steps, "
             f"the weights of step {self.best_step} kept",
+            "- codebooks: words of 2 and 3 numbers, learned on the training sequences' prototypes",
             f"- match calibration: fitted to {self.calibrated_on or 'nothing'} "
             "(`protomark calibrate`)",
             "",

@@ -21,6 +21,7 @@ from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.card import EncoderCard, SequencePrecision, describe_data
+from protomark.training.codebooks import with_codebooks
 from protomark.training.data import (
     REPORT_SEEDS,
     TrainingData,
@@ -155,6 +156,7 @@ def train_encoder(
         data=describe_data(data.sources),
         licence=request.licence,
     )
+    encoder = with_codebooks(encoder, data.views, progress)
     encoder, calibrated_on = _calibrated(
         encoder, [*request.training, *request.validation], threads, note
     )
