@@ -57,17 +57,16 @@ def model(
     usable = np.flatnonzero(rest > 0)
     total = int((difference**2).sum(1)[usable].sum())
     temperature = max(total // max(4 * len(usable), 1), 1)
-    numbers = prototypes * 128
+    numbers = prototypes * 16
 
     def own_distance(q: int) -> int:
-        now = queries[q] * 128 - numbers[own[q]]
-        before = difference[q] * 128
+        now = queries[q] * 16 - numbers[own[q]]
         s = 1 / float(rest[q])
-        a, b, c = (float((x * y).sum()) for x, y in ((now, now), (now, before), (before, before)))
-        return int(a + 2 * s * b + s * s * c) >> 14
+        both = float((now * difference[q]).sum()) / 16
+        return int(float((now**2).sum()) / 256 + 2 * s * both + s * s * (difference[q] ** 2).sum())
 
-    for _ in range(6):
-        rounded = np.sign(numbers) * ((2 * abs(numbers) + 128) // 256)
+    for _ in range(3):
+        rounded = np.sign(numbers) * ((2 * abs(numbers) + 16) // 32)
         rivals = {}
         for q in usable:
             distances = ((queries[q] - rounded) ** 2).sum(1)
@@ -75,22 +74,22 @@ def model(
             limit = own_distance(q) + 8 * temperature
             rivals[q] = [r for r in nearest if r != own[q] and distances[r] <= limit]
         usable = np.array([q for q in usable if rivals[q]], dtype=np.int64)
-        for _ in range(2):
+        for _ in range(4):
             sums = np.zeros_like(numbers)
             for q in usable:
-                away = [((queries[q] * 128 - numbers[r]) ** 2).sum() >> 14 for r in rivals[q]]
+                away = [((queries[q] * 16 - numbers[r]) ** 2).sum() >> 8 for r in rivals[q]]
                 distances = [own_distance(q), *map(int, away)]
                 terms = [exponential((d - min(distances)) * 64 // temperature) for d in distances]
                 pushes = [t * 32768 // sum(terms) for t in terms[1:]]
                 for r, push in zip(rivals[q], pushes, strict=True):
-                    sums[r] -= push * (queries[q] * 128 - numbers[r])
-                sums[own[q]] += sum(pushes) * (queries[q] * 128 - numbers[own[q]])
+                    sums[r] -= push * (queries[q] * 16 - numbers[r])
+                sums[own[q]] += sum(pushes) * (queries[q] * 16 - numbers[own[q]])
             step = 0.35 / ((counts + 2.0) * 32768.0)
-            moved = np.clip(numbers + step[:, None] * sums, -127 * 128, 127 * 128)
+            moved = np.clip(numbers + step[:, None] * sums, -127 * 16, 127 * 16)
             numbers = np.where(sums.any(1)[:, None], np.floor(moved + 0.5), numbers).astype(
                 np.int64
             )
-    return np.sign(numbers) * ((2 * abs(numbers) + 128) // 256)
+    return np.sign(numbers) * ((2 * abs(numbers) + 16) // 32)
 
 
 @settings(max_examples=12)

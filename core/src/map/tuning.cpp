@@ -8,7 +8,7 @@ namespace protomark {
 namespace {
 
 // Prototypes move `kPasses` times by the prototypes that were nearest at the begin of a round.
-constexpr int kRounds = 6, kPasses = 2;
+constexpr int kRounds = 3, kPasses = 4;
 constexpr double kStep = 0.35;
 // A prototype may be mistaken for the own one if exp(-d / T) is at least exp(-kReach) of its.
 constexpr int kReach = 8;
@@ -17,8 +17,10 @@ constexpr size_t kNearest = 16, kLists = 16;
 // Without an index, more prototypes get lists, as comparing all with all would take hours.
 constexpr size_t kManyRows = 1 << 16;
 constexpr size_t kPiece = 1 << 14;  // queries that are searched for at a time
-constexpr int kFraction = 7;        // bits of a number behind the point
-constexpr int kUnit = 1 << 15;      // of a probability
+constexpr int kFraction = 4;  // bits of a number behind the point, so that 32 bits hold a distance
+constexpr int kUnit = 1 << 15;  // of a probability
+// The sum of weights up to which their products with codes fit 32 bits.
+constexpr int64_t kPartWeight = (1 << 24) - 1;
 
 // Returns 2^30 exp(-i / 64), equal on every machine.
 const std::vector<uint32_t>& exponentials() {
@@ -211,24 +213,31 @@ class Tuner {
 
   int64_t owner_id(uint32_t rank) const { return tuned_.id(tuned_.owner(rows_[rank])); }
 
+  // Returns the squared distance of a query to a prototype, in units of 4^-kFraction.
+  uint32_t distance(const int8_t* code, const int16_t* prototype) const {
+    uint32_t sum = 0;
+    for (size_t d = 0; d < dim_; ++d) {
+      const int difference = code[d] * (1 << kFraction) - prototype[d];
+      sum += static_cast<uint32_t>(difference * difference);
+    }
+    return sum;
+  }
+
   // Returns the squared distance of a query to its own prototype as if it had not been added: with
   // s = w / (n - w) the difference is query - prototype + s (query - mean).
   int64_t own_distance(size_t q) const {
     const int16_t* prototype = &numbers_[own_[q] * dim_];
     const int8_t* code = queries_.codes.row(q);
     const int8_t* mean = means_.row(own_[q]);
-    int64_t a = 0, b = 0, c = 0;
+    int32_t product = 0;
     for (size_t d = 0; d < dim_; ++d) {
-      const int64_t now = (code[d] << kFraction) - prototype[d];
-      const int64_t before = (code[d] - mean[d]) << kFraction;
-      a += now * now;
-      b += now * before;
-      c += before * before;
+      product += (code[d] * (1 << kFraction) - prototype[d]) * (code[d] - mean[d]);
     }
     const double s = static_cast<double>(queries_.weights[q]) / static_cast<double>(rest(q));
-    const double distance =
-        static_cast<double>(a) + 2 * s * static_cast<double>(b) + s * s * static_cast<double>(c);
-    return static_cast<int64_t>(distance) >> (2 * kFraction);
+    const double now = distance(code, prototype) / double{1 << 2 * kFraction};
+    const double both = product / double{1 << kFraction};
+    const double before = squared_distance(code, mean, dim_);
+    return static_cast<int64_t>(now + 2 * s * both + s * s * before);
   }
 
   // Makes one pass over all queries, then moves all prototypes.
@@ -238,20 +247,34 @@ class Tuner {
     });
     parallel_for(threads_, rows_.size(), 64, [&](size_t begin, size_t end) {
       std::vector<int64_t> sums(dim_);
+      std::vector<int32_t> part(dim_);
       for (size_t rank = begin; rank < end; ++rank) {
         if (first_on_row_[rank] == first_on_row_[rank + 1]) continue;
         std::ranges::fill(sums, 0);
-        int16_t* prototype = &numbers_[rank * dim_];
+        std::ranges::fill(part, 0);
+        int64_t total = 0, in_part = 0;
+        const auto flush = [&] {
+          for (size_t d = 0; d < dim_; ++d) sums[d] += std::exchange(part[d], 0);
+          in_part = 0;
+        };
         for (size_t i = first_on_row_[rank]; i < first_on_row_[rank + 1]; ++i) {
-          const int64_t weight = weights_[on_row_[i]];
-          const int8_t* code = queries_.codes.row(contested_[forces_[on_row_[i]].query]);
-          for (size_t d = 0; d < dim_; ++d) {
-            sums[d] += weight * ((code[d] << kFraction) - prototype[d]);
+          const int32_t weight = weights_[on_row_[i]];
+          if (weight == 0) continue;
+          total += weight;
+          in_part += std::abs(weight);
+          if (in_part > kPartWeight) {
+            flush();
+            in_part = std::abs(weight);
           }
+          const int8_t* code = queries_.codes.row(contested_[forces_[on_row_[i]].query]);
+          for (size_t d = 0; d < dim_; ++d) part[d] += weight * code[d];
         }
+        flush();
+        int16_t* prototype = &numbers_[rank * dim_];
         const double step = kStep / (static_cast<double>(counts_[rank] + 2) * kUnit);
         for (size_t d = 0; d < dim_; ++d) {
-          const double moved = prototype[d] + step * static_cast<double>(sums[d]);
+          const int64_t sum = sums[d] * (1 << kFraction) - total * prototype[d];
+          const double moved = prototype[d] + step * static_cast<double>(sum);
           const double limit = 127 << kFraction;
           prototype[d] = static_cast<int16_t>(std::floor(std::clamp(moved, -limit, limit) + 0.5));
         }
@@ -266,13 +289,7 @@ class Tuner {
     distances[0] = own_distance(q);
     const int8_t* code = queries_.codes.row(q);
     for (size_t f = first + 1; f < end; ++f) {
-      const int16_t* prototype = &numbers_[forces_[f].rank * dim_];
-      int64_t sum = 0;
-      for (size_t d = 0; d < dim_; ++d) {
-        const int64_t difference = (code[d] << kFraction) - prototype[d];
-        sum += difference * difference;
-      }
-      distances[f - first] = sum >> (2 * kFraction);
+      distances[f - first] = distance(code, &numbers_[forces_[f].rank * dim_]) >> (2 * kFraction);
     }
     const size_t n = end - first;
     const int64_t nearest = *std::min_element(distances.begin(), distances.begin() + n);
