@@ -353,6 +353,32 @@ def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     np.testing.assert_array_equal(joined.prototypes(np.arange(10, 20)), scene.prototypes(scene.ids))
 
 
+def test_maps_of_other_scenes_or_worlds_are_not_merged(encoder: pm.Encoder, tmp_path: Path) -> None:
+    first, again, moved, other = (tmp_path / f"{name}.pmk" for name in "abcd")
+    ids = np.arange(60)
+    descriptors, positions = random_descriptors(60), np.random.default_rng(0).normal(size=(60, 3))
+    noisy = descriptors ^ (np.random.default_rng(1).random(descriptors.shape) < 0.1)
+    for file, seen, at in (
+        (first, descriptors, positions),
+        (again, noisy, positions + 0.01),
+        (moved, noisy, 2 * positions),
+        (other, descriptors[::-1], positions),
+    ):
+        scene = pm.PrototypeMap(encoder)
+        scene.add(ids, np.ascontiguousarray(seen))
+        scene.set_positions(ids, at)
+        scene.save(file)
+    output = tmp_path / "merged.pmk"
+    for file, message in ((other, "60 ids are in an earlier map, too"), (moved, "lie elsewhere")):
+        done = protomark("merge", first, file, "-o", output)
+        assert (done.returncode, output.exists()) == (1, False)
+        assert f"{file}: " in done.stderr
+        assert message in done.stderr
+        assert protomark("merge", first, file, "-o", output, "--renumber").returncode == 0
+        output.unlink()
+    assert "60 of them in an earlier map" in protomark("merge", first, again, "-o", output).stdout
+
+
 def test_a_folder_of_map_is_a_map(encoder: pm.Encoder, tmp_path: Path) -> None:
     folder, empty = tmp_path / "kitchen", tmp_path / "empty"
     folder.mkdir(), empty.mkdir()
