@@ -25,7 +25,7 @@ from protomark.evaluation.frames import QueryFrame, scene_depth
 from protomark.evaluation.protocol import split
 from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose import camera_centers, pose_error
-from protomark.geometry.pose_files import read_poses
+from protomark.geometry.pose_files import images_txt, read_poses
 from protomark.localization import Localization, Localizer, PosePrior
 from protomark.localization.batch import LocalizationRequest, localize_files
 from protomark.maps.build import build_map
@@ -408,6 +408,17 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
         assert done.exit_code == 0, done.output + str(done.exception)
         facts = json.loads((query / "f.json").read_text())
         assert facts["recall"][0]["recall"] == 1
+
+
+def test_true_poses_of_another_world_are_named(query: Path) -> None:
+    request = (query / "scene.pmk", query / "images", "-o", query / "out", "--poses")
+    aside = NEW_POSES.copy()
+    aside[:, :, 3] -= aside[:, :, :3] @ np.array([10.0, 0, 0])
+    for given, told in ((NEW_POSES, False), (aside, True)):
+        named = {f"{i}.png": pose for i, pose in enumerate(given, 1)}
+        (query / "poses.txt").write_text(images_txt(named, dict.fromkeys(named, 1)))
+        done = run(*request, query / "poses.txt")
+        assert ("in the map's world" in done.output) == told
 
 
 def test_geographic_coordinates(query: Path, scene: pm.PrototypeMap) -> None:

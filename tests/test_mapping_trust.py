@@ -300,6 +300,27 @@ def test_poses_that_do_not_fit_the_images(wrong: str, tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
+def test_poses_of_another_world_do_not_extend_a_map(tmp_path: Path) -> None:
+    poses = walk(2 * COUNT)
+    images = write_images(tmp_path / "images", poses[:COUNT])
+    more = write_images(tmp_path / "more", poses[COUNT:])
+    given = images_txt(poses[:COUNT], tmp_path / "given.txt")
+    scene = tmp_path / "scene"
+    made = run(images, "-o", scene, "--camera", CAMERA, "--poses", given, "-d", "orb")
+    assert made.returncode == 0, made.stderr
+    before = (scene / "scene.pmk").read_bytes()
+    # The same walk, ten metres aside: only the map can tell.
+    aside = poses[COUNT:].copy()
+    aside[:, :, 3] -= aside[:, :, :3] @ np.array([10.0, 0, 0])
+    extend = (more, "--into", scene, "--poses")
+    fails(run(*extend, images_txt(aside, tmp_path / "aside.txt")), "not in its world", "scale")
+    shuffled = images_txt(poses[COUNT:], tmp_path / "shuffled.txt", [*range(COUNT)][::-1])
+    fails(run(*extend, shuffled), "do not fit the images", "under its own name")
+    assert (scene / "scene.pmk").read_bytes() == before
+    done = run(*extend, images_txt(poses[COUNT:], tmp_path / "right.txt"))
+    assert f"{2 * COUNT} of {2 * COUNT} frames registered" in done.stdout, done.stderr
+
+
 def test_poses_that_put_landmarks_behind_the_cameras_do_not_fit() -> None:
     """Epipolar lines alone do not tell a translation from the opposite one."""
     rng = np.random.default_rng(0)

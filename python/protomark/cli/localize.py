@@ -119,7 +119,7 @@ def localize(
 
 
 def _show(batch: LocalizationBatch, output: Path) -> None:
-    from protomark.cli.terminal import console, print_facts, printable
+    from protomark.cli.terminal import console, note, print_facts, printable
     from protomark.localization.batch import CAMERAS, POSES, TABLE, TRAJECTORY
 
     facts = batch.summary()
@@ -146,6 +146,8 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         text = f"{facts['median_position_error']:.4g}, {facts['median_angle_error']:.3g} degrees"
         rows.append(("median error of localized", text))
     print_facts(rows)
+    if sentence := batch.contradiction():
+        note(f"warning: {sentence}")
     failed = [f"{image.name}: {image.error}" for image in batch.images if image.error]
     if len(failed) > 5:
         failed[5:] = [f"... and {len(failed) - 5} more, in {output / TABLE}"]

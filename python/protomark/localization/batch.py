@@ -39,6 +39,9 @@ TRAJECTORY = "trajectory.txt"
 _HEADER = "image,accepted,confidence,inliers,matches"
 # Distances in world units (metres if the map is metric) and angles in degrees, as in hloc.
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+# True poses are of another world if most believed ones are off by more degrees, or by a larger
+# share of their extent.
+_OTHER_DEGREES, _OTHER_SHARE, _MIN_JUDGED = 10.0, 0.25, 3
 STAGES = ("features", "encode", "search", "pose", "total")
 
 
@@ -73,8 +76,15 @@ class ImageResult:
     # Its localization, None if the image cannot be read or has no camera.
     found: Localization | None
     error: str = ""  # what is wrong with the image, else ""
-    # Distance and degrees from the true pose, infinite without a pose; None without a true pose.
-    true_error: tuple[float, float] | None = None
+    true_pose: NDArray[np.float64] | None = None  # (3, 4) cam_from_world, if it is known
+
+    @property
+    def true_error(self) -> tuple[float, float] | None:
+        """Distance and degrees from the true pose, infinite without one; None if that is unknown."""
+        if self.true_pose is None:
+            return None
+        pose = self.found.cam_from_world if self.found else None
+        return (np.inf, np.inf) if pose is None else pose_error(pose, self.true_pose)
 
     @property
     def confidence(self) -> float:
@@ -130,6 +140,21 @@ class LocalizationBatch:
             {"distance": d, "degrees": a, "recall": float((errors <= (d, a)).all(1).mean())}
             for d, a in (THRESHOLDS if len(errors) else ())
         ]
+
+    def contradiction(self) -> str:
+        """A sentence if most believed poses are far from the true ones, else ""."""
+        judged = [i for i in self.images if self.accepted(i) and i.true_pose is not None]
+        if len(judged) < _MIN_JUDGED:
+            return ""
+        distance, degrees = np.median([i.true_error for i in judged], axis=0)
+        centers = camera_centers(np.array([i.true_pose for i in judged]))
+        extent = np.linalg.norm(np.ptp(centers, axis=0))
+        if degrees <= _OTHER_DEGREES and distance <= _OTHER_SHARE * extent:
+            return ""
+        return (
+            "the true poses are far from most poses that are believed: are they in the map's world "
+            "(origin, axes, scale), as cam_from_world, and under the names of these images?"
+        )
 
     def summary(self) -> dict[str, Any]:
         """Figures over all images."""
@@ -342,7 +367,6 @@ def _localize_file(
 ) -> ImageResult:
     camera: Camera | None
     focal_length: FocalLength = "rough" if request.refine_focal_length else "known"
-    lost = None if true_pose is None else (np.inf, np.inf)
     try:
         image = read_gray(path)
         height, width = image.shape
@@ -354,7 +378,5 @@ def _localize_file(
             camera = cameras.find(name, width, height)
         found = localizer.localize(image, camera or ESTIMATE, prior, focal_length=focal_length)
     except (OSError, ValueError) as error:
-        return ImageResult(name, None, str(error), lost)
-    if true_pose is None or found.cam_from_world is None:
-        return ImageResult(name, found, true_error=lost)
-    return ImageResult(name, found, true_error=pose_error(found.cam_from_world, true_pose))
+        return ImageResult(name, None, str(error), true_pose)
+    return ImageResult(name, found, "", true_pose)

@@ -317,11 +317,15 @@ class Mapper:
         record.inliers = len(frame.seen)
 
     def _register_given_pose(self, frame: Frame, pose: Array) -> None:
-        """Register a frame whose pose is given."""
-        matches = LandmarkMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        """Register a frame whose pose is given, unless the map contradicts that."""
+        matches, o = LandmarkMatches(np.zeros(0, np.int64), np.zeros(0, np.int64)), self.options
         if len(self.structure.ids):
             with self.clock.stage("match"):
-                matches = self.tracker.match_projected(frame, pose, 1.5 * self.options.max_error)
+                matches = self.tracker.match_projected(frame, pose, 1.5 * o.max_error)
+                few = len(matches) < o.min_inliers
+                if few and trust.taken_elsewhere(self.tracker, frame, pose):
+                    self.history.records[frame.name].outcome = trust.ELSEWHERE
+                    return
         self._insert_frame(frame, TrackedPose(pose, matches))
 
     # Initialisation.

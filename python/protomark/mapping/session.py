@@ -33,7 +33,7 @@ from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
 from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open_source
 from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
 from protomark.mapping.survey import Survey, survey
-from protomark.mapping.trust import no_map
+from protomark.mapping.trust import are_elsewhere, no_map
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread, read_ahead
 
@@ -76,9 +76,11 @@ def _make_map(
             )
         except KeyboardInterrupt:
             raise Interrupted(f"stopped before the last adjustment of the map: {resume}") from None
-        if not len(mapper.structure.ids) or len(mapper.structure.frames) <= session.known:
+        known = session.known
+        elsewhere = known > 0 and are_elsewhere(mapper, source)
+        if not len(mapper.structure.ids) or len(mapper.structure.frames) <= known or elsewhere:
             shutil.rmtree(checkpoint, ignore_errors=True)
-            raise ValueError(no_map(mapper, source, session.known))
+            raise ValueError(no_map(mapper, source, known))
     progress("write", 0, 0)
     if request.extend:
         back_up(request.output)
@@ -159,15 +161,18 @@ class _Session:
                 "refined while mapping (--camera gives a calibrated one)"
             )
         else:
-            pixel = pixel_size((camera.width, camera.height), options.max_size)
-            if sentence := misfit(surveyed.pose_errors(camera, pixel)):
-                raise ValueError(f"{request.poses}: {sentence}")
+            self._check_poses(surveyed, camera, options)
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
         if self.mapper.calibration is not None:
             self.mapper.calibration.given = origin in (GIVEN, EXIF)
         self._prepare(surveyed, "", {})
+
+    def _check_poses(self, surveyed: Survey, camera: Camera, options: MappingOptions) -> None:
+        pixel = pixel_size((camera.width, camera.height), options.max_size)
+        if sentence := misfit(surveyed.pose_errors(camera, pixel)):
+            raise ValueError(f"{self.request.poses}: {sentence}")
 
     def _guess_camera(self, surveyed: Survey) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length."""
@@ -202,7 +207,9 @@ class _Session:
         inputs: dict[str, str] = facts.get("inputs", {})
         prefix = _prefix(self.mapper, self.source, inputs)
         self.known = len(self.mapper.structure.frames)
-        self._prepare(self._survey(self.mapper.options), prefix, inputs)
+        surveyed = self._survey(self.mapper.options)
+        self._check_poses(surveyed, self.mapper.camera, self.mapper.options)
+        self._prepare(surveyed, prefix, inputs)
         self.source.follow(self.mapper.structure, self.mapper.history.records)
 
     def _reordered(self, source: ImageFolder, options: MappingOptions, surveyed: Survey) -> Survey:

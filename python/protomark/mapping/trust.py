@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protomark.geometry.absolute_pose import free_lens, pose_covariance
+from protomark.geometry.absolute_pose import free_lens, pose_covariance, reprojection_error
 from protomark.geometry.neighbours import runs
 from protomark.geometry.pose import camera_centers, transform
 from protomark.mapping.adjustment import free_focal_lengths
@@ -18,7 +18,7 @@ from protomark.mapping.history import REGISTERED
 from protomark.mapping.initialisation import MIN_PARALLAX
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.structure import Structure
-from protomark.mapping.tracking import LandmarkMatches
+from protomark.mapping.tracking import LandmarkMatches, Tracker
 
 if TYPE_CHECKING:
     from protomark.mapping.mapper import Mapper
@@ -42,6 +42,10 @@ _MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
 # A frame is of another lens if a focal length fits better that is this share longer or shorter, and
 # so many standard deviations.
 _MAX_STRETCH, _STRETCH_SIGMAS = 0.025, 3.0
+# A given pose is wrong if it is this share of the longer side off in the image (median). A map is
+# not extended if that share of the new frames contradict their given poses.
+_MAX_OFFSET = 0.05
+_MAX_ELSEWHERE = 0.1
 # Maps with a smaller share of their frames are of something else than their input.
 _MIN_REGISTERED = 0.5
 
@@ -49,6 +53,7 @@ NOT_FOUND = "not found in the map: too few matches agree on a pose"
 UNCERTAIN = "its pose is uncertain: what it sees has too little depth, or lies too close together"
 THROWN = "it was thrown far away from its neighbours"
 WAITING = "before the first pair of frames with enough parallax"
+ELSEWHERE = "the map shows that it was taken elsewhere than its given pose says"
 TOO_FEW = "too few landmarks are left that it observes"
 
 
@@ -61,6 +66,24 @@ def is_uncertain(structure: Structure, frame: Frame, pose: Array, matches: Landm
         return True
     depth = float(np.median(np.abs(transform(pose, positions)[:, 2])))
     return bool(np.sqrt(np.trace(covariance[3:, 3:])) > _MAX_DEVIATION * depth)
+
+
+def taken_elsewhere(tracker: Tracker, frame: Frame, pose: Array) -> bool:
+    """Whether a frame is found in the map, but far from its given pose."""
+    found = tracker.relocalize(frame)
+    if found is None:
+        return False
+    rows, ids = found.matches.rows, found.matches.ids
+    camera = tracker.structure.cameras[frame.camera_id]
+    pixels = frame.keypoints[rows].astype(np.float64)
+    off = reprojection_error(pose, pixels, tracker.structure.positions[ids], camera)
+    return bool(np.median(off) > tracker.structure.tolerance(frame.camera_id, _MAX_OFFSET))
+
+
+def are_elsewhere(mapper: Mapper, source: FrameSource) -> bool:
+    """Whether the map contradicts the given poses of too many of its new frames."""
+    records = [r for r in mapper.history.records.values() if r.index >= source.first_index]
+    return sum(r.outcome == ELSEWHERE for r in records) > _MAX_ELSEWHERE * len(records)
 
 
 def untrusted_frames(structure: Structure) -> dict[int, str]:
@@ -232,6 +255,11 @@ def no_map(mapper: Mapper, source: FrameSource, known: int = 0) -> str:
     """Why there is no map, or why a map with `known` frames was not extended."""
     records = [r for r in mapper.history.records.values() if r.outcome != REGISTERED]
     common = Counter(r.outcome for r in records).most_common(1)
+    if known and are_elsewhere(mapper, source):
+        return (
+            f"{source.path}: the map stays as it was, as these poses are not in its world: "
+            "--poses must have its origin, axes and scale"
+        )
     if known:
         return (
             f"{source.path}: none of its frames fits the map, which stays as it was: "
