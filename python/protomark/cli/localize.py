@@ -20,7 +20,9 @@ def localize(
             metavar="MAP", help="Map file (.pmk) with positions, or a folder of `protomark map`."
         ),
     ],
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders.")],
+    images: Annotated[
+        list[Path], typer.Argument(metavar="IMAGES", help="Images, folders, videos.")
+    ],
     output: Annotated[
         Path,
         typer.Option(
@@ -68,6 +70,7 @@ def localize(
             help="Smallest probability of a pose in images.txt; poses.csv lists every image.",
         ),
     ] = 0.9,
+    every: Annotated[int, typer.Option(help="Take every n-th image or frame only.")] = 1,
     max_keypoints: MaxKeypoints = 2000,
     max_size: MaxSize = 1600,
     recall: Annotated[
@@ -98,6 +101,7 @@ def localize(
     request = LocalizationRequest(
         scene,
         images,
+        every=every,
         camera=camera,
         refine_focal_length=refine_focal_length,
         true_poses=poses,

@@ -9,12 +9,11 @@ from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from protomark.extras import optional
-from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray, to_gray
+from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray
+from protomark.features.video import check_video, video_frames
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif
 from protomark.geometry.pose_files import PoseSet, image_times
@@ -245,14 +244,7 @@ class Video(FrameSource):
     def __init__(self, path: Path, every: int = 1) -> None:
         super().__init__(path)
         self._every = every
-        cv2, video = optional("cv2"), _open_video(path)
-        count, rate = (float(video.get(p)) for p in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-        decodes = video.grab()
-        video.release()
-        if not decodes:
-            raise ValueError(f"{path}: no frame of this video decodes, convert it with ffmpeg")
-        self._rate = rate if np.isfinite(rate) and rate > 0 else 30.0
-        self._count = max(1, -(-int(max(count, 1)) // every))
+        self._count = -(-check_video(path) // every)
 
     def __len__(self) -> int:
         return self._count
@@ -281,29 +273,14 @@ class Video(FrameSource):
         chunk: set[int] | None = None,
         decode: bool = True,
     ) -> Iterator[InputImage]:
-        video, position = _open_video(self.path), optional("cv2").CAP_PROP_POS_MSEC
-        try:
-            number, time = -1, -1 / self._rate
-            while video.grab():
-                number += 1
-                # Frames need not follow each other at one rate; not every decoder knows when.
-                shown = video.get(position) / 1000
-                time = shown if shown > time else time + 1 / self._rate
-                index, rest = divmod(number, self._every)
-                name = f"{self.path.stem}-{number:06d}"
-                if rest or index < start or (only is not None and name not in only):
-                    continue
-                if chunk is not None and index not in chunk:
-                    continue
-                if not decode:
-                    yield InputImage(index, name, time, None)
-                    continue
-                decoded, image = video.retrieve()
-                gray = to_gray(np.asarray(image)) if decoded else None
-                problem = "" if decoded else "this frame does not decode"
-                yield InputImage(index, name, time, gray, problem=problem)
-        finally:
-            video.release()
+        for index, (name, time, read) in enumerate(video_frames(self.path, self._every)):
+            if index < start or (only is not None and name not in only):
+                continue
+            if chunk is not None and index not in chunk:
+                continue
+            image = read() if decode else None
+            problem = "this frame does not decode" if decode and image is None else ""
+            yield InputImage(index, name, time, image, problem=problem)
 
 
 def open_source(path: Path, every: int = 1) -> FrameSource:
@@ -327,20 +304,3 @@ def _is_same(one: Camera, other: Camera) -> bool:
         return False
     off = np.abs(np.subtract(one.params, other.params)).max()
     return bool(off <= _SAME_CAMERA * one.params[0])
-
-
-def _open_video(path: Path) -> Any:
-    cv2 = optional("cv2")
-    # OpenCV and FFmpeg would print their own view of a broken file.
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
-    try:
-        video = cv2.VideoCapture(str(path))
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if not video.isOpened():
-        raise ValueError(
-            f"{path}: not a video that OpenCV can decode; convert it, for example with "
-            "ffmpeg -i IN -c:v libx264 OUT.mp4, or give a folder of images"
-        )
-    return video
