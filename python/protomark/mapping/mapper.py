@@ -151,7 +151,7 @@ class Mapper:
             record.outcome = image.problem
             return None
         height, width = image.image.shape
-        camera_id = self._camera_id(image.camera)
+        camera_id = self.id_of_camera(image.camera)
         camera = self.structure.cameras[camera_id]
         if (width, height) != (camera.width, camera.height):
             record.outcome = (
@@ -183,7 +183,7 @@ class Mapper:
             turns=turns,
         )
 
-    def _camera_id(self, camera: Camera | None) -> int:
+    def id_of_camera(self, camera: Camera | None) -> int:
         """The id of a camera, a new one if no frame had it; None: that of the next frames."""
         cameras = self.structure.cameras
         if camera is None:

@@ -28,6 +28,7 @@ from protomark.mapping.request import (
     check_same_options,
     check_same_request,
     request_facts,
+    same_camera,
 )
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
 from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open_source
@@ -201,8 +202,12 @@ class _Session:
 
     def _extend(self) -> None:
         request = self.request
-        self.mapper, facts = load_state(request.output, request.threads, self._camera())
+        self.mapper, facts = load_state(request.output, request.threads)
         check_same_options(request, self.mapper.options)
+        camera = self._camera()
+        if camera is not None and not self.source.cameras:
+            camera = same_camera(request, self.mapper.structure.cameras.values(), camera)
+        self.mapper.camera_id = self.mapper.id_of_camera(camera)
         self._read_poses()
         inputs: dict[str, str] = facts.get("inputs", {})
         prefix = _prefix(self.mapper, self.source, inputs)
@@ -211,6 +216,12 @@ class _Session:
         self._check_poses(surveyed, self.mapper.camera, self.mapper.options)
         self._prepare(surveyed, prefix, inputs)
         self.source.follow(self.mapper.structure, self.mapper.history.records)
+        if shift := self.source.time_shift:
+            told = (
+                f"the map has frames of these times: those of {self.source.path.name} are shifted"
+            )
+            self.mapper.history.events.append(f"{told} by {shift:g}")
+            self.note(self.mapper.history.events[-1])
 
     def _reordered(self, source: ImageFolder, options: MappingOptions, surveyed: Survey) -> Survey:
         """What the first frames show in the order in which they match, if that is another one."""

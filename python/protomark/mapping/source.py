@@ -78,15 +78,22 @@ class FrameSource(ABC):
         self.first_index, self.time_shift = first_index, time_shift
 
     def follow(self, structure: Structure, records: Collection[str]) -> None:
-        """Number the frames after those of a map, and shift their times if these overlap.
+        """Number the frames after those of a map, and shift their times if these would mix.
 
-        Frames whose names are among the records are not new.
+        Frames whose names are among the records are not new. Times of one clock may mix, unless one
+        is taken: those of one folder, and seconds in names.
         """
         first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
-        old = [f.time for f in structure.frames]
-        new = [time for name, time in self.listing() if self.prefix + name not in records]
+        times = {self.prefix + name: time for name, time in self.listing()}
+        new = [time for name, time in times.items() if name not in records]
+        old = [frame.time for frame in structure.frames]
         overlap = bool(old and new) and min(new) <= max(old) and min(old) <= max(new)
-        self.shift(first, math.ceil(1 + max(old) - min(new)) if overlap else 0.0)
+        seconds = isinstance(self, ImageFolder) and self.timed
+        one_clock = all(
+            f.name in times or (seconds and f.time == _seconds(f.name)) for f in structure.frames
+        )
+        mixing = overlap and not (one_clock and set(new).isdisjoint(old))
+        self.shift(first, math.ceil(1 + max(old) - min(new)) if mixing else 0.0)
 
     def images(
         self, start: int = 0, only: set[str] | None = None, backward: bool = False
@@ -297,6 +304,11 @@ def open_source(path: Path, every: int = 1) -> FrameSource:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such folder of images or video file")
     return Video(path, every)
+
+
+def _seconds(name: str) -> float | None:
+    times, timed = image_times([name])
+    return times[0] if timed else None
 
 
 def _is_same(one: Camera, other: Camera) -> bool:
