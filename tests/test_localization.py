@@ -410,6 +410,15 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
         assert facts["recall"][0]["recall"] == 1
 
 
+def test_a_warning_of_a_command_is_one_sentence(query: Path) -> None:
+    request = (query / "scene.pmk", query / "images", "-o", query / "out", "--threads", 2)
+    done = run_command(*request, "--camera", "PINHOLE:300,300,80,60", command="localize")
+    assert done.stderr == (
+        "warning: camera PINHOLE 320 240 300 300 80 60: its principal point is far from the middle "
+        "of the image: was it calibrated at 160 x 120 pixels?\n"
+    )
+
+
 def test_a_video_is_localized_frame_by_frame(query: Path, images: list[NDArray[np.uint8]]) -> None:
     film = query / "walk.avi"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
