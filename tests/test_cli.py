@@ -7,11 +7,13 @@ import os
 import re
 import subprocess
 import sys
+from importlib.metadata import requires
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 from rich.console import Console
 
 import protomark as pm
@@ -62,6 +64,14 @@ def test_help_lists_the_commands() -> None:
         assert command in done.stdout
         assert protomark(command, "--help").returncode == 0
     assert protomark("--version").stdout.strip() == f"protomark {pm.__version__}"
+
+
+def test_releases_of_typer_that_fail_are_excluded() -> None:
+    """With 0.12 every command fails, with 0.13 to 0.15 and click 8.2 every --help."""
+    bounds = [Requirement(text) for text in requires("protomark") or []]
+    [typer] = [bound.specifier for bound in bounds if bound.name == "typer"]
+    assert not [*typer.filter(["0.12.0", "0.12.5", "0.13.0", "0.15.0", "0.15.4"])]
+    assert "0.16.0" in typer
 
 
 def test_other_distributions_add_commands(tmp_path: Path) -> None:
