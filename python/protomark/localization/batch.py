@@ -32,6 +32,7 @@ from protomark.geometry.pose_files import (
 from protomark.interrupt import deferred_interrupt
 from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
+from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import Localization
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import map_ahead
@@ -322,14 +323,21 @@ def localize_files(
             stopped = interrupted() and len(results) < len(queries)
     except BaseException:
         if any(result.found for result in results):
+            results[:] = _with_shared_cameras(results)
             batch.write(output)
         raise
     if all(result.found is None for result in results):
         raise ValueError(
             f"none of {len(results)} images is usable; {results[0].name}: {results[0].error}"
         )
+    results[:] = _with_shared_cameras(results)
     batch.write(output)
     return replace(batch, interrupted=stopped)
+
+
+def _with_shared_cameras(results: Sequence[ImageResult]) -> list[ImageResult]:
+    checked = iter(check_shared_cameras([result.found for result in results if result.found]))
+    return [replace(r, found=next(checked)) if r.found else r for r in results]
 
 
 @dataclass(frozen=True)
