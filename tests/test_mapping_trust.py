@@ -12,6 +12,7 @@ import pytest
 
 from mapping_scene import interrupted_at, show, turn_and_approach, walk, write_images
 from protomark.features.static_regions import describe, outside, read_mask, static_regions
+from protomark.geometry.absolute_pose import FreeLens
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.colmap import read_model
@@ -23,6 +24,7 @@ from protomark.geometry.pose import (
     transform,
 )
 from protomark.localization import Localizer
+from protomark.mapping import trust
 from protomark.mapping.frame import Frame, InputImage
 from protomark.mapping.initialisation import Initialiser
 from protomark.mapping.mapper import Mapper
@@ -461,3 +463,19 @@ def test_a_zoomed_frame_is_named() -> None:
         mapper.add(InputImage(i, f"{i}.png", float(i), show(pose, camera)))
     mapper.finish()
     assert other_lenses(mapper.structure, mapper.options.max_error) == ["14.png"]
+
+
+def test_frames_that_leave_the_focal_length_open_are_of_no_other_lens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From above, a flat scene moves the focal length by more than its landmarks' noise says."""
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=500), PINHOLE)
+    for i, pose in enumerate(turn_and_approach(16)):
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose)))
+    mapper.finish()
+    stretches = iter(np.exp([*np.linspace(-0.05, 0.05, 15), 0.3]))
+    monkeypatch.setattr(
+        trust, "free_lens", lambda pose, *_: FreeLens(pose, 0.0, 0.01, next(stretches), 0.01)
+    )
+    names = [frame.name for frame in mapper.structure.frames]
+    assert other_lenses(mapper.structure, mapper.options.max_error) == names[-1:]

@@ -39,9 +39,9 @@ _MAX_NAMED = 3
 # A given camera is wrong if another focal length fits better that is this share of it away, and so
 # many standard deviations.
 _MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
-# A frame is of another lens if a focal length fits better that is this share longer or shorter, and
-# so many standard deviations.
-_MAX_STRETCH, _STRETCH_SIGMAS = 0.025, 3.0
+# A frame is of another lens if it fits a focal length that is this share longer or shorter than
+# most frames fit, and so many standard deviations: its own, and that of most frames.
+_MAX_STRETCH, _STRETCH_SIGMAS, _MOST_SIGMAS = 0.04, 3.0, 3.5
 # A given pose is wrong if it is this share of the longer side off in the image (median). A map is
 # not extended if that share of the new frames contradict their given poses.
 _MAX_OFFSET = 0.05
@@ -188,8 +188,8 @@ def wrong_focal_lengths(structure: Structure) -> list[str]:
 
 
 def other_lenses(structure: Structure, max_error: float) -> list[str]:
-    """Names of frames that fit better with another focal length: a zoom, another camera."""
-    names = []
+    """Names of frames that fit another focal length than most: a zoom, another camera."""
+    found: dict[int, list[tuple[str, float, float]]] = {}
     for frame in structure.frames:
         camera, rows = structure.cameras[frame.camera_id], frame.observed
         if camera.wide or len(rows) < _MIN_LANDMARKS:
@@ -198,11 +198,31 @@ def other_lenses(structure: Structure, max_error: float) -> list[str]:
         pixels = frame.keypoints[rows].astype(np.float64)
         tolerance = structure.tolerance(frame.camera_id, max_error)
         free = free_lens(frame.pose, pixels, positions, camera, tolerance)
-        depth = float(np.median(transform(frame.pose, positions)[:, 2]))
-        # What leaves the camera's centre open along the view leaves the focal length as open.
-        if abs(free.stretch - 1) > max(_MAX_STRETCH, _STRETCH_SIGMAS * free.spread / depth):
-            names.append(frame.name)
+        one = frame.name, float(np.log(free.stretch)), free.deviation
+        found.setdefault(frame.camera_id, []).append(one)
+    names: list[str] = []
+    for frames in found.values():
+        middle, spread = _shortest_half([stretch for _, stretch, _ in frames])
+        limit = max(_MAX_STRETCH, _MOST_SIGMAS * spread)
+        names += [
+            name
+            for name, stretch, deviation in frames
+            if abs(stretch - middle) > max(limit, _STRETCH_SIGMAS * deviation)
+        ]
     return names
+
+
+def _shortest_half(values: Sequence[float]) -> tuple[float, float]:
+    """Median and standard deviation of most values, by the shortest interval with half of them.
+
+    Rousseeuw and Leroy, A Robust Scale Estimator Based on the Shortest Half, 1988.
+    """
+    ordered = np.sort(values)
+    half = len(ordered) // 2 + 1
+    lengths = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
+    first = int(np.argmin(lengths))
+    # Half of all normal numbers lie within 0.67 standard deviations.
+    return float(np.median(ordered[first : first + half])), float(lengths[first] / (2 * 0.6745))
 
 
 def warnings(mapper: Mapper) -> list[str]:
