@@ -101,11 +101,11 @@ def _encoder_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _track_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    from protomark.report import track_rows
+
     yield "descriptor", f"{facts['descriptor']}, {facts['bits']} bits"
     yield "keypoints", f"{facts['keypoints']:,} in {facts['keyframes']:,} keyframes"
-    yield "landmarks", f"{facts['landmarks']:,}"
-    each = facts["observations_per_landmark"]
-    yield "observations", f"{facts['observations']:,} ({each:.1f} per landmark)"
+    yield from track_rows(facts)
     yield "bytes", f"{facts['bytes']:,}"
 
 

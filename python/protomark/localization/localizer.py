@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -87,7 +86,6 @@ class Localizer:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
         self.calibration = self.scene.encoder.match_calibration(self.scene.dim)
-        self._extractors = threading.local()
 
     def localize(
         self,
@@ -254,7 +252,8 @@ class Localizer:
         positions[found] = self.scene.positions(ids[found])
         return positions
 
-    def _extract(self, image: NDArray[np.uint8]) -> Features:
+    @cached_property
+    def _extractor(self) -> Extractor:
         descriptor = self.scene.encoder.descriptor
         plain = descriptor.removesuffix(SUFFIX)
         if plain not in DESCRIPTORS:
@@ -262,11 +261,11 @@ class Localizer:
                 f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
                 "compute: describe the keypoints yourself and call localize_features"
             )
-        # OpenCV's detectors are not safe to share between threads.
-        if not hasattr(self._extractors, "of_thread"):
-            self._extractors.of_thread = Extractor(plain, self.max_keypoints, self.max_size)
-        features: Features = self._extractors.of_thread(image)
-        if descriptor.endswith(SUFFIX):
+        return Extractor(plain, self.max_keypoints, self.max_size)
+
+    def _extract(self, image: NDArray[np.uint8]) -> Features:
+        features = self._extractor(image)
+        if self.scene.encoder.descriptor.endswith(SUFFIX):
             features.descriptors = upright_descriptors(
                 features.descriptors, features.angles, features.sizes
             )

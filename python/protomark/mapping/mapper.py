@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 import protomark as pm
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import Features
 from protomark.features.static_regions import Mask, outside
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
@@ -71,7 +71,7 @@ class Mapper:
         # Features that are known already, and the part of the image that is left out.
         self.features: dict[str, Features] = {}
         self.mask: Mask | None = None
-        self._extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
+        self.extractor = options.extractor()
         self._reset_initialiser()
 
     @property
@@ -95,7 +95,7 @@ class Mapper:
     @property
     def descriptor_bytes(self) -> int:
         """Bytes of a descriptor."""
-        return self._extractor.kind.bytes
+        return self.extractor.kind.bytes
 
     # The paper's Section 3: detect, track or relocalize, observe, and extend the map by keyframes.
 
@@ -160,7 +160,7 @@ class Mapper:
             return None
         with self.clock.stage("detect"):
             features = image.features or self.features.get(image.name)
-            features = features or self._extractor(image.image)
+            features = features or self.extractor(image.image)
             if self.mask is not None and self.mask.shape == image.image.shape:
                 features = features.where(outside(self.mask, features.keypoints))
         record.keypoints = len(features)

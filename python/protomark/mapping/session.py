@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from protomark.features.extractor import Extractor, Features, pixel_size
+from protomark.features.extractor import Features, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
 from protomark.files import only_writer
 from protomark.geometry.camera import Camera
@@ -117,7 +117,6 @@ class _Session:
         self.progress, self.note = progress, note
         self.cursor = self.known = 0
         self._order: list[str] = []  # names of photos that had none
-        self._ahead: Extractor | None = None  # of the thread that reads ahead
         self.facts: dict[str, Any] = {}
         if request.resume:
             self._resume()
@@ -225,10 +224,9 @@ class _Session:
 
     def _reordered(self, source: ImageFolder, options: MappingOptions, surveyed: Survey) -> Survey:
         """What the first frames show in the order in which they match, if that is another one."""
-        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         known = surveyed.features
         images, count = source.images(), len(source)
-        self._order = matching_order(images, count, extractor, known, self.progress)
+        self._order = matching_order(images, count, options.extractor(), known, self.progress)
         if not self._order:
             return surveyed
         self.note("the photos are in no order: each is mapped after one that it matches")
@@ -240,8 +238,7 @@ class _Session:
         self.progress("look at the first frames", 0, 0)
         started = time.perf_counter()
         size = self.source.size()
-        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
-        surveyed = survey(self.source.images(), extractor, size, known or {})
+        surveyed = survey(self.source.images(), options.extractor(), size, known or {})
         matches = [(pair.first, pair.second) for pair in surveyed.pairs]
         mask = static_regions(matches, size, pixel_size(size, options.max_size))
         if region := describe(mask):
@@ -331,10 +328,7 @@ class _Session:
         known = image.name in mapper.features or image.name in mapper.history.records
         if known or image.image is None or image.image.shape[::-1] != self.source.size():
             return image
-        options = mapper.options
-        if self._ahead is None:
-            self._ahead = Extractor(options.descriptor, options.max_keypoints, options.max_size)
-        return replace(image, features=self._ahead(image.image))
+        return replace(image, features=mapper.extractor(image.image))
 
     def _stage(self) -> str:
         """The name of the stage: a progress bar starts anew with each."""
