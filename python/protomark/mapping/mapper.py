@@ -299,13 +299,9 @@ class Mapper:
         for frame in structure.frames:
             rows = frame.observed
             if not frame.keyframe and len(rows) >= 6:
-                frame.pose, _ = refine_pose(
-                    frame.pose,
-                    frame.keypoints[rows].astype(np.float64),
-                    structure.positions[frame.landmarks[rows]],
-                    structure.cameras[frame.camera_id],
-                    structure.tolerance(frame.camera_id, self.options.max_error),
-                )
+                matched = structure.matched(frame, rows, frame.seen)
+                limit = structure.tolerance(frame.camera_id, self.options.max_error)
+                frame.pose, _ = refine_pose(frame.pose, *matched, limit)
 
     def _window(self) -> list[int]:
         return [i for i, frame in enumerate(self.structure.frames) if frame.in_window]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protomark.geometry.absolute_pose import free_lens, pose_covariance, reprojection_error
+from protomark.geometry.absolute_pose import free_lens, pose_covariance
 from protomark.geometry.neighbours import runs
 from protomark.geometry.pose import camera_centers, transform
 from protomark.mapping.adjustment import free_focal_lengths
@@ -59,25 +59,21 @@ TOO_FEW = "too few landmarks are left that it observes"
 
 def is_uncertain(structure: Structure, frame: Frame, pose: Array, matches: LandmarkMatches) -> bool:
     """Whether landmarks that match leave open where a frame was taken."""
-    pixels = frame.keypoints[matches.rows].astype(np.float64)
-    positions = structure.positions[matches.ids]
-    covariance = pose_covariance(pose, pixels, positions, structure.cameras[frame.camera_id])
+    matched = structure.matched(frame, matches.rows, matches.ids)
+    covariance = pose_covariance(pose, *matched)
     if covariance is None:
         return True
-    depth = float(np.median(np.abs(transform(pose, positions)[:, 2])))
+    depth = float(np.median(np.abs(transform(pose, matched[1])[:, 2])))
     return bool(np.sqrt(np.trace(covariance[3:, 3:])) > _MAX_DEVIATION * depth)
 
 
 def taken_elsewhere(tracker: Tracker, frame: Frame, pose: Array) -> bool:
     """Whether a frame is found in the map, but far from its given pose."""
-    found = tracker.relocalize(frame)
+    found, structure = tracker.relocalize(frame), tracker.structure
     if found is None:
         return False
-    rows, ids = found.matches.rows, found.matches.ids
-    camera = tracker.structure.cameras[frame.camera_id]
-    pixels = frame.keypoints[rows].astype(np.float64)
-    off = reprojection_error(pose, pixels, tracker.structure.positions[ids], camera)
-    return bool(np.median(off) > tracker.structure.tolerance(frame.camera_id, _MAX_OFFSET))
+    off = structure.median_error(pose, frame, found.matches.rows, found.matches.ids)
+    return off > structure.tolerance(frame.camera_id, _MAX_OFFSET)
 
 
 def are_elsewhere(mapper: Mapper, source: FrameSource) -> bool:
@@ -194,10 +190,9 @@ def other_lenses(structure: Structure, max_error: float) -> list[str]:
         camera, rows = structure.cameras[frame.camera_id], frame.observed
         if camera.wide or len(rows) < _MIN_LANDMARKS:
             continue
-        positions = structure.positions[frame.landmarks[rows]]
-        pixels = frame.keypoints[rows].astype(np.float64)
+        matched = structure.matched(frame, rows, frame.seen)
         tolerance = structure.tolerance(frame.camera_id, max_error)
-        free = free_lens(frame.pose, pixels, positions, camera, tolerance)
+        free = free_lens(frame.pose, *matched, tolerance)
         one = frame.name, float(np.log(free.stretch)), free.deviation
         found.setdefault(frame.camera_id, []).append(one)
     names: list[str] = []
