@@ -25,7 +25,7 @@ from protomark.evaluation.frames import QueryFrame, scene_depth
 from protomark.evaluation.protocol import split
 from protomark.geometry.camera_files import camera_from_exif
 from protomark.geometry.pose import camera_centers, pose_error
-from protomark.geometry.pose_files import read_poses
+from protomark.geometry.pose_files import images_txt, read_poses
 from protomark.localization import Localization, Localizer, PosePrior
 from protomark.localization.batch import LocalizationRequest, localize_files
 from protomark.maps.build import build_map
@@ -409,6 +409,60 @@ def test_cameras_and_poses_from_elsewhere(query: Path) -> None:
         assert facts["recall"][0]["recall"] == 1
 
 
+def test_a_warning_of_a_command_is_one_sentence(query: Path) -> None:
+    request = (query / "scene.pmk", query / "images", "-o", query / "out", "--threads", 2)
+    done = run_command(*request, "--camera", "PINHOLE:300,300,80,60", command="localize")
+    assert done.stderr == (
+        "warning: camera PINHOLE 320 240 300 300 80 60: its principal point is far from the middle "
+        "of the image: was it calibrated at 160 x 120 pixels?\n"
+    )
+
+
+def test_a_video_is_localized_frame_by_frame(query: Path, images: list[NDArray[np.uint8]]) -> None:
+    film = query / "walk.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
+    for image in [image for image in images for _ in range(2)]:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    rows = [
+        " ".join(map(str, [f"{0.2 * i:.2f}", *camera_centers(pose), *v, w]))
+        for i, pose in enumerate(NEW_POSES)
+        for w, *v in [quaternion(pose[:, :3].T)]
+    ]
+    (query / "tum.txt").write_text("\n".join(rows) + "\n")
+    out, camera = query / "out", "PINHOLE:300,300,160,120"
+    done = run(
+        *(query / "scene.pmk", film, query / "images" / "1.png", "-o", out, "--camera", camera),
+        *("--every", 2, "--poses", query / "tum.txt", "--json", query / "f.json"),
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    facts = json.loads((query / "f.json").read_text())
+    names = ["walk-000000", "walk-000002", "walk-000004"]
+    assert [row["image"] for row in facts["each"]] == [*names, "1.png"]
+    assert facts["recall"][0] == {"distance": 0.05, "degrees": 5.0, "recall": 1.0}
+    assert facts["with_true_pose"] == 3
+    assert facts["localized"] == 4
+    done = run(query / "scene.pmk", film, "-o", out, "--camera", camera, "--threads", 2)
+    assert read_poses(out / "trajectory.txt").times == pytest.approx(np.arange(6) / 10)
+    (query / "notes.txt").write_text("no image")
+    (query / "torn.mp4").write_bytes(b"0" * 1000)
+    done = run(query / "scene.pmk", query / "notes.txt", film, "-o", out, "--camera", camera)
+    assert re.search(r"not usable +1\b", done.output)
+    done = run(query / "scene.pmk", query / "torn.mp4", "-o", out)
+    assert "not a video that OpenCV can decode" in str(done.exception)
+
+
+def test_true_poses_of_another_world_are_named(query: Path) -> None:
+    request = (query / "scene.pmk", query / "images", "-o", query / "out", "--poses")
+    aside = NEW_POSES.copy()
+    aside[:, :, 3] -= aside[:, :, :3] @ np.array([10.0, 0, 0])
+    for given, told in ((NEW_POSES, False), (aside, True)):
+        named = {f"{i}.png": pose for i, pose in enumerate(given, 1)}
+        (query / "poses.txt").write_text(images_txt(named, dict.fromkeys(named, 1)))
+        done = run(*request, query / "poses.txt")
+        assert ("in the map's world" in done.output) == told
+
+
 def test_geographic_coordinates(query: Path, scene: pm.PrototypeMap) -> None:
     offset = np.array([371234.5, 5412345.25, 520.0])
     moved = scene.part(scene.ids)
@@ -464,7 +518,7 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["{q}/scene.pmk", "{q}/nowhere"], "no such image or folder"),
+        (["{q}/scene.pmk", "{q}/nowhere"], "no such image, folder or video"),
         (["{q}/scene.pmk", "{q}/true"], "this folder holds no image"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "{q}/gone.txt"], "no cameras.txt"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 300"], "has 4 parameters"),

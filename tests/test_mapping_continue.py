@@ -10,12 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping_scene import interrupted_at, walk, write_images
+import protomark as pm
+from mapping_scene import PINHOLE, interrupted_at, walk, write_images
 from protomark import interrupt
 from protomark.mapping import session
+from protomark.mapping.frame import Frame
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
+from protomark.mapping.source import open_source
+from protomark.mapping.structure import Structure
 from test_mapping import CAMERA, SETTINGS, run
 from test_tracks_command import fails
 
@@ -96,6 +100,11 @@ def test_options_that_differ_from_the_map_are_refused(extended: Path, tmp_path: 
     fails(run(*into, "-d", "akaze"), "--descriptor akaze", "orb")
     fails(run(*into, "--dim", "16"), "--dim 16", "48")
     fails(run(*into, "--focal", "300"), "--focal")
+    fails(run(*into, "--camera", "PINHOLE:400,400,160,120"), "was made with PINHOLE 320 240 300")
+    done = run(*into, "--camera", "SIMPLE_PINHOLE:300.5,160,120")
+    assert done.returncode == 0, done.stderr
+    cameras = pm.open(extended).metadata["cameras"]
+    assert len(cameras.splitlines()) == 1
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     fails(run(*into, "--poses", tmp_path / "poses.txt"), "without --poses")
 
@@ -108,10 +117,47 @@ def test_times_stay_unique_and_the_old_map_is_kept(extended: Path, tmp_path: Pat
     rows = np.loadtxt(extended / "trajectory.txt")
     assert len(rows) == FRAMES + 4
     assert (np.diff(rows[:, 0]) > 0).all()
+    assert "those of more are shifted by 9" in done.stderr
     # The camera walks on along x, so the frames are in the order in which they were taken.
     along = rows[:, 1:4] @ np.linalg.svd(rows[:, 1:4] - rows[:, 1:4].mean(0))[2][0]
     assert (np.diff(along) > 0).all() or (np.diff(along) < 0).all()
     assert contents(extended / "previous") == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "shift"),
+    [
+        (["a/0.png", "a/2.png"], ["b/4.png", "b/6.png"], 0),  # later
+        (
+            ["a/0.png", "a/2.png"],
+            ["b/1.png", "b/3.png"],
+            2,
+        ),  # perhaps of another day
+        (["a/0.png", "a/2.png"], ["a/1.png"], 0),  # between those of the same folder
+        (["a/0.25.png", "a/2.25.png"], ["b/1.25.png", "b/3.25.png"], 0),  # two cameras at a time
+        (["a/0.25.png", "a/2.25.png"], ["b/2.25.png", "b/3.25.png"], 1),  # the same time twice
+        (["a/1.png", "a/x.png"], ["b/1.5.png", "b/2.5.png"], 0),  # indices 0 and 1
+        (["a/1.png", "a/x.png"], ["b/0.5.png", "b/2.5.png"], 2),
+    ],
+)
+def test_times_are_shifted_only_if_they_would_mix(
+    tmp_path: Path, old: list[str], new: list[str], shift: float
+) -> None:
+    for name in {*old, *new}:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    folders = [Path(names[0]).parent.name for names in (old, new)]
+    first, second = (open_source(tmp_path / folder) for folder in folders)
+    first.prefix, second.prefix = (f"{folder}/" for folder in folders)
+    frames = [
+        Frame(i, first.prefix + name, time, 1, *[np.zeros(0)] * 3)
+        for i, (name, time) in enumerate(first.listing())
+        if first.prefix + name in old
+    ]
+    structure = Structure({1: PINHOLE}, 1600)
+    structure.frames = frames
+    second.follow(structure, [frame.name for frame in frames])
+    assert second.time_shift == shift
 
 
 def test_a_stopped_extension_keeps_the_old_map(

@@ -4,12 +4,12 @@ import pytest
 
 import protomark as pm
 from mapping_memory import check_changes, check_search, observations
+from protomark.features import video as video_module
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import CameraSet, read_cameras
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
-from protomark.mapping import source
 from protomark.mapping.history import FrameRecord
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
@@ -214,7 +214,7 @@ class Capture:
     ],
 )
 def test_times_of_a_video_are_those_of_its_frames(monkeypatch, tmp_path, times, expected):
-    monkeypatch.setattr(source, "_open_video", lambda path: Capture(times))
+    monkeypatch.setattr(video_module, "open_video", lambda path: Capture(times))
     video = Video(tmp_path / "a.mp4")
     np.testing.assert_allclose([time for _, time in video.listing()], expected)
     np.testing.assert_allclose([i.time for i in video.images(backward=True)], expected[::-1])

@@ -12,6 +12,7 @@ import pytest
 
 from mapping_scene import interrupted_at, show, turn_and_approach, walk, write_images
 from protomark.features.static_regions import describe, outside, read_mask, static_regions
+from protomark.geometry.absolute_pose import FreeLens
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.colmap import read_model
@@ -23,6 +24,7 @@ from protomark.geometry.pose import (
     transform,
 )
 from protomark.localization import Localizer
+from protomark.mapping import trust
 from protomark.mapping.frame import Frame, InputImage
 from protomark.mapping.initialisation import Initialiser
 from protomark.mapping.mapper import Mapper
@@ -300,6 +302,27 @@ def test_poses_that_do_not_fit_the_images(wrong: str, tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
+def test_poses_of_another_world_do_not_extend_a_map(tmp_path: Path) -> None:
+    poses = walk(2 * COUNT)
+    images = write_images(tmp_path / "images", poses[:COUNT])
+    more = write_images(tmp_path / "more", poses[COUNT:])
+    given = images_txt(poses[:COUNT], tmp_path / "given.txt")
+    scene = tmp_path / "scene"
+    made = run(images, "-o", scene, "--camera", CAMERA, "--poses", given, "-d", "orb")
+    assert made.returncode == 0, made.stderr
+    before = (scene / "scene.pmk").read_bytes()
+    # The same walk, ten metres aside: only the map can tell.
+    aside = poses[COUNT:].copy()
+    aside[:, :, 3] -= aside[:, :, :3] @ np.array([10.0, 0, 0])
+    extend = (more, "--into", scene, "--poses")
+    fails(run(*extend, images_txt(aside, tmp_path / "aside.txt")), "not in its world", "scale")
+    shuffled = images_txt(poses[COUNT:], tmp_path / "shuffled.txt", [*range(COUNT)][::-1])
+    fails(run(*extend, shuffled), "do not fit the images", "under its own name")
+    assert (scene / "scene.pmk").read_bytes() == before
+    done = run(*extend, images_txt(poses[COUNT:], tmp_path / "right.txt"))
+    assert f"{2 * COUNT} of {2 * COUNT} frames registered" in done.stdout, done.stderr
+
+
 def test_poses_that_put_landmarks_behind_the_cameras_do_not_fit() -> None:
     """Epipolar lines alone do not tell a translation from the opposite one."""
     rng = np.random.default_rng(0)
@@ -440,3 +463,19 @@ def test_a_zoomed_frame_is_named() -> None:
         mapper.add(InputImage(i, f"{i}.png", float(i), show(pose, camera)))
     mapper.finish()
     assert other_lenses(mapper.structure, mapper.options.max_error) == ["14.png"]
+
+
+def test_frames_that_leave_the_focal_length_open_are_of_no_other_lens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From above, a flat scene moves the focal length by more than its landmarks' noise says."""
+    mapper = Mapper(MappingOptions(descriptor="orb", max_keypoints=500), PINHOLE)
+    for i, pose in enumerate(turn_and_approach(16)):
+        mapper.add(InputImage(i, f"{i}.png", float(i), show(pose)))
+    mapper.finish()
+    stretches = iter(np.exp([*np.linspace(-0.05, 0.05, 15), 0.3]))
+    monkeypatch.setattr(
+        trust, "free_lens", lambda pose, *_: FreeLens(pose, 0.0, 0.01, next(stretches), 0.01)
+    )
+    names = [frame.name for frame in mapper.structure.frames]
+    assert other_lenses(mapper.structure, mapper.options.max_error) == names[-1:]

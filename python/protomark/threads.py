@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from itertools import islice
 from typing import TypeVar
@@ -43,6 +44,26 @@ def parallel_map(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def map_ahead(
+    function: Callable[[S], T], items: Iterable[S], threads: int
+) -> Generator[T, None, None]:
+    """Yield `function(item)` for each item in order, from several threads.
+
+    Of the items only those at hand are held. Closing the generator cancels what has not begun.
+    """
+    with ThreadPoolExecutor(threads) as pool:
+        pending: deque[Future[T]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(function, item))
+                if len(pending) >= 2 * threads:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def read_ahead(items: Iterator[S], threads: int) -> Iterator[S]:

@@ -25,7 +25,7 @@ def info(
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Describe what a file holds, and what its bytes are spent on.
+    """Describe what a file holds; --json has all, such as what its bytes are spent on.
 
     protomark info kitchen/scene.pmk --verify
     """
@@ -48,41 +48,65 @@ def info(
 
 
 def show(facts: dict[str, Any]) -> None:
-    """Print what `protomark.maps.info.describe` returned."""
+    """Print the most important of what `protomark.maps.info.describe` returned."""
     from protomark.cli.terminal import print_facts
 
-    print_facts(list(_rows(facts)))
+    rows = {"tracks": _track_rows, "encoder": _encoder_rows}.get(facts["kind"], _map_rows)
+    checked = [("checksums", facts["checksums"])] if "checksums" in facts else []
+    # A text of a stranger's file must not pass for another row.
+    lines = [
+        ("; ".join(name.splitlines()), "; ".join(text.splitlines())) for name, text in rows(facts)
+    ]
+    print_facts([("kind", facts["kind"]), *lines, *checked])
 
 
-def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for key, value in facts.items():
-        name = key.replace("_", " ")
-        if value is None or key == "bytes_per_landmark_by_section":
-            continue
-        if key == "count_histogram":
-            yield "observations per landmark", f"1 {_bars(value)} 16 and more"
-        elif key == "extent":
-            yield name, " to ".join(_vector(corner) for corner in value)
-        elif key == "position_error":
-            yield name, _vector(value)
-        elif key == "bytes_by_section":
-            for section, size in value.items():
-                each = facts["bytes_per_landmark_by_section"][section]
-                yield _text(f"bytes: {section}"), f"{size:,}  {each:,.2f} per landmark"
-        elif isinstance(value, dict):
-            yield from _nested_rows(name, value)
-        else:
-            yield name, _text(value)
+def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    landmarks, encoder = facts["landmarks"], facts["encoder"]
+    several = facts["prototypes_per_landmark"]
+    each = f"{several:.2f} prototypes" if several else "a prototype"
+    yield "landmarks", f"{landmarks:,}, each with {each} of {facts['dim']} numbers"
+    bars = _bars(facts["count_histogram"])
+    yield "observations", f"{facts['observations']:,}; per landmark 1 {bars} 16 and more"
+    sections = facts["bytes_by_section"]
+    each = (facts["bytes"] - sections["encoder"]) / max(landmarks, 1)
+    yield (
+        "bytes",
+        f"{facts['bytes']:,}: {sections['encoder']:,} for the encoder, {each:,.1f} per landmark",
+    )
+    yield "encoder", f"{encoder['name']}, for {encoder['descriptor']} of {encoder['bits']} bits"
+    lists = facts["nlist"]
+    yield "index", f"{lists:,} inverted lists" if lists else "none: every search is exact"
+    posed = facts["landmarks_with_position"]
+    where = f"of {posed:,} landmarks" if posed else "none: images cannot be localized in it"
+    if facts["position_error"]:
+        where += f", exact to {max(facts['position_error']):.2g}"
+    yield "positions", where
+    if facts["extent"]:
+        yield "extent", " to ".join(_vector(corner) for corner in facts["extent"])
+    for name, text in facts["metadata"].items():
+        yield f"metadata: {name}", text
+    if facts["journal"]:
+        yield "journal", f"{facts['journal']['commits']:,} commits since the file was written"
+    if sealed := facts.get("sealed"):
+        yield "sealed map", f"{sealed['file']}, {sealed['bytes']:,} bytes"
 
 
-def _nested_rows(name: str, values: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for key, value in values.items():
-        label = f"{name}: {key.replace('_', ' ')}"
-        if key == "notes" and isinstance(value, dict):
-            for note, text in value.items():
-                yield _text(f"{label}: {note.replace('_', ' ')}"), _text(text)
-        else:
-            yield _text(label), _text(value)
+def _encoder_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "name", facts["name"]
+    yield "descriptor", f"{facts['descriptor']}, {facts['bits']} bits"
+    yield "numbers", f"{', '.join(map(str, facts['dims']))} per prototype"
+    yield "trained on", facts["data"]
+    yield "licence", facts["licence"]
+    yield "bytes", f"{facts['bytes']:,}"
+
+
+def _track_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    from protomark.report import track_rows
+
+    yield "descriptor", f"{facts['descriptor']}, {facts['bits']} bits"
+    yield "keypoints", f"{facts['keypoints']:,} in {facts['keyframes']:,} keyframes"
+    yield from track_rows(facts)
+    yield "bytes", f"{facts['bytes']:,}"
 
 
 def _bars(histogram: list[int]) -> str:
@@ -94,12 +118,3 @@ def _bars(histogram: list[int]) -> str:
 
 def _vector(values: list[float]) -> str:
     return f"({', '.join(f'{v:,.6g}' for v in values)})"
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, str) and not value.isprintable():
-        # A stranger's file must not control the terminal.
-        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in value)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return str(value)
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}"

@@ -20,7 +20,9 @@ def localize(
             metavar="MAP", help="Map file (.pmk) with positions, or a folder of `protomark map`."
         ),
     ],
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGES", help="Images, or folders.")],
+    images: Annotated[
+        list[Path], typer.Argument(metavar="IMAGES", help="Images, folders, videos.")
+    ],
     output: Annotated[
         Path,
         typer.Option(
@@ -68,6 +70,7 @@ def localize(
             help="Smallest probability of a pose in images.txt; poses.csv lists every image.",
         ),
     ] = 0.9,
+    every: Annotated[int, typer.Option(help="Take every n-th image or frame only.")] = 1,
     max_keypoints: MaxKeypoints = 2000,
     max_size: MaxSize = 1600,
     recall: Annotated[
@@ -98,6 +101,7 @@ def localize(
     request = LocalizationRequest(
         scene,
         images,
+        every=every,
         camera=camera,
         refine_focal_length=refine_focal_length,
         true_poses=poses,
@@ -119,7 +123,7 @@ def localize(
 
 
 def _show(batch: LocalizationBatch, output: Path) -> None:
-    from protomark.cli.terminal import console, print_facts, printable
+    from protomark.cli.terminal import console, note, print_facts, printable
     from protomark.localization.batch import CAMERAS, POSES, TABLE, TRAJECTORY
 
     facts = batch.summary()
@@ -146,6 +150,8 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         text = f"{facts['median_position_error']:.4g}, {facts['median_angle_error']:.3g} degrees"
         rows.append(("median error of localized", text))
     print_facts(rows)
+    if sentence := batch.contradiction():
+        note(f"warning: {sentence}")
     failed = [f"{image.name}: {image.error}" for image in batch.images if image.error]
     if len(failed) > 5:
         failed[5:] = [f"... and {len(failed) - 5} more, in {output / TABLE}"]

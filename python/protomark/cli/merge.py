@@ -24,7 +24,7 @@ def merge(
         typer.Option(
             "--renumber",
             help="The maps have no landmark in common, whatever the ids say: landmarks of each "
-            "further map get new ids above all earlier ones.",
+            "further map get new ids above all earlier ones. Positions must be of one world.",
         ),
     ] = False,
     json_file: JsonFile = None,
@@ -32,8 +32,8 @@ def merge(
     """Merge maps that were built apart, exactly.
 
     Reads learning maps and writes the map that would have been built from all their observations
-    together. Landmarks with the same id are one landmark, and their observations are summed. The
-    command prints how many there are, as ids may be equal by accident.
+    together. Landmarks with the same id are one landmark, and their observations are summed; maps
+    in which these do not look alike, or lie elsewhere, are refused.
 
     protomark merge monday.pmk tuesday.pmk -o week.pmk
     """

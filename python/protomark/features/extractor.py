@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -67,10 +68,10 @@ def pixel_size(size: tuple[int, int], max_size: int) -> float:
     return max(1.0, max(size) / max_size)
 
 
-class Extractor:
-    """Detects and describes the keypoints of images.
+class Extractor(threading.local):
+    """Detects and describes the keypoints of images; threads may share it.
 
-    OpenCV's detectors are not safe to share between threads, so each thread needs an extractor.
+    OpenCV's detectors are not safe to share between threads, so each thread makes its own.
 
     Args:
         name: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.

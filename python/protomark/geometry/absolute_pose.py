@@ -157,6 +157,7 @@ class FreeLens:
     gain: float
     spread: float  # standard deviation of the camera centre in world units, infinite if it is open
     stretch: float = 1.0  # the focal length that fits best, by that of the camera
+    deviation: float = np.inf  # standard deviation of the stretch, with exact landmarks
 
 
 def free_lens(
@@ -191,7 +192,7 @@ def free_lens(
     before, after = square(cam_from_world, fixed), square(pose, lens)
     losses = [np.minimum(np.log1p(s / scale), _MAX_LOSS).mean() for s in (before, after)]
     inlier = after <= scale / _LOSS_SHARE**2
-    count, spread = int(inlier.sum()), np.inf
+    count, spread, deviation = int(inlier.sum()), np.inf, np.inf
     if count >= _MIN_FREE:
         x, y, z = transform(pose, positions[inlier]).T
         projected = np.stack([x / z, y / z], 1)
@@ -205,7 +206,8 @@ def free_lens(
         covariance = _covariance(jacobian, float(after[inlier].sum()))
         if covariance is not None:
             spread = float(np.sqrt(np.trace(covariance[3:6, 3:6])))
-    return FreeLens(pose, float(losses[0] - losses[1]), spread, float(lens[0]))
+            deviation = float(np.sqrt(covariance[6, 6]))
+    return FreeLens(pose, float(losses[0] - losses[1]), spread, float(lens[0]), deviation)
 
 
 def _minimise(

@@ -175,6 +175,12 @@ class Camera:
         camera.rescale(width, height)
         return Camera.from_colmap(camera)
 
+    def zoomed(self, factor: float) -> Camera:
+        """The camera with a focal length that is `factor` times as long."""
+        params = np.array(self.params)
+        params[self.colmap.focal_length_idxs()] *= factor
+        return replace(self, params=tuple(params.tolist()))
+
     def resembles(self, other: Camera) -> bool:
         """Whether both project alike: same size, and rays within 1 % of the image."""
         if (self.width, self.height) != (other.width, other.height):

@@ -70,6 +70,7 @@ def misfit(errors: Sequence[Array]) -> str:
     return (
         f"the poses do not fit the images: in {len(errors) - fitting} of {len(errors)} pairs of "
         f"images, matches lie over {_MAX_ERROR:g} pixels off their epipolar lines or behind the "
-        "cameras: are the poses camera-to-world instead of world-to-camera, with other axes "
-        "(OpenGL), or under names of other images, or is the camera wrong?"
+        "cameras. Each image needs, under its own name, its pose as in COLMAP (cam_from_world, x "
+        "right, y down, z forward): are these camera-to-world, with other axes (OpenGL), or of "
+        "other images, or is the camera wrong?"
     )

@@ -113,7 +113,7 @@ def read_poses(path: Path) -> PoseSet:
 
 
 def poses_of_images(
-    path: Path, names: Sequence[str], times: Sequence[float] | None = None
+    path: Path, names: Sequence[str], times: Sequence[float | None] | None = None
 ) -> PoseSet:
     """Read the poses of these images, see `read_poses`, and warn if few of them have one.
 
@@ -121,7 +121,7 @@ def poses_of_images(
         path: a file or folder of poses.
         names: names of all images; one in another folder has the pose of its base name if that is
             unique among them and among the poses.
-        times: times of all images in seconds, see `PoseSet.find`.
+        times: times of all images in seconds, None for one without, see `PoseSet.find`.
 
     Raises:
         ValueError: none of the images has a pose; or see `read_poses`.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
+from protomark.features.video import is_video, video_frames
 from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
@@ -30,8 +32,10 @@ from protomark.geometry.pose_files import (
 from protomark.interrupt import deferred_interrupt
 from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
+from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import Localization
 from protomark.progress import Progress, silent, tracked
+from protomark.threads import map_ahead
 
 POSES, CAMERAS, POINTS, TABLE = "images.txt", "cameras.txt", "points3D.txt", "poses.csv"
 TRAJECTORY = "trajectory.txt"
@@ -39,6 +43,9 @@ TRAJECTORY = "trajectory.txt"
 _HEADER = "image,accepted,confidence,inliers,matches"
 # Distances in world units (metres if the map is metric) and angles in degrees, as in hloc.
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+# True poses are of another world if most believed ones are off by more degrees, or by a larger
+# share of their extent.
+_OTHER_DEGREES, _OTHER_SHARE, _MIN_JUDGED = 10.0, 0.25, 3
 STAGES = ("features", "encode", "search", "pose", "total")
 
 
@@ -47,7 +54,8 @@ class LocalizationRequest:
     """What to localize, and how."""
 
     scene: Path  # a map file, or the folder that `protomark map` wrote
-    images: Sequence[Path]  # image files, and folders of them
+    images: Sequence[Path]  # image files, folders of them, and videos
+    every: int = 1  # take every n-th image and frame only
     # A cameras.txt, a folder with a COLMAP model, or a camera written out. None: those that the map
     # was made with, for images of their size; "estimate", and for other images: focal lengths come
     # from EXIF data and matches.
@@ -73,8 +81,16 @@ class ImageResult:
     # Its localization, None if the image cannot be read or has no camera.
     found: Localization | None
     error: str = ""  # what is wrong with the image, else ""
-    # Distance and degrees from the true pose, infinite without a pose; None without a true pose.
-    true_error: tuple[float, float] | None = None
+    true_pose: NDArray[np.float64] | None = None  # (3, 4) cam_from_world, if it is known
+    time: float | None = None  # seconds since the video began that it is a frame of
+
+    @property
+    def true_error(self) -> tuple[float, float] | None:
+        """Distance and degrees from the true pose, infinite without one; None if it is unknown."""
+        if self.true_pose is None:
+            return None
+        pose = self.found.cam_from_world if self.found else None
+        return (np.inf, np.inf) if pose is None else pose_error(pose, self.true_pose)
 
     @property
     def confidence(self) -> float:
@@ -131,6 +147,21 @@ class LocalizationBatch:
             for d, a in (THRESHOLDS if len(errors) else ())
         ]
 
+    def contradiction(self) -> str:
+        """A sentence if most believed poses are far from the true ones, else ""."""
+        judged = [i for i in self.images if self.accepted(i) and i.true_pose is not None]
+        if len(judged) < _MIN_JUDGED:
+            return ""
+        distance, degrees = np.median([i.true_error for i in judged], axis=0)
+        centers = camera_centers(np.array([i.true_pose for i in judged]))
+        extent = np.linalg.norm(np.ptp(centers, axis=0))
+        if degrees <= _OTHER_DEGREES and distance <= _OTHER_SHARE * extent:
+            return ""
+        return (
+            "the true poses are far from most poses that are believed: are they in the map's world "
+            "(origin, axes, scale), as cam_from_world, and under the names of these images?"
+        )
+
     def summary(self) -> dict[str, Any]:
         """Figures over all images."""
         accepted = [i for i in self.images if self.accepted(i)]
@@ -163,7 +194,7 @@ class LocalizationBatch:
     def write(self, folder: Path) -> None:
         """Write a COLMAP model and a TUM trajectory of accepted poses, and a table of all images.
 
-        Times of the trajectory are those of `image_times`.
+        Times of the trajectory are those of the frames of one video, else of `image_times`.
         """
         folder.mkdir(parents=True, exist_ok=True)
         camera_lines: dict[str, int] = {}
@@ -180,7 +211,10 @@ class LocalizationBatch:
         write_text(folder / POSES, images_txt(poses, camera_ids))
         write_text(folder / POINTS, "# The landmarks are in the map\n")
         write_text(folder / TABLE, self.table())
+        seconds = [i.time for i in self.images if i.time is not None]
         times, _ = image_times([image.name for image in self.images])
+        if len(seconds) == len(times) and (np.diff(seconds) > 0).all():
+            times = seconds
         posed = [
             (time, poses[image.name])
             for time, image in zip(times, self.images, strict=True)
@@ -252,7 +286,7 @@ def localize_files(
             fit, or no image can be localized.
         FileExistsError: the folder holds files that no earlier run wrote.
     """
-    images = list_images(request.images)
+    queries = _list_queries(request.images, request.every)
     _check_folder(output)
     localizer = Localizer(
         request.scene,
@@ -261,100 +295,129 @@ def localize_files(
         recall=request.recall,
     )
     given = request.camera is not None and request.camera != ESTIMATE
-    names = [name for name, _ in images]
+    names = [query.name for query in queries]
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
     true_poses, priors = (
-        poses_of_images(path, names) if path else PoseSet({})
+        poses_of_images(path, names, [query.time for query in queries]) if path else PoseSet({})
         for path in (request.true_poses, request.priors)
     )
 
-    def localize(image: tuple[str, Path]) -> ImageResult:
-        name, path = image
-        rough = priors.find(name)
+    def localize(query: _Query) -> ImageResult:
+        rough = priors.find(query.name, query.time)
         prior = rough is not None and PosePrior(
             rough, request.prior_distance, request.prior_degrees
         )
-        return _localize_file(
-            localizer, name, path, cameras, request, prior or None, true_poses.find(name)
-        )
+        found, problem = _localize(localizer, query, cameras, request, prior or None)
+        true_pose = true_poses.find(query.name, query.time)
+        return ImageResult(query.name, found, problem, true_pose, query.time)
 
     results: list[ImageResult] = []
     batch = LocalizationBatch(results, request.min_confidence)
     try:
-        with deferred_interrupt() as interrupted, ThreadPoolExecutor(request.threads) as pool:
-            futures = [pool.submit(localize, image) for image in images]
-            try:
-                for future in tracked(futures, progress, "localize"):
-                    results.append(future.result())
-                    if interrupted():
-                        break
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
-            stopped = interrupted() and len(results) < len(images)
+        results_ahead = map_ahead(localize, _with_frames(queries), request.threads)
+        with deferred_interrupt() as interrupted, closing(results_ahead):
+            for result in tracked(results_ahead, progress, "localize", len(queries)):
+                results.append(result)
+                if interrupted():
+                    break
+            stopped = interrupted() and len(results) < len(queries)
     except BaseException:
         if any(result.found for result in results):
+            results[:] = _with_shared_cameras(results)
             batch.write(output)
         raise
     if all(result.found is None for result in results):
         raise ValueError(
             f"none of {len(results)} images is usable; {results[0].name}: {results[0].error}"
         )
+    results[:] = _with_shared_cameras(results)
     batch.write(output)
     return replace(batch, interrupted=stopped)
 
 
-def list_images(sources: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Names and paths of images; those of a folder have relative names, in natural order.
+def _with_shared_cameras(results: Sequence[ImageResult]) -> list[ImageResult]:
+    checked = iter(check_shared_cameras([result.found for result in results if result.found]))
+    return [replace(r, found=next(checked)) if r.found else r for r in results]
+
+
+@dataclass(frozen=True)
+class _Query:
+    """An image to localize."""
+
+    name: str
+    path: Path  # its file, or the video that it is a frame of
+    time: float | None = None  # of a frame: seconds since the video began
+    image: NDArray[np.uint8] | None = None  # of a frame: what it shows
+
+
+def _list_queries(sources: Sequence[Path], every: int) -> list[_Query]:
+    """Images, and frames that are not decoded yet, in natural order within each source.
 
     Raises:
         FileNotFoundError: a source is missing, or a folder holds no image.
-        ValueError: two images have the same name.
+        ValueError: two images have the same name, or a video does not decode.
     """
-    found: dict[str, Path] = {}
+    if every < 1:
+        raise ValueError(f"--every {every}: it must be at least 1")
+    found: dict[str, _Query] = {}
     for source in sources:
         if source.is_dir():
-            names = [(name, source / name) for name in image_names(source)]
-            if not names:
+            queries = [_Query(name, source / name) for name in image_names(source)]
+            if not queries:
                 raise FileNotFoundError(f"{source}: this folder holds no image")
-        elif source.is_file():
-            names = [(source.name, source)]
+        elif not source.is_file():
+            raise FileNotFoundError(f"{source}: no such image, folder or video")
+        elif is_video(source):
+            queries = [_Query(name, source, time) for name, time, _ in video_frames(source)]
         else:
-            raise FileNotFoundError(f"{source}: no such image or folder")
-        for name, path in names:
-            if not is_utf8(name):
-                raise ValueError(f"{path}: the name of this image is not UTF-8, rename it")
-            if name in found:
+            queries = [_Query(source.name, source)]
+        for query in queries:
+            if not is_utf8(query.name):
+                raise ValueError(f"{query.path}: the name of this image is not UTF-8, rename it")
+            if query.name in found:
                 raise ValueError(
-                    f"{found[name]} and {path} have the same name {name}: localize them apart"
+                    f"{found[query.name].path} and {query.path} have the same name {query.name}: "
+                    "localize them apart"
                 )
-            found[name] = path
-    return list(found.items())
+            found[query.name] = query
+    return list(found.values())[::every]
 
 
-def _localize_file(
+def _with_frames(queries: Sequence[_Query]) -> Iterator[_Query]:
+    """The queries, with the images of those that are frames of a video."""
+    for path, group in groupby(queries, key=lambda query: query.path):
+        asked = {query.name: query for query in group}
+        if next(iter(asked.values())).time is None:
+            yield from asked.values()
+            continue
+        for name, _, decode in video_frames(path):
+            if name in asked:
+                yield replace(asked[name], image=decode())
+
+
+def _localize(
     localizer: Localizer,
-    name: str,
-    path: Path,
+    query: _Query,
     cameras: CameraSet | None,
     request: LocalizationRequest,
     prior: PosePrior | None,
-    true_pose: NDArray[np.float64] | None,
-) -> ImageResult:
+) -> tuple[Localization | None, str]:
+    """The localization of an image, or what is wrong with it."""
     camera: Camera | None
     focal_length: FocalLength = "rough" if request.refine_focal_length else "known"
-    lost = None if true_pose is None else (np.inf, np.inf)
     try:
-        image = read_gray(path)
+        image = read_gray(query.path) if query.time is None else query.image
+        if image is None:
+            raise ValueError("this frame does not decode")
         height, width = image.shape
         if cameras is None:
             camera = None if request.camera else localizer.map_camera(width, height)
             if camera is None:
-                camera, focal_length = camera_from_exif(path), "rough"
+                camera = None if query.image is not None else camera_from_exif(query.path)
+                focal_length = "rough"
         else:
-            camera = cameras.find(name, width, height)
+            camera = cameras.find(query.name, width, height)
         found = localizer.localize(image, camera or ESTIMATE, prior, focal_length=focal_length)
     except (OSError, ValueError) as error:
-        return ImageResult(name, None, str(error), lost)
-    if true_pose is None or found.cam_from_world is None:
-        return ImageResult(name, found, true_error=lost)
-    return ImageResult(name, found, true_error=pose_error(found.cam_from_world, true_pose))
+        return None, str(error)
+    return found, ""

@@ -47,6 +47,10 @@ class Evidence:
     gain: float = 0.0  # by how much that lowers the mean (Cauchy) loss of the matches
     # Standard deviation of the camera centre, as a share of the depth, with a free lens.
     spread: float = np.inf
+    # The focal length that fits best with a free lens, by that of the camera, and its standard
+    # deviation; `shared_camera` compares it over several images.
+    stretch: float = 1.0
+    deviation: float = np.inf
 
     def place(self) -> NDArray[np.float64]:
         """Features (3,) float64 of whether the matches are of this place."""
@@ -75,19 +79,20 @@ def occupied_cells(camera: Camera, pixels: NDArray[np.float64]) -> int:
 
 def confidence(evidence: Evidence) -> float:
     """Probability that a pose with this evidence is right."""
-    return _place(evidence) * _lens(evidence)
+    return place_probability(evidence) * _lens(evidence)
 
 
 def doubt(evidence: Evidence) -> str:
     """A sentence if the camera is what makes a pose unlikely, else ""."""
-    if _place(evidence) < 0.5 or _lens(evidence) >= 0.5:
+    if place_probability(evidence) < 0.5 or _lens(evidence) >= 0.5:
         return ""
     return (
         "the matches do not confirm this camera: is its calibration right, and of this resolution?"
     )
 
 
-def _place(evidence: Evidence) -> float:
+def place_probability(evidence: Evidence) -> float:
+    """Probability that the matches are of this place, whatever the camera."""
     return float(sigmoid(PLACE_WEIGHTS[0] + evidence.place() @ np.array(PLACE_WEIGHTS[1:])))
 
 

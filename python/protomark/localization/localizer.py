@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.localization.prior import PosePrior, visible
+from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
 from protomark.maps.cameras import map_cameras
 from protomark.maps.open import open_map
@@ -86,7 +86,6 @@ class Localizer:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
         self.calibration = self.scene.encoder.match_calibration(self.scene.dim)
-        self._extractors = threading.local()
 
     def localize(
         self,
@@ -154,6 +153,9 @@ class Localizer:
     ) -> list[Localization]:
         """The poses of several images, as `localize` finds each, on several threads.
 
+        If they agree on another focal length than their camera's, a warning names that; poses that
+        it moves by more than 5 % of the depth get a confidence of 0.
+
         Args:
             images: files or arrays.
             camera: the camera of all of them, see `localize`.
@@ -163,10 +165,12 @@ class Localizer:
         Raises:
             FileNotFoundError, ValueError: see `localize`; the first image with an error ends it.
         """
-        return parallel_map(
-            lambda image: self.localize(image, camera, focal_length=focal_length),
-            list(images),
-            threads or available_threads(),
+        return check_shared_cameras(
+            parallel_map(
+                lambda image: self.localize(image, camera, focal_length=focal_length),
+                list(images),
+                threads or available_threads(),
+            )
         )
 
     def __reduce__(self) -> NoReturn:
@@ -248,7 +252,8 @@ class Localizer:
         positions[found] = self.scene.positions(ids[found])
         return positions
 
-    def _extract(self, image: NDArray[np.uint8]) -> Features:
+    @cached_property
+    def _extractor(self) -> Extractor:
         descriptor = self.scene.encoder.descriptor
         plain = descriptor.removesuffix(SUFFIX)
         if plain not in DESCRIPTORS:
@@ -256,11 +261,11 @@ class Localizer:
                 f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
                 "compute: describe the keypoints yourself and call localize_features"
             )
-        # OpenCV's detectors are not safe to share between threads.
-        if not hasattr(self._extractors, "of_thread"):
-            self._extractors.of_thread = Extractor(plain, self.max_keypoints, self.max_size)
-        features: Features = self._extractors.of_thread(image)
-        if descriptor.endswith(SUFFIX):
+        return Extractor(plain, self.max_keypoints, self.max_size)
+
+    def _extract(self, image: NDArray[np.uint8]) -> Features:
+        features = self._extractor(image)
+        if self.scene.encoder.descriptor.endswith(SUFFIX):
             features.descriptors = upright_descriptors(
                 features.descriptors, features.angles, features.sizes
             )

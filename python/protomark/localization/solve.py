@@ -163,16 +163,16 @@ def _lens_evidence(
     positions: NDArray[np.float64],
     camera: Camera,
     max_error: float,
-) -> tuple[float, float, float]:
-    """Shift, gain and spread of `Evidence`, from all accepted matches that are roughly right."""
+) -> tuple[float, float, float, float, float]:
+    """What `Evidence` has of the lens, from all accepted matches that are roughly right."""
     near = reprojection_error(pose, pixels, positions, camera) <= _NEAR * max_error
     if not near.any():
-        return np.inf, 0.0, np.inf
+        return np.inf, 0.0, np.inf, 1.0, np.inf
     free = free_lens(pose, pixels[near], positions[near], camera, max_error)
     depth = float(np.median(np.abs(transform(pose, positions[near])[:, 2])))
     distance, degrees = pose_error(free.cam_from_world, pose)
     shift = max(distance / (DEPTH_SHARE * depth), degrees / DEGREES)
-    return shift, free.gain, free.spread / depth
+    return shift, free.gain, free.spread / depth, free.stretch, free.deviation
 
 
 def _complete(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from protomark.extras import optional
-from protomark.geometry.absolute_pose import reprojection_error
 from protomark.geometry.pose import camera_centers
 from protomark.mapping.frame import Array, Frame, Ids
 from protomark.mapping.memory import Memory
@@ -54,9 +53,8 @@ def close_loop(
     if found is None:
         return 0, False
     matches = found.matches
-    drift = _drift(structure, frame, found.pose) > _DRIFT * structure.tolerance(
-        frame.camera_id, max_error
-    )
+    off = structure.median_error(found.pose, frame, frame.observed, frame.seen)
+    drift = off > _DRIFT * structure.tolerance(frame.camera_id, max_error)
     if drift:
         _correct_drift(structure, newest, found.pose, matches.rows, matches.ids)
     seen = frame.landmarks[matches.rows]
@@ -78,21 +76,6 @@ def _across_gap(
     predicted = predict(others, frame.index, frame.camera_id)
     found = None if predicted is None else tracker.track_among(frame, predicted, old)
     return None if found is None else tracker.track_local_map(frame, found.pose, old)
-
-
-def _drift(structure: Structure, frame: Frame, pose: Array) -> float:
-    """Median reprojection error in pixels of what a frame observes, under another pose."""
-    rows = frame.observed
-    return float(
-        np.median(
-            reprojection_error(
-                pose,
-                frame.keypoints[rows].astype(np.float64),
-                structure.positions[frame.landmarks[rows]],
-                structure.cameras[frame.camera_id],
-            )
-        )
-    )
 
 
 def _correct_drift(structure: Structure, newest: int, pose: Array, rows: Ids, ids: Ids) -> None:

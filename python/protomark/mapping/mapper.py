@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 import protomark as pm
-from protomark.features.extractor import Extractor, Features
+from protomark.features.extractor import Features
 from protomark.features.static_regions import Mask, outside
 from protomark.geometry.absolute_pose import refine_pose
 from protomark.geometry.camera import Camera
@@ -71,7 +71,7 @@ class Mapper:
         # Features that are known already, and the part of the image that is left out.
         self.features: dict[str, Features] = {}
         self.mask: Mask | None = None
-        self._extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
+        self.extractor = options.extractor()
         self._reset_initialiser()
 
     @property
@@ -95,7 +95,7 @@ class Mapper:
     @property
     def descriptor_bytes(self) -> int:
         """Bytes of a descriptor."""
-        return self._extractor.kind.bytes
+        return self.extractor.kind.bytes
 
     # The paper's Section 3: detect, track or relocalize, observe, and extend the map by keyframes.
 
@@ -151,7 +151,7 @@ class Mapper:
             record.outcome = image.problem
             return None
         height, width = image.image.shape
-        camera_id = self._camera_id(image.camera)
+        camera_id = self.id_of_camera(image.camera)
         camera = self.structure.cameras[camera_id]
         if (width, height) != (camera.width, camera.height):
             record.outcome = (
@@ -160,7 +160,7 @@ class Mapper:
             return None
         with self.clock.stage("detect"):
             features = image.features or self.features.get(image.name)
-            features = features or self._extractor(image.image)
+            features = features or self.extractor(image.image)
             if self.mask is not None and self.mask.shape == image.image.shape:
                 features = features.where(outside(self.mask, features.keypoints))
         record.keypoints = len(features)
@@ -183,7 +183,7 @@ class Mapper:
             turns=turns,
         )
 
-    def _camera_id(self, camera: Camera | None) -> int:
+    def id_of_camera(self, camera: Camera | None) -> int:
         """The id of a camera, a new one if no frame had it; None: that of the next frames."""
         cameras = self.structure.cameras
         if camera is None:
@@ -299,13 +299,9 @@ class Mapper:
         for frame in structure.frames:
             rows = frame.observed
             if not frame.keyframe and len(rows) >= 6:
-                frame.pose, _ = refine_pose(
-                    frame.pose,
-                    frame.keypoints[rows].astype(np.float64),
-                    structure.positions[frame.landmarks[rows]],
-                    structure.cameras[frame.camera_id],
-                    structure.tolerance(frame.camera_id, self.options.max_error),
-                )
+                matched = structure.matched(frame, rows, frame.seen)
+                limit = structure.tolerance(frame.camera_id, self.options.max_error)
+                frame.pose, _ = refine_pose(frame.pose, *matched, limit)
 
     def _window(self) -> list[int]:
         return [i for i, frame in enumerate(self.structure.frames) if frame.in_window]
@@ -317,11 +313,15 @@ class Mapper:
         record.inliers = len(frame.seen)
 
     def _register_given_pose(self, frame: Frame, pose: Array) -> None:
-        """Register a frame whose pose is given."""
-        matches = LandmarkMatches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        """Register a frame whose pose is given, unless the map contradicts that."""
+        matches, o = LandmarkMatches(np.zeros(0, np.int64), np.zeros(0, np.int64)), self.options
         if len(self.structure.ids):
             with self.clock.stage("match"):
-                matches = self.tracker.match_projected(frame, pose, 1.5 * self.options.max_error)
+                matches = self.tracker.match_projected(frame, pose, 1.5 * o.max_error)
+                few = len(matches) < o.min_inliers
+                if few and trust.taken_elsewhere(self.tracker, frame, pose):
+                    self.history.records[frame.name].outcome = trust.ELSEWHERE
+                    return
         self._insert_frame(frame, TrackedPose(pose, matches))
 
     # Initialisation.

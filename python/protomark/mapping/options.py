@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protomark.features.descriptors import descriptor_kind
-from protomark.features.extractor import MAX_SIZE
+from protomark.features.extractor import MAX_SIZE, Extractor
 from protomark.maps.build import APPEARANCE_BITS, DIM
 
 
@@ -29,6 +29,10 @@ class MappingOptions:
     min_inliers: int = 20  # number of matches that must agree with a frame's pose
     calibrate: bool = False  # whether focal length and distortion are refined while mapping
     fixed_poses: bool = False  # whether poses are given and not adjusted
+
+    def extractor(self) -> Extractor:
+        """What detects and describes the keypoints of frames."""
+        return Extractor(self.descriptor, self.max_keypoints, self.max_size)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from protomark.geometry.camera import Camera
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.source import FrameSource
 from protomark.mapping.state import CHECKPOINT, STATE
@@ -114,6 +116,25 @@ def check_same_options(request: MapRequest, options: MappingOptions) -> None:
                 f"{_option(name)} {asked}: {request.output} was made with {value}, so leave the "
                 "option out, or make another map with -o"
             )
+
+
+def same_camera(request: MapRequest, cameras: Iterable[Camera], given: Camera) -> Camera:
+    """The camera of a map that is the given one, or this if none has its size.
+
+    Raises:
+        ValueError: the map has another camera of that size.
+    """
+    sized = [c for c in cameras if (c.width, c.height) == (given.width, given.height)]
+    for camera in sized:
+        if camera.resembles(given):
+            return camera
+    if sized:
+        raise ValueError(
+            f"--camera {request.camera}: {request.output} was made with {sized[-1]}: leave the "
+            "option out, or, for images of another lens, give a COLMAP model that names their "
+            "cameras"
+        )
+    return given
 
 
 def _option(name: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from protomark.features.extractor import Extractor, Features, pixel_size
+from protomark.features.extractor import Features, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
 from protomark.files import only_writer
 from protomark.geometry.camera import Camera
@@ -28,12 +28,13 @@ from protomark.mapping.request import (
     check_same_options,
     check_same_request,
     request_facts,
+    same_camera,
 )
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
 from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open_source
 from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
 from protomark.mapping.survey import Survey, survey
-from protomark.mapping.trust import no_map
+from protomark.mapping.trust import are_elsewhere, no_map
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread, read_ahead
 
@@ -76,9 +77,11 @@ def _make_map(
             )
         except KeyboardInterrupt:
             raise Interrupted(f"stopped before the last adjustment of the map: {resume}") from None
-        if not len(mapper.structure.ids) or len(mapper.structure.frames) <= session.known:
+        known = session.known
+        elsewhere = known > 0 and are_elsewhere(mapper, source)
+        if not len(mapper.structure.ids) or len(mapper.structure.frames) <= known or elsewhere:
             shutil.rmtree(checkpoint, ignore_errors=True)
-            raise ValueError(no_map(mapper, source, session.known))
+            raise ValueError(no_map(mapper, source, known))
     progress("write", 0, 0)
     if request.extend:
         back_up(request.output)
@@ -114,7 +117,6 @@ class _Session:
         self.progress, self.note = progress, note
         self.cursor = self.known = 0
         self._order: list[str] = []  # names of photos that had none
-        self._ahead: Extractor | None = None  # of the thread that reads ahead
         self.facts: dict[str, Any] = {}
         if request.resume:
             self._resume()
@@ -159,15 +161,18 @@ class _Session:
                 "refined while mapping (--camera gives a calibrated one)"
             )
         else:
-            pixel = pixel_size((camera.width, camera.height), options.max_size)
-            if sentence := misfit(surveyed.pose_errors(camera, pixel)):
-                raise ValueError(f"{request.poses}: {sentence}")
+            self._check_poses(surveyed, camera, options)
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
         self.mapper = Mapper(options, camera, request.threads)
         if self.mapper.calibration is not None:
             self.mapper.calibration.given = origin in (GIVEN, EXIF)
         self._prepare(surveyed, "", {})
+
+    def _check_poses(self, surveyed: Survey, camera: Camera, options: MappingOptions) -> None:
+        pixel = pixel_size((camera.width, camera.height), options.max_size)
+        if sentence := misfit(surveyed.pose_errors(camera, pixel)):
+            raise ValueError(f"{self.request.poses}: {sentence}")
 
     def _guess_camera(self, surveyed: Survey) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length."""
@@ -196,21 +201,32 @@ class _Session:
 
     def _extend(self) -> None:
         request = self.request
-        self.mapper, facts = load_state(request.output, request.threads, self._camera())
+        self.mapper, facts = load_state(request.output, request.threads)
         check_same_options(request, self.mapper.options)
+        camera = self._camera()
+        if camera is not None and not self.source.cameras:
+            camera = same_camera(request, self.mapper.structure.cameras.values(), camera)
+        self.mapper.camera_id = self.mapper.id_of_camera(camera)
         self._read_poses()
         inputs: dict[str, str] = facts.get("inputs", {})
         prefix = _prefix(self.mapper, self.source, inputs)
         self.known = len(self.mapper.structure.frames)
-        self._prepare(self._survey(self.mapper.options), prefix, inputs)
+        surveyed = self._survey(self.mapper.options)
+        self._check_poses(surveyed, self.mapper.camera, self.mapper.options)
+        self._prepare(surveyed, prefix, inputs)
         self.source.follow(self.mapper.structure, self.mapper.history.records)
+        if shift := self.source.time_shift:
+            told = (
+                f"the map has frames of these times: those of {self.source.path.name} are shifted"
+            )
+            self.mapper.history.events.append(f"{told} by {shift:g}")
+            self.note(self.mapper.history.events[-1])
 
     def _reordered(self, source: ImageFolder, options: MappingOptions, surveyed: Survey) -> Survey:
         """What the first frames show in the order in which they match, if that is another one."""
-        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         known = surveyed.features
         images, count = source.images(), len(source)
-        self._order = matching_order(images, count, extractor, known, self.progress)
+        self._order = matching_order(images, count, options.extractor(), known, self.progress)
         if not self._order:
             return surveyed
         self.note("the photos are in no order: each is mapped after one that it matches")
@@ -222,8 +238,7 @@ class _Session:
         self.progress("look at the first frames", 0, 0)
         started = time.perf_counter()
         size = self.source.size()
-        extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
-        surveyed = survey(self.source.images(), extractor, size, known or {})
+        surveyed = survey(self.source.images(), options.extractor(), size, known or {})
         matches = [(pair.first, pair.second) for pair in surveyed.pairs]
         mask = static_regions(matches, size, pixel_size(size, options.max_size))
         if region := describe(mask):
@@ -313,10 +328,7 @@ class _Session:
         known = image.name in mapper.features or image.name in mapper.history.records
         if known or image.image is None or image.image.shape[::-1] != self.source.size():
             return image
-        options = mapper.options
-        if self._ahead is None:
-            self._ahead = Extractor(options.descriptor, options.max_keypoints, options.max_size)
-        return replace(image, features=self._ahead(image.image))
+        return replace(image, features=mapper.extractor(image.image))
 
     def _stage(self) -> str:
         """The name of the stage: a progress bar starts anew with each."""

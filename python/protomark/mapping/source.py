@@ -9,12 +9,11 @@ from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from protomark.extras import optional
-from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray, to_gray
+from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray
+from protomark.features.video import check_video, video_frames
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif
 from protomark.geometry.pose_files import PoseSet, image_times
@@ -79,15 +78,22 @@ class FrameSource(ABC):
         self.first_index, self.time_shift = first_index, time_shift
 
     def follow(self, structure: Structure, records: Collection[str]) -> None:
-        """Number the frames after those of a map, and shift their times if these overlap.
+        """Number the frames after those of a map, and shift their times if these would mix.
 
-        Frames whose names are among the records are not new.
+        Frames whose names are among the records are not new. Times of one clock may mix, unless one
+        is taken: those of one folder, and seconds in names.
         """
         first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
-        old = [f.time for f in structure.frames]
-        new = [time for name, time in self.listing() if self.prefix + name not in records]
+        times = {self.prefix + name: time for name, time in self.listing()}
+        new = [time for name, time in times.items() if name not in records]
+        old = [frame.time for frame in structure.frames]
         overlap = bool(old and new) and min(new) <= max(old) and min(old) <= max(new)
-        self.shift(first, math.ceil(1 + max(old) - min(new)) if overlap else 0.0)
+        seconds = isinstance(self, ImageFolder) and self.timed
+        one_clock = all(
+            f.name in times or (seconds and f.time == _seconds(f.name)) for f in structure.frames
+        )
+        mixing = overlap and not (one_clock and set(new).isdisjoint(old))
+        self.shift(first, math.ceil(1 + max(old) - min(new)) if mixing else 0.0)
 
     def images(
         self, start: int = 0, only: set[str] | None = None, backward: bool = False
@@ -245,14 +251,7 @@ class Video(FrameSource):
     def __init__(self, path: Path, every: int = 1) -> None:
         super().__init__(path)
         self._every = every
-        cv2, video = optional("cv2"), _open_video(path)
-        count, rate = (float(video.get(p)) for p in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-        decodes = video.grab()
-        video.release()
-        if not decodes:
-            raise ValueError(f"{path}: no frame of this video decodes, convert it with ffmpeg")
-        self._rate = rate if np.isfinite(rate) and rate > 0 else 30.0
-        self._count = max(1, -(-int(max(count, 1)) // every))
+        self._count = -(-check_video(path) // every)
 
     def __len__(self) -> int:
         return self._count
@@ -281,29 +280,14 @@ class Video(FrameSource):
         chunk: set[int] | None = None,
         decode: bool = True,
     ) -> Iterator[InputImage]:
-        video, position = _open_video(self.path), optional("cv2").CAP_PROP_POS_MSEC
-        try:
-            number, time = -1, -1 / self._rate
-            while video.grab():
-                number += 1
-                # Frames need not follow each other at one rate; not every decoder knows when.
-                shown = video.get(position) / 1000
-                time = shown if shown > time else time + 1 / self._rate
-                index, rest = divmod(number, self._every)
-                name = f"{self.path.stem}-{number:06d}"
-                if rest or index < start or (only is not None and name not in only):
-                    continue
-                if chunk is not None and index not in chunk:
-                    continue
-                if not decode:
-                    yield InputImage(index, name, time, None)
-                    continue
-                decoded, image = video.retrieve()
-                gray = to_gray(np.asarray(image)) if decoded else None
-                problem = "" if decoded else "this frame does not decode"
-                yield InputImage(index, name, time, gray, problem=problem)
-        finally:
-            video.release()
+        for index, (name, time, read) in enumerate(video_frames(self.path, self._every)):
+            if index < start or (only is not None and name not in only):
+                continue
+            if chunk is not None and index not in chunk:
+                continue
+            image = read() if decode else None
+            problem = "this frame does not decode" if decode and image is None else ""
+            yield InputImage(index, name, time, image, problem=problem)
 
 
 def open_source(path: Path, every: int = 1) -> FrameSource:
@@ -322,25 +306,13 @@ def open_source(path: Path, every: int = 1) -> FrameSource:
     return Video(path, every)
 
 
+def _seconds(name: str) -> float | None:
+    times, timed = image_times([name])
+    return times[0] if timed else None
+
+
 def _is_same(one: Camera, other: Camera) -> bool:
     if (one.model, one.width, one.height) != (other.model, other.width, other.height):
         return False
     off = np.abs(np.subtract(one.params, other.params)).max()
     return bool(off <= _SAME_CAMERA * one.params[0])
-
-
-def _open_video(path: Path) -> Any:
-    cv2 = optional("cv2")
-    # OpenCV and FFmpeg would print their own view of a broken file.
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
-    try:
-        video = cv2.VideoCapture(str(path))
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if not video.isOpened():
-        raise ValueError(
-            f"{path}: not a video that OpenCV can decode; convert it, for example with "
-            "ffmpeg -i IN -c:v libx264 OUT.mp4, or give a folder of images"
-        )
-    return video

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from protomark._core import FileError
 from protomark.extras import optional
 from protomark.files import replacing, replacing_folder
-from protomark.geometry.camera import Camera, cameras_from_json
+from protomark.geometry.camera import cameras_from_json
 from protomark.mapping.frame import Frame
 from protomark.mapping.history import History
 from protomark.mapping.mapper import Mapper
@@ -75,12 +75,8 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         file.write(save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, metadata))
 
 
-def load_state(
-    folder: Path, threads: int = 1, camera: Camera | None = None
-) -> tuple[Mapper, dict[str, Any]]:
+def load_state(folder: Path, threads: int = 1) -> tuple[Mapper, dict[str, Any]]:
     """Load a map or a checkpoint, to continue it, and the facts that were saved with it.
-
-    The camera is that of the next frames, if it is another one.
 
     Raises:
         FileError: the folder holds no state, or a broken one.
@@ -106,9 +102,6 @@ def load_state(
         raise FileError(
             f"{path}: not the state of a map, or broken ({error}): make the map anew with --force"
         ) from None
-    if camera is not None and camera != mapper.camera:
-        mapper.camera_id = max(cameras) + 1
-        mapper.structure.cameras[mapper.camera_id] = camera
     return mapper, state["facts"]
 
 

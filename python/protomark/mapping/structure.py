@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.features.extractor import MAX_SIZE, pixel_size
+from protomark.geometry.absolute_pose import reprojection_error
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
 from protomark.geometry.triangulation import pixel_errors
@@ -85,6 +86,15 @@ class Structure:
         """See `pixel_size`: keypoints of a camera are so accurate."""
         camera = self.cameras[camera_id]
         return pixel_size((camera.width, camera.height), self.max_size)
+
+    def matched(self, frame: Frame, rows: Ids, ids: Ids) -> tuple[Array, Array, Camera]:
+        """Pixels (n, 2) of a frame's keypoints, positions (n, 3) of landmarks, and its camera."""
+        pixels = frame.keypoints[rows].astype(np.float64)
+        return pixels, self.positions[ids], self.cameras[frame.camera_id]
+
+    def median_error(self, pose: Array, frame: Frame, rows: Ids, ids: Ids) -> float:
+        """Median distance in pixels of a frame's keypoints from landmarks projected by a pose."""
+        return float(np.median(reprojection_error(pose, *self.matched(frame, rows, ids))))
 
     def keyframes(self) -> list[int]:
         """Indices of the keyframes."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.geometry.absolute_pose import estimate_pose, refine_pose, reprojection_error
+from protomark.geometry.absolute_pose import estimate_pose, refine_pose
 from protomark.geometry.neighbours import near_pairs, runs
 from protomark.mapping.frame import Array, Frame, Ids
 from protomark.mapping.memory import Memory
@@ -78,13 +78,9 @@ class Tracker:
 
     def _misses_matches(self, frame: Frame, predicted: Array, found: TrackedPose) -> bool:
         """Whether the prediction was so far off that right matches lie outside of its radius."""
-        off = reprojection_error(
-            predicted,
-            frame.keypoints[found.matches.rows].astype(np.float64),
-            self.structure.positions[found.matches.ids],
-            self.structure.cameras[frame.camera_id],
-        )
-        return bool(np.median(off) > self.structure.tolerance(frame.camera_id, _LARGE_OFFSET))
+        matches = found.matches
+        off = self.structure.median_error(predicted, frame, matches.rows, matches.ids)
+        return off > self.structure.tolerance(frame.camera_id, _LARGE_OFFSET)
 
     def relocalize(self, frame: Frame, among: Ids | None = None) -> TrackedPose | None:
         """The pose of a frame anywhere in the map, by search among landmarks; None: all of them.
@@ -162,11 +158,8 @@ class Tracker:
     def _solve(self, frame: Frame, matches: LandmarkMatches) -> TrackedPose | None:
         if len(matches) < self.min_inliers:
             return None
-        camera = self.structure.cameras[frame.camera_id]
         found = estimate_pose(
-            frame.keypoints[matches.rows].astype(np.float64),
-            self.structure.positions[matches.ids],
-            camera,
+            *self.structure.matched(frame, matches.rows, matches.ids),
             self.structure.tolerance(frame.camera_id, self.max_error),
         )
         if found is None or found.inliers.sum() < self.min_inliers:
@@ -178,9 +171,7 @@ class Tracker:
     ) -> tuple[Array, NDArray[np.bool_]]:
         return refine_pose(
             pose,
-            frame.keypoints[matches.rows].astype(np.float64),
-            self.structure.positions[matches.ids],
-            self.structure.cameras[frame.camera_id],
+            *self.structure.matched(frame, matches.rows, matches.ids),
             self.structure.tolerance(frame.camera_id, self.max_error),
             self.structure.weights(pose, matches.ids),
         )

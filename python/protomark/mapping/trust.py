@@ -18,7 +18,7 @@ from protomark.mapping.history import REGISTERED
 from protomark.mapping.initialisation import MIN_PARALLAX
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.structure import Structure
-from protomark.mapping.tracking import LandmarkMatches
+from protomark.mapping.tracking import LandmarkMatches, Tracker
 
 if TYPE_CHECKING:
     from protomark.mapping.mapper import Mapper
@@ -39,9 +39,13 @@ _MAX_NAMED = 3
 # A given camera is wrong if another focal length fits better that is this share of it away, and so
 # many standard deviations.
 _MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
-# A frame is of another lens if a focal length fits better that is this share longer or shorter, and
-# so many standard deviations.
-_MAX_STRETCH, _STRETCH_SIGMAS = 0.025, 3.0
+# A frame is of another lens if it fits a focal length that is this share longer or shorter than
+# most frames fit, and so many standard deviations: its own, and that of most frames.
+_MAX_STRETCH, _STRETCH_SIGMAS, _MOST_SIGMAS = 0.04, 3.0, 3.5
+# A given pose is wrong if it is this share of the longer side off in the image (median). A map is
+# not extended if that share of the new frames contradict their given poses.
+_MAX_OFFSET = 0.05
+_MAX_ELSEWHERE = 0.1
 # Maps with a smaller share of their frames are of something else than their input.
 _MIN_REGISTERED = 0.5
 
@@ -49,18 +53,33 @@ NOT_FOUND = "not found in the map: too few matches agree on a pose"
 UNCERTAIN = "its pose is uncertain: what it sees has too little depth, or lies too close together"
 THROWN = "it was thrown far away from its neighbours"
 WAITING = "before the first pair of frames with enough parallax"
+ELSEWHERE = "the map shows that it was taken elsewhere than its given pose says"
 TOO_FEW = "too few landmarks are left that it observes"
 
 
 def is_uncertain(structure: Structure, frame: Frame, pose: Array, matches: LandmarkMatches) -> bool:
     """Whether landmarks that match leave open where a frame was taken."""
-    pixels = frame.keypoints[matches.rows].astype(np.float64)
-    positions = structure.positions[matches.ids]
-    covariance = pose_covariance(pose, pixels, positions, structure.cameras[frame.camera_id])
+    matched = structure.matched(frame, matches.rows, matches.ids)
+    covariance = pose_covariance(pose, *matched)
     if covariance is None:
         return True
-    depth = float(np.median(np.abs(transform(pose, positions)[:, 2])))
+    depth = float(np.median(np.abs(transform(pose, matched[1])[:, 2])))
     return bool(np.sqrt(np.trace(covariance[3:, 3:])) > _MAX_DEVIATION * depth)
+
+
+def taken_elsewhere(tracker: Tracker, frame: Frame, pose: Array) -> bool:
+    """Whether a frame is found in the map, but far from its given pose."""
+    found, structure = tracker.relocalize(frame), tracker.structure
+    if found is None:
+        return False
+    off = structure.median_error(pose, frame, found.matches.rows, found.matches.ids)
+    return off > structure.tolerance(frame.camera_id, _MAX_OFFSET)
+
+
+def are_elsewhere(mapper: Mapper, source: FrameSource) -> bool:
+    """Whether the map contradicts the given poses of too many of its new frames."""
+    records = [r for r in mapper.history.records.values() if r.index >= source.first_index]
+    return sum(r.outcome == ELSEWHERE for r in records) > _MAX_ELSEWHERE * len(records)
 
 
 def untrusted_frames(structure: Structure) -> dict[int, str]:
@@ -165,21 +184,40 @@ def wrong_focal_lengths(structure: Structure) -> list[str]:
 
 
 def other_lenses(structure: Structure, max_error: float) -> list[str]:
-    """Names of frames that fit better with another focal length: a zoom, another camera."""
-    names = []
+    """Names of frames that fit another focal length than most: a zoom, another camera."""
+    found: dict[int, list[tuple[str, float, float]]] = {}
     for frame in structure.frames:
         camera, rows = structure.cameras[frame.camera_id], frame.observed
         if camera.wide or len(rows) < _MIN_LANDMARKS:
             continue
-        positions = structure.positions[frame.landmarks[rows]]
-        pixels = frame.keypoints[rows].astype(np.float64)
+        matched = structure.matched(frame, rows, frame.seen)
         tolerance = structure.tolerance(frame.camera_id, max_error)
-        free = free_lens(frame.pose, pixels, positions, camera, tolerance)
-        depth = float(np.median(transform(frame.pose, positions)[:, 2]))
-        # What leaves the camera's centre open along the view leaves the focal length as open.
-        if abs(free.stretch - 1) > max(_MAX_STRETCH, _STRETCH_SIGMAS * free.spread / depth):
-            names.append(frame.name)
+        free = free_lens(frame.pose, *matched, tolerance)
+        one = frame.name, float(np.log(free.stretch)), free.deviation
+        found.setdefault(frame.camera_id, []).append(one)
+    names: list[str] = []
+    for frames in found.values():
+        middle, spread = _shortest_half([stretch for _, stretch, _ in frames])
+        limit = max(_MAX_STRETCH, _MOST_SIGMAS * spread)
+        names += [
+            name
+            for name, stretch, deviation in frames
+            if abs(stretch - middle) > max(limit, _STRETCH_SIGMAS * deviation)
+        ]
     return names
+
+
+def _shortest_half(values: Sequence[float]) -> tuple[float, float]:
+    """Median and standard deviation of most values, by the shortest interval with half of them.
+
+    Rousseeuw and Leroy, A Robust Scale Estimator Based on the Shortest Half, 1988.
+    """
+    ordered = np.sort(values)
+    half = len(ordered) // 2 + 1
+    lengths = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
+    first = int(np.argmin(lengths))
+    # Half of all normal numbers lie within 0.67 standard deviations.
+    return float(np.median(ordered[first : first + half])), float(lengths[first] / (2 * 0.6745))
 
 
 def warnings(mapper: Mapper) -> list[str]:
@@ -232,6 +270,11 @@ def no_map(mapper: Mapper, source: FrameSource, known: int = 0) -> str:
     """Why there is no map, or why a map with `known` frames was not extended."""
     records = [r for r in mapper.history.records.values() if r.outcome != REGISTERED]
     common = Counter(r.outcome for r in records).most_common(1)
+    if known and are_elsewhere(mapper, source):
+        return (
+            f"{source.path}: the map stays as it was, as these poses are not in its world: "
+            "--poses must have its origin, axes and scale"
+        )
     if known:
         return (
             f"{source.path}: none of its frames fits the map, which stays as it was: "

@@ -10,6 +10,7 @@ import numpy as np
 import protomark as pm
 from protomark.maps.open import map_path
 from protomark.tracks.file import Tracks
+from protomark.tracks.summary import summarise
 
 
 def is_tracks(path: Path) -> bool:
@@ -34,16 +35,9 @@ def describe(path: Path) -> dict[str, Any]:
 
 def _describe_tracks(path: Path) -> dict[str, Any]:
     tracks = Tracks.load(path)
-    observations = len(tracks.observations)
     return {
         "kind": "tracks",
-        "descriptor": tracks.descriptor,
-        "bits": tracks.bits,
-        "keyframes": len(tracks.keyframe_names),
-        "keypoints": len(tracks.keypoints),
-        "landmarks": len(tracks.landmark_ids),
-        "observations": observations,
-        "observations_per_landmark": observations / max(1, len(tracks.landmark_ids)),
+        **summarise(tracks),
         "cameras": [camera.as_dict() for camera in tracks.cameras.values()],
         "info": tracks.info,
         "bytes": path.stat().st_size,

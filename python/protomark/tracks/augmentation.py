@@ -8,7 +8,6 @@ valid.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -85,22 +84,15 @@ def add_augmentations(
         raise ValueError("these tracks are augmented already: give the plain ones")
     plain = tracks.where(tracks.landmark_of_keypoint >= 0)
     options = tracks.info.get("options", {})
-    local = threading.local()
+    limits = int(options.get("max_keypoints", 2000)), int(options.get("max_size", MAX_SIZE))
+    extractor = Extractor(tracks.descriptor, *limits)
 
     def copies(index: int) -> list[tuple[Features, NDArray[np.int64]]]:
-        if not hasattr(local, "extractor"):
-            local.extractor = Extractor(
-                tracks.descriptor,
-                int(options.get("max_keypoints", 2000)),
-                int(options.get("max_size", MAX_SIZE)),
-            )
         image = read_gray(images / tracks.keyframe_names[index])
         rows = plain.keypoints_of(index)
         seen = (plain.keypoints[rows], plain.sizes[rows], plain.landmark_of_keypoint[rows])
-        return [
-            _copy(image, np.random.default_rng([index, k]), local.extractor, *seen)
-            for k in range(count)
-        ]
+        rngs = (np.random.default_rng([index, k]) for k in range(count))
+        return [_copy(image, rng, extractor, *seen) for rng in rngs]
 
     found = parallel_map(copies, range(len(tracks.keyframe_names)), threads, progress, "augment")
     flat = [(i, k, *one[k]) for i, one in enumerate(found) for k in range(count)]

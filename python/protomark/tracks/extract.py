@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import threading
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -446,16 +445,13 @@ def _detect(
 ) -> tuple[colmap.ColmapModel, list[Features], dict[str, str]]:
     """The images that can be read, their features, and what is wrong with each of the others."""
     cv2 = optional("cv2")
-    # OpenCV's detectors are costly to create and not thread-safe, so each thread has its own.
-    local = threading.local()
+    extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
 
     def one(index: int) -> Features | str:
-        if not hasattr(local, "extractor"):
-            local.extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
         path = sequence.images / model.names[index]
         try:
             image = read_gray(path)
-            features: Features = local.extractor(image)
+            features = extractor(image)
         except ValueError as error:
             return str(error).removeprefix(f"{path}: ")
         camera = model.cameras[int(model.camera_ids[index])]
