@@ -44,7 +44,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, searched in (
             ("learning", scene),
-            ("sealed, 4 bits", scene.seal(Path(folder) / "map.pmk", bytes_per_landmark=17)),
+            ("sealed, 17 bytes", scene.seal(Path(folder) / "map.pmk", bytes_per_landmark=17)),
         ):
             for queries in (1000, 1):
                 asked = np.ascontiguousarray(codes[rng.choice(LANDMARKS, queries)])

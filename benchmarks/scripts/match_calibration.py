@@ -6,7 +6,7 @@ The script localizes keyframes of the later half of each sequence in a map of th
 a random tenth of the keyframes in a map of the other nine tenths. It fits the calibration to the
 other sequences. Precision and recall are those of accepted matches over all keypoints; a pose is
 found if its errors are at most 1 % of the median scene depth and 2 degrees. It then applies the
-same calibration, fitted to maps of 8 bits per number, to maps of 4 bits per number and of several
+same calibration, fitted to int8 prototypes, to words of two numbers, also tuned, and to several
 appearances per landmark. Prints the tables of docs/results/localization.md.
 """
 
@@ -44,7 +44,7 @@ from protomark_bench.report import ReportTable
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
 RATIOS = (0.7, 0.8, 0.9, 0.95)
 PARTS = ("tenth", "half")
-KINDS = ("8 bits", "4 bits", "appearances")
+KINDS = ("int8", "words", "tuned words", "appearances")
 FRAMES = 40
 # A rule: squared distances (n, 2) -> the score of each match, and the lowest accepted score.
 Rule = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], float]]
@@ -125,10 +125,12 @@ def kinds(
     result = []
     for kind in KINDS:
         scene = pm.PrototypeMap(encoder, dim, APPEARANCE_BITS if kind == "appearances" else 0)
-        scene.add(tracks.landmark_of_keypoint[rows], tracks.descriptors[rows])
+        observed = tracks.landmark_of_keypoint[rows], tracks.descriptors[rows]
+        scene.add(*observed)
         with tempfile.TemporaryDirectory() as folder:
-            size = 4 * -(-dim // 8) + 1 if kind == "4 bits" else None
-            sealed = scene.seal(Path(folder) / "scene.pmk", bytes_per_landmark=size)
+            size = dim // 2 + 1 if "words" in kind else None
+            by = observed if "tuned" in kind else (None, None)
+            sealed = scene.seal(Path(folder) / "scene.pmk", *by, bytes_per_landmark=size)
             given = label_matches(tracks, queries, sealed.search)
         found = measure_calibration("", dim, calibration, given)
         result.append([found.precision, found.expected, found.recall])

@@ -398,7 +398,7 @@ def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
     assert not any("failed" in note for note in results.skipped), results.skipped
     assert not any(NOT_NAMED in note for note in results.skipped)
     assert {point["landmarks"] for point in results.growth} == {1_000}
-    assert results.large["8 bits: recall of the nearest of 8 bits"] >= 0.9
-    assert results.large["4 bits: file bytes"] < results.large["8 bits: file bytes"]
+    assert results.large["int8: recall of the nearest of int8"] >= 0.9
+    assert results.large["words: file bytes"] < results.large["int8: file bytes"]
     assert results.command == "protomark bench --scale quick --landmarks 1000"
     assert (tmp_path / "benchmarks.md").is_file()

@@ -18,16 +18,17 @@ from protomark_bench.speed.peers.index import K
 from protomark_bench.speed.sections import Bench
 
 RECALL, THREADS = 0.95, 2
-CODE_BITS = (8, 4)
+# How prototypes are stored: as int8 numbers, and as words of two numbers.
+FORMS = ("int8", "words")
 # Bytes per landmark, about, of a learning map while it is built and sealed, and of both files.
 _LEARNING_BYTES, _FILE_BYTES = 140, 70
 _OBSERVATIONS = 2  # per landmark, so that generating them takes minutes, not hours
 _PART = 1 << 20
-_FINER = f"recall of the nearest of 8 bits, asked for {sections.RECALL}"
+_FINER = f"recall of the nearest of int8, asked for {sections.RECALL}"
 
 
 def large(bench: Bench) -> None:
-    """Measure file size, opening, and 1,000 queries at a recall, with 8 and 4 bits per number."""
+    """Measure file size, opening, and 1,000 queries at a recall, as int8 and as words."""
     workload, settings, n = bench.workload, bench.settings, bench.settings.large
     if n == 0:
         return
@@ -57,22 +58,22 @@ def large(bench: Bench) -> None:
     landmarks = np.random.default_rng(7).integers(0, n, settings.queries)
     codes = workload.codes(synthetic.queries(landmarks))
     with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
-        paths = {bits: Path(folder) / f"{bits}.pmk" for bits in CODE_BITS}
-        for bits, path in paths.items():
-            bench.advance(f"sealing, {bits} bits")
-            size = None if bits == 8 else 4 * -(-workload.dim // 8) + 1
+        paths = {form: Path(folder) / f"{form}.pmk" for form in FORMS}
+        for form, path in paths.items():
+            bench.advance(f"sealing, {form}")
+            size = None if form == "int8" else workload.dim // 2 + 1
             scene.seal(path, bytes_per_landmark=size)
         del scene
         bench.advance("searching exactly")
-        nearest = pm.open(paths[8]).search_codes(codes, k=1, threads=THREADS)[0][:, 0]
+        nearest = pm.open(paths["int8"]).search_codes(codes, k=1, threads=THREADS)[0][:, 0]
         name = "the nearest prototype is of the landmark asked for"
         figures[name] = _share(nearest, landmarks)
-        for bits, path in paths.items():
-            bench.advance(f"searching, {bits} bits")
+        for form, path in paths.items():
+            bench.advance(f"searching, {form}")
             measured = _measured(path, codes, nearest, landmarks)
-            figures |= {f"{bits} bits: {name}": value for name, value in measured.items()}
+            figures |= {f"{form}: {name}": value for name, value in measured.items()}
         bench.advance("searching as smaller maps are")
-        _extend_growth(bench, paths[8], codes, figures[f"8 bits: {_FINER}"])
+        _extend_growth(bench, paths["int8"], codes, figures[f"int8: {_FINER}"])
     bench.results.large = figures
 
 
@@ -87,7 +88,7 @@ def _measured(
     Args:
         path: the file of the map.
         codes: (q, dim) queries.
-        nearest: (q,) nearest landmarks of an exact search among prototypes of 8 bits.
+        nearest: (q,) nearest landmarks of an exact search among int8 prototypes.
         landmarks: (q,) landmarks that the queries observe.
     """
     begin = time.perf_counter()
@@ -107,7 +108,7 @@ def _measured(
         "first 1,000 queries, seconds": per * seconds[0],
         "1,000 queries, seconds": per * median(seconds),
         "recall of this file's nearest": _share(found, exact),
-        "recall of the nearest of 8 bits": _share(found, nearest),
+        "recall of the nearest of int8": _share(found, nearest),
         _FINER: _share(finer, nearest),
         "landmark asked for": _share(found, landmarks),
     }

@@ -77,7 +77,7 @@ _GROWTH = (
 _LARGEST = (
     "Two threads, a recall of 0.95 asked for; held-out observations are the queries. Four bits "
     "round the prototypes: how often a search finds what is nearest in this file, what is nearest "
-    "among the prototypes of 8 bits, and the landmark that the query observes."
+    "among int8 prototypes, and the landmark that the query observes."
 )
 _FACTS = {
     "recall": ("recall@1", ".3f"),
