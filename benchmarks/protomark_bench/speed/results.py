@@ -275,9 +275,9 @@ def draw_growth(results: BenchResults) -> Figure | None:
         return None
     if results.large:
         n = results.large["landmarks"]
-        for bits, color in ((8, plot.VIOLET), (4, plot.BLUE)):
-            size = results.large[f"{bits} bits: file bytes"] / 2**20
-            memory.append(plot.Series(f"sealed file, {bits} bits", [n], [size], color, "D"))
+        for form, color in (("int8", plot.VIOLET), ("words", plot.BLUE)):
+            size = results.large[f"{form}: file bytes"] / 2**20
+            memory.append(plot.Series(f"sealed file, {form}", [n], [size], color, "D"))
     return plot.draw_lines(
         [
             plot.Panel(title, "landmarks (log)", y, series, log="xy")
