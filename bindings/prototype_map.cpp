@@ -333,7 +333,8 @@ Args:
     path: the file to write.
     landmark_ids: (n,), of descriptors.
     descriptors: (n, bits / 8) uint8, the observations that the map was built from, as far as they
-        are at hand. Prototypes are tuned by them, or else by the map's appearances.
+        are at hand. Prototypes are tuned by them, or else by the map's appearances if only one
+        prototype per landmark fits.
     bytes_per_landmark: bytes that a landmark may take on average for its prototypes, their number
         and its count (not for position, id and index). None: the sealed map gives the answers of
         this one: int8 numbers, every appearance (at most 255 per landmark). Otherwise prototypes

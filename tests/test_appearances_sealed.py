@@ -40,7 +40,7 @@ def test_search_across_chunks(encoder: pm.Encoder, folder: Path) -> None:
     assert scene.prototype_count > 3000
     assert_search(scene, queries, k=3)
     for size, kept in ((None, scene.prototype_count), (in_words(scene, 4.3), 700 * 43 // 10)):
-        scene.seal(folder / "large.pmk", bytes_per_landmark=size)
+        scene.seal(folder / "large.pmk", bytes_per_landmark=size, tune=False)
         sealed = pm.open(folder / "large.pmk")
         assert f"{kept} prototypes" in repr(sealed)
         assert_search(sealed, queries, k=3)
@@ -94,7 +94,7 @@ def test_sealing_equals_plain_merging(
     scene.add_codes(ids, pool[rows])
     reference.add(ids, pool[rows])
     size = in_words(scene, prototypes)
-    sealed = scene.seal(folder / "w.pmk", bytes_per_landmark=size)
+    sealed = scene.seal(folder / "w.pmk", bytes_per_landmark=size, tune=False)
     pm.verify_file(folder / "w.pmk")
     known = reference.ids()
     n, m = len(known), len(reference.rows)
@@ -118,7 +118,7 @@ def test_bytes_per_landmark(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene.add_codes(np.arange(8000) % 1600, codes)
     path = tmp_path / "s.pmk"
     # Sealed to one prototype per landmark, the file is one without appearances.
-    scene.seal(path, bytes_per_landmark=7)
+    scene.seal(path, bytes_per_landmark=7, tune=False)
     sizes = dict(pm.file_sections(path))
     assert set(sizes) == {"encoder", "shape", "counts", "width", "protos"}
     plain = pm.PrototypeMap(encoder)

@@ -107,7 +107,7 @@ def test_words_and_search_equal_the_definition(
 ) -> None:
     dim, width = shape
     scene = filled(coders[width], dim, n, limit, seed)
-    sealed = scene.seal(folder / "s.pmk", bytes_per_landmark=dim // width + 1)
+    sealed = scene.seal(folder / "s.pmk", bytes_per_landmark=dim // width + 1, tune=False)
     pm.verify_file(folder / "s.pmk")
     means = rounded(scene.prototypes(scene.ids))
     expected = quantized(means, CODEBOOKS[width])
@@ -140,7 +140,7 @@ def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
     rng = np.random.default_rng(0)
     scene.add_codes(np.arange(3000), rng.integers(-127, 128, (3000, 21)).astype(np.int8))
     scene.set_positions([5], np.array([[1.0, 2.0, 3.0]]))
-    scene.seal(folder / "large.pmk", bytes_per_landmark=8)
+    scene.seal(folder / "large.pmk", bytes_per_landmark=8, tune=False)
     sealed = pm.open(folder / "large.pmk")
     assert isinstance(sealed, pm.SealedMap)
     assert "7 words" in repr(sealed)

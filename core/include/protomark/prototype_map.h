@@ -189,8 +189,9 @@ class PROTOMARK_API PrototypeMap {
   // bytes_per_landmark than the fewest words of a prototype take, if they need codebooks and the
   // encoder has none, and for positions further than 3.4e38 from the middle of the map.
   //
-  // Prototypes are tuned by the map's appearances, or better by observations: descriptor i (n x
-  // bytes) is of landmark ids[i]; those of landmarks that the map does not hold are ignored.
+  // Prototypes are tuned by observations: descriptor i (n x bytes) is of landmark ids[i]; those of
+  // landmarks that the map does not hold are ignored. Without any, they are tuned by the map's
+  // appearances if only one prototype per landmark fits, and else left as they are.
   void seal(const std::filesystem::path& path, const SealOptions& options = {},
             std::span<const int64_t> ids = {}, Descriptors descriptors = {}) const;
 

@@ -303,7 +303,10 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
   const PrototypeStore& map = state_->store;
   const SealFormat format = seal_format(map, *encoder(), options.bytes_per_landmark);
   auto changed = merge_appearances(map, format.dim, format.row_limit);
-  if (options.tune && options.bytes_per_landmark && (map.several() || !ids.empty())) {
+  // Appearances that remain say no more of what they are mistaken for.
+  const bool merged =
+      map.several() && changed && changed->prototype_count() == map.landmark_count();
+  if (options.tune && options.bytes_per_landmark && (merged || !ids.empty())) {
     const TuningQueries queries =
         ids.empty() ? TuningQueries(map, format.dim)
                     : TuningQueries({ids.begin(), ids.end()},
