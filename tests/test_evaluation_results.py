@@ -32,6 +32,7 @@ def result(sequence: str = "ring", lift: float = 0.0, descriptor: str = "freak")
     return SequenceResult(
         sequence=sequence,
         descriptor=descriptor,
+        split="random",
         keyframes=20,
         landmarks=400,
         observations=4000,
@@ -91,8 +92,8 @@ def test_json_holds_results_and_the_rows_of_their_tables(tmp_path: Path) -> None
 def test_markdown_has_a_table_a_sequence_and_a_mean_a_descriptor() -> None:
     text = evaluation_markdown([result(), result("other"), result(descriptor="orb")])
     assert text.count("|---|") == 4
-    assert "FREAK: mean of ring, other" in text
-    assert "ORB: mean" not in text
+    assert "FREAK, random split: mean of ring, other" in text
+    assert "ORB, random split: mean" not in text
     assert "| **Protomark-32** | **33** | **0.720 ±0.028** | **90.0%** |" in text
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert widths == {8}

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from protomark.evaluation.protocol import SplitKind
 from protomark.files import write_text
 from protomark.plot import AMBER, MUTED, OURS, Curve, draw_curves, new_figure, save_figure
 from protomark.report import markdown_table, percent
@@ -28,7 +29,13 @@ _TABLE_HEAD = (
     "ms per 1,000 queries",
 )
 # Families of several sizes have a colour, single methods are grey.
-_COLOURS = {"pca": AMBER, "discriminant": "#7c3aed"}
+_COLOURS = {
+    "pca": AMBER,
+    "discriminant": "#7c3aed",
+    "pq": "#be123c",
+    "itq": "#0369a1",
+    "lsh": "#4d7c0f",
+}
 _OUR_COLOURS = (OURS, "#0369a1", "#4d7c0f", "#be123c")
 _CURVE_LABELS = {
     "unaggregated": "all descriptors",
@@ -40,6 +47,9 @@ _CURVE_LABELS = {
     "mean": "mean of bits",
     "pca": "PCA",
     "discriminant": "discriminant",
+    "pq": "product quantiser",
+    "itq": "ITQ",
+    "lsh": "LSH",
     "protomark": "Protomark",
     "protomark-sealed": "Protomark, sealed",
     "protomark-appearances": "sealed, tuned by appearances",
@@ -111,6 +121,7 @@ class SequenceResult:
 
     sequence: str
     descriptor: str
+    split: SplitKind  # how keyframes were split into map and queries
     # keyframes, landmarks, observations: numbers in the tracks.
     keyframes: int
     landmarks: int
@@ -162,7 +173,8 @@ def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -
 def caption(result: SequenceResult) -> str:
     """The data of an evaluation in one line."""
     return (
-        f"{result.sequence}, {result.descriptor.upper()}: {result.keyframes} keyframes, "
+        f"{result.sequence}, {result.descriptor.upper()}, {result.split} split: "
+        f"{result.keyframes} keyframes, "
         f"{result.map_landmarks:,.0f} landmarks in the map from "
         f"{result.support_observations:,.0f} observations, {result.queries:,.0f} queries, "
         f"{len(result.seeds)} seed{'s' if len(result.seeds) != 1 else ''}"
@@ -197,7 +209,7 @@ def evaluation_markdown(results: Sequence[SequenceResult]) -> str:
     for descriptor, same in group_by_descriptor(results).items():
         if len(same) > 1:
             names = ", ".join(result.sequence for result in same)
-            parts.append(f"#### {descriptor.upper()}: mean of {names}\n")
+            parts.append(f"#### {descriptor.upper()}, {same[0].split} split: mean of {names}\n")
             parts.append(summary_markdown(mean_rows(same)))
         for result in same:
             parts.append(f"#### {caption(result)}\n")
