@@ -26,7 +26,7 @@ def result(sequence: str = "ring", lift: float = 0.0, descriptor: str = "freak")
     def method(name: str, family: str, size: float, precision: list[float]) -> MethodResult:
         return MethodResult(
             name, name.title(), family, [size] * 2, [p + lift for p in precision], [3.0, 5.0],
-            [0.1, 0.1], frames=8, found=6, selected=40, right=30,
+            [0.1, 0.1], frames=8, found=6, selected=40, right=30, landmarks_found=100,
         )  # fmt: skip
 
     return SequenceResult(
@@ -57,6 +57,7 @@ def test_rows() -> None:
     assert ours.spread == pytest.approx(np.std([0.7, 0.74], ddof=1))
     assert ours.ratio == pytest.approx(0.72 / 0.8)
     assert (ours.pose_recall, ours.right_share, ours.search_ms) == (0.75, 0.75, 3)
+    assert ours.landmarks_per_frame == 12.5
 
 
 def test_rows_without_what_was_not_measured() -> None:
@@ -66,6 +67,7 @@ def test_rows_without_what_was_not_measured() -> None:
     one.methods[0].frames = one.methods[0].selected = 0
     row = one.rows()[0]
     assert row.spread is row.ratio is row.pose_recall is row.right_share is None
+    assert row.landmarks_per_frame is None
     assert "–" in summary_markdown([row])
 
 

@@ -77,6 +77,8 @@ class MethodResult:
     found: int = 0
     selected: int = 0  # matches for RANSAC, over all frames
     right: int = 0  # selected matches that are right
+    # Landmarks that are rightly the nearest of a keypoint, selected or not, over all frames.
+    landmarks_found: int = 0
 
     def summary(self) -> MethodSummary:
         """Means over seeds, but the least search time."""
@@ -90,6 +92,7 @@ class MethodResult:
             spread=spread,
             pose_recall=self.found / self.frames if self.frames else None,
             right_share=self.right / self.selected if self.selected else None,
+            landmarks_per_frame=self.landmarks_found / self.frames if self.frames else None,
             # Other programs on the machine only add time.
             search_ms=min(self.search_ms),
         )
@@ -112,6 +115,7 @@ class MethodSummary:
     pose_recall: float | None = None
     # Share of right matches among the selected ones, None without matches.
     right_share: float | None = None
+    landmarks_per_frame: float | None = None  # right landmarks per frame, None without frames
     search_ms: float = 0.0  # milliseconds to search for 1,000 queries on one thread
 
 
@@ -154,7 +158,14 @@ def mean_rows(results: Sequence[SequenceResult]) -> list[MethodSummary]:
         same = [table[name] for table in tables]
         means: dict[str, Any] = {
             key: _mean([getattr(row, key) for row in same])
-            for key in ("bytes_per_landmark", "precision", "ratio", "pose_recall", "right_share")
+            for key in (
+                "bytes_per_landmark",
+                "precision",
+                "ratio",
+                "pose_recall",
+                "right_share",
+                "landmarks_per_frame",
+            )
         }
         search_ms = float(np.mean([row.search_ms for row in same]))
         rows.append(MethodSummary(name, first.label, first.family, **means, search_ms=search_ms))

@@ -208,9 +208,13 @@ def measure_poses(
     threads: int,
     result: MethodResult,
 ) -> None:
-    """Add the numbers of localized frames and of right matches to a result."""
+    """Add the numbers of localized frames, of right matches and of landmarks to a result."""
     for frame in frames:
-        matches = select_matches(*method.match(frame.descriptors, threads=threads))
+        answers = method.match(frame.descriptors, threads=threads)
+        every = select_matches(*answers, share=1.0)
+        found = right_matches(frame, every, tracks.positions_of(every.landmarks))
+        result.landmarks_found += int(found.sum())
+        matches = select_matches(*answers)
         positions = tracks.positions_of(matches.landmarks)
         result.frames += 1
         result.selected += len(matches.landmarks)
