@@ -38,7 +38,7 @@ def evaluate(
         str,
         typer.Option(
             help="Methods to compare, for example unaggregated,medoid,pca,protomark. By default "
-            "all except those that end in -float."
+            "all except those that end in -float, and of the codes pq, itq and lsh those of 32 bytes."
         ),
     ] = "",
     split: Annotated[
