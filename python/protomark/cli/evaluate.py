@@ -38,7 +38,7 @@ def evaluate(
         str,
         typer.Option(
             help="Methods to compare, for example unaggregated,medoid,pca,protomark. By default "
-            "all except those that end in -float, and of the codes pq, itq and lsh those of 32 bytes."
+            "all but float, appearances and untuned ones, and pq, itq and lsh of 32 bytes only."
         ),
     ] = "",
     split: Annotated[
