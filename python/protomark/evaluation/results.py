@@ -13,7 +13,7 @@ import numpy as np
 
 from protomark.evaluation.protocol import SplitKind
 from protomark.files import write_text
-from protomark.plot import AMBER, MUTED, OURS, Curve, draw_curves, new_figure, save_figure
+from protomark.plot import AMBER, INK, MUTED, OURS, RED, Curve, draw_curves, new_figure, save_figure
 from protomark.report import markdown_table, percent
 
 FORMAT = "protomark-evaluation"
@@ -32,9 +32,9 @@ _TABLE_HEAD = (
 _COLOURS = {
     "pca": AMBER,
     "discriminant": "#7c3aed",
-    "pq": "#be123c",
-    "itq": "#0369a1",
-    "lsh": "#4d7c0f",
+    "pq": RED,
+    "itq": "#db2777",
+    "lsh": INK,
 }
 _OUR_COLOURS = (OURS, "#0369a1", "#4d7c0f", "#be123c")
 _CURVE_LABELS = {
