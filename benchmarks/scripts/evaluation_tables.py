@@ -191,6 +191,8 @@ def descriptors_text(results: Sequence[SequenceResult], plot: Path) -> str:
     title = "Landmarks found per frame, sealed maps"
     axes = figure.add_subplot()
     draw_curves(axes, curves, "kilobytes per map, without positions (log)", "landmarks", title)
+    # Labels right of the last points are only drawn within the axes.
+    axes.set_xlim(right=1.5 * max(curve.x[-1] for curve in curves))
     save_figure(figure, plot, made_by="evaluation_tables.py")
     heads = ["descriptor", "frames", "landmarks in the map"]
     heads += [COLUMNS[name].replace("**", "") for name in names]
