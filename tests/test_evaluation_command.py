@@ -13,6 +13,7 @@ import pytest
 
 import protomark as pm
 from evaluation_scene import ring_scene
+from protomark.evaluation.protocol import split
 from protomark.evaluation.results import MethodResult
 from protomark.evaluation.run import encoders_for, learn_moments
 from protomark.tracks.file import sequence_name
@@ -53,12 +54,12 @@ def test_everything_at_once(tracks: Path, model: Path, tmp_path: Path) -> None:
         "--json", out[0], "--markdown", out[1], "--plot", out[2],
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    for shown in ("ring, TEST: 20 keyframes", "Protomark, 12", "mean of 2 sequences"):
+    for shown in ("ring, TEST, random split: 20", "Protomark, 12", "mean of 2 sequences"):
         assert shown in done.stdout
     results = sequences(out[0])
     assert [r["sequence"] for r in results] == ["ring", "other"]
     figures = {m["name"]: MethodResult(**m) for m in results[0]["methods"]}
-    assert len(figures) == 17
+    assert len(figures) == 24
     assert all(len(m.precision) == 2 for m in figures.values())
     # What is easy by making: little noise, and the mean takes most of it away.
     assert figures["unaggregated"].summary().precision > 0.95
@@ -67,6 +68,22 @@ def test_everything_at_once(tracks: Path, model: Path, tmp_path: Path) -> None:
     assert json.loads(out[0].read_text())["sequences"][0]["table"][0]["ratio"] == 1
     assert out[1].read_text().count("#### ") == 3
     assert out[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_revisits(tracks: Path, tmp_path: Path) -> None:
+    out = [tmp_path / "r.json", tmp_path / "r.md"]
+    done = evaluate(
+        tracks, "--split", "later", "--seeds", 2, "--methods", "medoid,itq-8",
+        "--json", out[0], "--markdown", out[1],
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "ring, TEST, later split" in done.stdout
+    assert "ring, TEST, later split" in out[1].read_text()
+    (result,) = sequences(out[0])
+    parts = [split(ring_scene(), seed, "later") for seed in (0, 1)]
+    assert result["split"] == "later"
+    assert result["queries"] == np.mean([len(part.query_rows) for part in parts])
+    assert result["methods"][0]["frames"] == sum(len(part.query_keyframes) for part in parts)
 
 
 def test_without_an_encoder_the_others_are_compared(tracks: Path) -> None:

@@ -171,6 +171,19 @@ def test_frames_are_whole_query_keyframes() -> None:
         assert (frame.landmarks == -1).sum() == 40
 
 
+@pytest.mark.parametrize(("common", "drawn"), [(19, False), (20, True)])
+def test_frames_that_see_hardly_any_of_the_map_are_not_drawn(common: int, drawn: bool) -> None:
+    tracks = ring_scene()
+    part = split(tracks, 0, "later")
+    first = tracks.keypoints_of(int(part.query_keyframes[0]))
+    in_map = np.unique(tracks.landmark_of_keypoint[part.support_rows])
+    landmark = tracks.landmark_of_keypoint.copy()
+    seen = np.flatnonzero(np.isin(landmark[first], in_map))
+    landmark[first][seen[common:]] = -1
+    frames = draw_frames(replace(tracks, landmark_of_keypoint=landmark), part, 100)
+    assert len(frames) == len(part.query_keyframes) - (not drawn)
+
+
 def test_figures_of_a_method_against_one_query_at_a_time() -> None:
     tracks = ring_scene(noise=0.25)
     chosen = choose_methods(method_choices(), ["unaggregated", "pca-8"])
@@ -189,16 +202,28 @@ def test_figures_of_a_method_against_one_query_at_a_time() -> None:
     assert whole.precision == [right / len(part.query_rows)]
     assert 0 < small.precision[0] < whole.precision[0] < 1
 
-    accepted = good = found = 0
+    accepted = good = found = landmarks = 0
     for keyframe in part.query_keyframes:
         frame = QueryFrame.of(tracks, int(keyframe))
-        matches = select_matches(*method.match(frame.descriptors))
+        answers, distances = method.match(frame.descriptors)
+        matches = select_matches(answers, distances)
         positions = tracks.positions_of(matches.landmarks)
+        near = radial_pixels(
+            tracks.landmark_positions[answers[:, 0]] @ frame.cam_from_world[:, :3].T
+            + frame.cam_from_world[:, 3]
+        )
+        error = np.linalg.norm(near - frame.keypoints, axis=1)
+        right = (frame.landmarks == answers[:, 0]) | (error <= 3.2)
+        ratio = distances[:, 0] / distances[:, 1]
+        for landmark in np.unique(answers[:, 0]):
+            asked = np.flatnonzero(answers[:, 0] == landmark)
+            landmarks += bool(right[asked[np.lexsort((distances[asked, 0], ratio[asked]))[0]]])
         accepted += len(matches.keypoints)
         good += int(right_matches(frame, matches, positions).sum())
         found += localize_frame(frame, matches, positions).found(result.scene_depth)
     assert (whole.frames, whole.found) == (2, found)
     assert (whole.selected, whole.right) == (accepted, good)
+    assert good < whole.landmarks_found == landmarks
     assert found == 2
 
 

@@ -26,12 +26,13 @@ def result(sequence: str = "ring", lift: float = 0.0, descriptor: str = "freak")
     def method(name: str, family: str, size: float, precision: list[float]) -> MethodResult:
         return MethodResult(
             name, name.title(), family, [size] * 2, [p + lift for p in precision], [3.0, 5.0],
-            [0.1, 0.1], frames=8, found=6, selected=40, right=30,
+            [0.1, 0.1], frames=8, found=6, selected=40, right=30, landmarks_found=100,
         )  # fmt: skip
 
     return SequenceResult(
         sequence=sequence,
         descriptor=descriptor,
+        split="random",
         keyframes=20,
         landmarks=400,
         observations=4000,
@@ -56,6 +57,7 @@ def test_rows() -> None:
     assert ours.spread == pytest.approx(np.std([0.7, 0.74], ddof=1))
     assert ours.ratio == pytest.approx(0.72 / 0.8)
     assert (ours.pose_recall, ours.right_share, ours.search_ms) == (0.75, 0.75, 3)
+    assert ours.landmarks_per_frame == 12.5
 
 
 def test_rows_without_what_was_not_measured() -> None:
@@ -65,6 +67,7 @@ def test_rows_without_what_was_not_measured() -> None:
     one.methods[0].frames = one.methods[0].selected = 0
     row = one.rows()[0]
     assert row.spread is row.ratio is row.pose_recall is row.right_share is None
+    assert row.landmarks_per_frame is None
     assert "–" in summary_markdown([row])
 
 
@@ -91,8 +94,8 @@ def test_json_holds_results_and_the_rows_of_their_tables(tmp_path: Path) -> None
 def test_markdown_has_a_table_a_sequence_and_a_mean_a_descriptor() -> None:
     text = evaluation_markdown([result(), result("other"), result(descriptor="orb")])
     assert text.count("|---|") == 4
-    assert "FREAK: mean of ring, other" in text
-    assert "ORB: mean" not in text
+    assert "FREAK, random split: mean of ring, other" in text
+    assert "ORB, random split: mean" not in text
     assert "| **Protomark-32** | **33** | **0.720 ±0.028** | **90.0%** |" in text
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert widths == {8}

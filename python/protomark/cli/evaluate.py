@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,13 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from protomark.evaluation.results import MethodSummary, SequenceResult
+
+
+class SplitChoice(str, Enum):
+    """Which keyframes query the map."""
+
+    random = "random"
+    later = "later"
 
 
 def evaluate(
@@ -30,10 +38,17 @@ def evaluate(
         str,
         typer.Option(
             help="Methods to compare, for example unaggregated,medoid,pca,protomark. By default "
-            "all except those that end in -float."
+            "all but float, appearances and untuned ones, and pq, itq and lsh of 32 bytes only."
         ),
     ] = "",
-    seeds: Annotated[int, typer.Option(min=1, help="Random splits into map and queries.")] = 3,
+    split: Annotated[
+        SplitChoice,
+        typer.Option(
+            help="Queries: a random tenth of the keyframes, or revisits: the later keyframes in a "
+            "map of the earlier ones."
+        ),
+    ] = SplitChoice.random,
+    seeds: Annotated[int, typer.Option(min=1, help="Splits into map and queries.")] = 3,
     pose_frames: Annotated[int, typer.Option(min=0, help="Frames to localize per split.")] = 20,
     discriminant_from: Annotated[
         list[Path] | None,
@@ -56,7 +71,8 @@ def evaluate(
 
     Reads tracks and prints, for each method, the precision of search, the share of poses found,
     bytes per landmark and search time on one thread. The protocol is the paper's: a random 90 % of
-    the keyframes build the map, and the descriptors of the others query it.
+    the keyframes build the map, and the descriptors of the others query it. `--split later` asks
+    for revisits instead.
 
     protomark evaluate kitchen.freak.safetensors --plot precision.png
     """
@@ -78,6 +94,7 @@ def evaluate(
     if plot_file:
         check_suffix(plot_file)
     options = EvaluationOptions(
+        split=split.value,
         seeds=range(seeds),
         pose_frames=pose_frames,
         threads=threads,
@@ -95,7 +112,7 @@ def evaluate(
     by_descriptor = group_by_descriptor(results)
     for descriptor, same in by_descriptor.items():
         if len(same) > 1:
-            title = f"{descriptor.upper()}: mean of {len(same)} sequences"
+            title = f"{descriptor.upper()}, {split.value} split: mean of {len(same)} sequences"
             console.print(results_table(title, mean_rows(same)))
     if json_file:
         save_json(results, json_file)
@@ -108,7 +125,7 @@ def evaluate(
                 path = path.with_name(f"{path.stem}.{descriptor}{path.suffix}")
             rows = mean_rows(same) if len(same) > 1 else same[0].rows()
             names = ", ".join(result.sequence for result in same)
-            save_precision_plot(rows, path, f"{descriptor.upper()}: {names}")
+            save_precision_plot(rows, path, f"{descriptor.upper()}, {split.value} split: {names}")
 
 
 def results_table(title: str, rows: Sequence[MethodSummary]) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from protomark.baselines.binary import (
     random_sample,
     unaggregated,
 )
+from protomark.baselines.hashing import iterative_quantization, random_hyperplanes
 from protomark.baselines.linear import (
     linear_discriminants,
     mean_of_bits,
@@ -27,6 +29,7 @@ from protomark.baselines.linear import (
     projected_mean,
 )
 from protomark.baselines.method import Method
+from protomark.baselines.quantization import product_quantized_mean
 from protomark.baselines.support import Moments, Support
 from protomark.features.upright import SUFFIX
 from protomark.maps.info import matching_bytes
@@ -36,6 +39,9 @@ SEALED_BYTES = (9, 17, 25, 33, 65)
 # Signs that tell appearances apart in the learning maps that are sealed, as `protomark map` has.
 APPEARANCE_BITS = 5
 PROJECTED_DIMS = (8, 16, 32, 64)
+# Bytes of codes of the mean, and those that are compared by default: one that takes little time.
+CODE_BYTES = (8, 16, 32, 64)
+DEFAULT_CODE_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,7 @@ def method_choices(
     # Moments to learn linear discriminants from; None: those of the support.
     discriminant_from: Moments | None = None,
     threads: int = 1,
+    bits: int = 512,  # length of the descriptors
 ) -> list[MethodChoice]:
     """Every method, in the order of tables."""
     listed = [
@@ -128,6 +135,23 @@ def method_choices(
                         default=rounded,
                     )
                 )
+    for family, label, build_code in (
+        ("pq", "Product quantiser", product_quantized_mean),
+        ("itq", "Iterative quantisation", iterative_quantization),
+        ("lsh", "Random hyperplanes", random_hyperplanes),
+    ):
+        listed += [
+            MethodChoice(
+                f"{family}-{size}",
+                f"{label}, {size} B",
+                family,
+                partial(build_code, size=size),
+                default=size == DEFAULT_CODE_BYTES,
+            )
+            for size in CODE_BYTES
+            # There are no more components than bits.
+            if family != "itq" or 8 * size <= bits
+        ]
     for encoder in encoders:
         listed += _prototype_choices(encoder, len(encoders) > 1, threads)
     return listed
@@ -138,14 +162,14 @@ def _prototype_choices(encoder: pm.Encoder, named: bool, threads: int) -> list[M
     tail = f"@{encoder.name}" if named else ""
     upright = encoder.descriptor.endswith(SUFFIX)
 
-    def choice(name: str, label: str, family: str, default: bool, *wanted: Any) -> MethodChoice:
+    def choice(name: str, label: str, family: str, default: bool, **wanted: Any) -> MethodChoice:
         def build(support: Support) -> Method:
-            return prototype_map(support, encoder, *wanted, threads=threads)
+            return prototype_map(support, encoder, threads=threads, **wanted)
 
         return MethodChoice(name + tail, label + mark, family + tail, build, default, upright)
 
     listed = [
-        choice(f"protomark-{d}", f"Protomark, {d}", "protomark", True, d)
+        choice(f"protomark-{d}", f"Protomark, {d}", "protomark", True, dim=d)
         for d in sorted(encoder.dims)
     ]
     smallest = min(
@@ -162,9 +186,8 @@ def _prototype_choices(encoder: pm.Encoder, named: bool, threads: int) -> list[M
                 f"{label}, {size} B",
                 f"protomark-{family}",
                 family == "sealed",
-                None,
-                size,
-                tuned_by,
+                bytes_per_landmark=size,
+                tuned_by=tuned_by,
             )
             for size in SEALED_BYTES
             if smallest is not None and smallest <= size

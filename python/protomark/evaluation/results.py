@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from protomark.evaluation.protocol import SplitKind
 from protomark.files import write_text
-from protomark.plot import AMBER, MUTED, OURS, Curve, draw_curves, new_figure, save_figure
+from protomark.plot import AMBER, INK, MUTED, OURS, RED, Curve, draw_curves, new_figure, save_figure
 from protomark.report import markdown_table, percent
 
 FORMAT = "protomark-evaluation"
@@ -28,7 +29,13 @@ _TABLE_HEAD = (
     "ms per 1,000 queries",
 )
 # Families of several sizes have a colour, single methods are grey.
-_COLOURS = {"pca": AMBER, "discriminant": "#7c3aed"}
+_COLOURS = {
+    "pca": AMBER,
+    "discriminant": "#7c3aed",
+    "pq": RED,
+    "itq": "#db2777",
+    "lsh": INK,
+}
 _OUR_COLOURS = (OURS, "#0369a1", "#4d7c0f", "#be123c")
 _CURVE_LABELS = {
     "unaggregated": "all descriptors",
@@ -40,6 +47,9 @@ _CURVE_LABELS = {
     "mean": "mean of bits",
     "pca": "PCA",
     "discriminant": "discriminant",
+    "pq": "product quantiser",
+    "itq": "ITQ",
+    "lsh": "LSH",
     "protomark": "Protomark",
     "protomark-sealed": "Protomark, sealed",
     "protomark-appearances": "sealed, tuned by appearances",
@@ -67,6 +77,8 @@ class MethodResult:
     found: int = 0
     selected: int = 0  # matches for RANSAC, over all frames
     right: int = 0  # selected matches that are right
+    # Landmarks that are rightly the nearest of a keypoint, selected or not, over all frames.
+    landmarks_found: int = 0
 
     def summary(self) -> MethodSummary:
         """Means over seeds, but the least search time."""
@@ -80,6 +92,7 @@ class MethodResult:
             spread=spread,
             pose_recall=self.found / self.frames if self.frames else None,
             right_share=self.right / self.selected if self.selected else None,
+            landmarks_per_frame=self.landmarks_found / self.frames if self.frames else None,
             # Other programs on the machine only add time.
             search_ms=min(self.search_ms),
         )
@@ -102,6 +115,7 @@ class MethodSummary:
     pose_recall: float | None = None
     # Share of right matches among the selected ones, None without matches.
     right_share: float | None = None
+    landmarks_per_frame: float | None = None  # right landmarks per frame, None without frames
     search_ms: float = 0.0  # milliseconds to search for 1,000 queries on one thread
 
 
@@ -111,6 +125,7 @@ class SequenceResult:
 
     sequence: str
     descriptor: str
+    split: SplitKind  # how keyframes were split into map and queries
     # keyframes, landmarks, observations: numbers in the tracks.
     keyframes: int
     landmarks: int
@@ -143,7 +158,14 @@ def mean_rows(results: Sequence[SequenceResult]) -> list[MethodSummary]:
         same = [table[name] for table in tables]
         means: dict[str, Any] = {
             key: _mean([getattr(row, key) for row in same])
-            for key in ("bytes_per_landmark", "precision", "ratio", "pose_recall", "right_share")
+            for key in (
+                "bytes_per_landmark",
+                "precision",
+                "ratio",
+                "pose_recall",
+                "right_share",
+                "landmarks_per_frame",
+            )
         }
         search_ms = float(np.mean([row.search_ms for row in same]))
         rows.append(MethodSummary(name, first.label, first.family, **means, search_ms=search_ms))
@@ -162,7 +184,8 @@ def save_json(results: Sequence[SequenceResult], path: str | os.PathLike[str]) -
 def caption(result: SequenceResult) -> str:
     """The data of an evaluation in one line."""
     return (
-        f"{result.sequence}, {result.descriptor.upper()}: {result.keyframes} keyframes, "
+        f"{result.sequence}, {result.descriptor.upper()}, {result.split} split: "
+        f"{result.keyframes} keyframes, "
         f"{result.map_landmarks:,.0f} landmarks in the map from "
         f"{result.support_observations:,.0f} observations, {result.queries:,.0f} queries, "
         f"{len(result.seeds)} seed{'s' if len(result.seeds) != 1 else ''}"
@@ -197,7 +220,7 @@ def evaluation_markdown(results: Sequence[SequenceResult]) -> str:
     for descriptor, same in group_by_descriptor(results).items():
         if len(same) > 1:
             names = ", ".join(result.sequence for result in same)
-            parts.append(f"#### {descriptor.upper()}: mean of {names}\n")
+            parts.append(f"#### {descriptor.upper()}, {same[0].split} split: mean of {names}\n")
             parts.append(summary_markdown(mean_rows(same)))
         for result in same:
             parts.append(f"#### {caption(result)}\n")

@@ -21,7 +21,7 @@ from protomark.evaluation.frames import (
     select_matches,
 )
 from protomark.evaluation.methods import MethodChoice, choose_methods, method_choices
-from protomark.evaluation.protocol import SupportQuerySplit, split
+from protomark.evaluation.protocol import SplitKind, SupportQuerySplit, split
 from protomark.evaluation.results import MethodResult, SequenceResult
 from protomark.features.upright import SUFFIX
 from protomark.progress import Progress, silent
@@ -30,12 +30,15 @@ from protomark.tracks.file import Tracks, sequence_name
 
 TIMED_QUERIES = 1000
 POSE_FRAMES = 20
+# Frames that observe fewer landmarks of the map are not asked for their pose.
+MIN_COMMON = 20
 
 
 @dataclass(frozen=True)
 class EvaluationOptions:
     """How an evaluation runs."""
 
+    split: SplitKind = "random"
     seeds: Sequence[int] = (0, 1, 2)  # seeds of the splits
     pose_frames: int = POSE_FRAMES  # limit on query keyframes to localize per seed
     threads: int = 1  # threads for all that is not timed
@@ -64,7 +67,7 @@ def evaluate_files(
             sources = options.discriminant_from
             learned[kind] = learn_moments(sources, tracks) if sources else None
         fitting = encoders_for(tracks, encoders, given=bool(options.encoders))
-        choices = method_choices(fitting, learned[kind], options.threads)
+        choices = method_choices(fitting, learned[kind], options.threads, tracks.bits)
         chosen = choose_methods(choices, options.methods)
         yield evaluate(tracks, sequence_name(path), chosen, options, progress)
 
@@ -121,7 +124,7 @@ def evaluate(
     depth = scene_depth(tracks)
     sizes, done = [], 0
     for seed in options.seeds:
-        part = split(tracks, seed)
+        part = split(tracks, seed, options.split)
         landmarks = tracks.landmark_of_keypoint[part.support_rows]
         supports = {
             upright: Support(landmarks, source.descriptors[part.support_rows], seed)
@@ -149,6 +152,7 @@ def evaluate(
     return SequenceResult(
         sequence=sequence,
         descriptor=tracks.descriptor,
+        split=options.split,
         keyframes=len(tracks.keyframe_names),
         landmarks=len(tracks.landmark_ids),
         observations=len(tracks.observations),
@@ -163,8 +167,12 @@ def evaluate(
 
 
 def draw_frames(tracks: Tracks, part: SupportQuerySplit, limit: int) -> list[QueryFrame]:
-    """Up to `limit` query keyframes, drawn at random, in order."""
-    chosen = part.query_keyframes
+    """Up to `limit` query keyframes that see part of the map, drawn at random, in order."""
+    in_map = np.isin(
+        tracks.landmark_of_keypoint, np.unique(tracks.landmark_of_keypoint[part.support_rows])
+    )
+    common = np.bincount(tracks.keyframe_of_keypoint[in_map], minlength=len(tracks.keyframe_names))
+    chosen = part.query_keyframes[common[part.query_keyframes] >= MIN_COMMON]
     if len(chosen) > limit:
         rng = np.random.default_rng(part.seed)
         chosen = np.sort(rng.choice(chosen, size=limit, replace=False))
@@ -200,9 +208,13 @@ def measure_poses(
     threads: int,
     result: MethodResult,
 ) -> None:
-    """Add the numbers of localized frames and of right matches to a result."""
+    """Add the numbers of localized frames, of right matches and of landmarks to a result."""
     for frame in frames:
-        matches = select_matches(*method.match(frame.descriptors, threads=threads))
+        answers = method.match(frame.descriptors, threads=threads)
+        every = select_matches(*answers, share=1.0)
+        found = right_matches(frame, every, tracks.positions_of(every.landmarks))
+        result.landmarks_found += int(found.sum())
+        matches = select_matches(*answers)
         positions = tracks.positions_of(matches.landmarks)
         result.frames += 1
         result.selected += len(matches.landmarks)
