@@ -53,8 +53,7 @@ COLUMNS = {
     **{f"appearances-{size}": f"**by appearances, {size} B**" for size in SIZES},
 }
 # Families of methods that are compared at equal bytes, and how many more bytes than its name says a
-# method takes, for the count. Signs need
-# no count, so they take a byte less.
+# method takes, for the count. Signs need no count, so they take a byte less.
 BUDGETS = {
     "PQ of the mean": ("pq", 1),
     "ITQ": ("itq", 1),
