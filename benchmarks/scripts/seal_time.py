@@ -3,7 +3,8 @@
 python benchmarks/scripts/seal_time.py TRACKS... [--landmarks 1000000]
 
 The map has synthetic landmarks of 4 observations (see `protomark_bench.speed.landmarks`), 48
-numbers, 5 bits of appearances and an index, and is sealed to 33 bytes per landmark on two threads.
+numbers, 5 bits of appearances and an index, and is sealed to 25 bytes per landmark, one prototype
+of each, on two threads.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def main() -> None:
             sealed = scene.seal(
                 Path(folder) / "s.pmk",
                 *observed,
-                bytes_per_landmark=33,
+                bytes_per_landmark=25,
                 position_bits=0,
                 tune=tune,
                 threads=THREADS,
