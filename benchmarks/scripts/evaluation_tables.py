@@ -117,12 +117,13 @@ def joined(results: Sequence[SequenceResult]) -> list[SequenceResult]:
 
 
 def precision_table(results: Sequence[SequenceResult], names: Sequence[str]) -> ReportTable:
-    """Precision of these methods, a row per sequence."""
-    rows = []
-    for result in results:
-        found = {row.name: row.precision for row in result.rows()}
-        cells = [number(found.get(name)) for name in names]
-        rows.append([result.sequence, set_of(result.sequence), *cells])
+    """Precision of those of these methods that were measured, a row per sequence."""
+    figures = [{row.name: row.precision for row in result.rows()} for result in results]
+    names = [name for name in names if any(name in found for found in figures)]
+    rows = [
+        [result.sequence, set_of(result.sequence), *(number(found.get(name)) for name in names)]
+        for result, found in zip(results, figures, strict=True)
+    ]
     return ReportTable(["sequence", "set", *(COLUMNS[n] for n in names)], rows, words=2)
 
 
@@ -130,17 +131,22 @@ def ratio_table(results: Sequence[SequenceResult]) -> str:
     """Mean share of the unaggregated precision, by bytes per landmark."""
     ratios = {row.name: row.ratio for row in mean_rows(results)}
     paper = PAPER if (results[0].descriptor, results[0].split) == ("freak", "random") else {}
+    heads = [
+        head
+        for head, (name, count) in BUDGETS.items()
+        if any(f"{name}-{size - count}" in ratios for size in SIZES)
+    ]
     rows = [
         [
             f"{size}",
             number(paper.get(size)),
-            *(number(ratios.get(f"{name}-{size - count}")) for name, count in BUDGETS.values()),
+            *(number(ratios.get(f"{BUDGETS[h][0]}-{size - BUDGETS[h][1]}")) for h in heads),
         ]
         for size in SIZES
     ]
     names = ", ".join(result.sequence for result in results)
     title = f"Mean ratio to the unaggregated precision ({names}):"
-    table = ReportTable(["bytes per landmark", "paper", *BUDGETS], rows, words=0)
+    table = ReportTable(["bytes per landmark", "paper", *heads], rows, words=0)
     return f"{title}\n\n{table.markdown()}"
 
 
@@ -215,14 +221,16 @@ def card_text(results: Sequence[SequenceResult]) -> str:
     """The card's section on the test sequences; all results are of its descriptor."""
     names = ["unaggregated", "medoid", "majority", *(f"protomark-{dim}" for dim in DIMS)]
     missing = [name for name in SETS["test"] if name not in {r.sequence for r in results}]
+    measured = {row.name for result in results for row in result.rows()}
+    sealed = [f"sealed-{size}" for size in SIZES if f"sealed-{size}" in measured]
     parts = [
         "## Test sequences",
         "Measured once training was over; nothing was chosen by them. Integer encoder, int8\n"
         "prototypes, mean of three splits, as `protomark evaluate` measures.",
         precision_table(results, names).markdown(),
         f"Not measured: {', '.join(missing)}." if missing else "",
-        "Sealed maps, by bytes per landmark:",
-        precision_table(results, [f"sealed-{size}" for size in SIZES]).markdown(),
+        "Sealed maps, by bytes per landmark:" if sealed else "",
+        precision_table(results, sealed).markdown() if sealed else "",
         ratio_table(results),
     ]
     return "\n\n".join(part for part in parts if part)
@@ -234,7 +242,7 @@ def upright_table(plain: Sequence[SequenceResult], upright: Sequence[SequenceRes
     others = {result.sequence: result for result in upright}
     rows = []
     for result in plain:
-        if result.sequence in others:
+        if result.sequence in others and result.split == "random":
             one = {row.name: row.precision for row in result.rows()}
             other = {row.name: row.precision for row in others[result.sequence].rows()}
             cells = [f"{one[name]:.3f}, {other[name]:.3f}" for name in names]
