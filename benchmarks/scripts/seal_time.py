@@ -26,7 +26,7 @@ _QUERIES = 10_000
 
 
 def main() -> None:
-    """Prints the table of docs/results/sealing.md."""
+    """Prints the table of docs/results/large-maps.md."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tracks", type=Path, nargs="+", help="of one descriptor")
     parser.add_argument("--landmarks", type=int, default=1_000_000)

@@ -27,7 +27,8 @@ struct TuningQueries {
 // networks (Snell et al. 2017): p_r is the softmax of -d(query, r) / T over the query's own
 // prototype, without the query itself, and the ones near to it, d being squared distances and T a
 // quarter of their mean to the own prototypes. Each pass moves the own prototype of n observations
-// by 0.35 / (n + 2) (1 - p_own) (query - prototype), and the others by -0.35 / (n + 2) p_r (query - prototype).
+// by 0.35 / (n + 2) (1 - p_own) (query - prototype), and the others by -0.35 / (n + 2) p_r (query -
+// prototype).
 PrototypeStore tune_prototypes(const PrototypeStore& store, const TuningQueries& queries,
                                int threads);
 
