@@ -70,7 +70,7 @@ class Tuner {
     }
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
       Sum sum{};
-      for (size_t d = 0; d < dim_; ++d) sum[d] = rounded(rank, d);
+      std::ranges::copy(rounded(rank), sum.begin());
       tuned_.set(rows_[rank], sum, 1);
     }
     if (indexed_) {
@@ -107,13 +107,18 @@ class Tuner {
   void round_numbers() {
     auto* packed = reinterpret_cast<int8_t*>(packed_.data());
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      const std::vector<int8_t> code = rounded(rank);
       for (size_t d = 0; d < dim_; ++d) {
-        packed[packed_index(rows_[rank].value, d, dim_)] = rounded(rank, d);
+        packed[packed_index(rows_[rank].value, d, dim_)] = code[d];
       }
     }
   }
-  int8_t rounded(size_t rank, size_t d) const {
-    return rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
+  std::vector<int8_t> rounded(size_t rank) const {
+    std::vector<int8_t> code(dim_);
+    for (size_t d = 0; d < dim_; ++d) {
+      code[d] = rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
+    }
+    return code;
   }
 
   // Finds the own prototype of each query, the nearest one of its landmark, and the temperature.
