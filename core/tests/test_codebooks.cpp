@@ -55,6 +55,26 @@ void test_files() {
     CHECK(read.codebooks() == e.codebooks());
     CHECK(read.identity() == encoder->identity());
   }
+  const auto bad = [&](std::vector<Codebook> codebooks, const std::string& message) {
+    try {
+      with(std::move(codebooks));
+      CHECK(false);
+    } catch (const std::invalid_argument& error) {
+      CHECK(std::string(error.what()).find(message) != std::string::npos);
+    }
+  };
+  const auto book = [](std::size_t width, std::size_t numbers) {
+    return Codebook{width, std::vector<std::int8_t>(numbers, 1)};
+  };
+  for (const std::size_t width : {0, 5})
+    bad({book(width, 2560)}, "words of a codebook have 1 to 4");
+  for (const std::size_t numbers : {0, 256, 513, 14 * 256}) {
+    bad({book(2, numbers)}, "256 words for each 2 numbers");
+  }
+  bad({book(2, 512), book(3, 768), book(2, 1024)}, "two codebooks have words of 2 numbers");
+  Codebook low = book(2, 512);
+  low.words[9] = -128;
+  bad({low}, "numbers of words must be -127 to 127");
   const Codebook& three = encoder->codebooks()[1];
   CHECK(three.width == 3 && three.covers(6) && three.covers(12));
   CHECK(!three.covers(4) && !three.covers(15));

@@ -49,7 +49,6 @@ struct Parts {
   std::vector<Layer> layers;
   std::vector<std::size_t> dims{6, 12};
   float scale = 1;
-  std::vector<Codebook> codebooks;
 
   Parts() {
     test::Random random(1);
@@ -61,7 +60,7 @@ void test_encoder() {
   const auto bad = [](const auto& change, const std::string& message) {
     Parts p;
     change(p);
-    CHECK(refused([&] { Encoder(p.info, p.layers, p.dims, p.scale, p.codebooks); }, message));
+    CHECK(refused([&] { Encoder(p.info, p.layers, p.dims, p.scale); }, message));
   };
   test::Random random(2);
   const auto layer = [&](std::size_t inputs, std::size_t outputs) {
@@ -96,20 +95,6 @@ void test_encoder() {
   for (const float scale : {0.0f, -1.0f, NAN, INFINITY}) {
     bad([&](Parts& p) { p.scale = scale; }, "scale must be positive");
   }
-  const auto codebook = [&](std::size_t width, std::size_t numbers) {
-    return Codebook{width, std::vector<std::int8_t>(numbers, 1)};
-  };
-  for (const std::size_t width : {0, 5}) {
-    bad([&](Parts& p) { p.codebooks = {codebook(width, 2560)}; },
-        "words of a codebook have 1 to 4");
-  }
-  for (const std::size_t numbers : {0, 256, 513, 14 * 256}) {
-    bad([&](Parts& p) { p.codebooks = {codebook(2, numbers)}; }, "256 words for each 2 numbers");
-  }
-  bad([&](Parts& p) { p.codebooks = {codebook(2, 512), codebook(3, 768), codebook(2, 1024)}; },
-      "two codebooks have words of 2 numbers");
-  bad([&](Parts& p) { p.codebooks = {codebook(2, 512)}, p.codebooks[0].words[9] = -128; },
-      "numbers of words must be -127 to 127");
 
   // The largest shift and sums that just fit.
   Parts p;
