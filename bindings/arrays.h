@@ -59,6 +59,10 @@ inline Array2<std::int8_t> codes(nb::handle object) {
   return array_of<Array2<std::int8_t>>(object, "int8", 2, "codes: a (n, dim) int8");
 }
 
+inline bool is_int8(nb::handle object) {
+  return numpy("asarray")(object).attr("dtype").equal(numpy("dtype")("int8"));
+}
+
 // Converts one integer or an array of integers of any type.
 inline Array1<std::int64_t> landmark_ids(nb::handle object) {
   nb::object array = numpy("atleast_1d")(numpy("asarray")(object));

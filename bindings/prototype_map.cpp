@@ -311,6 +311,11 @@ Raises:
             if (array.is_none()) {
               const nb::gil_scoped_release release;
               self.seal(path, options);
+            } else if (is_int8(array)) {
+              const auto l = landmark_ids(ids);
+              const auto c = codes(array);
+              const nb::gil_scoped_release release;
+              self.seal_codes(path, options, view(l), view(c));
             } else {
               const auto l = landmark_ids(ids);
               const auto d = descriptors(array);
@@ -324,24 +329,26 @@ Raises:
           "bytes_per_landmark"_a = nb::none(), "position_bits"_a = 32, "tune"_a = true,
           "threads"_a = 1,
           nb::sig("def seal(self, path: str | os.PathLike[str], landmark_ids: ArrayLike | None = "
-                  "None, descriptors: NDArray[numpy.uint8] | None = None, *, bytes_per_landmark: "
-                  "float | None = None, position_bits: int = 32, tune: bool = True, threads: int = "
+                  "None, descriptors: NDArray[numpy.uint8 | numpy.int8] | None = None, *, "
+                  "bytes_per_landmark: float | None = None, position_bits: int = 32, tune: bool = "
+                  "True, threads: int = "
                   "1) -> SealedMap"),
           R"(Write a sealed map, whole or not at all, and open it.
 
 Args:
     path: the file to write.
     landmark_ids: (n,), of descriptors.
-    descriptors: (n, bits / 8) uint8, the observations that the map was built from, as far as they
-        are at hand. Prototypes are tuned by them, or else by the map's appearances if only one
-        prototype per landmark fits.
+    descriptors: (n, bits / 8) uint8, or their codes, (n, dim) int8: the observations that the map
+        was built from, as far as they are at hand. Prototypes are tuned by them, or else by the
+        map's appearances if only one prototype per landmark fits.
     bytes_per_landmark: bytes that a landmark may take on average for its prototypes, their number
         and its count (not for position, id and index). None: the sealed map gives the answers of
         this one: int8 numbers, every appearance (at most 255 per landmark). Otherwise prototypes
-        are int8 numbers, too, if all of them fit; else words of one of the encoder's codebooks, as
-        many as fit, of as many numbers; and appearances are merged, over the whole map those first
-        whose merging adds least to the squared distances of observations to their prototypes
-        (Ward's criterion), until they fit.
+        are int8 numbers, too, if all of them fit; else words of one of the encoder's codebooks, and
+        appearances are merged, over the whole map those first whose merging adds least to the
+        squared distances of observations to their prototypes (Ward's criterion), until they fit.
+        It takes the most words that fit, or, if no observations tune it, the most that leave room
+        for 1.25 prototypes per landmark, from 48 numbers on.
     position_bits: bits per coordinate. With 32, positions are floats relative to the middle of the
         map; with 16 they take half the bytes, as steps of a grid over their bounding box, 65534
         from end to end along each axis (position_error); with 0 they are left out.

@@ -16,7 +16,8 @@ import protomark as pm
 from protomark.geometry.camera import CAMERA_MODELS, Camera
 from protomark.geometry.colmap import pycolmap
 from protomark.mapping.options import MappingOptions
-from protomark.mapping.state import STATE, load_state
+from protomark.mapping.state import load_state
+from protomark.maps.open import STATE
 
 USES: list[Callable[[Camera], Any]] = [
     lambda camera: camera.rays(np.ones((2, 2))),

@@ -139,7 +139,10 @@ def test_only_the_window_keeps_descriptors() -> None:
     assert len(mapper.structure.keyframes()) > SETTINGS.window
     assert len(kept) == SETTINGS.window
     mapper.finish()
-    assert all(f.descriptors is None and f.encoded is None for f in mapper.structure.frames)
+    assert all(f.descriptors is None for f in mapper.structure.frames)
+    ids, codes = mapper.structure.codes()
+    assert len(ids) == sum(len(f.seen) for f in mapper.structure.frames)
+    assert codes.dtype == np.int8
     assert all((f.landmarks >= 0).all() for f in mapper.structure.frames)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import load, save
 
 import protomark as pm
 from mapping_scene import PINHOLE, interrupted_at, walk, write_images
@@ -20,6 +21,8 @@ from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.mapping.source import open_source
 from protomark.mapping.structure import Structure
+from protomark.maps.open import SCENE_MAP, SEALED_MAP, STATE
+from protomark.maps.seal import seal
 from test_mapping import CAMERA, SETTINGS, run
 from test_tracks_command import fails
 
@@ -171,3 +174,27 @@ def test_a_stopped_extension_keeps_the_old_map(
     make_map(replace(request, resume=True))
     assert contents(extended / "previous") == before
     assert len(np.loadtxt(extended / "trajectory.txt")) == FRAMES + 4
+
+
+def test_the_sealed_map_is_tuned_by_what_observed_its_landmarks(
+    extended: Path, tmp_path: Path
+) -> None:
+    scene = pm.open(extended / SCENE_MAP)
+    arrays = load((extended / STATE).read_bytes())
+    assert len(arrays["landmarks"]) == len(arrays["codes"]) > len(scene)
+    expected = tmp_path / "expected.pmk"
+    scene.seal(
+        expected, arrays["landmarks"], arrays["codes"], bytes_per_landmark=33, position_bits=16
+    )
+    assert (extended / SEALED_MAP).read_bytes() == expected.read_bytes()
+    seal(extended, again := tmp_path / "again.pmk")
+    assert again.read_bytes() == expected.read_bytes()
+    # Codes of other landmarks tune nothing, and broken ones are named.
+    others = {**arrays, "landmarks": np.roll(arrays["landmarks"], 1000)}
+    (extended / STATE).write_bytes(save(others))
+    seal(extended, again)
+    scene.seal(expected, bytes_per_landmark=33, position_bits=16)
+    assert again.read_bytes() == expected.read_bytes()
+    (extended / STATE).write_bytes(save(arrays)[:-1])
+    with pytest.raises(ValueError, match=f"{STATE}: broken .*, or map the images anew"):
+        seal(extended, again)

@@ -180,3 +180,37 @@ def test_observations_are_checked(folder: Path, coder: pm.Encoder) -> None:
     with pytest.raises(ValueError, match="bytes"):
         scene.seal(path, ids, descriptors[:, 1:].copy(), bytes_per_landmark=DIM + 1)
     assert not path.exists()
+
+
+def test_codes_tune_as_their_descriptors_do(folder: Path, coder: pm.Encoder) -> None:
+    ids, descriptors = observed(100, 3)
+    scene = pm.PrototypeMap(coder)
+    scene.add(ids, descriptors)
+    scene.seal(folder / "a.pmk", ids, descriptors, bytes_per_landmark=DIM + 1)
+    codes = coder.encode(descriptors)
+    scene.seal(folder / "b.pmk", ids, codes, bytes_per_landmark=DIM + 1)
+    assert (folder / "a.pmk").read_bytes() == (folder / "b.pmk").read_bytes()
+    with pytest.raises(ValueError, match=f"codes have {DIM - 1} dimensions, the map has {DIM}"):
+        scene.seal(folder / "b.pmk", ids, codes[:, 1:], bytes_per_landmark=DIM + 1)
+    codes[0, 0] = -128
+    with pytest.raises(ValueError, match="codes must be -127 to 127"):
+        scene.seal(folder / "b.pmk", ids, codes, bytes_per_landmark=DIM + 1)
+
+
+def test_untuned_maps_have_room_for_second_prototypes(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    encoder = pm.Encoder.load("freak")
+    ids = np.repeat(np.arange(400), 4)
+    descriptors = rng.integers(0, 256, (1600, encoder.bits // 8), np.uint8)
+    scene = pm.PrototypeMap(encoder, appearance_bits=5)
+    scene.add(ids, descriptors)
+    found = {}
+    for size in (17, 25, 33, 49):
+        for by, tuners in ((None, None), (ids, descriptors)):
+            sealed = scene.seal(folder / "s.pmk", by, tuners, bytes_per_landmark=size)
+            assert sealed.bytes_per_landmark <= size
+            found[size, by is not None] = (sealed.dim, sealed.words)
+            several = sealed.prototype_count / len(sealed)
+            assert (several >= 1.25) == (size > 33 or (size > 17 and by is None))
+    assert [found[n, False] for n in (17, 25, 33, 49)] == [(48, 16), (48, 16), (48, 24), (64, 32)]
+    assert [found[n, True] for n in (17, 25, 33, 49)] == [(48, 16), (48, 24), (64, 32), (64, 32)]

@@ -25,10 +25,11 @@ struct SealOptions {
   // Bytes that a landmark may take on average for its prototypes, their number and its count (not
   // for position, id and index). By default prototypes are int8 numbers and every appearance is
   // kept, so that the sealed map gives the answers of the learning map. Otherwise they are, too, if
-  // all of them fit. Else they are words of one of the encoder's codebooks, as many as fit, of as
-  // many numbers; and appearances are merged, those of least merge cost first (Ward's criterion:
-  // what merging adds to the squared distances of all observations to their prototypes), until they
-  // fit.
+  // all of them fit. Else they are words of one of the encoder's codebooks, and appearances are
+  // merged, those of least merge cost first (Ward's criterion: what merging adds to the squared
+  // distances of all observations to their prototypes), until they fit. It takes the most words
+  // that fit, or, if no observations tune it, the most that leave room for 1.25 prototypes per
+  // landmark, from 48 numbers on.
   std::optional<double> bytes_per_landmark = std::nullopt;
   // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
   // bounding box, 65534 from end to end along each axis. 0: no positions.
@@ -191,9 +192,12 @@ class PROTOMARK_API PrototypeMap {
   //
   // Prototypes are tuned by observations: descriptor i (n x bytes) is of landmark ids[i]; those of
   // landmarks that the map does not hold are ignored. Without any, they are tuned by the map's
-  // appearances if only one prototype per landmark fits, and else left as they are.
+  // appearances if only one prototype per landmark fits, and else left as they are. seal_codes
+  // takes codes of the map's dim instead.
   void seal(const std::filesystem::path& path, const SealOptions& options = {},
             std::span<const int64_t> ids = {}, Descriptors descriptors = {}) const;
+  void seal_codes(const std::filesystem::path& path, const SealOptions& options,
+                  std::span<const int64_t> ids, Codes codes) const;
 
  private:
   friend struct MapState;

@@ -1,6 +1,8 @@
 // The state of a learning map, and the guard of its changes.
 #pragma once
 
+#include <cstring>
+
 #include "file/journal.h"
 #include "map/prototype_store.h"
 #include "protomark/prototype_map.h"
@@ -55,6 +57,16 @@ struct MapState {
 
 inline void check_pairs(size_t ids, size_t others, const char* what) {
   if (ids != others) invalid(ids, " landmark ids for ", others, " ", what);
+}
+
+inline void check_codes(Codes codes, size_t dim) {
+  if (codes.columns != dim) {
+    invalid("codes have ", codes.columns, " dimensions, the map has ", dim);
+  }
+  const size_t n = codes.rows * codes.columns;
+  if (n > 0 && std::memchr(codes.data, -128, n) != nullptr) {
+    invalid("codes must be -127 to 127, one is -128");
+  }
 }
 
 // Reads a map file and the commits to it. Throws FileError.

@@ -12,16 +12,6 @@ constexpr size_t kEncodeChunk = 1 << 13;
 // Descriptors that a thread encodes at a time while another one adds.
 constexpr size_t kMinShare = 64, kMaxShare = 512;
 
-void check_codes(Codes codes, size_t dim) {
-  if (codes.columns != dim) {
-    invalid("codes have ", codes.columns, " dimensions, the map has ", dim);
-  }
-  const size_t n = codes.rows * codes.columns;
-  if (n > 0 && std::memchr(codes.data, -128, n) != nullptr) {
-    invalid("codes must be -127 to 127, one is -128");
-  }
-}
-
 void check_new_id(int64_t id) {
   if (id < 0) invalid("landmark id ", id, " is negative");
 }

@@ -295,22 +295,29 @@ class SealedContent {
 
 void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& options,
                         std::span<const int64_t> ids, Descriptors descriptors) const {
+  check_pairs(ids.size(), descriptors.rows, "descriptors");
+  if (ids.empty()) return seal_codes(path, options, {}, {});
+  seal_codes(path, options, ids, encoder()->encode(descriptors, dim(), options.threads));
+}
+
+void PrototypeMap::seal_codes(const std::filesystem::path& path, const SealOptions& options,
+                              std::span<const int64_t> ids, Codes codes) const {
   if (options.position_bits != 32 && options.position_bits != 16 && options.position_bits != 0) {
     invalid("position_bits must be 32, 16 or 0, not ", options.position_bits);
   }
-  check_pairs(ids.size(), descriptors.rows, "descriptors");
+  check_pairs(ids.size(), codes.rows, "codes");
+  if (codes.rows != 0) check_codes(codes, dim());
   const std::shared_lock lock(state_->changing);
   const PrototypeStore& map = state_->store;
-  const SealFormat format = seal_format(map, *encoder(), options.bytes_per_landmark);
+  const SealFormat format =
+      seal_format(map, *encoder(), options.bytes_per_landmark, options.tune && !ids.empty());
   auto changed = merge_appearances(map, format.dim, format.row_limit);
   // Appearances that remain say no more of what they are mistaken for.
   const bool merged =
       map.several() && changed && changed->prototype_count() == map.landmark_count();
   if (options.tune && options.bytes_per_landmark && (merged || !ids.empty())) {
     const TuningQueries queries =
-        ids.empty() ? TuningQueries(map, format.dim)
-                    : TuningQueries({ids.begin(), ids.end()},
-                                    encoder()->encode(descriptors, format.dim, options.threads));
+        ids.empty() ? TuningQueries(map, format.dim) : TuningQueries(ids, codes, format.dim);
     changed.emplace(tune_prototypes(changed ? *changed : map, queries, options.threads));
   }
   const PrototypeStore& store = changed ? *changed : map;

@@ -12,6 +12,11 @@ namespace {
 // A sealed map stores the number of a landmark's prototypes in a byte.
 constexpr size_t kMaxRows = 255;
 
+// Without observations to tune by, so many prototypes per landmark are worth more than longer ones
+// once these have so many numbers (measured on caliterra, viking and conch).
+constexpr double kWorthwhile = 1.25;
+constexpr size_t kEnoughNumbers = 48;
+
 // Sums of the first `dim` numbers and counts of one landmark's rows.
 struct LandmarkSums {
   LandmarkSums(const PrototypeStore& store, LandmarkIndex landmark, size_t dim) {
@@ -196,7 +201,7 @@ int owner_bits(size_t landmarks) {
 }
 
 SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
-                       std::optional<double> bytes_per_landmark) {
+                       std::optional<double> bytes_per_landmark, bool observed) {
   const size_t n = store.landmark_count(), dim = store.dim();
   size_t rows = store.prototype_count();
   store.each_landmark([&](LandmarkIndex l) {
@@ -206,23 +211,34 @@ SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
   if (!bytes_per_landmark) return lossless;
   // The rounding of products must not cost a prototype.
   const double limit = *bytes_per_landmark * (1 + 1e-12), budget = limit * static_cast<double>(n);
-  const auto fits = [&](size_t row_bytes) {
-    return !(static_cast<double>(sealed_bytes(n, rows, row_bytes)) > budget);
+  // Returns how many prototypes of so many bytes fit.
+  const auto fitting = [&](size_t row_bytes) {
+    if (static_cast<double>(sealed_bytes(n, rows, row_bytes)) <= budget) return rows;
+    if (static_cast<double>(sealed_bytes(n, n, row_bytes)) > budget) return size_t{0};
+    const double several = (budget - 2 * static_cast<double>(n)) / static_cast<double>(row_bytes);
+    return std::max(n, static_cast<size_t>(std::max(0.0, several)));
   };
-  size_t smallest = SIZE_MAX, words = 0;
-  SealFormat best = lossless;
+  const size_t worthwhile =
+      std::min(rows, static_cast<size_t>(kWorthwhile * static_cast<double>(n)));
+  size_t smallest = SIZE_MAX;
+  // The most words that fit, and the most that leave room for a worthwhile number of prototypes.
+  std::pair<size_t, SealFormat> most{0, lossless}, several{0, lossless};
   for (const size_t of_codes : encoder.dims()) {
     for (const Codebook& codebook : encoder.codebooks()) {
       if (of_codes > dim || !codebook.covers(of_codes)) continue;
-      const size_t own_words = of_codes / codebook.width;
-      smallest = std::min(smallest, own_words);
-      if (own_words < words || static_cast<double>(own_words + 1) > limit) continue;
-      words = own_words;
-      best = {of_codes, &codebook, rows};
+      const size_t words = of_codes / codebook.width;
+      smallest = std::min(smallest, words);
+      if (static_cast<double>(words + 1) > limit) continue;
+      const std::pair found{words, SealFormat{of_codes, &codebook, fitting(words)}};
+      if (words >= most.first) most = found;
+      if (words >= several.first && !observed && of_codes >= kEnoughNumbers &&
+          found.second.row_limit >= std::max<size_t>(1, worthwhile)) {
+        several = found;
+      }
     }
   }
   const bool enough = limit >= static_cast<double>(std::min(smallest, packed_dim(dim)) + 1);
-  if (enough && fits(packed_dim(dim))) return lossless;
+  if (enough && fitting(packed_dim(dim)) == rows) return lossless;
   if (smallest == SIZE_MAX) {
     invalid("bytes_per_landmark needs codebooks, which encoder '", encoder.info().name,
             "' does not have for this map: give it some, or seal the map as it is, without "
@@ -232,10 +248,7 @@ SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
     invalid("bytes_per_landmark must be at least ", smallest + 1,
             " for this map, which one prototype of ", smallest, " words takes");
   }
-  if (fits(words)) return best;
-  const double row_limit = (budget - 2 * static_cast<double>(n)) / static_cast<double>(words);
-  best.row_limit = std::max(n, static_cast<size_t>(std::max(0.0, row_limit)));
-  return best;
+  return several.first != 0 ? several.second : most.second;
 }
 
 std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t dim,

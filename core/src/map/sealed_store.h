@@ -12,10 +12,11 @@ struct SealFormat {
   size_t row_limit;          // prototypes in all
 };
 
-// Chooses the format for a number of bytes per landmark (SealOptions). Throws
-// std::invalid_argument, which names the smallest possible number, if that is too small.
+// Chooses the format for a number of bytes per landmark (SealOptions); `observed` says whether
+// observations will tune the prototypes. Throws std::invalid_argument, which names the smallest
+// possible number, if that is too small.
 SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
-                       std::optional<double> bytes_per_landmark);
+                       std::optional<double> bytes_per_landmark, bool observed);
 
 // Returns the bytes that prototypes of `row_bytes`, their number and the counts of landmarks take.
 size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes);

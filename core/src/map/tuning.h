@@ -9,11 +9,11 @@ namespace protomark {
 struct TuningQueries {
   // Takes the appearances of a learning map, cut to `dim` numbers.
   TuningQueries(const PrototypeStore& map, size_t dim);
-  // Takes observations, whose codes have the numbers that prototypes have.
-  TuningQueries(std::vector<int64_t> its_landmarks, Matrix<int8_t> its_codes)
-      : landmarks(std::move(its_landmarks)),
-        codes(std::move(its_codes)),
-        weights(landmarks.size(), uint8_t{1}) {}
+  // Takes observations, cut to `dim` numbers.
+  TuningQueries(std::span<const int64_t> ids, Codes observed, size_t dim)
+      : landmarks(ids.begin(), ids.end()), codes(ids.size(), dim), weights(ids.size(), uint8_t{1}) {
+    for (size_t i = 0; i < ids.size(); ++i) std::copy_n(observed.row(i), dim, codes.row(i));
+  }
 
   std::vector<int64_t> landmarks;  // ids; queries of others than the map's are ignored
   Matrix<int8_t> codes;

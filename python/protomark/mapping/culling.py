@@ -47,8 +47,8 @@ def remove_observations(structure: Structure, memory: Memory, seen: Observations
     for index in np.unique(seen.frames).tolist():
         frame = structure.frames[index]
         rows = seen.rows[seen.frames == index]
-        if frame.encoded is not None:
-            memory.subtract(frame.landmarks[rows], frame.encoded[rows])
+        if frame.in_window:
+            memory.subtract(frame.landmarks[rows], frame.codes[rows])
         frame.landmarks[rows] = -1
 
 

@@ -44,7 +44,8 @@ class Frame:
     # (n,) float64, standard deviation of the keypoints in pixels, which grows with their size.
     sigma: Array
     descriptors: NDArray[np.uint8] | None = None  # (n, B) uint8, None outside of the window
-    # (n, width), the form that the memory compares; None outside of the window.
+    # (n, width), the form that the memory compares. Outside of the window only the seal reads it,
+    # to tune prototypes by what observed them.
     encoded: NDArray[Any] | None = None
     # (3, 4) float64, cam_from_world; NaN before the frame is registered.
     pose: Array = field(default_factory=lambda: np.full((3, 4), np.nan))
@@ -86,7 +87,7 @@ class Frame:
     @property
     def codes(self) -> NDArray[Any]:
         """The encoded descriptors of a frame in the window."""
-        if self.encoded is None:
+        if not self.in_window or self.encoded is None:
             raise ValueError(f"{self.name}: the frame has left the window and has no descriptors")
         return self.encoded
 
@@ -101,7 +102,8 @@ class Frame:
         for name in ("keypoints", "rays", "sigma", "landmarks"):
             setattr(self, name, getattr(self, name)[rows])
         self.turns = None if self.turns is None else self.turns[rows]
-        self.descriptors = self.encoded = None
+        self.encoded = None if self.encoded is None else self.encoded[rows]
+        self.descriptors = None
 
 
 def keypoint_sigma(sizes: NDArray[np.float32]) -> Array:

@@ -438,7 +438,7 @@ class Mapper:
             self._adjust_global_bundle(2)
             self._remove_untrusted_frames()
         for frame in self.structure.frames:
-            frame.descriptors = frame.encoded = None
+            frame.descriptors = None
         # With an empty window every landmark counts as old, and unconfirmed ones are culled.
         with self.clock.stage("adjust"):
             culling.cull_landmarks(

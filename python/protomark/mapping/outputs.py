@@ -66,7 +66,7 @@ def write_outputs(
     (scene / SEALED_MAP).unlink(missing_ok=True)  # it would not be of this map
     mapper.scene.save(scene / SCENE_MAP)
     if seal and finished:
-        sealed = seal_map(mapper.scene, scene / SEALED_MAP)
+        sealed = seal_map(mapper.scene, scene / SEALED_MAP, observations=structure.codes())
         figures |= {"sealed_bytes": sealed["bytes"]}
     write_model(structure, scene / MODEL)
     frames = sorted(structure.frames, key=lambda f: (f.time, f.name))

@@ -11,7 +11,8 @@ from typing import Any
 from protomark.geometry.camera import Camera
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.source import FrameSource
-from protomark.mapping.state import CHECKPOINT, STATE
+from protomark.mapping.state import CHECKPOINT
+from protomark.maps.open import STATE
 
 
 @dataclass(frozen=True)

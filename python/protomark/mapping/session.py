@@ -32,9 +32,10 @@ from protomark.mapping.request import (
 )
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
 from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open_source
-from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_checkpoint, save_state
+from protomark.mapping.state import CHECKPOINT, load_state, save_checkpoint, save_state
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import are_elsewhere, no_map
+from protomark.maps.open import STATE
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread, read_ahead
 

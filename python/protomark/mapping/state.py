@@ -1,6 +1,7 @@
 """Saves the state of a map in the making, so that mapping resumes exactly where it stopped.
 
-A checkpoint holds the descriptors of the window; a finished map has none.
+A checkpoint holds the descriptors of the window; a finished map has none. Both hold the codes of
+observations, by which `seal` tunes prototypes.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.self_calibration import Calibration
-from protomark.maps.open import SCENE_MAP, open_learning_map
+from protomark.maps.open import SCENE_MAP, STATE, open_learning_map
 
-STATE, CHECKPOINT = "state.safetensors", "checkpoint"
+CHECKPOINT = "checkpoint"
 _FORMAT, _VERSION = "protomark-mapping", "1"
 
 
@@ -44,6 +45,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
     every = [*frames, *waiting]
     descriptors = [f.descriptors for f in every if f.descriptors is not None]
     no_descriptors = np.zeros((0, mapper.descriptor_bytes), np.uint8)
+    codes = [f.encoded for f in frames if not f.in_window and f.encoded is not None]
     arrays: dict[str, NDArray[Any]] = {
         "positions": structure.positions,
         "directions": structure.directions,
@@ -56,6 +58,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
         "sigma": np.concatenate([np.zeros(0), *(f.sigma for f in every)]),
         "landmarks": np.concatenate([np.zeros(0, np.int64), *(f.landmarks for f in frames)]),
         "descriptors": np.concatenate([no_descriptors, *descriptors]),
+        "codes": np.concatenate([mapper.memory.encode(no_descriptors), *codes]),
     }
     state = {
         "options": asdict(mapper.options),
@@ -139,7 +142,7 @@ def _restore_structure(
     if not count:
         raise ValueError("positions are missing")
     types = {"born": "int64", "views": "int64", "offsets": "int64", "landmarks": "int64"}
-    types |= {"keypoints": "float32", "descriptors": "uint8"}
+    types |= {"keypoints": "float32", "descriptors": "uint8", "codes": "int8"}
     for name in {*shapes, *types, "sigma"}:
         if arrays[name].dtype != types.get(name, "float64"):
             raise ValueError(f"{name} has the wrong type {arrays[name].dtype}")
@@ -160,7 +163,8 @@ def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict
     landmarks = arrays["landmarks"]
     if len(landmarks) and not -1 <= landmarks.min() <= landmarks.max() < len(structure.positions):
         raise ValueError("a keypoint observes a landmark that does not exist")
-    used = 0
+    codes = arrays["codes"]
+    used = without = 0
     for i, (index, name, time, camera_id, *flags) in enumerate(state["frames"] + state["waiting"]):
         a, b = int(offsets[i]), int(offsets[i + 1])
         rays, turns = structure.cameras[camera_id].local_rays(keypoints[a:b])
@@ -173,6 +177,11 @@ def _restore_frames(mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict
                 raise ValueError("descriptors are missing")
             frame.descriptors = arrays["descriptors"][used - (b - a) : used].copy()
             frame.encoded = mapper.memory.encode(frame.descriptors)
+        else:
+            without += b - a
+            frame.encoded = codes[without - (b - a) : without].copy()
+            if frame.encoded.shape != (b - a, mapper.scene.dim):
+                raise ValueError("codes are missing")
         if flags:
             frame.pose, frame.keyframe = arrays["poses"][i].copy(), keyframe
             frame.landmarks = landmarks[a:b].copy()

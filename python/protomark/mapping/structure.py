@@ -96,6 +96,12 @@ class Structure:
         """Median distance in pixels of a frame's keypoints from landmarks projected by a pose."""
         return float(np.median(reprojection_error(pose, *self.matched(frame, rows, ids))))
 
+    def codes(self) -> tuple[Ids, NDArray[Any]]:
+        """Landmarks (n,) of all observations, and the codes (n, width) of their keypoints."""
+        frames = [f for f in self.frames if f.encoded is not None]
+        codes = [f.encoded[f.observed] for f in frames if f.encoded is not None]
+        return np.concatenate([f.seen for f in frames]), np.concatenate(codes)
+
     def keyframes(self) -> list[int]:
         """Indices of the keyframes."""
         return [i for i, frame in enumerate(self.frames) if frame.keyframe]

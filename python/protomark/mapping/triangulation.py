@@ -122,5 +122,5 @@ def _continue_tracks(
 
 def update_prototypes(memory: Memory, frame: Frame, rows: Ids) -> None:
     """Add the codes of keypoints to the prototypes of their landmarks (Eq. 1 and 2)."""
-    if len(rows) and frame.encoded is not None:
-        memory.add(frame.landmarks[rows], frame.encoded[rows])
+    if len(rows) and frame.in_window:
+        memory.add(frame.landmarks[rows], frame.codes[rows])

@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
+from protomark.extras import optional
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
 from protomark.maps.info import is_tracks
-from protomark.maps.open import open_learning_map
+from protomark.maps.open import SCENE_MAP, STATE, open_learning_map
 from protomark.maps.selection import Views, select_landmarks
 from protomark.progress import Progress, silent
 from protomark.tracks.file import Tracks
 
 Index = Literal["auto", "yes", "no"]
-# Landmark ids (n,), and their descriptors (n, bits / 8) uint8.
-Observations = tuple[NDArray[np.int64], NDArray[np.uint8]]
+# Landmark ids (n,), and their descriptors (n, bits / 8) uint8 or codes (n, dim) int8.
+Observations = tuple[NDArray[np.int64], NDArray[np.uint8] | NDArray[np.int8]]
 
 BYTES_PER_LANDMARK = 33.0
 # An exact search of fewer prototypes is as fast (docs/large-maps.md).
@@ -30,6 +31,8 @@ INDEX_FROM = 100_000
 # The smallest map that is tried: a pose needs four landmarks.
 MIN_LANDMARKS = 4
 MODEL = "sparse"
+# Of so many observations the own prototype is nearer than another one, if both are of one map.
+_MIN_ALIKE = 0.75
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,34 @@ def seal(
     scene = open_learning_map(source)
     model = source / MODEL
     views = (lambda: Views.of_model(model)) if model.is_dir() else None
-    return seal_map(scene, output, request, views, None, progress)
+    return seal_map(scene, output, request, views, codes_of(source, scene), progress)
+
+
+def codes_of(folder: Path, scene: pm.PrototypeMap) -> Observations | None:
+    """The codes of observations that `protomark map` keeps in a folder.
+
+    None if there are none, or if they are not of this map, which somebody put there.
+
+    Raises:
+        ValueError: the file is broken.
+    """
+    path = folder / STATE
+    if not path.is_file():
+        return None
+    safetensors = optional("safetensors")
+    try:
+        with safetensors.safe_open(path, "numpy") as file:
+            ids, codes = file.get_tensor("landmarks"), file.get_tensor("codes")
+        rows = np.flatnonzero(np.isin(ids, scene.ids))[:1000]
+        others = np.roll(rows, len(rows) // 2)
+        own, other = (
+            ((scene.prototypes(ids[r]) - codes[rows]) ** 2).sum(axis=1) for r in (rows, others)
+        )
+    except (safetensors.SafetensorError, ValueError, IndexError) as error:
+        raise ValueError(
+            f"{path}: broken ({error}): seal {folder / SCENE_MAP}, or map the images anew"
+        ) from None
+    return (ids, codes) if len(rows) and (own < other).mean() > _MIN_ALIKE else None
 
 
 def observed(tracks: Tracks) -> Observations:
