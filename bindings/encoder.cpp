@@ -171,14 +171,15 @@ Raises:
         below 1.)")
       .def(
           "match_calibration",
-          [](const Encoder& encoder, nb::object dim) {
-            return MatchCalibration::of(encoder, code_length(dim));
+          [](const Encoder& encoder, nb::object dim, bool tuned) {
+            return MatchCalibration::of(encoder, code_length(dim), tuned);
           },
-          "dim"_a.none() = nb::none(),
-          nb::sig("def match_calibration(self, dim: int | None = None) -> MatchCalibration"),
+          "dim"_a.none() = nb::none(), "tuned"_a = false,
+          nb::sig("def match_calibration(self, dim: int | None = None, tuned: bool = False) -> "
+                  "MatchCalibration"),
           "How likely a match is right, by the distances to the two nearest landmarks, for codes "
-          "of `dim` numbers, one of `dims` (None: the full length). Raises ValueError if the "
-          "encoder was not calibrated for codes of this length.")
+          "of `dim` numbers, one of `dims` (None: the full length), in a map of mean or of tuned "
+          "prototypes. Raises ValueError if the encoder was not calibrated for these.")
       .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor.")
       .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
       .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")

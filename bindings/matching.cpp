@@ -77,13 +77,15 @@ keypoint's landmark is in the map at all. Where there is no second landmark, s i
           "Take the weights w0, w1, w2.")
       .def_static(
           "of",
-          [](const Encoder& encoder, nb::object dim) {
-            return MatchCalibration::of(encoder, code_length(dim));
+          [](const Encoder& encoder, nb::object dim, bool tuned) {
+            return MatchCalibration::of(encoder, code_length(dim), tuned);
           },
-          "encoder"_a, "dim"_a.none() = nb::none(),
-          nb::sig("def of(encoder: Encoder, dim: int | None = None) -> MatchCalibration"),
+          "encoder"_a, "dim"_a.none() = nb::none(), "tuned"_a = false,
+          nb::sig("def of(encoder: Encoder, dim: int | None = None, tuned: bool = False) -> "
+                  "MatchCalibration"),
           "The calibration that an encoder's model file has for codes of `dim` numbers (None: "
-          "all). Raises ValueError if the encoder was never calibrated for codes of this length.")
+          "all), and for mean or tuned prototypes. Raises ValueError if the encoder was never "
+          "calibrated for these.")
       .def_prop_ro(
           "weights",
           [](const MatchCalibration& c) {

@@ -34,6 +34,8 @@ void bind_sealed_map(nb::module_& m) {
       .def_prop_ro("words", &SealedMap::words,
                    "Words of the encoder's codebook per prototype; 0: prototypes are int8 numbers, "
                    "as in the learning map.")
+      .def_prop_ro("tuned", &SealedMap::tuned,
+                   "Whether prototypes were tuned against each other (PrototypeMap.seal).")
       .def_prop_ro("bytes_per_landmark", &SealedMap::bytes_per_landmark,
                    "Bytes that a landmark takes on average for its prototypes, their number and "
                    "its count, as PrototypeMap.seal counts them.")

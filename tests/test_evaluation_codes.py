@@ -44,7 +44,7 @@ def test_nearest_words_against_all_distances() -> None:
 def test_k_means_is_lloyds() -> None:
     # Of normal numbers, as means of few bits are often equally far from two words.
     values = np.random.default_rng(0).normal(size=(900, 6)).astype(np.float32)
-    words = values[np.random.default_rng(3).choice(900, 20, replace=False)].astype(float)
+    words = np.unique(values, axis=0)[np.random.default_rng(3).permutation(900)[:20]].astype(float)
     for _ in range(quantization.PASSES):
         nearest = ((values[:, None] - words[None]) ** 2).sum(axis=2).argmin(axis=1)
         words = np.array([values[nearest == i].mean(axis=0) for i in range(20)])
@@ -55,8 +55,7 @@ def test_words_of_fewer_values() -> None:
     values = np.repeat(np.arange(12, dtype=np.float32), 50)[:, None]
     words = k_means(values, 16, np.random.default_rng(0))
     assert len(words) == 16
-    assert np.isin(words, values).all()
-    assert len(k_means(values[:5], 16, np.random.default_rng(0))) == 5
+    assert set(words.ravel()) == set(values.ravel())
 
 
 def test_as_many_words_as_landmarks_are_the_means() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from protomark.match_calibration import (
 )
 from protomark.matching import MIN_PROBABILITY
 from protomark.tracks.file import Tracks
-from protomark.training.match_calibration import matches_by_dim, measure_calibration
+from protomark.training.match_calibration import matches_by_kind, measure_calibration
 
 LIMIT = 600_000
 
@@ -62,17 +63,24 @@ def test_probability() -> None:
 
 
 def test_the_note_changes_neither_identity_nor_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
-    fitted = {5: MatchCalibration((1.0, -2.5, 3e-7)), 12: MatchCalibration((0.0, 1.0, 12345.6))}
+    fitted = {
+        (5, False): MatchCalibration((1.0, -2.5, 3e-7)),
+        (12, False): MatchCalibration((0.0, 1.0, 12345.6)),
+        (12, True): MatchCalibration((0.5, 1.0, 2.0)),
+    }
     with_calibration(encoder, fitted, "here, there").save(tmp_path / "x.pme")
     read = pm.Encoder.load(tmp_path / "x.pme")
     assert read.identity == encoder.identity
-    assert MatchCalibration.of(read, 5) == fitted[5]
-    assert MatchCalibration.of(read) == fitted[12]
+    assert MatchCalibration.of(read, 5) == fitted[5, False]
+    assert MatchCalibration.of(read) == fitted[12, False]
+    assert MatchCalibration.of(read, tuned=True) == fitted[12, True]
+    with pytest.raises(ValueError, match="no match calibration for tuned prototypes of 5 numbers"):
+        read.match_calibration(5, tuned=True)
     assert read.notes[SOURCE_KEY] == "here, there"
     # A map keeps it.
     pm.PrototypeMap(read, 5).save(tmp_path / "m.pmk")
     scene = pm.open(tmp_path / "m.pmk")
-    assert MatchCalibration.of(scene.encoder, scene.dim) == fitted[5]
+    assert MatchCalibration.of(scene.encoder, scene.dim) == fitted[5, False]
 
 
 def test_without_a_note_the_error_says_what_to_do(encoder: pm.Encoder) -> None:
@@ -101,17 +109,19 @@ def test_what_ships_is_calibrated_and_as_its_card_says(name: str) -> None:
     for test_sequence in ("toy", "kitchen", "castle", "kitti07"):
         assert test_sequence not in encoder.notes[SOURCE_KEY]
     for dim in encoder.dims:
-        near, far = encoder.match_calibration(dim).probability([[1, 10_000], [9801, 10_000]])
-        assert near > 0.8
-        assert near - far > 0.3
+        for tuned in (False, True):
+            calibration = encoder.match_calibration(dim, tuned)
+            near, far = calibration.probability([[1, 10_000], [9801, 10_000]])
+            assert near > 0.8
+            assert near - far > 0.3
 
 
 def test_probabilities_hold_on_a_sequence_that_they_were_not_fitted_to() -> None:
     encoder = pm.Encoder.load("freak")
     tracks = Tracks.load(sample.path())
-    found = matches_by_dim(encoder, tracks, frames=5)
-    for dim in (16, 32, 64):
-        figures = measure_calibration("toy", dim, MatchCalibration.of(encoder, dim), found[dim])
+    found = matches_by_kind(encoder, tracks, frames=5)
+    for kind in product((16, 32, 64), (False, True)):
+        figures = measure_calibration("toy", *kind, encoder.match_calibration(*kind), found[kind])
         assert figures.precision == pytest.approx(figures.expected, abs=0.12)
         assert figures.recall > 0.6
 

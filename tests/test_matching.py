@@ -78,7 +78,7 @@ def test_matches_are_as_defined(kind: str, encoder: pm.Encoder, tmp_path: Path) 
     rng = np.random.default_rng(1)
     # Steep enough that many probabilities are 1, so that rows decide.
     calibration = MatchCalibration((2.0, -0.05, 2.0))
-    encoder = with_calibration(encoder, {12: calibration}, "made up")
+    encoder = with_calibration(encoder, {(12, False): calibration}, "made up")
     ids = rng.permutation(10_000)[:500]
     bits = rng.integers(0, 256, (500, encoder.bits // 8)).astype(np.uint8)
     scene: Any = pm.PrototypeMap(encoder, 12, 4 if kind == "appearances" else 0)
@@ -112,7 +112,7 @@ def test_bad_input(encoder: pm.Encoder) -> None:
     frame = np.zeros((1, encoder.bits // 8), np.uint8)
     with pytest.raises(ValueError, match="protomark calibrate"):
         pm.match(scene, frame)
-    calibrated = with_calibration(encoder, {12: MatchCalibration((0, 0, 0))}, "made up")
+    calibrated = with_calibration(encoder, {(12, False): MatchCalibration((0, 0, 0))}, "made up")
     scene = pm.PrototypeMap(calibrated, 12)
     for least in (-0.1, 1.1, math.nan):
         with pytest.raises(ValueError, match="min_probability must be 0 to 1"):

@@ -8,7 +8,7 @@ import numpy as np
 
 import protomark as pm
 from conftest import random_descriptors, random_layers
-from protomark.training.codebooks import k_means, tuned_prototypes, with_codebooks
+from protomark.training.codebooks import tuned_prototypes, with_codebooks, words_of
 from protomark.training.sampling import Views
 
 
@@ -28,7 +28,7 @@ def error(words: np.ndarray, points: np.ndarray) -> float:
 def test_words_fit_points_better_than_points_themselves() -> None:
     rng = np.random.default_rng(0)
     points = np.clip(rng.normal(0, 40, (5000, 2)), -127, 127).astype(np.int8)
-    words = k_means(points, 256)
+    words = words_of(points)
     assert words.shape == (256, 2)
     assert words.dtype == np.int8
     assert error(words, points) < 0.7 * error(points[:256], points)
@@ -36,7 +36,7 @@ def test_words_fit_points_better_than_points_themselves() -> None:
 
 def test_few_points_are_words() -> None:
     points = np.array([[1, 2], [1, 2], [-127, 127], [0, 0]], np.int8)
-    assert error(k_means(points, 256), points) == 0
+    assert error(words_of(points), points) == 0
 
 
 def test_codebooks_shrink_prototypes_with_less_error_than_even_levels(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ The script localizes keyframes of the later half of each sequence in a map of th
 a random tenth of the keyframes in a map of the other nine tenths. It fits the calibration to the
 other sequences. Precision and recall are those of accepted matches over all keypoints; a pose is
 found if its errors are at most 1 % of the median scene depth and 2 degrees. It then applies the
-same calibration, fitted to int8 prototypes, to words of two numbers, also tuned, and to several
+same calibration, fitted to int8 prototypes, mean or tuned, to words of two numbers and to several
 appearances per landmark. Prints the tables of docs/results/localization.md.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,7 @@ from protomark.training.match_calibration import (
     fit_calibration,
     held_out_frames,
     label_matches,
-    matches_by_dim,
+    matches_by_kind,
     measure_calibration,
 )
 from protomark_bench.report import ReportTable
@@ -118,7 +118,7 @@ def measure(
 
 
 def kinds(
-    tracks: Tracks, encoder: pm.Encoder, dim: int, calibration: MatchCalibration
+    tracks: Tracks, encoder: pm.Encoder, dim: int, calibrations: Sequence[MatchCalibration]
 ) -> NDArray[np.float64]:
     """(kind of map, 3): precision of accepted matches, the expected one, recall."""
     rows, queries = held_out_frames(tracks)
@@ -132,7 +132,7 @@ def kinds(
             by = observed if "tuned" in kind else (None, None)
             sealed = scene.seal(Path(folder) / "scene.pmk", *by, bytes_per_landmark=size)
             given = label_matches(tracks, queries, sealed.search)
-        found = measure_calibration("", dim, calibration, given)
+        found = measure_calibration("", dim, sealed.tuned, calibrations[sealed.tuned], given)
         result.append([found.precision, found.expected, found.recall])
     return np.array(result)
 
@@ -149,11 +149,14 @@ def main() -> None:
     by_rule, by_kind, given = [], [], {}
     with progress_bar() as progress:
         for name, tracks in tracked(loaded.items(), progress, "query maps"):
-            given[name] = matches_by_dim(encoder, tracks)[args.dim]
+            given[name] = matches_by_kind(encoder, tracks)
         for name, tracks in tracked(loaded.items(), progress, "localize"):
-            fitted = fit_calibration([m for other, m in given.items() if other != name])
-            by_rule.append(measure(tracks, encoder, args.dim, rules(fitted)))
-            by_kind.append(kinds(tracks, encoder, args.dim, fitted))
+            others = [m for other, m in given.items() if other != name]
+            mean, tuned = (
+                fit_calibration([m[args.dim, kind] for m in others]) for kind in (False, True)
+            )
+            by_rule.append(measure(tracks, encoder, args.dim, rules(mean)))
+            by_kind.append(kinds(tracks, encoder, args.dim, (mean, tuned)))
     names = list(rules(MatchCalibration((0.0, 0.0, 0.0))))
     means = np.mean(by_rule, axis=0)
     rows = [

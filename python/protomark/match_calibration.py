@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import protomark as pm
 from protomark._core import MatchCalibration as MatchCalibration
 
-KEY = "match_calibration"
+KEY, TUNED_KEY = "match_calibration", "match_calibration_tuned"
 SOURCE_KEY = "match_calibration_data"
 # The squared distance that search returns where there is no landmark.
 NO_DISTANCE = np.iinfo(np.int32).max
@@ -33,12 +33,17 @@ def calibration_features(
 
 
 def with_calibration(
-    encoder: pm.Encoder, fitted: Mapping[int, MatchCalibration], source: str
+    encoder: pm.Encoder,
+    # By code length, and whether prototypes are tuned.
+    fitted: Mapping[tuple[int, bool], MatchCalibration],
+    source: str,
 ) -> pm.Encoder:
     """A copy of an encoder with a calibration; identity and codes are the same."""
-    lines = [
-        " ".join([str(dim), *(f"{w:.6g}" for w in fitted[dim].weights)]) for dim in sorted(fitted)
-    ]
+    lines: dict[str, list[str]] = {KEY: [], TUNED_KEY: []}
+    for (dim, tuned), calibration in sorted(fitted.items(), key=lambda item: item[0]):
+        weights = (f"{w:.6g}" for w in calibration.weights)
+        lines[TUNED_KEY if tuned else KEY].append(" ".join([str(dim), *weights]))
+    notes = {key: "\n".join(of_key) for key, of_key in lines.items() if of_key}
     return pm.Encoder(
         encoder.layers,
         encoder.dims,
@@ -47,7 +52,7 @@ def with_calibration(
         encoder.scale,
         encoder.data,
         encoder.licence,
-        {**encoder.notes, KEY: "\n".join(lines), SOURCE_KEY: source},
+        {**encoder.notes, **notes, SOURCE_KEY: source},
         encoder.codebooks,
     )
 

@@ -11,13 +11,15 @@ namespace protomark {
 // The probability that the nearest landmark of a keypoint is the right one:
 //   P = 1 / (1 + exp(-(w0 + w1 d^2 + w2 (s^2 - d^2))))
 // d and s are the distances to the nearest and the second nearest landmark; without a second, s is
-// 2 d. `protomark calibrate` fits the weights to data for each encoder and length of its codes.
+// 2 d. `protomark calibrate` fits the weights to data for each encoder and length of its codes,
+// with mean prototypes and with tuned ones.
 struct PROTOMARK_API MatchCalibration {
   std::array<double, 3> weights{};  // w0, w1, w2
 
-  // Reads the calibration for codes of `dim` numbers, 0 for the full length, from the encoder's
-  // notes. Throws std::invalid_argument if there is none, or a note that cannot be read.
-  static MatchCalibration of(const Encoder& encoder, size_t dim = 0);
+  // Reads the calibration for codes of `dim` numbers, 0 for the full length, and for the prototypes
+  // of a map, which are tuned or not, from the encoder's notes. Throws std::invalid_argument if
+  // there is none, or a note that cannot be read.
+  static MatchCalibration of(const Encoder& encoder, size_t dim = 0, bool tuned = false);
   // Takes squared distances as a search gives them. Returns 0 where there is no nearest landmark.
   double probability(double nearest, double second) const;
   bool operator==(const MatchCalibration&) const = default;

@@ -32,6 +32,8 @@ class PROTOMARK_API SealedMap {
   size_t prototype_count() const;
   // Words of the encoder's codebook per prototype; 0: numbers are int8, as in the learning map.
   size_t words() const;
+  // Whether prototypes were tuned against each other (SealOptions).
+  bool tuned() const;
   // Bytes that a landmark takes on average for its prototypes, their number and its count, as
   // SealOptions counts them; 0 for an empty map.
   double bytes_per_landmark() const;

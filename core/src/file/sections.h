@@ -31,6 +31,7 @@ inline constexpr char kRows[] = "rows";
 inline constexpr char kPrototypes[] = "protos";
 inline constexpr char kWidth[] = "width";
 inline constexpr char kSteps[] = "steps";
+inline constexpr char kTuned[] = "tuned";
 inline constexpr char kListRows[] = "listrows";
 inline constexpr char kOwners[] = "owners";
 inline constexpr char kOwnerChecksums[] = "ownercrc";

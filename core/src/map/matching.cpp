@@ -11,8 +11,8 @@
 namespace protomark {
 namespace {
 
-// The note has a line for each length of codes: the length and three weights.
-constexpr char kNote[] = "match_calibration";
+// A note has a line for each length of codes: the length and three weights.
+constexpr char kNote[] = "match_calibration", kTunedNote[] = "match_calibration_tuned";
 
 std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
   std::optional<MatchCalibration> found;
@@ -34,11 +34,12 @@ std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
 }
 
 template <typename Map>
-MatchList match_with(const Map& map, Descriptors descriptors, const MatchOptions& options) {
+MatchList match_with(const Map& map, bool tuned, Descriptors descriptors,
+                     const MatchOptions& options) {
   if (!(options.min_probability >= 0 && options.min_probability <= 1)) {
     invalid("min_probability must be 0 to 1, not ", options.min_probability);
   }
-  const auto calibration = MatchCalibration::of(*map.encoder(), map.dim());
+  const auto calibration = MatchCalibration::of(*map.encoder(), map.dim(), tuned);
   SearchOptions search;
   search.recall = options.recall;
   search.among = options.among;
@@ -55,13 +56,14 @@ MatchList match_with(const Map& map, Descriptors descriptors, const MatchOptions
 
 }  // namespace
 
-MatchCalibration MatchCalibration::of(const Encoder& encoder, size_t dim) {
+MatchCalibration MatchCalibration::of(const Encoder& encoder, size_t dim, bool tuned) {
   if (dim == 0) dim = encoder.dim();
   for (const auto& [key, note] : encoder.info().notes) {
-    if (key != kNote) continue;
+    if (key != (tuned ? kTunedNote : kNote)) continue;
     if (const auto found = read_note(note, dim)) return *found;
   }
-  invalid("encoder '", encoder.info().name, "' has no match calibration for codes of ", dim,
+  invalid("encoder '", encoder.info().name, "' has no match calibration for ",
+          tuned ? "tuned prototypes" : "codes", " of ", dim,
           " numbers: run `protomark calibrate MODEL TRACKS...` and build the map with that model");
 }
 
@@ -95,10 +97,10 @@ MatchList accept(std::span<const int64_t> nearest, std::span<const double> proba
 }
 
 MatchList match(const PrototypeMap& map, Descriptors descriptors, const MatchOptions& options) {
-  return match_with(map, descriptors, options);
+  return match_with(map, false, descriptors, options);
 }
 MatchList match(const SealedMap& map, Descriptors descriptors, const MatchOptions& options) {
-  return match_with(map, descriptors, options);
+  return match_with(map, map.tuned(), descriptors, options);
 }
 
 }  // namespace protomark

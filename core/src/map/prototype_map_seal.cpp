@@ -315,7 +315,8 @@ void PrototypeMap::seal_codes(const std::filesystem::path& path, const SealOptio
   // Appearances that remain say no more of what they are mistaken for.
   const bool merged =
       map.several() && changed && changed->prototype_count() == map.landmark_count();
-  if (options.tune && options.bytes_per_landmark && (merged || !ids.empty())) {
+  const bool tuned = options.tune && options.bytes_per_landmark && (merged || !ids.empty());
+  if (tuned) {
     const TuningQueries queries =
         ids.empty() ? TuningQueries(map, format.dim) : TuningQueries(ids, codes, format.dim);
     changed.emplace(tune_prototypes(changed ? *changed : map, queries, options.threads));
@@ -334,6 +335,7 @@ void PrototypeMap::seal_codes(const std::filesystem::path& path, const SealOptio
   if (format.codebook != nullptr) {
     add_value(file, section::kWidth, static_cast<uint32_t>(format.codebook->width));
   }
+  if (tuned) add_value(file, section::kTuned, uint32_t{1});
   if (codec && codec->bits() == 16) add_value(file, section::kSteps, codec->step());
   const BlockPacker packer(store, format.codebook);
   SealedContent content(store, map, packer, codec);

@@ -205,6 +205,7 @@ size_t SealedMap::dim() const { return content_->shape.dim; }
 size_t SealedMap::size() const { return content_->shape.landmarks; }
 size_t SealedMap::prototype_count() const { return content_->prototype_count; }
 size_t SealedMap::words() const { return content_->words(); }
+bool SealedMap::tuned() const { return content_->file.has(section::kTuned); }
 size_t SealedMap::nlist() const { return content_->nlist(); }
 std::vector<int64_t> SealedMap::ids() const { return unchanged().ids.all(); }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,22 +38,25 @@ def product_quantized_mean(support: Support, size: int) -> EuclideanMap:
     return EuclideanMap(decoded, support.ids, size + 1)
 
 
-def k_means(
-    values: NDArray[np.float32], count: int, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Words (k, d) of values (n, d) by Lloyd's iterations; k is `count`, or n if that is less."""
-    words = values[rng.choice(len(values), min(count, len(values)), replace=False)]
-    for _ in range(PASSES):
-        nearest = nearest_words(values, words)
-        sizes = np.bincount(nearest, minlength=len(words))
-        order = np.argsort(nearest, kind="stable")
-        used = np.flatnonzero(sizes)
-        starts = np.cumsum(sizes)[used] - sizes[used]
-        words = words.copy()
-        words[used] = np.add.reduceat(values[order], starts, axis=0) / sizes[used, None]
-        # A word that no value is nearest to is drawn anew.
-        unused = np.flatnonzero(sizes == 0)
-        words[unused] = values[rng.choice(len(values), len(unused))]
+def k_means(points: NDArray[Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Words (count, d) of points (n, d) by Lloyd's algorithm.
+
+    Up to `count` distinct points are words themselves, some of them several times.
+    """
+    distinct, counts = np.unique(points, axis=0, return_counts=True)
+    x = distinct.astype(np.float32)
+    words = x[rng.permutation(max(len(x), count))[:count] % len(x)]
+    for _ in range(PASSES if len(x) > count else 0):
+        distances = (words**2).sum(1) - 2 * x @ words.T
+        nearest = distances.argmin(1)
+        mass = np.bincount(nearest, counts, minlength=count)
+        sums = np.stack(
+            [np.bincount(nearest, counts * column, minlength=count) for column in x.T], axis=1
+        )
+        words[mass > 0] = (sums[mass > 0] / mass[mass > 0, None]).astype(np.float32)
+        # A word without points moves to the point that is worst served.
+        worst = np.argsort(-counts * (distances.min(1) + (x**2).sum(1)))
+        words[mass == 0] = x[worst[: int((mass == 0).sum())]]
     return words
 
 

@@ -22,10 +22,10 @@ def calibrate(
 ) -> None:
     """Fit how likely an encoder's matches are right.
 
-    Reads a model and tracks, whose landmarks are known. Fits, for each code length, the
-    probability that a match is right, given the distances to the two nearest landmarks, and writes
-    the fit into the model file. Codes and maps stay the same. `protomark train` does this by
-    itself.
+    Reads a model and tracks, whose landmarks are known. Fits, for each code length, and for
+    mean and tuned prototypes, the probability that a match is right, given the distances to the two
+    nearest landmarks, and writes the fit into the model file. Codes and maps stay the same.
+    `protomark train` does this by itself.
 
     protomark calibrate freak.pme tracks/*.freak.safetensors
     """
@@ -40,10 +40,13 @@ def calibrate(
         encoder, quality = fit(Encoder.load(model), tracks, threads, progress)
     encoder.save(output or model)
     write_json(json_file, {"figures": [vars(one) for one in quality]})
-    table = table_of("sequence", "dim", "right of all", "precision", "expected", "recall")
+    table = table_of(
+        "sequence", "dim", "prototypes", "right of all", "precision", "expected", "recall"
+    )
     for one in quality:
         shares = (one.right, one.precision, one.expected, one.recall)
-        table.add_row(one.sequence, str(one.dim), *(f"{share:.3f}" for share in shares))
+        kind = "tuned" if one.tuned else "mean"
+        table.add_row(one.sequence, str(one.dim), kind, *(f"{share:.3f}" for share in shares))
     console.print(table)
     say(
         f"Matches with a probability of {MIN_PROBABILITY:g} or more. Each sequence is measured "

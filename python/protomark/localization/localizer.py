@@ -85,7 +85,8 @@ class Localizer:
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
-        self.calibration = self.scene.encoder.match_calibration(self.scene.dim)
+        tuned = isinstance(self.scene, pm.SealedMap) and self.scene.tuned
+        self.calibration = self.scene.encoder.match_calibration(self.scene.dim, tuned)
 
     def localize(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -73,18 +74,24 @@ def held_out_frames(
     return part.support_rows, draw_frames(tracks, part, frames)
 
 
-def matches_by_dim(
+def matches_by_kind(
     encoder: pm.Encoder, tracks: Tracks, frames: int = FRAMES, seed: int = 0, threads: int = 1
-) -> dict[int, LabelledMatches]:
-    """Matches with maps of `tracks`, by code length."""
+) -> dict[tuple[int, bool], LabelledMatches]:
+    """Matches with maps of `tracks`, by code length and whether prototypes are tuned."""
     tracks = tracks_for(encoder, tracks)
     rows, queries = held_out_frames(tracks, frames, seed)
-    codes = encoder.encode(tracks.descriptors[rows], threads=threads)
+    ids, every = tracks.landmark_of_keypoint[rows], encoder.encode(tracks.descriptors[rows])
     found = {}
     for dim in encoder.dims:
-        scene = pm.PrototypeMap(encoder, dim)
-        scene.add_codes(tracks.landmark_of_keypoint[rows], np.ascontiguousarray(codes[:, :dim]))
-        found[dim] = label_matches(tracks, queries, partial(scene.search, threads=threads))
+        scene, codes = pm.PrototypeMap(encoder, dim), np.ascontiguousarray(every[:, :dim])
+        scene.add_codes(ids, codes)
+        with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
+            # Words of as many numbers have about the same calibration.
+            path, size = Path(folder) / "scene.sealed.pmk", 4 * -(-dim // 4) + 1
+            tuned = scene.seal(path, ids, codes, bytes_per_landmark=size, threads=threads)
+        for of_map in (scene, tuned):
+            search = partial(of_map.search, threads=threads)
+            found[dim, of_map is tuned] = label_matches(tracks, queries, search)
     return found
 
 
@@ -94,6 +101,7 @@ class CalibrationQuality:
 
     sequence: str
     dim: int  # code length
+    tuned: bool  # whether prototypes are tuned
     right: float  # share of keypoints whose nearest landmark is right
     precision: float  # share of accepted matches that are right
     recall: float  # share of right matches that are accepted
@@ -101,7 +109,7 @@ class CalibrationQuality:
 
 
 def measure_calibration(
-    sequence: str, dim: int, calibration: MatchCalibration, matches: LabelledMatches
+    sequence: str, dim: int, tuned: bool, calibration: MatchCalibration, matches: LabelledMatches
 ) -> CalibrationQuality:
     """Measure how well a calibration predicts which matches of a sequence are right."""
     probability = calibration.probability(matches.distances)
@@ -110,6 +118,7 @@ def measure_calibration(
     return CalibrationQuality(
         sequence,
         dim,
+        tuned,
         float(matches.right.mean()),
         float(right.mean()) if len(right) else 0.0,
         float(right.sum() / max(matches.right.sum(), 1)),
@@ -124,21 +133,22 @@ def calibrate(
 
     The quality on a sequence is that of a fit to the others, if there are any.
     """
-    found: dict[str, dict[int, LabelledMatches]] = {}
+    found: dict[str, dict[tuple[int, bool], LabelledMatches]] = {}
     for path in tracked(paths, progress, "query maps"):
         name = sequence_name(path)
         if name in found:
             raise ValueError(f"{path}: two files are of the sequence {name}, give one of them")
         tracks = Tracks.load(path)
         try:
-            found[name] = matches_by_dim(encoder, tracks, threads=threads)
+            found[name] = matches_by_kind(encoder, tracks, threads=threads)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
     quality = []
     for name in found:
         others = [matches for other, matches in found.items() if other != name] or [found[name]]
-        for dim in encoder.dims:
-            fitted = fit_calibration([matches[dim] for matches in others])
-            quality.append(measure_calibration(name, dim, fitted, found[name][dim]))
-    calibration = {dim: fit_calibration([m[dim] for m in found.values()]) for dim in encoder.dims}
+        for kind, matches in found[name].items():
+            fitted = fit_calibration([other[kind] for other in others])
+            quality.append(measure_calibration(name, *kind, fitted, matches))
+    kinds = next(iter(found.values()), {})
+    calibration = {kind: fit_calibration([m[kind] for m in found.values()]) for kind in kinds}
     return with_calibration(encoder, calibration, ", ".join(found)), quality
