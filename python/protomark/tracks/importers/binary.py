@@ -9,9 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-_U8, _U16, _U32, _U64 = (struct.Struct(f"<{c}") for c in "BHIQ")
-_I8, _I16, _I32, _I64 = (struct.Struct(f"<{c}") for c in "bhiq")
-_F32, _F64 = struct.Struct("<f"), struct.Struct("<d")
+_NUMBERS = {name: struct.Struct(f"<{name}") for name in "BHIQbhiqfd"}
 
 
 class Reader:
@@ -22,26 +20,34 @@ class Reader:
         path: the file that they are from, for errors.
     """
 
+    remedy = "the file is cut off or broken, save it again"
+
     def __init__(self, data: bytes | memoryview, path: Path) -> None:
         self.data = memoryview(data).cast("B")
         self.path = path
         self.offset = 0
         self.where = ""  # what is being read, for errors
 
-    def __len__(self) -> int:
-        """Bytes that remain."""
+    @property
+    def remaining(self) -> int:
+        """Bytes that have not been read."""
         return len(self.data) - self.offset
 
     def fail(self, what: str) -> NoReturn:
         """Raise ValueError: `what` is wrong, in this file, at this byte."""
         where = f"{self.where}, " if self.where else ""
-        raise ValueError(f"{self.path}, {where}byte {self.offset:,}: {what}")
+        raise ValueError(f"{self.path}, {where}byte {self.offset:,}: {what}: {self.remedy}")
+
+    def expect(self, fits: Any, what: str) -> None:
+        """Fail unless something `fits`."""
+        if not fits:
+            self.fail(what)
 
     def skip(self, count: int) -> int:
         """Pass `count` bytes over; returns where they began."""
         begin = self.offset
         if not 0 <= count <= len(self.data) - begin:
-            self.fail(f"{count:,} bytes should follow, but {len(self):,} do: cut off, or broken")
+            self.fail(f"{count:,} bytes should follow, but {self.remaining:,} do")
         self.offset = begin + count
         return begin
 
@@ -55,62 +61,53 @@ class Reader:
         return form.unpack_from(self.data, self.skip(form.size))
 
     def array(self, dtype: DTypeLike, *shape: int) -> NDArray[Any]:
-        """The next numbers as an array, not copied and not writable.
-
-        Args:
-            dtype: what they are, such as "<f4", or a structure.
-            shape: how many.
-        """
+        """The next numbers as an array of this shape, not copied and not writable."""
         kind = np.dtype(dtype)
-        count = 1
+        count = 1 if min(shape, default=0) >= 0 else -1
         for side in shape:
             count *= side
-        begin = self.skip(count * kind.itemsize if min(shape, default=0) >= 0 else -1)
+        begin = self.skip(count * kind.itemsize)
         return np.frombuffer(self.data, kind, count, begin).reshape(shape)
 
-    def count(self, size: int, form: struct.Struct = _U64) -> int:
-        """A number of items of at least `size` bytes each that must fit into what remains."""
-        number = int(self.unpack(form)[0])
-        if not 0 <= number * size <= len(self):
-            self.fail(f"{number:,} items should follow in {len(self):,} bytes: cut off, or broken")
+    def count(self, size: int = 1, form: str = "Q") -> int:
+        """A number of items of at least `size` bytes each, which must fit into what remains."""
+        number = int(self.unpack(_NUMBERS[form])[0])
+        if not 0 <= number * size <= self.remaining:
+            self.fail(f"{number:,} items should follow in {self.remaining:,} bytes")
         return number
 
     def u8(self) -> int:
         """An unsigned byte."""
-        return int(self.unpack(_U8)[0])
+        return int(self.unpack(_NUMBERS["B"])[0])
 
     def u16(self) -> int:
         """An unsigned 16-bit number."""
-        return int(self.unpack(_U16)[0])
+        return int(self.unpack(_NUMBERS["H"])[0])
 
     def u32(self) -> int:
         """An unsigned 32-bit number."""
-        return int(self.unpack(_U32)[0])
+        return int(self.unpack(_NUMBERS["I"])[0])
 
     def u64(self) -> int:
         """An unsigned 64-bit number."""
-        return int(self.unpack(_U64)[0])
-
-    def i8(self) -> int:
-        """A signed byte."""
-        return int(self.unpack(_I8)[0])
+        return int(self.unpack(_NUMBERS["Q"])[0])
 
     def i16(self) -> int:
         """A signed 16-bit number."""
-        return int(self.unpack(_I16)[0])
+        return int(self.unpack(_NUMBERS["h"])[0])
 
     def i32(self) -> int:
         """A signed 32-bit number."""
-        return int(self.unpack(_I32)[0])
+        return int(self.unpack(_NUMBERS["i"])[0])
 
     def i64(self) -> int:
         """A signed 64-bit number."""
-        return int(self.unpack(_I64)[0])
+        return int(self.unpack(_NUMBERS["q"])[0])
 
     def f32(self) -> float:
         """A 32-bit number."""
-        return float(self.unpack(_F32)[0])
+        return float(self.unpack(_NUMBERS["f"])[0])
 
     def f64(self) -> float:
         """A 64-bit number."""
-        return float(self.unpack(_F64)[0])
+        return float(self.unpack(_NUMBERS["d"])[0])
