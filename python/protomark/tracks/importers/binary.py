@@ -58,7 +58,13 @@ class Reader:
 
     def unpack(self, form: struct.Struct) -> tuple[Any, ...]:
         """The next numbers, as a compiled `struct` has them."""
-        return form.unpack_from(self.data, self.skip(form.size))
+        try:
+            numbers = form.unpack_from(self.data, self.offset)
+        except struct.error:
+            self.skip(form.size)  # which fails
+            raise
+        self.offset += form.size
+        return numbers
 
     def array(self, dtype: DTypeLike, *shape: int) -> NDArray[Any]:
         """The next numbers as an array of this shape, not copied and not writable."""
@@ -71,43 +77,43 @@ class Reader:
 
     def count(self, size: int = 1, form: str = "Q") -> int:
         """A number of items of at least `size` bytes each, which must fit into what remains."""
-        number = int(self.unpack(_NUMBERS[form])[0])
+        number: int = self.unpack(_NUMBERS[form])[0]
         if not 0 <= number * size <= self.remaining:
             self.fail(f"{number:,} items should follow in {self.remaining:,} bytes")
         return number
 
     def u8(self) -> int:
         """An unsigned byte."""
-        return int(self.unpack(_NUMBERS["B"])[0])
+        return self.unpack(_NUMBERS["B"])[0]
 
     def u16(self) -> int:
         """An unsigned 16-bit number."""
-        return int(self.unpack(_NUMBERS["H"])[0])
+        return self.unpack(_NUMBERS["H"])[0]
 
     def u32(self) -> int:
         """An unsigned 32-bit number."""
-        return int(self.unpack(_NUMBERS["I"])[0])
+        return self.unpack(_NUMBERS["I"])[0]
 
     def u64(self) -> int:
         """An unsigned 64-bit number."""
-        return int(self.unpack(_NUMBERS["Q"])[0])
+        return self.unpack(_NUMBERS["Q"])[0]
 
     def i16(self) -> int:
         """A signed 16-bit number."""
-        return int(self.unpack(_NUMBERS["h"])[0])
+        return self.unpack(_NUMBERS["h"])[0]
 
     def i32(self) -> int:
         """A signed 32-bit number."""
-        return int(self.unpack(_NUMBERS["i"])[0])
+        return self.unpack(_NUMBERS["i"])[0]
 
     def i64(self) -> int:
         """A signed 64-bit number."""
-        return int(self.unpack(_NUMBERS["q"])[0])
+        return self.unpack(_NUMBERS["q"])[0]
 
     def f32(self) -> float:
         """A 32-bit number."""
-        return float(self.unpack(_NUMBERS["f"])[0])
+        return self.unpack(_NUMBERS["f"])[0]
 
     def f64(self) -> float:
         """A 64-bit number."""
-        return float(self.unpack(_NUMBERS["d"])[0])
+        return self.unpack(_NUMBERS["d"])[0]

@@ -16,7 +16,7 @@ _BINARY = struct.pack("<Q", len(SIGNATURE)) + SIGNATURE
 _TEXT = b"%d %s" % (len(SIGNATURE), SIGNATURE)
 # Sizes of int, long, float, double, and a 1 that tells the order of bytes: 64-bit little-endian.
 _MACHINE = bytes([4, 8, 4, 8, 1, 0, 0, 0])
-_U64 = struct.Struct("<Q")
+_POINTER = struct.Struct("<hI")
 
 
 def is_archive(head: bytes) -> bool:
@@ -97,23 +97,21 @@ class Archive(Reader):
         self.skip(4)  # their version
         return range(number)
 
-    def pairs(self, key: str, value: str) -> NDArray[Any]:
-        """A std::map of numbers, as an array with the fields `key` and `value`."""
-        kind = np.dtype([("key", key), ("value", value)])
-        number = len(self.items(f"map of {key} to {value}", kind.itemsize))
+    def pairs(self, key: str, value: str) -> memoryview:
+        """The bytes of a std::map of numbers: each key, then its value."""
+        size = struct.calcsize(f"<{key}{value}")
+        number = len(self.items(f"map of {key} to {value}", size))
         if number:
             self.begin(f"pair of {key} and {value}")
-        return self.array(kind, number)
+        return self.take(number * size)
 
-    def skip_vectors(self, count: int, size: int) -> int:
-        """Pass over `count` vectors of numbers of `size` bytes; returns how many numbers."""
-        unpack, data, at, total = _U64.unpack_from, self.data, self.offset, 0
-        end = len(data) - 8
-        for _ in range(count):
-            number = unpack(data, at)[0] if at <= end else 0
-            at += 8 + number * size
-            if at > end + 8:
-                self.fail(f"a list that should follow does not fit into {self.remaining:,} bytes")
-            total += number
-        self.offset = at
-        return total
+    def skip_vectors(self, count: int) -> None:
+        """Pass over `count` vectors of 64-bit numbers."""
+        words = self.data[self.offset : self.offset + self.remaining // 8 * 8].cast("Q")
+        at = 0
+        try:
+            for _ in range(count):
+                at += words[at] + 1
+        except IndexError:
+            at = len(words) + 1
+        self.skip(8 * at)

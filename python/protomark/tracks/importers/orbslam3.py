@@ -15,7 +15,7 @@ from protomark.geometry.camera import Camera
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers.boost import is_archive
 from protomark.tracks.importers.lens import opencv_camera
-from protomark.tracks.importers.orbslam3_atlas import Atlas, AtlasReader, Keyframe, Lens, Map
+from protomark.tracks.importers.orbslam3_atlas import NAMED, Atlas, AtlasReader, Keyframe, Lens, Map
 
 PROGRAM = "ORB-SLAM3"
 _MAX_ID = 2**63 - 1
@@ -60,14 +60,14 @@ def _tracks(atlas: Atlas) -> Tracks:
     summaries = []
     last, first_keyframe = -1, 0
     for one in maps:
-        numbers = [p.id for p in one.points]
+        own_ids = [p.id for p in one.points]
         # Ids of several maps may interleave.
-        shift = max(0, last + 1 - min(numbers))
-        if len(set(numbers)) < len(numbers) or max(numbers) + shift > _MAX_ID:
+        shift = max(0, last + 1 - min(own_ids))
+        if len(set(own_ids)) < len(own_ids) or max(own_ids) + shift > _MAX_ID:
             raise ValueError(
                 f"landmarks of map {one.id} share an id, or have one that is too large"
             )
-        own = np.array(numbers, np.int64)
+        own = np.array(own_ids, np.int64)
         end = first_keyframe + len(one.keyframes)
         rows, owners = _observations(one, starts[first_keyframe:end], own, dropped)
         labels[rows] = owners + shift
@@ -111,7 +111,7 @@ def _tracks(atlas: Atlas) -> Tracks:
 
 def _without_bad(one: Map, dropped: Counter[str]) -> Map:
     """A map without what the program has given up, but not removed yet."""
-    keyframes = [k for k in one.keyframes if not k.bad]
+    keyframes = sorted((k for k in one.keyframes if not k.bad), key=lambda k: k.id)
     points = [p for p in one.points if not p.bad and np.isfinite(p.position).all()]
     dropped["bad keyframes"] += len(one.keyframes) - len(keyframes)
     dropped["bad landmarks"] += len(one.points) - len(points)
@@ -130,19 +130,20 @@ def _observations(
     counts that it names, else the first.
     """
     sides = [p.left for p in one.points] + [p.right for p in one.points]
-    named = np.concatenate(sides)
-    owner = np.repeat(np.concatenate([ids, ids]), [len(side) for side in sides])
-    seen = named["value"] >= 0
+    named = np.frombuffer(b"".join(sides), NAMED)
+    lengths = np.array([len(side) for side in sides]) // NAMED.itemsize
+    owner = np.repeat(np.concatenate([ids, ids]), lengths)
+    seen = named["row"] >= 0
     named, owner = named[seen], owner[seen]
     numbers = np.array([k.id for k in one.keyframes], np.uint64)
     by_number = np.argsort(numbers)
     if (np.diff(numbers[by_number]) == 0).any():
         raise ValueError(f"two keyframes of map {one.id} have the same id")
-    at = np.searchsorted(numbers, named["key"], sorter=by_number)
+    at = np.searchsorted(numbers, named["keyframe"], sorter=by_number)
     keyframe = by_number[np.minimum(at, len(numbers) - 1)]
-    present = numbers[keyframe] == named["key"]
+    present = numbers[keyframe] == named["keyframe"]
     dropped["observations of keyframes that are not in the file"] += int((~present).sum())
-    keyframe, row, owner = keyframe[present], named["value"][present], owner[present]
+    keyframe, row, owner = keyframe[present], named["row"][present], owner[present]
     limits = np.array([len(k.points) for k in one.keyframes])
     if (row >= limits[keyframe]).any():
         raise ValueError(f"a landmark of map {one.id} names a keypoint that its keyframe lacks")
@@ -160,7 +161,7 @@ def _images(
     """Names, camera ids, poses and numbers of keypoints of all images, and the cameras by id."""
     # Images that the program has rectified keep the coefficients of those that it was given.
     bent = {k.lens for k in keyframes if (k.keypoints["xy"] != k.undistorted["xy"]).any()}
-    lenses = {k.lens: _camera(k.lens, k.lens in bent, atlas) for k in keyframes}
+    lenses = {lens: _camera(lens, lens in bent, atlas) for lens in {k.lens for k in keyframes}}
     found: dict[Camera, int] = {}
     taken: Counter[str] = Counter()
     names, numbers, poses, lengths = [], [], [], []

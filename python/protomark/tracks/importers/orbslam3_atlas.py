@@ -22,7 +22,11 @@ _KEYPOINT = np.dtype(
         *((name, "<i4") for name in ("class_id", "octave")),
     ]
 )
-_MAT_DTYPES = {0: "u1", 5: "<f4", 6: "<f8"}  # by cv::Mat's number of a type
+# How a point names a keypoint: its keyframe's id and its row there, -1 for none.
+NAMED = np.dtype([("keyframe", "<u8"), ("row", "<i4")])
+_FLOATS = ("angle", "response", "size", "xy")
+# By cv::Mat's number of a type.
+_MAT_DTYPES: dict[int, np.dtype[Any]] = {0: np.dtype("u1"), 5: np.dtype("<f4"), 6: np.dtype("<f8")}
 _MAX_PIXEL = 1e6
 # Bytes that each takes at least, which bounds how many there may be.
 _MIN_MAP, _MIN_CAMERA, _MIN_KEYFRAME, _MIN_POINT, _MIN_MEASUREMENT = 60, 30, 2500, 115, 28
@@ -30,6 +34,7 @@ _MIN_MAP, _MIN_CAMERA, _MIN_KEYFRAME, _MIN_POINT, _MIN_MEASUREMENT = 60, 30, 250
 _MAP_HEAD = struct.Struct("<QQQi")
 _KEYFRAME_HEAD = struct.Struct("<QQd2i3f9f")
 _SCALES = struct.Struct("<i2f")
+_MATRIX = struct.Struct("<3iB")
 _PARENT = struct.Struct("<Bq")
 _POINT_HEAD = struct.Struct("<Qqqi3f3f")
 _POINT_TAIL = struct.Struct("<QBq2f")
@@ -76,8 +81,8 @@ class Point(NamedTuple):
     id: int
     position: tuple[float, float, float]
     bad: bool
-    left: NDArray[Any]  # structures of key (keyframe id) and value (row of keypoint, -1: none)
-    right: NDArray[Any]
+    left: memoryview  # bytes of `NAMED`: keypoints of left, or only, images
+    right: memoryview
 
 
 @dataclass
@@ -172,7 +177,7 @@ class AtlasReader(Archive):
         self.numbers("<f4"), self.numbers("<f4")  # x in the right image, depth
         descriptors = self._matrix()
         self.begin("BowVector")
-        self.pairs("<u4", "<f8")
+        self.pairs("I", "d")
         self.begin("FeatureVector")
         for _ in self.items("map of node to keypoints", 12):
             self.begin("pair of node to keypoints")
@@ -187,7 +192,7 @@ class AtlasReader(Archive):
         pose = self._pose()
         points = self.numbers("<i8")
         self._grid()
-        self.pairs("<u8", "<i4")  # covisible keyframes
+        self.pairs("Q", "i")  # covisible keyframes
         self.unpack(_PARENT)
         for _ in range(3):
             self.numbers("<u8")  # children, loop edges, merge edges
@@ -222,25 +227,29 @@ class AtlasReader(Archive):
 
     def _point(self) -> Point:
         head = self.unpack(_POINT_HEAD)
-        left = self.pairs("<u8", "<i4")
-        right = self.pairs("<u8", "<i4")
-        self._matrix()  # one of its descriptors
+        left = self.pairs("Q", "i")
+        right = self.pairs("Q", "i")
+        kind, rows, columns = self._matrix_shape()  # of one of its descriptors
+        self.skip(kind.itemsize * rows * columns)
         _, bad, *_ = self.unpack(_POINT_TAIL)
         self.expect(bad <= 1, "a truth value is neither 0 nor 1")
         return Point(head[0], head[4:7], bool(bad), left, right)
 
     def _matrix(self) -> NDArray[Any]:
         """A cv::Mat of one channel (rows, columns)."""
-        columns, rows, kind = self.array("<i4", 3).tolist()
-        self.flags(1)
-        self.expect(kind in _MAT_DTYPES, f"a matrix of type {kind} is unknown")
-        return self.array(_MAT_DTYPES[kind], rows, columns)
+        return self.array(*self._matrix_shape())
+
+    def _matrix_shape(self) -> tuple[np.dtype[Any], int, int]:
+        columns, rows, kind, continuous = self.unpack(_MATRIX)
+        fits = kind in _MAT_DTYPES and min(columns, rows) >= 0 and continuous <= 1
+        self.expect(fits, f"a matrix of type {kind} with {rows} x {columns} numbers is unknown")
+        return _MAT_DTYPES[kind], rows, columns
 
     def _keypoints(self) -> NDArray[Any]:
         keypoints = self.array(_KEYPOINT, self.count(_KEYPOINT.itemsize, "i"))
-        numbers = [np.abs(keypoints[name]).max(initial=0) for name in ("xy", "size", "angle")]
         # False for NaN, too.
-        self.expect(max(numbers, key=np.nan_to_num) < _MAX_PIXEL, "keypoints lie outside any image")
+        fits = all((np.abs(keypoints[name]) < _MAX_PIXEL).all() for name in _FLOATS)
+        self.expect(fits, "keypoints lie outside any image")
         return keypoints
 
     def _pose(self) -> NDArray[np.float64]:
@@ -255,7 +264,7 @@ class AtlasReader(Archive):
     def _grid(self) -> None:
         """Which keypoints lie in each cell, of all columns and rows."""
         for _ in self.items("grid", 12):
-            self.skip_vectors(len(self.items("column of a grid", 8)), 8)
+            self.skip_vectors(len(self.items("column of a grid", 8)))
 
     def _inertial(self) -> None:
         self.begin("bias")
