@@ -29,7 +29,7 @@ _FLOATS = ("angle", "response", "size", "xy")
 _MAT_DTYPES: dict[int, np.dtype[Any]] = {0: np.dtype("u1"), 5: np.dtype("<f4"), 6: np.dtype("<f8")}
 _MAX_PIXEL = 1e6
 # Bytes that each takes at least, which bounds how many there may be.
-_MIN_MAP, _MIN_CAMERA, _MIN_KEYFRAME, _MIN_POINT, _MIN_MEASUREMENT = 60, 30, 2500, 115, 28
+_MIN_MAP, _MIN_CAMERA, _MIN_KEYFRAME, _MIN_POINT, _MEASUREMENT = 60, 30, 2500, 115, 28
 
 _MAP_HEAD = struct.Struct("<QQQi")
 _KEYFRAME_HEAD = struct.Struct("<QQd2i3f9f")
@@ -271,8 +271,9 @@ class AtlasReader(Archive):
         self.skip(6 * 4)
         self.begin("integrated measurements")
         self.skip(_INTEGRATED)
-        for _ in self.items("measurements", _MIN_MEASUREMENT):
+        measurements = len(self.items("measurements", _MEASUREMENT))
+        if measurements:
             self.begin("measurement")
-            self.skip(_MIN_MEASUREMENT)
+        self.skip(measurements * _MEASUREMENT)
         self.begin("calibration")
         self.skip(_CALIBRATION + _INERTIAL_TAIL)
