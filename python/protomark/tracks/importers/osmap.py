@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protomark.files import hash_files
 from protomark.geometry.camera import Camera
-from protomark.geometry.pose import transform
+from protomark.geometry.pose import camera_centers, transform
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers.binary import Reader
 from protomark.tracks.importers.lens import opencv_camera
@@ -30,7 +30,11 @@ _PATCH, _SCALE_FACTOR = 31.0, 1.2
 _DESCRIPTOR, _MAX_OCTAVE, _MAX_PIXEL = 32, 32, 1e5
 _MAX_ID = 2**63 - 1
 _MAX_SKEW = 0.01
+_BLOCK = 128  # landmarks that are projected at a time
 _F32, _F64, _POSE, _BYTES = (struct.Struct(f"<{form}") for form in ("f", "d", "12f", "32s"))
+
+# Three numbers, each after the number and the wire type of its field.
+_XYZ, _XYZ_KEYS = struct.Struct("<BfBfBf"), [axis << 3 | FIXED32 for axis in (1, 2, 3)]
 
 _KEYFRAMES = struct.Struct("<QQd12f")
 _KEYFRAME = np.dtype([("id", "<u8"), ("camera", "<u8"), ("time", "<f8"), ("pose", "<f4", (3, 4))])
@@ -123,19 +127,32 @@ def _keyframes(path: Path) -> NDArray[Any]:
 def _points(path: Path) -> NDArray[Any]:
     reader, out = Reader(path.read_bytes(), path), bytearray()
     for size in _messages(reader):
-        point, xyz, descriptor = 0, [0.0, 0.0, 0.0], b""
+        point, descriptor = 0, b""
+        xyz: Sequence[float] = (0.0, 0.0, 0.0)
         for number, wire, value in fields(reader, size):
             if (number, wire) == (1, VARINT):
                 point = value
             elif (number, wire) == (2, BYTES):
-                for axis, kind, number_bytes in fields(reader, value):
-                    reader.expect(axis <= 3 and kind == FIXED32, "a position is not x, y, z")
-                    (xyz[axis - 1],) = _F32.unpack(number_bytes)
+                xyz = _position(reader, value)
             elif (number, wire) == (5, BYTES):
                 descriptor = b"".join(_packed(reader, value, _BYTES))
         reader.expect(descriptor, f"landmark {point} has no descriptor")
         out += _POINTS.pack(point, *xyz, descriptor)
     return np.frombuffer(out, _POINT)
+
+
+def _position(reader: Reader, size: int) -> Sequence[float]:
+    """x, y and z, of which zeros may be left out."""
+    if size == _XYZ.size:
+        keys_and_numbers = list(reader.unpack(_XYZ))
+        if keys_and_numbers[::2] == _XYZ_KEYS:
+            return keys_and_numbers[1::2]
+        reader.offset -= size
+    xyz = [0.0, 0.0, 0.0]
+    for axis, wire, number in fields(reader, size):
+        reader.expect(axis <= 3 and wire == FIXED32, "a position is not x, y, z")
+        (xyz[axis - 1],) = _F32.unpack(number)
+    return xyz
 
 
 def _features(path: Path, text: str) -> NDArray[Any]:
@@ -291,18 +308,24 @@ def _projected(
     dropped: Counter[str],
 ) -> NDArray[Any]:
     """Each landmark as a keypoint of the keyframe whose axis passes it at the smallest angle."""
-    xyz = points["xyz"].astype(np.float64)
-    best, found = np.full(len(points), np.inf), np.zeros(len(points), _FEATURE)
-    for keyframe, number in zip(keyframes, numbers, strict=True):
-        local = transform(keyframe["pose"].astype(np.float64), xyz)
-        slope = np.hypot(local[:, 0], local[:, 1]) / np.where(local[:, 2] > 0, local[:, 2], np.nan)
-        rows = np.flatnonzero(slope < best)
-        best[rows] = slope[rows]
-        found["keyframe"][rows] = keyframe["id"]
-        fx, fy, cx, cy = cameras[int(number)].params
-        pixels = local[rows, :2] / local[rows, 2:] * (fx, fy) + (cx - 0.5, cy - 0.5)
-        found["xy"][rows] = pixels
+    poses = keyframes["pose"].astype(np.float64)
+    xyz, centers = points["xyz"].astype(np.float64), camera_centers(poses)
+    found = np.zeros(len(points), _FEATURE)
     found["point"], found["descriptor"], found["angle"] = points["id"], points["descriptor"], -1
-    seen = np.isfinite(best) & (np.abs(found["xy"]) < _MAX_PIXEL).all(axis=1)
+    seen = np.zeros(len(points), bool)
+    for begin in range(0, len(points), _BLOCK):
+        rows = slice(begin, begin + _BLOCK)
+        depth = xyz[rows] @ poses[:, 2, :3].T + poses[:, 2, 3]
+        square = (xyz[rows] ** 2).sum(1)[:, None] - 2 * xyz[rows] @ centers.T + (centers**2).sum(1)
+        facing = np.where(depth > 0, depth * np.abs(depth) / np.maximum(square, 1e-12), -1)
+        found["keyframe"][rows] = facing.argmax(axis=1)
+        seen[rows] = facing.max(axis=1) > 0
+    nearest = found["keyframe"].astype(np.int64)
+    local = transform(poses[nearest], xyz)
+    params = np.array([cameras[int(n)].params for n in numbers])[nearest]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found["xy"] = local[:, :2] / local[:, 2:] * params[:, :2] + params[:, 2:] - 0.5
+    found["keyframe"] = keyframes["id"][nearest]
+    seen &= (np.abs(found["xy"]) < _MAX_PIXEL).all(axis=1)
     dropped["descriptors of landmarks that no keyframe faces"] = int((~seen).sum())
     return found[seen]

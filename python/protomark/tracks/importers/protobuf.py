@@ -20,35 +20,45 @@ def varint(reader: Reader) -> int:
         byte = data[at]
         at += 1
         value |= (byte & 127) << shift
-        shift += 7
         if byte < 128:
             reader.offset = at
             return value & 0xFFFF_FFFF_FFFF_FFFF
+        shift += 7
     reader.fail("a number does not end")
 
 
 def fields(reader: Reader, length: int | None = None) -> Iterator[tuple[int, int, Any]]:
     """Number, wire type and value of each field of a message of `length` bytes; None: of the rest.
 
-    Values are int of `VARINT`, else bytes. Of `BYTES`, as messages are, it is their length: the
-    caller reads or skips them before the next field.
+    Values of `VARINT` are int, those of `FIXED32` and `FIXED64` bytes. Of `BYTES`, as messages
+    are, the value is their length, and the caller reads or skips them before the next field.
     """
-    end = len(reader.data) if length is None else reader.offset + length
+    data = reader.data
+    end = len(data) if length is None else reader.offset + length
     while reader.offset < end:
-        key = varint(reader)
+        key = data[reader.offset]
+        if key < 128:
+            reader.offset += 1
+        else:
+            key = varint(reader)
         number, wire = key >> 3, key & 7
-        reader.expect(0 < number <= _MAX_NUMBER, f"a field has the number {number}")
-        if wire == VARINT:
-            yield number, wire, varint(reader)
-        elif wire == BYTES:
+        if not 0 < number <= _MAX_NUMBER:
+            reader.fail(f"a field has the number {number}")
+        if wire == BYTES:
             size = varint(reader)
-            reader.expect(size <= end - reader.offset, f"{size:,} bytes end after their message")
-            after = reader.offset + size
+            begin = reader.offset
+            if size > end - begin:
+                reader.fail(f"{size:,} bytes end after their message")
             yield number, wire, size
-            reader.expect(reader.offset in (after - size, after), "a message ends elsewhere")
-            reader.offset = after
+            if reader.offset not in (begin, begin + size):
+                reader.fail("a message ends elsewhere")
+            reader.offset = begin + size
+        elif wire == VARINT:
+            yield number, wire, varint(reader)
         elif wire in _SIZES:
-            yield number, wire, bytes(reader.take(_SIZES[wire]))
+            begin = reader.skip(_SIZES[wire])
+            yield number, wire, data[begin : reader.offset]
         else:
             reader.fail(f"a field has the unknown wire type {wire}")
-    reader.expect(reader.offset == end, "a field ends after its message")
+    if reader.offset != end:
+        reader.fail("a field ends after its message")
