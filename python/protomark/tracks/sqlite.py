@@ -95,7 +95,7 @@ def open_database(path: Path, kind: str) -> Iterator[Database]:
             yield Database(connection, path, kind)
         finally:
             connection.close()
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # of names of tables
         if "locked" in str(error):
             raise ValueError(
                 f"{path} is locked: another process writes to it, wait for it"
