@@ -52,7 +52,7 @@ def test_what_was_written_is_read(version: str, camera: Camera, tmp_path: Path) 
     assert found.info["source"]["version"] == ("unknown" if version == "db" else version)
     assert "dropped" not in found.info["source"]
     if version == VERSIONS[-1]:
-        assert found.info["detector"]["num_levels"] == 8
+        assert found.info["detector"]["levels"] == 8
     assert len(build_map(found, pm.Encoder.load("orb"))) > 100
 
 

@@ -53,7 +53,10 @@ class Database:
             )
         room = self._room
         for row in self._connection.execute(f"SELECT {columns} FROM {table}"):
-            room -= _MIN_ROW + sum(len(cell) for cell in row if isinstance(cell, (bytes, str)))
+            room -= _MIN_ROW
+            for cell in row:
+                if cell.__class__ is bytes or cell.__class__ is str:
+                    room -= len(cell)
             if room < 0:
                 raise ValueError(f"{self.path}: the rows of {table} exceed the size of the file")
             yield row
@@ -75,6 +78,13 @@ class Database:
                 )
             ids.add(row_id)
             yield row_id, tuple(row)
+
+
+def blob(cell: Any) -> bytes:
+    """The bytes of a cell, none if it is NULL; raises ValueError for anything else."""
+    if cell is not None and not isinstance(cell, bytes):
+        raise ValueError(f"{str(cell)[:40]!r} is where bytes should be")
+    return cell or b""
 
 
 @contextmanager

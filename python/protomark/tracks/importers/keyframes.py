@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +22,22 @@ from protomark.tracks.file import Tracks
 _ORB_PATCH = 31
 _MAX_OCTAVE = 32
 _MAX_PIXEL = 1e9
+
+
+@contextmanager
+def unexpected(path: Path, what: str) -> Iterator[None]:
+    """Turn errors of unexpected values in the block into ValueErrors that say where they are."""
+    try:
+        yield
+    except KeyError as error:
+        problem = f"it has no {str(error.args[0])[:40]}"
+    except (IndexError, TypeError, ValueError, OverflowError, struct.error, zlib.error) as error:
+        problem = str(error).splitlines()[0][:300] if str(error) else type(error).__name__
+        if problem.startswith(str(path)):
+            raise
+    else:
+        return
+    raise ValueError(f"{path}, {what}: {problem}: save the map anew")
 
 
 @dataclass

@@ -7,8 +7,6 @@ files of it. Keypoints are stored undistorted, with (0, 0) as the centre of the 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ from protomark.tracks.importers.keyframes import (
     distort,
     join,
     orb_sizes,
+    unexpected,
 )
 from protomark.tracks.importers.messagepack import Unpacker
 from protomark.tracks.sqlite import MAGIC, has_tables, open_database
@@ -35,7 +34,10 @@ PROGRAM = "stella_vslam"
 _TABLES = ("cameras", "keyframes", "landmarks", "associations")
 _KEYS = (*_TABLES[:3], "keyframe_next_id", "frame_next_id", "landmark_next_id", "orb_params")
 _RECORDS = ("keypts", "undist_keypts", "undists", "descs", "x_rights", "depths")
-_SETTINGS = ("num_levels", "scale_factor", "ini_fast_threshold", "min_fast_threshold")
+_SETTINGS = {
+    **{"num_levels": "levels", "scale_factor": "scale_factor"},
+    **{"ini_fast_threshold": "fast_threshold", "min_fast_threshold": "min_fast_threshold"},
+}
 # A .db does not hold the settings; this is the default of ORB-SLAM and its descendants.
 _SCALE_FACTOR = 1.2
 # A cv::KeyPoint.
@@ -82,7 +84,9 @@ class _Map:
     def tracks(self, path: Path, source: dict[str, Any]) -> Tracks:
         detector: dict[str, Any] = {"name": "ORB-SLAM"}
         for values in list(self.settings.values())[:1]:
-            detector |= {k: v for k in _SETTINGS if isinstance(v := values.get(k), (int, float))}
+            for theirs, ours in _SETTINGS.items():
+                if isinstance(values.get(theirs), (int, float)):
+                    detector[ours] = values[theirs]
         if not self.keyframes:
             raise ValueError(
                 f"{path}: this map of {PROGRAM} is empty: save it after the program has tracked "
@@ -90,11 +94,11 @@ class _Map:
             )
         cameras = {}
         for number, (name, values) in enumerate(self.cameras.items(), 1):
-            with _naming(path, f"camera {name}"):
+            with unexpected(path, f"camera {name}"):
                 cameras[name] = (number, _camera(values))
         keyframes = []
         for number in sorted(self.keyframes):
-            with _naming(path, f"keyframe {number}"):
+            with unexpected(path, f"keyframe {number}"):
                 keyframes.append(self._keyframe(number, cameras))
         landmarks = np.array(self.landmark_ids), np.array(self.positions)
         if landmarks[0].size and landmarks[0].min() < 0:
@@ -126,17 +130,6 @@ class _Map:
         if landmarks.shape != (len(features),):
             raise ValueError(f"{len(features)} keypoints have {landmarks.size} landmark ids")
         return Keyframe(f"keyframe{number}", camera_id, k["pose"], features, landmarks)
-
-
-@contextmanager
-def _naming(path: Path, what: str) -> Iterator[None]:
-    """Turn errors of unexpected values in the block into ValueErrors that say where they are."""
-    try:
-        yield
-    except KeyError as error:
-        raise ValueError(f"{path}, {what}: it has no {error.args[0]}: save the map anew") from None
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}, {what}: {str(error)[:200]}: save the map anew") from None
 
 
 def _camera(c: dict[str, Any]) -> Camera:
@@ -176,12 +169,12 @@ def _read_messagepack(path: Path) -> _Map:
             setattr(found, "cameras" if key == "cameras" else "settings", values)
         elif key == "keyframes":
             for name in data.map_keys():
-                with _naming(path, f"keyframe {name}"):
+                with unexpected(path, f"keyframe {name}"):
                     found.keyframes[int(name)] = _read_keyframe(data, versions)
         elif key == "landmarks":
             for name in data.map_keys():
                 values = data.value()
-                with _naming(path, f"landmark {name}"):
+                with unexpected(path, f"landmark {name}"):
                     x, y, z = values["pos_w"]
                     found.landmark_ids.append(int(name))
                     found.positions.extend((x, y, z))
@@ -227,12 +220,12 @@ def _read_database(path: Path) -> _Map:
         columns = [c for c in database.columns("cameras") if c not in ("id", "name")]
         for _, (name, *values) in database.rows_by_id("cameras", ", ".join(["name", *columns])):
             camera = dict(zip(columns, values, strict=True))
-            with _naming(path, f"camera {str(name)[:40]!r}"):
+            with unexpected(path, f"camera {str(name)[:40]!r}"):
                 camera["model_type"] = _text(camera.get("model_type"))
                 found.cameras[_text(name)] = camera
         kept = "cam, pose_cw, undist_keypts, descs"
         for number, (cam, pose, keypoints, descriptors) in database.rows_by_id("keyframes", kept):
-            with _naming(path, f"keyframe {number}"):
+            with unexpected(path, f"keyframe {number}"):
                 points = np.frombuffer(keypoints or b"", _KEYPOINT)
                 found.keyframes[number] = {
                     **{name: points[name] for name in ("xy", *_NUMBERS, "octave")},
@@ -243,11 +236,11 @@ def _read_database(path: Path) -> _Map:
                     "pose": np.frombuffer(pose, "<f8").reshape(4, 4).T[:3].copy(),
                 }
         for number, (ids,) in database.rows_by_id("associations", "lm_ids"):
-            with _naming(path, f"keyframe {number}"):
+            with unexpected(path, f"keyframe {number}"):
                 if number in found.keyframes:
                     found.keyframes[number]["lm_ids"] = np.frombuffer(ids or b"", "<i4")
         for number, (position,) in database.rows_by_id("landmarks", "pos_w"):
-            with _naming(path, f"landmark {number}"):
+            with unexpected(path, f"landmark {number}"):
                 x, y, z = np.frombuffer(position, "<f8")
                 found.landmark_ids.append(number)
                 found.positions.extend((x, y, z))
