@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 from protomark.tracks.file import Tracks
@@ -36,6 +37,8 @@ def read_source(path: Path) -> Tracks:
             head = file.read(_HEAD)
     programs = []
     for name in _MODULES:
+        if find_spec(f"{__name__}.{name}") is None:
+            continue
         module = import_module(f"{__name__}.{name}")
         programs.append(module.PROGRAM)
         if module.recognizes(path, head):

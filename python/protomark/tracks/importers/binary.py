@@ -9,7 +9,9 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-_NUMBERS = {name: struct.Struct(f"<{name}") for name in "BHIQbhiqfd"}
+_U8, _U16, _U32, _U64 = (struct.Struct(f"<{c}") for c in "BHIQ")
+_I8, _I16, _I32, _I64 = (struct.Struct(f"<{c}") for c in "bhiq")
+_F32, _F64 = struct.Struct("<f"), struct.Struct("<d")
 
 
 class Reader:
@@ -28,9 +30,8 @@ class Reader:
         self.offset = 0
         self.where = ""  # what is being read, for errors
 
-    @property
-    def remaining(self) -> int:
-        """Bytes that have not been read."""
+    def __len__(self) -> int:
+        """Bytes that remain."""
         return len(self.data) - self.offset
 
     def fail(self, what: str) -> NoReturn:
@@ -47,7 +48,7 @@ class Reader:
         """Pass `count` bytes over; returns where they began."""
         begin = self.offset
         if not 0 <= count <= len(self.data) - begin:
-            self.fail(f"{count:,} bytes should follow, but {self.remaining:,} do")
+            self.fail(f"{count:,} bytes should follow, but {len(self):,} do")
         self.offset = begin + count
         return begin
 
@@ -75,45 +76,49 @@ class Reader:
         begin = self.skip(count * kind.itemsize)
         return np.frombuffer(self.data, kind, count, begin).reshape(shape)
 
-    def count(self, size: int = 1, form: str = "Q") -> int:
+    def count(self, size: int = 1, form: struct.Struct = _U64) -> int:
         """A number of items of at least `size` bytes each, which must fit into what remains."""
-        number: int = self.unpack(_NUMBERS[form])[0]
-        if not 0 <= number * size <= self.remaining:
-            self.fail(f"{number:,} items should follow in {self.remaining:,} bytes")
+        number: int = self.unpack(form)[0]
+        if not 0 <= number * size <= len(self):
+            self.fail(f"{number:,} items should follow in {len(self):,} bytes")
         return number
 
     def u8(self) -> int:
         """An unsigned byte."""
-        return self.unpack(_NUMBERS["B"])[0]
+        return self.unpack(_U8)[0]
 
     def u16(self) -> int:
         """An unsigned 16-bit number."""
-        return self.unpack(_NUMBERS["H"])[0]
+        return self.unpack(_U16)[0]
 
     def u32(self) -> int:
         """An unsigned 32-bit number."""
-        return self.unpack(_NUMBERS["I"])[0]
+        return self.unpack(_U32)[0]
 
     def u64(self) -> int:
         """An unsigned 64-bit number."""
-        return self.unpack(_NUMBERS["Q"])[0]
+        return self.unpack(_U64)[0]
+
+    def i8(self) -> int:
+        """A signed byte."""
+        return self.unpack(_I8)[0]
 
     def i16(self) -> int:
         """A signed 16-bit number."""
-        return self.unpack(_NUMBERS["h"])[0]
+        return self.unpack(_I16)[0]
 
     def i32(self) -> int:
         """A signed 32-bit number."""
-        return self.unpack(_NUMBERS["i"])[0]
+        return self.unpack(_I32)[0]
 
     def i64(self) -> int:
         """A signed 64-bit number."""
-        return self.unpack(_NUMBERS["q"])[0]
+        return self.unpack(_I64)[0]
 
     def f32(self) -> float:
         """A 32-bit number."""
-        return self.unpack(_NUMBERS["f"])[0]
+        return self.unpack(_F32)[0]
 
     def f64(self) -> float:
         """A 64-bit number."""
-        return self.unpack(_NUMBERS["d"])[0]
+        return self.unpack(_F64)[0]

@@ -107,7 +107,7 @@ class Archive(Reader):
 
     def skip_vectors(self, count: int) -> None:
         """Pass over `count` vectors of 64-bit numbers."""
-        words = self.data[self.offset : self.offset + self.remaining // 8 * 8].cast("Q")
+        words = self.data[self.offset : self.offset + len(self) // 8 * 8].cast("Q")
         at = 0
         try:
             for _ in range(count):

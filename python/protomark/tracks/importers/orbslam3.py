@@ -14,7 +14,6 @@ from protomark.files import hash_files
 from protomark.geometry.camera import Camera
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers.boost import is_archive
-from protomark.tracks.importers.lens import opencv_camera
 from protomark.tracks.importers.orbslam3_atlas import NAMED, Atlas, AtlasReader, Keyframe, Lens, Map
 
 PROGRAM = "ORB-SLAM3"
@@ -198,10 +197,11 @@ def _camera(lens: Lens, bent: bool, atlas: Atlas) -> Camera:
     fisheye, params = atlas.cameras[lens.id]
     size = right - left, bottom - top
     if fisheye:
-        return opencv_camera(size, params[:2], params[2:4], params[4:], fisheye=True)
+        return Camera.from_opencv(*size, params[:4], params[4:], fisheye=True)
+    pinhole = *lens.focal, *lens.center
     if bent:
-        return opencv_camera(_raw_size(lens), lens.focal, lens.center, lens.distortion)
-    return opencv_camera(size, lens.focal, lens.center)
+        return Camera.from_opencv(*_raw_size(lens), pinhole, lens.distortion)
+    return Camera.from_opencv(*size, pinhole)
 
 
 def _raw_size(lens: Lens) -> tuple[int, int]:

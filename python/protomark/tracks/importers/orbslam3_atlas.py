@@ -34,6 +34,7 @@ _MIN_MAP, _MIN_CAMERA, _MIN_KEYFRAME, _MIN_POINT, _MEASUREMENT = 60, 30, 2500, 1
 _MAP_HEAD = struct.Struct("<QQQi")
 _KEYFRAME_HEAD = struct.Struct("<QQd2i3f9f")
 _SCALES = struct.Struct("<i2f")
+_COUNT = struct.Struct("<i")
 _MATRIX = struct.Struct("<3iB")
 _PARENT = struct.Struct("<Bq")
 _POINT_HEAD = struct.Struct("<Qqqi3f3f")
@@ -132,7 +133,7 @@ class AtlasReader(Archive):
         cameras = dict(self._camera() for _ in self.items("GeometricCamera*", _MIN_CAMERA))
         self.skip(6 * 8)  # next ids
         self.where = "end"
-        self.expect(not self.remaining, f"{self.remaining:,} bytes too many")
+        self.expect(not len(self), f"{len(self):,} bytes too many")
         return Atlas(self.version, maps, cameras)
 
     def _map(self) -> Map:
@@ -246,7 +247,7 @@ class AtlasReader(Archive):
         return _MAT_DTYPES[kind], rows, columns
 
     def _keypoints(self) -> NDArray[Any]:
-        keypoints = self.array(_KEYPOINT, self.count(_KEYPOINT.itemsize, "i"))
+        keypoints = self.array(_KEYPOINT, self.count(_KEYPOINT.itemsize, _COUNT))
         # False for NaN, too.
         fits = all((np.abs(keypoints[name]) < _MAX_PIXEL).all() for name in _FLOATS)
         self.expect(fits, "keypoints lie outside any image")

@@ -17,7 +17,6 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers.binary import Reader
-from protomark.tracks.importers.lens import opencv_camera
 from protomark.tracks.importers.protobuf import BYTES, FIXED32, FIXED64, VARINT, fields, varint
 
 PROGRAM = "ORB-SLAM2 (osmap)"
@@ -162,9 +161,9 @@ def _features(path: Path, text: str) -> NDArray[Any]:
         for size in _messages(reader):
             _add_features(reader, size, out)
     else:
-        while reader.remaining:
+        while len(reader):
             size = varint(reader)
-            reader.expect(size <= reader.remaining, f"{size:,} bytes of a keyframe should follow")
+            reader.expect(size <= len(reader), f"{size:,} bytes of a keyframe should follow")
             end, first = reader.offset + size, reader.offset
             # Messages of keyframes may be wrapped in ones of lists.
             if size and reader.data[first] == (1 << 3 | BYTES):
@@ -295,7 +294,7 @@ def _cameras(text: str, features: NDArray[Any] | None, numbers: NDArray[np.uint6
     if not (np.array(sizes) < _MAX_PIXEL).all():
         raise ValueError("a camera matrix has a principal point outside any image")
     return [
-        opencv_camera((int(size[0]), int(size[1])), one[:2], one[2:])
+        Camera.from_opencv(int(size[0]), int(size[1]), one)
         for one, size in zip(params, sizes, strict=True)
     ]
 
