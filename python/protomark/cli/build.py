@@ -11,11 +11,25 @@ from protomark.cli.options import EncoderName, JsonFile, NoSeal, Threads
 
 
 def build(
-    tracks: Annotated[Path, typer.Argument(metavar="TRACKS", help="Tracks of `protomark tracks`.")],
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE",
+            help="Tracks of `protomark tracks`; a map of ORB-SLAM3 (.osa), ORB-SLAM2 (osmap), "
+            "stella_vslam, RTAB-Map, OpenMVG, OpenSfM, kapture or Astrobee; images or a "
+            "COLMAP database with binary descriptors, followed by the folder of the COLMAP model.",
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
     encoder: EncoderName = None,
     dim: Annotated[int | None, typer.Option(help="Numbers per prototype; by default 48.")] = None,
-    min_observations: Annotated[int, typer.Option(help="Smallest number of observations.")] = 2,
+    min_observations: Annotated[
+        int | None,
+        typer.Option(
+            help="Smallest number of observations of a landmark; by default 2, or 1 for sources "
+            "that keep one descriptor per landmark."
+        ),
+    ] = None,
     frame: Annotated[
         str | None,
         typer.Option(
@@ -35,13 +49,18 @@ def build(
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
-    """Build a map from tracks.
+    """Build a map from tracks, or from a map of another program.
 
-    Reads one tracks file and writes a learning map with the prototypes and the position of each
-    landmark, and a sealed one beside it, scene.sealed.pmk: what ships, 33 bytes per landmark and
-    its position (`protomark seal` makes other sizes).
+    Reads observations of landmarks and writes a learning map with the prototypes and the position
+    of each landmark, and a sealed one beside it, scene.sealed.pmk: what ships, 33 bytes per
+    landmark and its position (`protomark seal` makes other sizes). Several sources are several
+    places, whose landmarks get ids apart, by the sources' names in order.
 
     protomark build kitchen.freak.safetensors -o kitchen.pmk
+
+    protomark build atlas.osa -o scene.pmk
+
+    protomark build database.db sparse/ -o scene.pmk
     """
     from protomark import Encoder
     from protomark.cli.info import show
@@ -51,26 +70,26 @@ def build(
     from protomark.maps.build import build_map, tracks_for
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
+    from protomark.maps.origin import origin_texts
     from protomark.maps.seal import SealRequest, observed, seal_map, sealed_path
     from protomark.maps.selection import Views
-    from protomark.tracks.file import Tracks
+    from protomark.maps.sources import find_sources, join_sources, read_sources
 
     sealed = None if no_seal else sealed_path(output)
-    check_outputs(output, json_file, sealed, inputs=[tracks, encoder])
+    check_outputs(output, json_file, sealed, inputs=[*sources, encoder])
     texts = command_metadata(frame, metadata or [])
     with progress_bar() as progress:
-        progress("read tracks", 0, 0)
-        seen = Tracks.load(tracks)
-        network = Encoder.load(encoder or seen.descriptor)
+        progress("read sources", 0, 0)
+        network = Encoder.load(encoder) if encoder else None
+        found = find_sources(sources)
+        read = read_sources(found, network.descriptor if network else None, threads, progress)
+        seen = join_sources(found, read, min_observations)
+        detectors = [one.info.get("detector", {}) for one in read]
+        texts = origin_texts(seen.info["sources"], detectors) | texts
+        network = network or Encoder.load(seen.descriptor)
         seen = tracks_for(network, seen)
         progress("build the map", 0, 0)
-        scene = build_map(
-            seen,
-            network,
-            dim,
-            min_observations=min_observations,
-            threads=threads,
-        )
+        scene = build_map(seen, network, dim, min_observations=1, threads=threads)
         scene.metadata = {cameras.KEY: cameras.cameras_text(seen.cameras.values()), **texts}
         progress("write the map", 0, 0)
         scene.save(output)
@@ -79,7 +98,7 @@ def build(
             seal_map(
                 scene, sealed, request, lambda: Views.of_tracks(seen), observed(seen), progress
             )
-        facts = describe(output)
+        facts = describe(output) | {"sources": seen.info["sources"]}
         if sealed:
             facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}
     write_json(json_file, facts)

@@ -69,7 +69,7 @@ def read(path: Path) -> Tracks:
 
     Without a .features file there is one descriptor per landmark, and nothing tells whose keypoint
     it was. It becomes one where the landmark projects to in the keyframe that faces it most
-    directly, and `info["source"]["keypoints"]` says so.
+    directly, and `info["source"]["note"]` says so.
 
     Raises:
         FileNotFoundError: a file that the .yaml names is missing.
@@ -242,7 +242,9 @@ def _tracks(
     source: dict[str, Any] = {"program": PROGRAM, "version": "unknown"}
     if features is None:
         features = _projected(keyframes, points, cameras, numbers, dropped)
-        source["keypoints"] = "landmarks that were projected: the file has one descriptor of each"
+        source["note"] = (
+            "no .features: the one descriptor of each landmark has no keypoint of its own"
+        )
     row = np.searchsorted(keyframes["id"], features["keyframe"])
     row = np.minimum(row, len(keyframes) - 1)
     present = keyframes["id"][row] == features["keyframe"]
