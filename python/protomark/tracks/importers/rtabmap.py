@@ -299,11 +299,10 @@ def _find_landmarks(
         view_of[view.rows] = i
     placed = (np.abs(world) < 1e9).all(axis=1)
     rows = np.flatnonzero((found.word > 0) & (found.word < 2**31) & placed)
-    worlds = np.array([view.world for view in views])
+    worlds = np.unique([view.world for view in views], return_inverse=True)[1]
     # Words of each world.
-    words, word = np.unique(
-        np.column_stack([found.word[rows], worlds[view_of[rows]]]), axis=0, return_inverse=True
-    )
+    key = found.word[rows] * len(views) + worlds[view_of[rows]]
+    words, word = np.unique(key, return_inverse=True)
     place = np.full(len(rows), -1)
     ambiguous = np.zeros(len(rows), bool)
     for number in range(_MAX_PLACES):
@@ -322,17 +321,19 @@ def _find_landmarks(
     lost = place < 0
     dropped["observations of words that are at two places"] += int((ambiguous | lost).sum())
     rows, place, word = (a[~(ambiguous | lost)] for a in (rows, place, word))
-    places, landmark = np.unique(np.column_stack([words[word], place]), axis=0, return_inverse=True)
-    starts, lengths = runs(places[:, 0])
-    ids = places[:, 0] + 2**32 * (np.arange(len(places)) - np.repeat(starts, lengths))
+    places, landmark = np.unique(words[word] * _MAX_PLACES + place, return_inverse=True)
+    owner = places // (_MAX_PLACES * len(views))
+    starts, lengths = runs(owner)
+    ids = owner + 2**32 * (np.arange(len(places)) - np.repeat(starts, lengths))
     count = np.bincount(landmark, minlength=len(ids))[:, None]
     sums = [np.bincount(landmark, axis, len(ids)) for axis in world[rows].T]
     positions = np.column_stack(sums) / count if len(ids) else np.zeros((0, 3))
     # Of several observations in an image the nearest one is kept.
     distance = np.linalg.norm(world[rows] - positions[landmark], axis=1)
     order = np.lexsort((distance, view_of[rows], landmark))
-    key = np.column_stack([landmark, view_of[rows]])[order]
-    first = np.concatenate([[True], (key[1:] != key[:-1]).any(axis=1)])[: len(order)]
+    starts, _ = runs((landmark * len(views) + view_of[rows])[order])
+    first = np.zeros(len(order), bool)
+    first[starts] = True
     dropped["observations of a landmark twice in a keyframe"] += int((~first).sum())
     found.label[rows[order[first]]] = ids[landmark[order[first]]]
     return ids, positions
