@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ _AKAZE_THRESHOLDS = (1e-3, 1e-4)  # the second is for images with little contras
 # Images whose longer side is larger are reduced to this many pixels before detection.
 MAX_SIZE = 1600
 _MIN_MAX_SIZE = 64
+_MAX_LEVELS, _MAX_FACTOR = 32, 4
 
 FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
 
@@ -77,15 +78,31 @@ class Extractor(threading.local):
         name: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
         max_size: images whose longer side has more pixels are reduced to it before detection.
+        detector: how other images were described, which these will be matched with: "levels" and
+            "scale_factor" of the image pyramid of ORB, see `Tracks.info`.
+
+    Raises:
+        ValueError: a number or the name is out of range.
     """
 
-    def __init__(self, name: str, max_keypoints: int = 2000, max_size: int = MAX_SIZE) -> None:
+    def __init__(
+        self,
+        name: str,
+        max_keypoints: int = 2000,
+        max_size: int = MAX_SIZE,
+        detector: Mapping[str, Any] | None = None,
+    ) -> None:
         if max_keypoints < 1:
             raise ValueError(f"max_keypoints is {max_keypoints}, but it must be at least 1")
         if max_size < _MIN_MAX_SIZE:
             raise ValueError(f"max_size is {max_size}, but it must be at least {_MIN_MAX_SIZE}")
         self.kind = descriptor_kind(name)
         self.max_keypoints, self.max_size = max_keypoints, max_size
+        pyramid = _pyramid(detector or {})
+
+        def orb(**threshold: int) -> Any:
+            return _opencv("ORB_create")(nfeatures=5 * max_keypoints, **pyramid, **threshold)
+
         # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
         self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
@@ -98,12 +115,10 @@ class Extractor(threading.local):
             self._detect = [a.detect for a in akaze]
             self._akaze = akaze[-1].detectAndCompute
         else:
-            orb = _opencv("ORB_create")
-            limit = 5 * max_keypoints
-            self._detect = [orb(nfeatures=limit, fastThreshold=t).detect for t in (20, 7)]
+            self._detect = [orb(fastThreshold=t).detect for t in (20, 7)]
         self._compute = {
             "freak": lambda: _opencv("FREAK_create")(),
-            "orb": lambda: _opencv("ORB_create")(nfeatures=5 * max_keypoints, fastThreshold=20),
+            "orb": lambda: orb(fastThreshold=20),
             "brisk": lambda: _opencv("BRISK_create")(),
             "akaze": lambda: _opencv("AKAZE_create")(),
             "latch": lambda: _opencv("LATCH_create")(bytes=32),
@@ -188,6 +203,18 @@ class Extractor(threading.local):
         """The keypoints to keep, and whether they reach the limit."""
         chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
         return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
+
+
+def _pyramid(detector: Mapping[str, Any]) -> dict[str, Any]:
+    """OpenCV's parameters for the image pyramid of a detector."""
+    levels, factor = detector.get("levels", 8), detector.get("scale_factor", 1.2)
+    if not (isinstance(levels, (int, float)) and levels in range(1, _MAX_LEVELS + 1)):
+        raise ValueError(f"a detector has 1 to {_MAX_LEVELS} levels, not {str(levels)[:40]}")
+    if not (isinstance(factor, (int, float)) and 1 < factor <= _MAX_FACTOR):
+        raise ValueError(
+            f"levels of a detector differ by a factor in (1, {_MAX_FACTOR}], not {str(factor)[:40]}"
+        )
+    return {"nlevels": int(levels), "scaleFactor": float(factor)}
 
 
 def _opencv(name: str) -> Any:
