@@ -24,7 +24,6 @@ _AKAZE_THRESHOLDS = (1e-3, 1e-4)  # the second is for images with little contras
 # Images whose longer side is larger are reduced to this many pixels before detection.
 MAX_SIZE = 1600
 _MIN_MAX_SIZE = 64
-_MAX_LEVELS, _MAX_FACTOR = 32, 4
 
 FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
 
@@ -78,8 +77,8 @@ class Extractor(threading.local):
         name: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
         max_size: images whose longer side has more pixels are reduced to it before detection.
-        detector: how other images were described, which these will be matched with: "levels" and
-            "scale_factor" of the image pyramid of ORB, see `Tracks.info`.
+        detector: how images were described that these will be matched with, as `Tracks.info` has
+            it: "levels" and "scale_factor" of ORB's image pyramid; "name" if it begins with GFTT.
 
     Raises:
         ValueError: a number or the name is out of range.
@@ -98,7 +97,8 @@ class Extractor(threading.local):
             raise ValueError(f"max_size is {max_size}, but it must be at least {_MIN_MAX_SIZE}")
         self.kind = descriptor_kind(name)
         self.max_keypoints, self.max_size = max_keypoints, max_size
-        pyramid = _pyramid(detector or {})
+        settings = detector or {}
+        pyramid = _pyramid(settings)
 
         def orb(**threshold: int) -> Any:
             return _opencv("ORB_create")(nfeatures=5 * max_keypoints, **pyramid, **threshold)
@@ -114,6 +114,8 @@ class Extractor(threading.local):
             akaze = [_opencv("AKAZE_create")(threshold=t) for t in _AKAZE_THRESHOLDS]
             self._detect = [a.detect for a in akaze]
             self._akaze = akaze[-1].detectAndCompute
+        elif str(settings.get("name")).startswith("GFTT"):  # RTAB-Map's
+            self._detect = [_good_features(settings, 5 * max_keypoints).detect]
         else:
             self._detect = [orb(fastThreshold=t).detect for t in (20, 7)]
         self._compute = {
@@ -205,16 +207,30 @@ class Extractor(threading.local):
         return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
 
 
+def _good_features(detector: Mapping[str, Any], limit: int) -> Any:
+    """Shi and Tomasi's corners, which have no size and angle."""
+    quality = _setting(detector, "quality_level", 0.001, 1e-9, 1)
+    distance = _setting(detector, "min_distance", 7, 0, 1000)
+    return _opencv("GFTTDetector_create")(
+        limit, quality, distance, int(_setting(detector, "block_size", 3, 2, 31))
+    )
+
+
 def _pyramid(detector: Mapping[str, Any]) -> dict[str, Any]:
     """OpenCV's parameters for the image pyramid of a detector."""
-    levels, factor = detector.get("levels", 8), detector.get("scale_factor", 1.2)
-    if not (isinstance(levels, (int, float)) and levels in range(1, _MAX_LEVELS + 1)):
-        raise ValueError(f"a detector has 1 to {_MAX_LEVELS} levels, not {str(levels)[:40]}")
-    if not (isinstance(factor, (int, float)) and 1 < factor <= _MAX_FACTOR):
-        raise ValueError(
-            f"levels of a detector differ by a factor in (1, {_MAX_FACTOR}], not {str(factor)[:40]}"
-        )
-    return {"nlevels": int(levels), "scaleFactor": float(factor)}
+    return {
+        "nlevels": int(_setting(detector, "levels", 8, 1, 32)),
+        "scaleFactor": _setting(detector, "scale_factor", 1.2, 1.01, 4),
+    }
+
+
+def _setting(
+    detector: Mapping[str, Any], name: str, usual: float, low: float, high: float
+) -> float:
+    value = detector.get(name, usual)
+    if not (isinstance(value, (int, float)) and low <= value <= high):
+        raise ValueError(f"{name} of a detector is from {low} to {high}, not {str(value)[:40]}")
+    return float(value)
 
 
 def _opencv(name: str) -> Any:

@@ -30,7 +30,9 @@ def renumbered(tracks: Tracks, last: int) -> Tracks:
     labels = tracks.landmark_of_keypoint
     source = dict(tracks.info.get("source", {}))
     if "maps" in source:
-        source["maps"] = [{**m, "ids": [i + shift for i in m["ids"]]} for m in source["maps"]]
+        source["maps"] = [
+            {**m, "ids": [i + shift for i in m["ids"]]} if "ids" in m else m for m in source["maps"]
+        ]
     return replace(
         tracks,
         info={**tracks.info, "source": source},
