@@ -66,14 +66,13 @@ def build(
     from protomark.cli.info import show
     from protomark.cli.terminal import progress_bar, write_json
     from protomark.files import check_outputs
-    from protomark.maps import cameras
     from protomark.maps.build import build_map, tracks_for
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
-    from protomark.maps.origin import origin_texts
+    from protomark.maps.origin import tracks_metadata
     from protomark.maps.seal import SealRequest, observed, seal_map, sealed_path
     from protomark.maps.selection import Views
-    from protomark.maps.sources import find_sources, join_sources, read_sources
+    from protomark.maps.sources import read_places
 
     sealed = None if no_seal else sealed_path(output)
     check_outputs(output, json_file, sealed, inputs=[*sources, encoder])
@@ -81,16 +80,13 @@ def build(
     with progress_bar() as progress:
         progress("read sources", 0, 0)
         network = Encoder.load(encoder) if encoder else None
-        found = find_sources(sources)
-        read = read_sources(found, network.descriptor if network else None, threads, progress)
-        seen = join_sources(found, read, min_observations)
-        detectors = [one.info.get("detector", {}) for one in read]
-        texts = origin_texts(seen.info["sources"], detectors) | texts
+        descriptor = network.descriptor if network else None
+        seen = read_places(sources, descriptor, min_observations, threads, progress)
         network = network or Encoder.load(seen.descriptor)
         seen = tracks_for(network, seen)
         progress("build the map", 0, 0)
         scene = build_map(seen, network, dim, min_observations=1, threads=threads)
-        scene.metadata = {cameras.KEY: cameras.cameras_text(seen.cameras.values()), **texts}
+        scene.metadata = tracks_metadata(seen) | texts
         progress("write the map", 0, 0)
         scene.save(output)
         if sealed:

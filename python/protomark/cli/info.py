@@ -85,10 +85,10 @@ def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "positions", where
     if facts["extent"]:
         yield "extent", " to ".join(_vector(corner) for corner in facts["extent"])
-    metadata = dict(facts["metadata"])
-    yield from source_rows(metadata.pop(SOURCES, ""))
-    for name, text in metadata.items():
-        yield f"metadata: {name}", text
+    yield from source_rows(facts["metadata"])
+    for name, text in facts["metadata"].items():
+        if name != SOURCES:
+            yield f"metadata: {name}", text
     if facts["journal"]:
         yield "journal", f"{facts['journal']['commits']:,} commits since the file was written"
     if sealed := facts.get("sealed"):

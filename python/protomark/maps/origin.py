@@ -7,21 +7,59 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import protomark as pm
+from protomark.maps.cameras import KEY, cameras_text
 from protomark.report import first_of
+from protomark.tracks.file import Tracks
 
 SOURCES, DETECTOR = "sources", "detector"
+_COUNTED = ("keyframes", "landmarks", "observations")
 _MAX_BYTES = 1 << 16  # of a text in a map
 
 
-def origin_texts(
-    sources: Sequence[Mapping[str, Any]], detectors: Sequence[Mapping[str, Any]]
-) -> dict[str, str]:
-    """Metadata that name sources, and the detector of their images if that is known to be one."""
-    texts = {SOURCES: _sources_text(sources)}
-    different = {json.dumps(detector, sort_keys=True) for detector in detectors}
-    if len(different) == 1 and any(detectors):
-        texts[DETECTOR] = different.pop()
+def tracks_metadata(tracks: Tracks) -> dict[str, str]:
+    """The metadata of a map of tracks that `protomark.maps.sources.read_places` read.
+
+    They name cameras, sources, and the detector if all sources had the same.
+    """
+    texts = {
+        KEY: cameras_text(tracks.cameras.values()),
+        SOURCES: _sources_text(tracks.info["sources"]),
+    }
+    detectors = {json.dumps(one, sort_keys=True) for one in tracks.info["detectors"]}
+    if len(detectors) == 1 and detectors != {"{}"}:
+        texts[DETECTOR] = detectors.pop()
     return texts
+
+
+def joint_origin(
+    target: Mapping[str, str], source: Mapping[str, str], shift: int = 0
+) -> dict[str, str]:
+    """The metadata of a map after another one was merged into it: with the sources of both.
+
+    A detector stays if both had the same.
+
+    Args:
+        target: metadata of the map.
+        source: metadata of the other.
+        shift: what was added to the ids of the other.
+    """
+    texts = {**source, **target}
+    if target.get(DETECTOR) != source.get(DETECTOR):
+        del texts[DETECTOR]
+    sources = [*_sources(target), *(_shifted(one, shift) for one in _sources(source))]
+    return texts | ({SOURCES: _sources_text(sources)} if sources else {})
+
+
+def _shifted(one: Any, shift: int) -> Any:
+    """A source, or a map of it, with larger ids."""
+    if not isinstance(one, dict):
+        return one
+    out = dict(one)
+    if isinstance(one.get("ids"), list):
+        out["ids"] = [i + shift for i in one["ids"] if isinstance(i, int)]
+    if isinstance(one.get("maps"), list):
+        out["maps"] = [_shifted(part, shift) for part in one["maps"]]
+    return out
 
 
 def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
@@ -43,12 +81,15 @@ def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def source_rows(text: str) -> Iterator[tuple[str, str]]:
-    """Names of a map's sources and what is known of each, by its metadata `SOURCES`."""
-    sources = _parsed(text)
-    for one in sources if isinstance(sources, list) else []:
-        if isinstance(one, dict):
-            yield f"source: {one.get('name', '')}", "; ".join(_source_words(one))
+def source_rows(metadata: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Names of a map's sources, and what is known of each."""
+    for one in _sources(metadata):
+        yield f"source: {one.get('name', '')}", "; ".join(_source_words(one))
+
+
+def _sources(metadata: Mapping[str, str]) -> list[dict[str, Any]]:
+    found = _parsed(metadata.get(SOURCES, "[]"))
+    return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
 
 
 def _source_words(one: Mapping[str, Any]) -> Iterator[str]:
@@ -65,9 +106,6 @@ def _source_words(one: Mapping[str, Any]) -> Iterator[str]:
     dropped = one.get("dropped")
     if isinstance(dropped, dict) and dropped:
         yield "left out: " + first_of([f"{n} {reason}" for reason, n in dropped.items()])
-
-
-_COUNTED = ("keyframes", "landmarks", "observations")
 
 
 def _parsed(text: str) -> Any:

@@ -165,26 +165,36 @@ def _read(source: Source, descriptor: str | None, threads: int, progress: Progre
     return tracks
 
 
-def join_sources(
-    sources: Sequence[Source], tracks: Sequence[Tracks], min_observations: int | None = None
+def read_places(
+    paths: Sequence[Path],
+    descriptor: str | None = None,
+    min_observations: int | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> Tracks:
-    """The observations of all sources, each of which is a place of its own, in their order.
+    """The observations of all sources that paths name, each of which is a place of its own.
 
-    `info["sources"]` has facts on each. Landmarks keep their ids unless an earlier source has ids
-    as large: then they follow these.
+    Landmarks keep their ids unless an earlier source, by name, has ids as large: then they follow
+    these. `info["sources"]` has facts on each source, `info["detectors"]` its detector.
 
     Args:
-        sources: see `find_sources`.
-        tracks: the observations of each.
+        paths: see `find_sources`.
+        descriptor: see `read_sources`.
         min_observations: landmarks with fewer have none; None: 2, or 1 in sources in which no
             landmark has two.
+        threads: see `read_sources`.
+        progress: see `read_sources`.
 
     Raises:
-        ValueError: no landmark of a source has so many, or an id is too large.
+        FileNotFoundError, ValueError: see `find_sources` and `read_sources`; or no landmark of a
+            source has so many observations, or an id is too large.
     """
-    facts, parts = [], []
+    sources = find_sources(paths)
+    facts, parts, detectors = [], [], []
     last = -1
-    for source, one in zip(sources, tracks, strict=True):
+    for source, one in zip(
+        sources, read_sources(sources, descriptor, threads, progress), strict=True
+    ):
         try:
             one = renumbered(one, last)
             parts.append(_often_seen(one, min_observations))
@@ -192,7 +202,8 @@ def join_sources(
             raise ValueError(f"{source.path}: {error}") from None
         last = int(one.landmark_ids[-1])
         facts.append(_facts(source.name, one))
-    info: dict[str, Any] = {"sources": facts}
+        detectors.append(one.info.get("detector", {}))
+    info = {"sources": facts, "detectors": detectors}
     if len(parts) == 1:
         return replace(parts[0], info={**parts[0].info, **info})
     return join_tracks([source.name for source in sources], parts, info)
