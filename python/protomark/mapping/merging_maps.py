@@ -18,11 +18,15 @@ from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.outputs import write_outputs
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.state import STATE, load_state, save_state
-from protomark.maps.alignment import Alignment
+from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.merge import Merged, check_inputs, find_alignment
 from protomark.maps.open import SCENE_MAP
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import one_blas_thread
+
+# Maps meet in so many other places at most; there they are off by at most this share of the reach.
+_MAX_LOOPS = 3
+_MAX_DRIFT = 0.1
 
 
 def merge_folders(
@@ -128,17 +132,44 @@ def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
         mapper.history.records[record.name] = record
     ids = other.scene.ids
     mapper.scene.merge_map(other.scene, into=ids + shift, source=ids)
-    pairs = list(zip(found.into.tolist(), (found.source + shift).tolist(), strict=True))
-    merged = merge_duplicates(
-        structure, mapper.memory, pairs, mapper.options.max_error, check=False
-    )
-    if not mapper.options.fixed_poses:
-        adjustment.adjust_global_bundle(structure, 20, loss_scale=LOOP_LOSS_SCALE)
+    merged = _merge_duplicates(mapper, found.into, found.source + shift)
+    merged += _close_loops(mapper, count)
     mapper.history.events += [
         *(f"{name}: {event}" for event in other.history.events),
         f"{name}: merged by {found.agreeing} landmarks that agree, {merged} duplicates",
     ]
     return prefix
+
+
+def _merge_duplicates(mapper: Mapper, into: Ids, source: Ids) -> int:
+    """Merge landmarks that are one, and adjust all; returns their number."""
+    structure, options = mapper.structure, mapper.options
+    pairs = list(zip(into.tolist(), source.tolist(), strict=True))
+    merged = merge_duplicates(structure, mapper.memory, pairs, options.max_error, check=False)
+    if not options.fixed_poses:
+        adjustment.adjust_global_bundle(structure, 20, loss_scale=LOOP_LOSS_SCALE)
+    return merged
+
+
+def _close_loops(mapper: Mapper, count: int) -> int:
+    """Merge landmarks that only the first `count` frames see with those of the others, elsewhere.
+
+    Where two maps meet a second time, drift has kept their landmarks apart.
+    """
+    structure, scene, merged = mapper.structure, mapper.scene, 0
+    for _ in range(_MAX_LOOPS):
+        frames, landmarks = structure.pairs()
+        scene.set_positions(structure.ids, structure.positions[structure.ids])
+        first, second = (np.unique(landmarks[s]) for s in (frames < count, frames >= count))
+        alone = (np.setdiff1d(first, second), np.setdiff1d(second, first))
+        try:
+            found = align_maps(scene.part(alone[0]), scene.part(alone[1]))
+        except ValueError:
+            break
+        if found.problem or found.drift > _MAX_DRIFT * found.reach:
+            break
+        merged += _merge_duplicates(mapper, found.into, found.source)
+    return merged
 
 
 def _prefix(mapper: Mapper, other: Mapper, name: str) -> str:

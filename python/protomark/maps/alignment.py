@@ -47,7 +47,8 @@ class Alignment:
         into: (n,) int64, landmarks of the other map.
         source: (n,) int64, the same landmarks in this map.
         radius: how far apart moved positions of one landmark are, in the other world.
-        shift: how far landmarks are moved (median).
+        drift: how far it moves landmarks that are likely in both (median).
+        reach: median distance of the other map's landmarks from their middle.
         likely: number of pairs of landmarks that are likely to be the same by their prototypes and
             have one end where the other map has landmarks.
         agreeing: how many of these agree with the similarity.
@@ -60,7 +61,8 @@ class Alignment:
     into: Ids
     source: Ids
     radius: float
-    shift: float
+    drift: float
+    reach: float
     likely: int
     agreeing: int
     chance: float
@@ -70,7 +72,7 @@ class Alignment:
     @property
     def stays(self) -> bool:
         """Whether the map is in the other one's world already."""
-        return self.shift <= self.radius
+        return self.drift <= self.radius
 
     @property
     def problem(self) -> str:
@@ -166,6 +168,7 @@ def align_maps(
         *duplicates,
         radius,
         float(np.median(np.linalg.norm(motion(start) - start, axis=1))),
+        worlds[0].reach,
         int((near_other | agrees).sum()),
         int(agrees.sum()),
         found.chance,
