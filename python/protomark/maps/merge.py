@@ -15,6 +15,7 @@ from protomark.geometry.similarity import Array
 from protomark.maps import cameras
 from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.open import map_path, open_learning_map
+from protomark.maps.origin import joint_origin
 from protomark.progress import Progress, silent, tracked
 
 MAX_ID = 2**63 - 1
@@ -105,7 +106,7 @@ def merge_files(
             elif (found := find_alignment(merged, scene, fixed_scale, threads)) is not None:
                 _merge_aligned(merged, scene, found)
             else:
-                _merge_cameras(merged, scene)
+                _merge_texts(merged, scene)
                 merged.merge_map(scene)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
@@ -206,9 +207,10 @@ def _same_landmarks(merged: pm.PrototypeMap, scene: pm.PrototypeMap, common: Ids
 
 def _merge_aligned(merged: pm.PrototypeMap, scene: pm.PrototypeMap, found: Alignment) -> None:
     ids = scene.ids
-    into = ids + _first_free(merged, scene)
+    shift = _first_free(merged, scene)
+    into = ids + shift
     into[np.searchsorted(ids, found.source)] = found.into
-    _merge_cameras(merged, scene)
+    _merge_texts(merged, scene, shift)
     has_frame = "frame" in merged.metadata
     merged.merge_map(scene, into=into, source=ids)
     if not has_frame:  # the other map's describes the world that it leaves
@@ -218,9 +220,9 @@ def _merge_aligned(merged: pm.PrototypeMap, scene: pm.PrototypeMap, found: Align
 
 
 def _merge_renumbered(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
-    _merge_cameras(merged, scene)
-    theirs = scene.ids
-    merged.merge_map(scene, into=theirs + _first_free(merged, scene), source=theirs)
+    theirs, shift = scene.ids, _first_free(merged, scene)
+    _merge_texts(merged, scene, shift)
+    merged.merge_map(scene, into=theirs + shift, source=theirs)
 
 
 def _first_free(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> int:
@@ -234,7 +236,8 @@ def _first_free(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> int:
     return first
 
 
-def _merge_cameras(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
+def _merge_texts(merged: pm.PrototypeMap, scene: pm.PrototypeMap, shift: int = 0) -> None:
+    merged.metadata = merged.metadata | joint_origin(merged.metadata, scene.metadata, shift)
     if scene.metadata.get(cameras.KEY, "") not in ("", merged.metadata.get(cameras.KEY)):
         text = cameras.joint_cameras(merged, scene)
         merged.metadata = {**merged.metadata, cameras.KEY: text}

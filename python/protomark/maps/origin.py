@@ -10,6 +10,7 @@ import protomark as pm
 from protomark.maps.cameras import KEY, cameras_text
 from protomark.report import first_of
 from protomark.tracks.file import Tracks
+from protomark.tracks.joining import shifted_ids
 
 SOURCES, DETECTOR = "sources", "detector"
 _COUNTED = ("keyframes", "landmarks", "observations")
@@ -34,32 +35,20 @@ def tracks_metadata(tracks: Tracks) -> dict[str, str]:
 def joint_origin(
     target: Mapping[str, str], source: Mapping[str, str], shift: int = 0
 ) -> dict[str, str]:
-    """The metadata of a map after another one was merged into it: with the sources of both.
-
-    A detector stays if both had the same.
+    """What a map says of its origin once another one is merged into it.
 
     Args:
         target: metadata of the map.
         source: metadata of the other.
-        shift: what was added to the ids of the other.
+        shift: what is added to the ids of the other.
     """
-    texts = {**source, **target}
+    texts = {}
+    sources = [*_sources(target), *(shifted_ids(one, shift) for one in _sources(source))]
+    if sources:
+        texts[SOURCES] = _sources_text([s for i, s in enumerate(sources) if s not in sources[:i]])
     if target.get(DETECTOR) != source.get(DETECTOR):
-        del texts[DETECTOR]
-    sources = [*_sources(target), *(_shifted(one, shift) for one in _sources(source))]
-    return texts | ({SOURCES: _sources_text(sources)} if sources else {})
-
-
-def _shifted(one: Any, shift: int) -> Any:
-    """A source, or a map of it, with larger ids."""
-    if not isinstance(one, dict):
-        return one
-    out = dict(one)
-    if isinstance(one.get("ids"), list):
-        out["ids"] = [i + shift for i in one["ids"] if isinstance(i, int)]
-    if isinstance(one.get("maps"), list):
-        out["maps"] = [_shifted(part, shift) for part in one["maps"]]
-    return out
+        texts[DETECTOR] = "{}"
+    return texts
 
 
 def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:

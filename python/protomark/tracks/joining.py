@@ -18,6 +18,8 @@ MAX_ID = 2**63 - 1
 def renumbered(tracks: Tracks, last: int) -> Tracks:
     """The tracks with ids above `last`: their own, or all larger by the same number.
 
+    `info["source"]` tells them, too.
+
     Raises:
         ValueError: there is no room for them below 2^63.
     """
@@ -28,17 +30,22 @@ def renumbered(tracks: Tracks, last: int) -> Tracks:
     if int(ids[-1]) > MAX_ID - shift:
         raise ValueError(f"ids up to {ids[-1]} do not fit above {last}: use smaller ids")
     labels = tracks.landmark_of_keypoint
-    source = dict(tracks.info.get("source", {}))
-    if "maps" in source:
-        source["maps"] = [
-            {**m, "ids": [i + shift for i in m["ids"]]} if "ids" in m else m for m in source["maps"]
-        ]
     return replace(
         tracks,
-        info={**tracks.info, "source": source},
+        info={**tracks.info, "source": shifted_ids(tracks.info["source"], shift)},
         landmark_ids=ids + shift,
         landmark_of_keypoint=np.where(labels >= 0, labels + shift, -1),
     )
+
+
+def shifted_ids(source: dict[str, Any], shift: int) -> dict[str, Any]:
+    """Facts on a source, and on the maps in it, with "ids" that are larger by `shift`."""
+    out = dict(source)
+    if isinstance(ids := source.get("ids"), list):
+        out["ids"] = [number + shift for number in ids if isinstance(number, int)]
+    if isinstance(maps := source.get("maps"), list):
+        out["maps"] = [shifted_ids(one, shift) for one in maps if isinstance(one, dict)]
+    return out
 
 
 def join_tracks(names: Sequence[str], parts: Sequence[Tracks], info: dict[str, Any]) -> Tracks:
