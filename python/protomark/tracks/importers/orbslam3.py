@@ -101,7 +101,7 @@ def _tracks(atlas: Atlas) -> Tracks:
                 "version": "unknown",
                 "archive": f"Boost {atlas.archive_version}",
                 "maps": summaries,
-                "dropped": {reason: count for reason, count in dropped.items() if count},
+                **({"dropped": dict(dropped)} if (dropped := +dropped) else {}),
             },
             "detector": _detector(keyframes),
         },

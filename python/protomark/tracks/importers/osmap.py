@@ -273,7 +273,7 @@ def _tracks(
         landmark_ids=points["id"].astype(np.int64),
         landmark_positions=points["xyz"].astype(np.float64),
         info={
-            "source": {**source, "dropped": {k: n for k, n in dropped.items() if n}},
+            "source": {**source, **({"dropped": dict(dropped)} if (dropped := +dropped) else {})},
             "detector": {"name": "ORB-SLAM"},
         },
     )
@@ -310,23 +310,21 @@ def _projected(
 ) -> NDArray[Any]:
     """Each landmark as a keypoint of the keyframe whose axis passes it at the smallest angle."""
     poses = keyframes["pose"].astype(np.float64)
-    xyz, centers = points["xyz"].astype(np.float64), camera_centers(poses)
+    centers, params = camera_centers(poses), np.array([cameras[int(n)].params for n in numbers])
     found = np.zeros(len(points), _FEATURE)
     found["point"], found["descriptor"], found["angle"] = points["id"], points["descriptor"], -1
     seen = np.zeros(len(points), bool)
     for begin in range(0, len(points), _BLOCK):
         rows = slice(begin, begin + _BLOCK)
-        depth = xyz[rows] @ poses[:, 2, :3].T + poses[:, 2, 3]
-        square = (xyz[rows] ** 2).sum(1)[:, None] - 2 * xyz[rows] @ centers.T + (centers**2).sum(1)
+        xyz = points["xyz"][rows].astype(np.float64)
+        depth = xyz @ poses[:, 2, :3].T + poses[:, 2, 3]
+        square = (xyz**2).sum(1)[:, None] - 2 * xyz @ centers.T + (centers**2).sum(1)
         facing = np.where(depth > 0, depth * np.abs(depth) / np.maximum(square, 1e-12), -1)
-        found["keyframe"][rows] = facing.argmax(axis=1)
-        seen[rows] = facing.max(axis=1) > 0
-    nearest = found["keyframe"].astype(np.int64)
-    local = transform(poses[nearest], xyz)
-    params = np.array([cameras[int(n)].params for n in numbers])[nearest]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        found["xy"] = local[:, :2] / local[:, 2:] * params[:, :2] + params[:, 2:] - 0.5
-    found["keyframe"] = keyframes["id"][nearest]
-    seen &= (np.abs(found["xy"]) < _MAX_PIXEL).all(axis=1)
+        nearest = facing.argmax(axis=1)
+        local, lens = transform(poses[nearest], xyz), params[nearest]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = local[:, :2] / local[:, 2:] * lens[:, :2] + lens[:, 2:] - 0.5
+        seen[rows] = (facing.max(axis=1) > 0) & (np.abs(xy) < _MAX_PIXEL).all(axis=1)
+        found["keyframe"][rows], found["xy"][rows] = keyframes["id"][nearest], xy
     dropped["descriptors of landmarks that no keyframe faces"] = int((~seen).sum())
     return found[seen]
