@@ -61,6 +61,11 @@ def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
     return "[]"
 
 
+def map_sources(scene: pm.PrototypeMap | pm.SealedMap) -> list[dict[str, Any]]:
+    """What is known of each source that a map was built from; none if nobody stored them."""
+    return _sources(scene.metadata)
+
+
 def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
     """The detector of the images that a map was built from, by name, with its settings.
 
