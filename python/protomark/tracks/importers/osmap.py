@@ -284,7 +284,10 @@ def _cameras(text: str, features: NDArray[Any] | None, numbers: NDArray[np.uint6
 
     Keypoints to the right of or below that show that images are larger.
     """
-    params = [tuple(map(float, match)) for match in _CAMERA.findall(text)]
+    try:
+        params = [tuple(map(float, match)) for match in _CAMERA.findall(text)]
+    except ValueError:
+        raise ValueError("a camera matrix holds something that is no number") from None
     if not params or (numbers >= len(params)).any():
         raise ValueError(f"{len(params)} camera matrices are not those of the keyframes")
     reach = np.zeros(2)
