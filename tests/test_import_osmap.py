@@ -87,7 +87,7 @@ def write(folder: Path, tracks: Tracks, features: bool = True, delimited: bool =
 
 @pytest.fixture(scope="module")
 def tracks() -> Tracks:
-    found = orb_tracks(CAMERA)
+    found = orb_tracks(CAMERA, count=2)
     found.landmark_ids = found.landmark_ids + 1
     label = found.landmark_of_keypoint
     found.landmark_of_keypoint = np.where(label >= 0, label + 1, -1)
@@ -113,7 +113,7 @@ def test_what_was_written_is_read(delimited: bool, tracks: Tracks, tmp_path: Pat
 def test_one_descriptor_per_landmark(tracks: Tracks, tmp_path: Path) -> None:
     write(tmp_path, tracks, features=False)
     found = read(tmp_path)
-    assert counts(found) == (4, *[len(tracks.landmark_ids)] * 3)
+    assert counts(found) == (2, *[len(tracks.landmark_ids)] * 3)
     assert "no .features" in found.info["source"]["note"]
     assert np.array_equal(np.sort(found.landmark_of_keypoint), tracks.landmark_ids)
     done = protomark("build", tmp_path, "-o", tmp_path / "scene.pmk")
