@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 from protomark.tracks.file import Tracks
 
@@ -21,6 +23,16 @@ _MODULES = (
 _HEAD = 4096  # bytes by which a file is recognized
 
 
+def find_importer(path: Path) -> ModuleType | None:
+    """The module that reads the map of another program at a path, None if none does.
+
+    Raises:
+        FileNotFoundError: there is no such file or folder.
+    """
+    head = file_head(path)
+    return next((m for m in _modules() if m.recognizes(path, head)), None)
+
+
 def read_source(path: Path) -> Tracks:
     """Read the map of another program, which its content tells.
 
@@ -28,20 +40,31 @@ def read_source(path: Path) -> Tracks:
         FileNotFoundError: there is no such file or folder.
         ValueError: no known program wrote it, or it is broken.
     """
+    module = find_importer(path)
+    if module is None:
+        *programs, last = (m.PROGRAM for m in _modules())
+        raise ValueError(
+            f"{path} is no map that can be read: give tracks of `protomark tracks`, or a map of "
+            f"{', '.join(programs)} or {last}"
+        )
+    tracks: Tracks = module.read(path)
+    return tracks
+
+
+def file_head(path: Path) -> bytes:
+    """The first bytes of a file, none of a folder.
+
+    Raises:
+        FileNotFoundError: there is neither.
+    """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    head = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    programs = []
-    for name in _MODULES:
-        module = import_module(f"{__name__}.{name}")
-        programs.append(module.PROGRAM)
-        if module.recognizes(path, head):
-            tracks: Tracks = module.read(path)
-            return tracks
-    raise ValueError(
-        f"{path} is no map that can be read: give tracks of `protomark tracks`, or a map of "
-        f"{', '.join(programs[:-1])} or {programs[-1]}"
-    )
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(_HEAD)
+
+
+def _modules() -> list[ModuleType]:
+    names = [f"{__name__}.{name}" for name in _MODULES]
+    return [import_module(name) for name in names if find_spec(name)]

@@ -22,6 +22,8 @@ class Reader:
         path: the file that they are from, for errors.
     """
 
+    remedy = "the file is cut off or broken, save it again"
+
     def __init__(self, data: bytes | memoryview, path: Path) -> None:
         self.data = memoryview(data).cast("B")
         self.path = path
@@ -35,13 +37,18 @@ class Reader:
     def fail(self, what: str) -> NoReturn:
         """Raise ValueError: `what` is wrong, in this file, at this byte."""
         where = f"{self.where}, " if self.where else ""
-        raise ValueError(f"{self.path}, {where}byte {self.offset:,}: {what}")
+        raise ValueError(f"{self.path}, {where}byte {self.offset:,}: {what}: {self.remedy}")
+
+    def expect(self, fits: Any, what: str) -> None:
+        """Fail unless something `fits`."""
+        if not fits:
+            self.fail(what)
 
     def skip(self, count: int) -> int:
         """Pass `count` bytes over; returns where they began."""
         begin = self.offset
         if not 0 <= count <= len(self.data) - begin:
-            self.fail(f"{count:,} bytes should follow, but {len(self):,} do: cut off, or broken")
+            self.fail(f"{count:,} bytes should follow, but {len(self):,} do")
         self.offset = begin + count
         return begin
 
@@ -52,65 +59,66 @@ class Reader:
 
     def unpack(self, form: struct.Struct) -> tuple[Any, ...]:
         """The next numbers, as a compiled `struct` has them."""
-        return form.unpack_from(self.data, self.skip(form.size))
+        try:
+            numbers = form.unpack_from(self.data, self.offset)
+        except struct.error:
+            self.skip(form.size)  # which fails
+            raise
+        self.offset += form.size
+        return numbers
 
     def array(self, dtype: DTypeLike, *shape: int) -> NDArray[Any]:
-        """The next numbers as an array, not copied and not writable.
-
-        Args:
-            dtype: what they are, such as "<f4", or a structure.
-            shape: how many.
-        """
+        """The next numbers as an array of this shape, not copied and not writable."""
         kind = np.dtype(dtype)
-        count = 1
+        count = 1 if min(shape, default=0) >= 0 else -1
         for side in shape:
             count *= side
-        begin = self.skip(count * kind.itemsize if min(shape, default=0) >= 0 else -1)
+        begin = self.skip(count * kind.itemsize)
         return np.frombuffer(self.data, kind, count, begin).reshape(shape)
 
-    def count(self, size: int, form: struct.Struct = _U64) -> int:
-        """A number of items of at least `size` bytes each that must fit into what remains."""
-        number = int(self.unpack(form)[0])
+    def count(self, size: int = 1, form: struct.Struct = _U64) -> int:
+        """A number of items of at least `size` bytes each, which must fit into what remains."""
+        number: int = self.unpack(form)[0]
         if not 0 <= number * size <= len(self):
-            self.fail(f"{number:,} items should follow in {len(self):,} bytes: cut off, or broken")
+            self.fail(f"{number:,} items should follow in {len(self):,} bytes")
         return number
 
     def u8(self) -> int:
         """An unsigned byte."""
-        return int(self.unpack(_U8)[0])
+        return self.unpack(_U8)[0]
 
     def u16(self) -> int:
         """An unsigned 16-bit number."""
-        return int(self.unpack(_U16)[0])
+        return self.unpack(_U16)[0]
 
     def u32(self) -> int:
         """An unsigned 32-bit number."""
-        return int(self.unpack(_U32)[0])
+        return self.unpack(_U32)[0]
 
     def u64(self) -> int:
         """An unsigned 64-bit number."""
-        return int(self.unpack(_U64)[0])
+        return self.unpack(_U64)[0]
 
     def i8(self) -> int:
         """A signed byte."""
-        return int(self.unpack(_I8)[0])
+        return self.unpack(_I8)[0]
 
     def i16(self) -> int:
         """A signed 16-bit number."""
-        return int(self.unpack(_I16)[0])
+        return self.unpack(_I16)[0]
 
     def i32(self) -> int:
         """A signed 32-bit number."""
-        return int(self.unpack(_I32)[0])
+        return self.unpack(_I32)[0]
 
     def i64(self) -> int:
         """A signed 64-bit number."""
-        return int(self.unpack(_I64)[0])
+        return self.unpack(_I64)[0]
 
     def f32(self) -> float:
         """A 32-bit number."""
-        return float(self.unpack(_F32)[0])
+        return self.unpack(_F32)[0]
 
     def f64(self) -> float:
         """A 64-bit number."""
-        return float(self.unpack(_F64)[0])
+        return self.unpack(_F64)[0]
