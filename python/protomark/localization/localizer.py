@@ -26,6 +26,7 @@ from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
 from protomark.maps.cameras import map_cameras
 from protomark.maps.open import open_map
+from protomark.maps.origin import map_detector
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
@@ -261,7 +262,11 @@ class Localizer:
                 f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
                 "compute: describe the keypoints yourself and call localize_features"
             )
-        return Extractor(plain, self.max_keypoints, self.max_size)
+        detector, size = map_detector(self.scene), self.max_size
+        if detector:  # of a program that describes images at their own size
+            sides = [max(c.width, c.height) for c in self.cameras.cameras]
+            size = min([size, max(sides, default=size)])
+        return Extractor(plain, self.max_keypoints, size, detector)
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:
         features = self._extractor(image)

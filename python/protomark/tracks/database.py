@@ -12,7 +12,7 @@ from protomark.features.descriptors import DESCRIPTORS, descriptor_kind
 from protomark.features.extractor import Features
 from protomark.files import hash_files
 from protomark.tracks.file import Tracks
-from protomark.tracks.sqlite import open_database
+from protomark.tracks.sqlite import has_tables, open_database
 
 _MAX_PIXEL = 1e9  # a product of two such numbers is still a float32
 
@@ -26,6 +26,38 @@ def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
     digest = hash_files((path.name, path) for path in paths)
     options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
     return {"options": options, "input": digest}
+
+
+def is_database(path: Path, head: bytes) -> bool:
+    """Whether a file that begins with `head` is a COLMAP database."""
+    return has_tables(path, head, ("images", "keypoints", "descriptors", "two_view_geometries"))
+
+
+def stored_descriptor(database: Path) -> str:
+    """The descriptor of a database, which only the length tells; of 32 bytes most are ORB.
+
+    COLMAP's column `type` does not tell: opened by COLMAP 4, an older database calls ORB SIFT.
+
+    Raises:
+        ValueError: there are no binary descriptors, or several kinds have that length.
+    """
+    with open_database(database, "a COLMAP database") as tables:
+        lengths = {cols for rows, cols in tables.rows("descriptors", "rows, cols") if rows}
+    if len(lengths) != 1:
+        raise ValueError(f"{database}: the database has no descriptors, or several kinds of them")
+    length = lengths.pop()
+    kinds = [kind.name for kind in DESCRIPTORS.values() if kind.bytes == length]
+    if not kinds:
+        raise ValueError(
+            f"{database} has descriptors of {length} bytes, of which no encoder ships (128: SIFT): "
+            "name the folder of the images in its place, which are described anew"
+        )
+    if len(kinds) > 1 and "orb" not in kinds:
+        raise ValueError(
+            f"{database} has descriptors of {length} bytes: name one of {', '.join(kinds)} with "
+            "--encoder"
+        )
+    return "orb" if "orb" in kinds else kinds[0]
 
 
 def tracks_from_database(
@@ -81,9 +113,13 @@ def tracks_from_database(
     keep = np.flatnonzero(count >= 2)
     number = np.full(len(positions) + 1, -1, np.int64)
     number[keep] = np.arange(len(keep))
+    made_from = provenance(database, model_path, descriptor)
+    with open_database(database, "a COLMAP database") as tables:
+        version = tables.user_version
     info = {
         "sequence": name,
-        **provenance(database, model_path, descriptor),
+        "source": {"program": "COLMAP", "version": version, "digest": made_from["input"]},
+        **made_from,
         "images_without_pose": model.unposed,
         "poses_refined": False,
     }

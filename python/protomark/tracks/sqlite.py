@@ -21,6 +21,11 @@ class Database:
         pages = [connection.execute(f"PRAGMA page_{n}").fetchone()[0] for n in ("count", "size")]
         self._room = math.prod(pages)
 
+    @property
+    def user_version(self) -> str:
+        """The version that the program gave it: COLMAP 3.11 has 3900, COLMAP 4.2.1 has 4020100."""
+        return str(self._connection.execute("PRAGMA user_version").fetchone()[0])
+
     def columns(self, table: str) -> list[str]:
         """Names of a table's columns, none if there is no such table.
 
