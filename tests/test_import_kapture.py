@@ -151,8 +151,9 @@ def test_broken_data_sets(folder: Path, tmp_path: Path) -> None:
     check_broken_files(folder, read, tmp_path)
 
 
-def test_a_data_set_of_kapture() -> None:
-    path = foreign("kapture/m1x")
+@pytest.mark.parametrize("name", ["m1x", "t265/kapture", "virtual_gallery/kapture/training"])
+def test_data_sets_of_kapture(name: str) -> None:
+    path = foreign(f"kapture/{name}")
     assert recognizes(path, b"")
     with pytest.raises(ValueError, match="has no descriptors, but Protomark takes binary ones"):
         read(path)

@@ -187,10 +187,15 @@ def test_a_database_of_the_program(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "nodes"), [("strroke21_rtabmap", 411), ("brubaker", 0), ("vijayg", 0)]
+    ("name", "problem"),
+    [
+        ("strroke21_rtabmap", "has 411 nodes, but no features"),
+        ("brubaker", "0.20.7 is empty"),
+        ("vijayg", "0.22.1 is empty"),
+    ],
 )
-def test_databases_without_features(name: str, nodes: int) -> None:
+def test_databases_without_features(name: str, problem: str) -> None:
     path = foreign(f"rtabmap/{name}.db")
     assert recognizes(path, path.read_bytes()[:4096])
-    with pytest.raises(ValueError, match=f"has {nodes} nodes, but no features"):
+    with pytest.raises(ValueError, match=problem):
         read(path)

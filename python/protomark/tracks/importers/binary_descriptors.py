@@ -12,13 +12,17 @@ _AKAZE_PADDED = 64
 
 
 def binary_descriptor(name: str, dtype: str, size: int) -> str | None:
-    """The descriptor of this name, with `size` numbers of a type; None if it is not binary."""
+    """The descriptor of this name, with `size` numbers of a type; None if it is not binary.
+
+    One of another length than Protomark's has its bits in its name, such as "teblid512".
+    """
     if dtype != "uint8" or size >= 128:
         return None
-    for known in sorted(DESCRIPTORS, key=len, reverse=True):
+    for known, kind in sorted(DESCRIPTORS.items(), key=lambda item: -len(item[0])):
         if known in name.lower():
-            padded = known == "akaze" and size == _AKAZE_PADDED
-            return known if padded or DESCRIPTORS[known].bytes == size else None
+            if size == kind.bytes or (known == "akaze" and size == _AKAZE_PADDED):
+                return known
+            return f"{known}{8 * size}" if size in (32, 64) else None
     by_size = {32: "orb", 61: "akaze"}
     return by_size.get(size) if not name else name.lower() if size <= 64 else None
 

@@ -33,7 +33,7 @@ Pose = NDArray[np.float64]
 
 def recognizes(path: Path, head: bytes) -> bool:
     """Whether a folder is a kapture data set."""
-    return (path / "sensors" / "sensors.txt").is_file() and (path / "reconstruction").is_dir()
+    return (path / "sensors" / "sensors.txt").is_file()
 
 
 def read(path: Path) -> Tracks:

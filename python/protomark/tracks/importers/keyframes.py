@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import struct
 import tarfile
+import tokenize
+import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -22,7 +24,11 @@ from protomark.tracks.file import Tracks
 # What ORB-SLAM's extractor takes a keypoint's orientation from, in pixels of its pyramid level.
 _ORB_PATCH = 31
 _MAX_OCTAVE = 32
-_UNEXPECTED = (IndexError, TypeError, ValueError, OverflowError, RecursionError, SyntaxError)
+_UNEXPECTED = (
+    *(IndexError, TypeError, ValueError, OverflowError, RecursionError, SyntaxError, EOFError),
+    *(AttributeError, NotImplementedError, RuntimeError, struct.error, tarfile.TarError),
+    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
 _MAX_PIXEL = 1e9
 
 
@@ -33,7 +39,7 @@ def unexpected(path: Path, what: str) -> Iterator[None]:
         yield
     except KeyError as error:
         problem = f"it has no {str(error.args[0])[:40]}"
-    except (*_UNEXPECTED, struct.error, tarfile.TarError, zlib.error) as error:
+    except _UNEXPECTED as error:
         problem = str(error).splitlines()[0][:300] if str(error) else type(error).__name__
         if problem.startswith(str(path)):
             raise

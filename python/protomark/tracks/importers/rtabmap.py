@@ -181,6 +181,11 @@ def _read_features(database: Database, version: str, detector: str) -> _Features
         parts.append((*ids[:, keep], numbers[keep], data.reshape(keep.sum(), -1)))
     if not any(len(part[0]) for part in parts):
         nodes = sum(1 for _ in database.rows("Node", "id"))
+        if not nodes:
+            raise ValueError(
+                f"{database.path}: this database of {PROGRAM} {version} is empty: give one that "
+                "was recorded"
+            )
         raise ValueError(
             f"{database.path}: this database of {PROGRAM} {version} has {nodes} nodes, but no "
             "features with descriptors, of which landmarks are made: record it with Kp/MaxFeatures "
