@@ -7,6 +7,7 @@ of the sample (`workspace`, `names`). Commands that take long are only parsed.
 from __future__ import annotations
 
 import json
+import lzma
 import re
 import shlex
 import shutil
@@ -127,6 +128,11 @@ def write_foreign_maps(folder: Path) -> None:
     from stella_writer import write_msg
 
     tracks = orb_tracks(Camera("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0)))
+    data = ROOT / "tests" / "data" / "orbslam3"
+    (folder / "atlas.osa").write_bytes(lzma.decompress((data / "two_maps.osa.xz").read_bytes()))
+    (folder / "frames").mkdir()
+    for path in data.glob("*.jpg"):
+        shutil.copy(path, folder / "frames")
     write_msg(folder / "map.msg", tracks)
     write_rtabmap(folder / "rtabmap.db", tracks)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
@@ -66,5 +65,4 @@ def file_head(path: Path) -> bytes:
 
 
 def _modules() -> list[ModuleType]:
-    names = [f"{__name__}.{name}" for name in _MODULES]
-    return [import_module(name) for name in names if find_spec(name)]
+    return [import_module(f"{__name__}.{name}") for name in _MODULES]
