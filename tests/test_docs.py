@@ -7,10 +7,12 @@ of the sample (`workspace`, `names`). Commands that take long are only parsed.
 from __future__ import annotations
 
 import json
+import lzma
 import re
 import shlex
 import shutil
 import subprocess
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +110,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("kitchen", "new"):
         (folder / name).mkdir()
     shutil.copy(folder / "scene.pmk", folder / "kitchen")
+    if find_spec("pycolmap"):
+        write_foreign_maps(folder)
     noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
     image = cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC)
     cv2.imwrite(str(folder / "frame.jpg"), image)
@@ -115,6 +119,22 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cameras.txt").write_text("1 PINHOLE 640 480 525 525 320 240\n")
     (folder / "rough.txt").write_text("1 1 0 0 0 0 0 0 1 frame.jpg\n\n")
     return folder
+
+
+def write_foreign_maps(folder: Path) -> None:
+    from foreign_scene import orb_tracks
+    from protomark.geometry.camera import Camera
+    from rtabmap_writer import write_rtabmap
+    from stella_writer import write_msg
+
+    tracks = orb_tracks(Camera("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0)))
+    data = ROOT / "tests" / "data" / "orbslam3"
+    (folder / "atlas.osa").write_bytes(lzma.decompress((data / "two_maps.osa.xz").read_bytes()))
+    (folder / "frames").mkdir()
+    for path in data.glob("*.jpg"):
+        shutil.copy(path, folder / "frames")
+    write_msg(folder / "map.msg", tracks)
+    write_rtabmap(folder / "rtabmap.db", tracks)
 
 
 @pytest.fixture
@@ -152,6 +172,8 @@ def test_blocks_run(
     shutil.copytree(workspace, folder)
     monkeypatch.chdir(folder)
     quick = QUICK
+    if page.name.startswith("from-"):
+        pytest.importorskip("pycolmap")
     if page.name == MAPPED:
         pytest.importorskip("pycolmap")
         from mapping_scene import walk, write_images

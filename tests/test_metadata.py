@@ -169,8 +169,14 @@ def test_build_says_when_and_what(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "robot": "atlas=2",
         "cameras": f"1 {sample.load().cameras[1]}\n",
     }
-    assert pm.open(tmp_path / "a.pmk").metadata == expected
-    assert json.loads((tmp_path / "facts.json").read_text())["metadata"] == expected
+    metadata = dict(pm.open(tmp_path / "a.pmk").metadata)
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert facts["metadata"] == metadata
+    assert json.loads(metadata.pop("sources")) == facts["sources"]
+    assert [(one["name"], one["landmarks"]) for one in facts["sources"]] == [
+        (sample.path().name, len(sample.load().landmark_ids))
+    ]
+    assert metadata == expected
     assert "ENU, metres" in done.stdout
     assert (tmp_path / "a.pmk").read_bytes() == (tmp_path / "b.pmk").read_bytes()
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "soon")

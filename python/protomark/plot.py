@@ -239,6 +239,34 @@ def _frame_picture(
         side.set_color(GRID)
 
 
+def merge_figure(landmarks: Sequence[NDArray[np.float64]], common: NDArray[np.float64]) -> Figure:
+    """Maps in one world, positions (l, 3) each, and where they were recognized, (c, 3)."""
+    figure = new_figure(8, 6)
+    axes = figure.add_subplot()
+    every = [points[np.isfinite(points).all(axis=1)] for points in landmarks]
+    together = np.concatenate([*every, common])
+    together = together[:: 1 + len(together) // _MAX_LANDMARKS]
+    middle = np.median(together, axis=0)
+    # The plane of the widest spread, whatever few stray points do.
+    near = np.linalg.norm(together - middle, axis=1)
+    near = together[near <= np.quantile(near, 1 - _STRAY)] - middle
+    plane = np.linalg.svd(near, full_matrices=False)[2][:2]
+
+    def dots(points: NDArray[np.float64], **style: Any) -> None:
+        axes.scatter(*((points - middle) @ plane.T).T, **style)
+
+    for i, points in enumerate(every, 1):
+        points = points[:: 1 + len(points) // _MAX_LANDMARKS]
+        colour = SERIES[(i - 1) % len(SERIES)]
+        dots(points, s=3, color=colour, linewidths=0, alpha=0.6, label=f"map {i}")
+    dots(common, s=5, color=RED, linewidths=0, label="in both")
+    half = 1.1 * np.abs(near @ plane.T).max(axis=0)
+    _frame_picture(axes, np.zeros(2), float(half[0]), float(half[1]))
+    add_title(axes, "Maps in the world of the first, and the landmarks that join them")
+    axes.legend(frameon=False, fontsize=9, labelcolor=INK, markerscale=3)
+    return figure
+
+
 @dataclass(frozen=True)
 class MapPictures:
     """The data of the pictures in a map's report."""

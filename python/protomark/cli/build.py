@@ -11,11 +11,25 @@ from protomark.cli.options import EncoderName, JsonFile, NoSeal, Threads
 
 
 def build(
-    tracks: Annotated[Path, typer.Argument(metavar="TRACKS", help="Tracks of `protomark tracks`.")],
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE",
+            help="Tracks of `protomark tracks`; a map of ORB-SLAM3 (.osa), ORB-SLAM2 (osmap), "
+            "stella_vslam, RTAB-Map, OpenMVG, OpenSfM, kapture or Astrobee; images or a "
+            "COLMAP database with binary descriptors, followed by the folder of the COLMAP model.",
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
     encoder: EncoderName = None,
     dim: Annotated[int | None, typer.Option(help="Numbers per prototype; by default 48.")] = None,
-    min_observations: Annotated[int, typer.Option(help="Smallest number of observations.")] = 2,
+    min_observations: Annotated[
+        int | None,
+        typer.Option(
+            help="Smallest number of observations of a landmark; by default 2, or 1 for sources "
+            "that keep one descriptor per landmark."
+        ),
+    ] = None,
     frame: Annotated[
         str | None,
         typer.Option(
@@ -35,43 +49,44 @@ def build(
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
-    """Build a map from tracks.
+    """Build a map from tracks, or from a map of another program.
 
-    Reads one tracks file and writes a learning map with the prototypes and the position of each
-    landmark, and a sealed one beside it, scene.sealed.pmk: what ships, 33 bytes per landmark and
-    its position (`protomark seal` makes other sizes).
+    Reads observations of landmarks and writes a learning map with the prototypes and the position
+    of each landmark, and a sealed one beside it, scene.sealed.pmk: what ships, 33 bytes per
+    landmark and its position (`protomark seal` makes other sizes). Several sources are several
+    places, whose landmarks get ids apart, by the sources' names in order.
 
     protomark build kitchen.freak.safetensors -o kitchen.pmk
+
+    protomark build atlas.osa -o scene.pmk
+
+    protomark build database.db sparse/ -o scene.pmk
     """
     from protomark import Encoder
     from protomark.cli.info import show
     from protomark.cli.terminal import progress_bar, write_json
     from protomark.files import check_outputs
-    from protomark.maps import cameras
     from protomark.maps.build import build_map, tracks_for
     from protomark.maps.info import describe
     from protomark.maps.metadata import command_metadata
+    from protomark.maps.origin import tracks_metadata
     from protomark.maps.seal import SealRequest, observed, seal_map, sealed_path
     from protomark.maps.selection import Views
-    from protomark.tracks.file import Tracks
+    from protomark.maps.sources import read_places
 
     sealed = None if no_seal else sealed_path(output)
-    check_outputs(output, json_file, sealed, inputs=[tracks, encoder])
+    check_outputs(output, json_file, sealed, inputs=[*sources, encoder])
     texts = command_metadata(frame, metadata or [])
     with progress_bar() as progress:
-        progress("read tracks", 0, 0)
-        seen = Tracks.load(tracks)
-        network = Encoder.load(encoder or seen.descriptor)
+        progress("read sources", 0, 0)
+        network = Encoder.load(encoder) if encoder else None
+        descriptor = network.descriptor if network else None
+        seen = read_places(sources, descriptor, min_observations, threads, progress)
+        network = network or Encoder.load(seen.descriptor)
         seen = tracks_for(network, seen)
         progress("build the map", 0, 0)
-        scene = build_map(
-            seen,
-            network,
-            dim,
-            min_observations=min_observations,
-            threads=threads,
-        )
-        scene.metadata = {cameras.KEY: cameras.cameras_text(seen.cameras.values()), **texts}
+        scene = build_map(seen, network, dim, min_observations=1, threads=threads)
+        scene.metadata = tracks_metadata(seen) | texts
         progress("write the map", 0, 0)
         scene.save(output)
         if sealed:
@@ -79,7 +94,7 @@ def build(
             seal_map(
                 scene, sealed, request, lambda: Views.of_tracks(seen), observed(seen), progress
             )
-        facts = describe(output)
+        facts = describe(output) | {"sources": seen.info["sources"]}
         if sealed:
             facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}
     write_json(json_file, facts)

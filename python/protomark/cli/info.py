@@ -61,6 +61,8 @@ def show(facts: dict[str, Any]) -> None:
 
 
 def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    from protomark.maps.origin import SOURCES, source_rows
+
     landmarks, encoder = facts["landmarks"], facts["encoder"]
     several = facts["prototypes_per_landmark"]
     each = f"{several:.2f} prototypes" if several else "a prototype"
@@ -83,8 +85,10 @@ def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "positions", where
     if facts["extent"]:
         yield "extent", " to ".join(_vector(corner) for corner in facts["extent"])
+    yield from source_rows(facts["metadata"])
     for name, text in facts["metadata"].items():
-        yield f"metadata: {name}", text
+        if name != SOURCES:
+            yield f"metadata: {name}", text
     if facts["journal"]:
         yield "journal", f"{facts['journal']['commits']:,} commits since the file was written"
     if sealed := facts.get("sealed"):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import JsonFile
+from protomark.cli.options import JsonFile, NoSeal, Threads
 
 
 def merge(
@@ -15,10 +15,16 @@ def merge(
         list[Path],
         typer.Argument(
             metavar="MAP",
-            help="Learning maps of the same encoder, dimensions and appearance bits.",
+            help="Learning maps of the same encoder, dimensions and appearance bits, or folders "
+            "of `protomark map`.",
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Map file to write (.pmk), or new folder for folders' maps."
+        ),
+    ],
     renumber: Annotated[
         bool,
         typer.Option(
@@ -27,27 +33,89 @@ def merge(
             "further map get new ids above all earlier ones. Positions must be of one world.",
         ),
     ] = False,
+    fixed_scale: Annotated[
+        bool, typer.Option("--fixed-scale", help="The maps have one scale, such as metres.")
+    ] = False,
+    draw: Annotated[
+        Path | None,
+        typer.Option(
+            help="Draw the maps and what joins them from above (.png, .svg, .pdf).",
+        ),
+    ] = None,
+    no_seal: NoSeal = False,
+    threads: Threads = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Merge maps that were built apart, exactly.
+    """Merge maps that were built apart.
 
-    Reads learning maps and writes the map that would have been built from all their observations
-    together. Landmarks with the same id are one landmark, and their observations are summed; maps
-    in which these do not look alike, or lie elsewhere, are refused.
+    Maps that agree on what each id is are summed exactly: the map that would have been built from
+    all their observations together. Maps that number landmarks each on its own are recognized by
+    their prototypes and moved into the world of the first, in which duplicates become one
+    landmark; places that only look alike are refused.
+
+    Folders are merged with poses, cameras and observations, adjusted together; `map --into`
+    extends the result. A map file has landmarks only.
 
     protomark merge monday.pmk tuesday.pmk -o week.pmk
+
+    protomark merge kitchen/ hall/ -o flat/
     """
     from protomark.cli.terminal import print_facts, progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
+    from protomark.plot import check_suffix
 
-    check_outputs(output, json_file, inputs=maps)
+    to_folder = output.suffix != ".pmk"
+    if draw is not None:
+        check_suffix(draw)
+    if to_folder:
+        if renumber:
+            raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
+        check_outputs(draw, json_file, inputs=maps, folder=output)
+    else:
+        check_outputs(output, draw, json_file, inputs=maps)
     with progress_bar() as progress:
-        facts = merge_files(maps, output, renumber, progress)
+        if to_folder:
+            from protomark.mapping.merging_maps import merge_folders
+
+            merged = merge_folders(
+                maps,
+                output,
+                fixed_scale=fixed_scale,
+                seal=not no_seal,
+                threads=threads,
+                progress=progress,
+            )
+        else:
+            merged = merge_files(
+                maps,
+                output,
+                renumber=renumber,
+                fixed_scale=fixed_scale,
+                threads=threads,
+                progress=progress,
+            )
+    facts = merged.facts
     write_json(json_file, facts)
+    if draw is not None:
+        from protomark.plot import merge_figure, save_figure
+
+        save_figure(merge_figure(merged.landmarks, merged.common), draw, made_by="protomark merge")
     rows = []
     for i, one in enumerate(facts["inputs"]):
         shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
         rows.append((Path(one["file"]).name, f"{one['landmarks']:,} landmarks{shared}"))
+        if one["moved"]:
+            rows.append(("", _moved(one["moved"])))
     rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
     print_facts(rows)
+
+
+def _moved(facts: dict[str, Any]) -> str:
+    """What says how a map lies in the world of the first."""
+    return (
+        f"moved by {facts['degrees']:.1f} degrees, scaled by {facts['scale']:.4g}: "
+        f"{facts['agreeing']:,} of {facts['likely']:,} likely pairs agree (by chance: 1 in "
+        f"10^{-facts['log10_chance']:.0f} maps), in {facts['cube_share']:.0%} of the space that "
+        "both show"
+    )

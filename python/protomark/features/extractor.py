@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,15 +77,32 @@ class Extractor(threading.local):
         name: name of the descriptor, see `protomark.features.descriptors.DESCRIPTORS`.
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
         max_size: images whose longer side has more pixels are reduced to it before detection.
+        detector: how images were described that these will be matched with, as `Tracks.info` has
+            it: "levels" and "scale_factor" of ORB's image pyramid; "name" if it begins with GFTT.
+
+    Raises:
+        ValueError: a number or the name is out of range.
     """
 
-    def __init__(self, name: str, max_keypoints: int = 2000, max_size: int = MAX_SIZE) -> None:
+    def __init__(
+        self,
+        name: str,
+        max_keypoints: int = 2000,
+        max_size: int = MAX_SIZE,
+        detector: Mapping[str, Any] | None = None,
+    ) -> None:
         if max_keypoints < 1:
             raise ValueError(f"max_keypoints is {max_keypoints}, but it must be at least 1")
         if max_size < _MIN_MAX_SIZE:
             raise ValueError(f"max_size is {max_size}, but it must be at least {_MIN_MAX_SIZE}")
         self.kind = descriptor_kind(name)
         self.max_keypoints, self.max_size = max_keypoints, max_size
+        settings = detector or {}
+        pyramid = _pyramid(settings)
+
+        def orb(**threshold: int) -> Any:
+            return _opencv("ORB_create")(nfeatures=5 * max_keypoints, **pyramid, **threshold)
+
         # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
         self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
@@ -97,13 +114,13 @@ class Extractor(threading.local):
             akaze = [_opencv("AKAZE_create")(threshold=t) for t in _AKAZE_THRESHOLDS]
             self._detect = [a.detect for a in akaze]
             self._akaze = akaze[-1].detectAndCompute
+        elif str(settings.get("name")).startswith("GFTT"):  # RTAB-Map's
+            self._detect = [_good_features(settings, 5 * max_keypoints).detect]
         else:
-            orb = _opencv("ORB_create")
-            limit = 5 * max_keypoints
-            self._detect = [orb(nfeatures=limit, fastThreshold=t).detect for t in (20, 7)]
+            self._detect = [orb(fastThreshold=t).detect for t in (20, 7)]
         self._compute = {
             "freak": lambda: _opencv("FREAK_create")(),
-            "orb": lambda: _opencv("ORB_create")(nfeatures=5 * max_keypoints, fastThreshold=20),
+            "orb": lambda: orb(fastThreshold=20),
             "brisk": lambda: _opencv("BRISK_create")(),
             "akaze": lambda: _opencv("AKAZE_create")(),
             "latch": lambda: _opencv("LATCH_create")(bytes=32),
@@ -188,6 +205,32 @@ class Extractor(threading.local):
         """The keypoints to keep, and whether they reach the limit."""
         chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
         return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
+
+
+def _good_features(detector: Mapping[str, Any], limit: int) -> Any:
+    """Shi and Tomasi's corners, which have no size and angle."""
+    quality = _setting(detector, "quality_level", 0.001, 1e-9, 1)
+    distance = _setting(detector, "min_distance", 7, 0, 1000)
+    return _opencv("GFTTDetector_create")(
+        limit, quality, distance, int(_setting(detector, "block_size", 3, 2, 31))
+    )
+
+
+def _pyramid(detector: Mapping[str, Any]) -> dict[str, Any]:
+    """OpenCV's parameters for the image pyramid of a detector."""
+    return {
+        "nlevels": int(_setting(detector, "levels", 8, 1, 32)),
+        "scaleFactor": _setting(detector, "scale_factor", 1.2, 1.01, 4),
+    }
+
+
+def _setting(
+    detector: Mapping[str, Any], name: str, usual: float, low: float, high: float
+) -> float:
+    value = detector.get(name, usual)
+    if not (isinstance(value, (int, float)) and low <= value <= high):
+        raise ValueError(f"{name} of a detector is from {low} to {high}, not {str(value)[:40]}")
+    return float(value)
 
 
 def _opencv(name: str) -> Any:

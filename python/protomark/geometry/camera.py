@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
@@ -114,6 +115,44 @@ class Camera:
             raise TypeError(
                 f"a camera is a pm.Camera, a pycolmap.Camera or a str, not {type(camera).__name__}"
             ) from None
+
+    @classmethod
+    def from_opencv(
+        cls,
+        width: int,
+        height: int,
+        pinhole: Sequence[float],
+        distortion: Sequence[float] = (),
+        fisheye: bool = False,
+    ) -> Camera:
+        """A camera in OpenCV's conventions: (0, 0) is the centre of the first pixel.
+
+        Args:
+            width: image width in pixels.
+            height: image height in pixels.
+            pinhole: fx, fy, cx, cy.
+            distortion: k1, k2, p1, p2, k3, k4, k5, k6 or the first of these; of a fisheye lens k1
+                to k4.
+            fisheye: whether it is a fisheye lens.
+
+        Raises:
+            ValueError: the numbers make no camera.
+        """
+        fx, fy, cx, cy = map(float, pinhole)
+        lens = [float(k) for k in distortion]
+        size = 4 if fisheye else 8
+        if any(lens[size:]):
+            raise ValueError(f"{len(lens)} distortion coefficients are more than COLMAP's {size}")
+        lens = [*lens, *[0.0] * size][:size]
+        model = "OPENCV_FISHEYE"
+        if not fisheye:
+            model = "FULL_OPENCV" if any(lens[4:]) else "OPENCV" if any(lens) else "PINHOLE"
+        params = (fx, fy, cx + 0.5, cy + 0.5, *lens)
+        camera = cls(model, width, height, params[: CAMERA_MODELS[model]])
+        camera.check()
+        if fy <= 0:
+            raise ValueError(f"a camera of model {model} has a focal length that is not positive")
+        return camera
 
     def as_dict(self) -> dict[str, Any]:
         """The camera as JSON values, in the form that PoseLib and pycolmap take."""

@@ -100,18 +100,23 @@ def find_model(folder: Path) -> Path:
         FileNotFoundError: none of them holds a model.
     """
     for candidate in (folder / "sparse", folder / "sparse" / "0", folder):
-        if _suffix(candidate):
+        if is_model(candidate):
             break
     else:
         raise FileNotFoundError(
             f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or "
             "sparse/0/: name its folder with --model"
         )
-    others = [p for p in sorted((folder / "sparse").glob("*")) if p != candidate and _suffix(p)]
+    others = [p for p in sorted((folder / "sparse").glob("*")) if p != candidate and is_model(p)]
     if others:
         names = ", ".join(str(p) for p in others[:5])
         warnings.warn(f"{candidate} is read, other models exist: {names}", stacklevel=2)
     return candidate
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds the files of a sparse model."""
+    return _suffix(folder) is not None
 
 
 def _suffix(path: Path) -> str | None:

@@ -47,3 +47,34 @@ def runs(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     changes = np.concatenate([[True], values[1:] != values[:-1]])
     starts = np.flatnonzero(changes[: len(values)])
     return starts, np.diff(np.append(starts, len(values)))
+
+
+def cube_numbers(cubes: NDArray[np.floating]) -> NDArray[np.int64]:
+    """A number (n,) for each cube (n, 3) of whole numbers; hardly ever do two cubes share one."""
+    whole = np.clip(cubes, -(2.0**60), 2.0**60).astype(np.int64)
+    return np.asarray(
+        whole @ np.array([0x5D588B656C078965, 0x27BB2EE687B0B0FD, 0x369DEA0F31A53F85])
+    )
+
+
+def near_points(
+    first: NDArray[np.float64], second: NDArray[np.float64], radius: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """All pairs (i, j) for which first[i] and second[j], (n, 3) and (m, 3), are within a radius."""
+    first, second = first / (2 * radius), second / (2 * radius)
+    cell = cube_numbers(np.floor(second))
+    order = np.argsort(cell, kind="stable")
+    cell = cell[order]
+    # A ball reaches into the nearer of the two neighbouring cubes along each axis.
+    corner = np.floor(first - 0.5)
+    found = []
+    for offset in np.ndindex(2, 2, 2):
+        near = cube_numbers(corner + offset)
+        start = np.searchsorted(cell, near, side="left")
+        count = np.searchsorted(cell, near, side="right") - start
+        i = np.repeat(np.arange(len(first)), count)
+        j = order[np.arange(len(i)) + np.repeat(start - np.cumsum(count) + count, count)]
+        close = ((first[i] - second[j]) ** 2).sum(axis=1) <= 0.25
+        found.append((i[close], j[close]))
+    i, j = (np.concatenate(part) for part in zip(*found, strict=True))
+    return i, j

@@ -15,6 +15,18 @@ def transform(cam_from_world: Array, points: Array) -> Array:
     return rotate(cam_from_world[..., :3], points) + cam_from_world[..., 3]
 
 
+def compose(second: Array, first: Array) -> Array:
+    """The pose (3, 4) of the first motion and then the second."""
+    return np.column_stack(
+        [second[:, :3] @ first[:, :3], second[:, :3] @ first[:, 3] + second[:, 3]]
+    )
+
+
+def inverse(pose: Array) -> Array:
+    """The pose (3, 4) that undoes a pose (3, 4)."""
+    return np.column_stack([pose[:, :3].T, camera_centers(pose)])
+
+
 def camera_centers(cam_from_world: Array) -> Array:
     """Camera centres (..., 3) in world coordinates, of poses (..., 3, 4)."""
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]

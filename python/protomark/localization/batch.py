@@ -106,6 +106,7 @@ class ImageResult:
             "confidence": round(self.confidence, 6),
             "inliers": found.inliers if found else 0,
             "matches": found.evidence.matches if found else 0,
+            "place": found.place if found else "",
             "cam_from_world": None if pose is None else pose.tolist(),
             "focal_length": None if pose is None or found is None else found.camera.params[0],
             "position_error": self.true_error[0] if self.true_error else None,
@@ -236,7 +237,7 @@ class LocalizationBatch:
         header += [f"center_{axis}" for axis in "xyz"]
         header += [f"cam_from_world_{i}{j}" for i in range(3) for j in range(3)]
         header += ["focal_length", "position_error", "angle_error"]
-        writer.writerow([*header, *(f"seconds_{stage}" for stage in STAGES), "reason"])
+        writer.writerow([*header, *(f"seconds_{stage}" for stage in STAGES), "place", "reason"])
         for image in self.images:
             row = image.as_dict()
             pose = image.found.cam_from_world if image.found else None
@@ -250,6 +251,7 @@ class LocalizationBatch:
                     *numbers,
                     *(row[key] for key in ("focal_length", "position_error", "angle_error")),
                     *(row["seconds"].get(stage, "") for stage in STAGES),
+                    row["place"],
                     row["reason"],
                 ]
             )

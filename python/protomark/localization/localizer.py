@@ -23,9 +23,17 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.localization.prior import PosePrior, visible
 from protomark.localization.shared_camera import check_shared_cameras
-from protomark.localization.solve import CANDIDATES, Candidates, Localization, solve_pose
+from protomark.localization.solve import (
+    CANDIDATES,
+    Candidates,
+    Localization,
+    solve_place,
+    solve_pose,
+)
 from protomark.maps.cameras import map_cameras
 from protomark.maps.open import open_map
+from protomark.maps.origin import map_detector
+from protomark.maps.places import map_places
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
@@ -85,6 +93,7 @@ class Localizer:
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
+        self.places = map_places(self.scene)
         tuned = isinstance(self.scene, pm.SealedMap) and self.scene.tuned
         self.calibration = self.scene.encoder.match_calibration(self.scene.dim, tuned)
 
@@ -237,7 +246,11 @@ class Localizer:
                 self.calibration.probability(distances),
             )
             of_map = any(camera.resembles(c) for c in self.cameras.cameras)
-            result = solve_pose(candidates, camera, self.min_probability, focal_length, of_map)
+            request = (camera, self.min_probability, focal_length, of_map)
+            if self.places:
+                result = solve_place(candidates, self.places, *request)
+            else:
+                result = solve_pose(candidates, *request)
         return replace(result, seconds={**stages, "total": sum(stages.values())})
 
     @cached_property
@@ -262,7 +275,11 @@ class Localizer:
                 f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
                 "compute: describe the keypoints yourself and call localize_features"
             )
-        return Extractor(plain, self.max_keypoints, self.max_size)
+        detector, size = map_detector(self.scene), self.max_size
+        if detector:  # of a program that describes images at their own size
+            sides = [max(c.width, c.height) for c in self.cameras.cameras]
+            size = min([size, max(sides, default=size)])
+        return Extractor(plain, self.max_keypoints, size, detector)
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:
         features = self._extractor(image)

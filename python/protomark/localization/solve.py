@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from protomark.localization.confidence import (
     doubt,
     occupied_cells,
 )
+from protomark.maps.places import Place
 from protomark.matching import accept
 
 # Reprojection error of an inlier, as a share of the image's longer side.
@@ -36,6 +38,7 @@ _NEAR = 4
 # Number of nearest landmarks per keypoint that are candidates once there is a pose.
 CANDIDATES = 3
 MIN_MATCHES = 4
+_TRIED_PLACES = 2
 _NO_EVIDENCE = Evidence(0, 0, 0)
 
 
@@ -49,6 +52,8 @@ class Localization:
         covariance: (6, 6) float64 of the pose: rotation in radians, then translation, see
             `protomark.geometry.absolute_pose.pose_covariance`; None without a pose, or if its
             inliers leave a direction open.
+        place: in which of the places of the map, whose coordinates have nothing to do with each
+            other (see `protomark.maps.places`); "" if the map is one place, and without a pose.
         keypoints: (i,) int64, rows of the keypoints that agree with the pose.
         pixels: (i, 2) float64, these keypoints in the image.
         landmarks: (i,) int64, ids of the landmarks that they observe.
@@ -68,6 +73,7 @@ class Localization:
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
     covariance: NDArray[np.float64] | None = None
+    place: str = ""
 
     @property
     def inliers(self) -> int:
@@ -94,6 +100,40 @@ class Candidates:
     positions: NDArray[np.float64]  # (n, c, 3) float64, their positions, NaN where there is none
     # (n,) float64, the probability that the nearest landmark is right.
     probabilities: NDArray[np.float64]
+
+
+def solve_place(
+    candidates: Candidates,
+    places: Sequence[Place],
+    camera: Camera,
+    min_probability: float,
+    focal_length: FocalLength,
+    of_map: bool,
+) -> Localization:
+    """Solve the pose in the place that explains most keypoints.
+
+    Args:
+        candidates: see `solve_pose`.
+        places: places of the map, at least one.
+        camera: see `solve_pose`.
+        min_probability: see `solve_pose`.
+        focal_length: see `solve_pose`.
+        of_map: see `solve_pose`.
+    """
+    nearest = candidates.landmarks[:, 0]
+    votes = [candidates.probabilities[place.holds(nearest)].sum() for place in places]
+    found = []
+    for index in np.argsort(votes)[::-1][:_TRIED_PLACES]:
+        inside = places[index].holds(candidates.landmarks)
+        here = replace(
+            candidates,
+            landmarks=np.where(inside, candidates.landmarks, -1),
+            positions=np.where(inside[:, :, None], candidates.positions, np.nan),
+        )
+        one = solve_pose(here, camera, min_probability, focal_length, of_map)
+        posed = one.cam_from_world is not None
+        found.append(replace(one, place=places[index].name if posed else ""))
+    return max(found, key=lambda one: (one.inliers, one.confidence))
 
 
 def solve_pose(

@@ -44,7 +44,7 @@ _MAX_YOUNG_LOSSES = 3
 # A tracked pose that matches a smaller share of the landmarks in view is checked by relocalization.
 _MIN_TRACKED_SHARE = 0.3
 _LOOP_EVERY = 3
-_LOOP_LOSS_SCALE = 8.0
+LOOP_LOSS_SCALE = 8.0
 
 
 class Mapper:
@@ -268,7 +268,7 @@ class Mapper:
             )
         if drift:
             with self.clock.stage("adjust"):
-                adjustment.adjust_global_bundle(self.structure, 20, loss_scale=_LOOP_LOSS_SCALE)
+                adjustment.adjust_global_bundle(self.structure, 20, loss_scale=LOOP_LOSS_SCALE)
             self._adjust_global_bundle(1)
 
     def _adjust_global_bundle_if_grown(self) -> None:

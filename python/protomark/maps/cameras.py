@@ -28,3 +28,10 @@ def map_cameras(scene: pm.PrototypeMap | pm.SealedMap) -> CameraSet:
             raise ValueError(f"the map's metadata {KEY!r} hold no COLMAP camera: {error}") from None
         cameras.append(camera)
     return CameraSet(tuple(cameras))
+
+
+def joint_cameras(target: pm.PrototypeMap, source: pm.PrototypeMap) -> str:
+    """The text of a map's cameras, and of those of another map that resemble none of them."""
+    cameras, others = (list(map_cameras(scene).cameras) for scene in (target, source))
+    new = [c for c in others if not any(c.resembles(known) for known in cameras)]
+    return cameras_text([*cameras, *new])

@@ -1,8 +1,9 @@
-"""Merges maps that were built apart."""
+"""Merges maps that were built apart, in one world or each in its own."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,11 @@ import numpy as np
 
 import protomark as pm
 from protomark.files import check_outputs
+from protomark.geometry.similarity import Array
+from protomark.maps import cameras
+from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.open import map_path, open_learning_map
+from protomark.maps.origin import joint_origin
 from protomark.progress import Progress, silent, tracked
 
 MAX_ID = 2**63 - 1
@@ -21,90 +26,218 @@ _MIN_ALIKE = 0.75
 _MAX_SHIFT = 0.1
 
 
-def merge_files(
-    inputs: Sequence[Path], output: Path, renumber: bool = False, progress: Progress = silent
-) -> dict[str, Any]:
-    """Merge learning maps, in this order, into the map file `output`; returns facts as JSON.
+# So many landmarks tell whether maps without common ids are of different worlds.
+_PROBED = 2_000
 
-    With `renumber`, landmarks of different files differ, whatever their ids: those of each further
-    file get new ids above all earlier ones.
+
+@dataclass
+class Merged:
+    """What became of maps that were merged.
+
+    Attributes:
+        facts: what `protomark merge --json` writes.
+        landmarks: for each input (l, 3) positions of its landmarks, in the world of the first.
+        common: (c, 3) positions of landmarks by which inputs were recognized.
     """
-    check_outputs(output, inputs=[map_path(path, learning=True) for path in inputs])
-    if len(inputs) < 2:
-        raise ValueError("name at least two maps to merge")
-    resolved = [map_path(path, learning=True).resolve() for path in inputs]
-    for path, same in zip(inputs, resolved, strict=True):
-        if resolved.count(same) > 1:
-            raise ValueError(f"{path} is named twice, and its observations would count twice")
-    files: list[dict[str, Any]] = []
-    merged: pm.PrototypeMap | None = None
-    for path in tracked(inputs, progress, "merge"):
-        scene = open_learning_map(path)
-        facts = {"file": str(path), "landmarks": len(scene), "in_common": 0}
-        if merged is None:
-            merged = scene
-        else:
-            before = len(merged)
-            try:
-                if renumber:
-                    _merge_renumbered(merged, scene)
-                else:
-                    _check_common(merged, scene)
-                    merged.merge_map(scene)
-            except ValueError as error:
-                raise ValueError(f"{path}: {error}") from None
-            facts["in_common"] = before + len(scene) - len(merged)
-        files.append(facts)
-    assert merged is not None
+
+    facts: dict[str, Any]
+    landmarks: list[Array]
+    common: Array
+
+    @classmethod
+    def begin(cls, path: Path, scene: pm.PrototypeMap) -> Merged:
+        """Begin with the first map."""
+        merged = cls({"inputs": []}, [], np.zeros((0, 3)))
+        merged.note(path, scene, None, 0)
+        return merged
+
+    def note(
+        self, path: Path, scene: pm.PrototypeMap, found: Alignment | None, in_common: int
+    ) -> None:
+        """Note a map that was merged, before it changes."""
+        positions = scene.positions(scene.ids)
+        if found is not None:
+            common = found.similarity(scene.positions(found.source))
+            positions, self.common = found.similarity(positions), np.vstack([self.common, common])
+        self.landmarks.append(positions)
+        self.facts["inputs"].append(
+            {
+                "file": str(path),
+                "landmarks": len(scene),
+                "in_common": in_common,
+                "moved": None if found is None else found.facts(),
+            }
+        )
+
+
+def merge_files(
+    inputs: Sequence[Path],
+    output: Path,
+    *,
+    renumber: bool = False,
+    fixed_scale: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Merged:
+    """Merge learning maps, in this order, into the map file `output`.
+
+    Landmarks of one id are one landmark, if the maps agree on that. Otherwise each map numbers its
+    landmarks in a world of its own: it is moved into that of the first, and duplicates are merged.
+
+    Args:
+        inputs: map files, or folders of `protomark map`.
+        output: the map file to write.
+        renumber: landmarks of different files differ, whatever their ids, in one world: those of
+            each further file get new ids above all earlier ones.
+        fixed_scale: whether all maps have one scale already.
+        threads: threads to search on.
+        progress: told of each map.
+    """
+    check_outputs(output, inputs=check_inputs(inputs))
+    first, *others = inputs
+    merged = open_learning_map(first)
+    result = Merged.begin(first, merged)
+    for path in tracked(others, progress, "merge"):
+        scene, found = open_learning_map(path), None
+        before = len(merged)
+        try:
+            if renumber:
+                _merge_renumbered(merged, scene)
+            elif (found := find_alignment(merged, scene, fixed_scale, threads)) is not None:
+                _merge_aligned(merged, scene, found)
+            else:
+                _merge_texts(merged, scene)
+                merged.merge_map(scene)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        result.note(path, scene, found, before + len(scene) - len(merged))
     merged.save(output)
-    return {
+    result.facts |= {
         "kind": "learning map",
-        "inputs": files,
         "landmarks": len(merged),
         "dim": merged.dim,
         "appearance_bits": merged.appearance_bits or None,
         "bytes": output.stat().st_size,
     }
+    return result
 
 
-def _check_common(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
-    """Raise ValueError if landmarks of one id are different ones, or in different worlds."""
+def check_inputs(inputs: Sequence[Path]) -> list[Path]:
+    """The map files of inputs to merge.
+
+    Raises:
+        ValueError: there are fewer than two, or one is named twice.
+    """
+    files = [map_path(path, learning=True) for path in inputs]
+    if len(files) < 2:
+        raise ValueError("name at least two maps to merge")
+    resolved = [path.resolve() for path in files]
+    for path, same in zip(inputs, resolved, strict=True):
+        if resolved.count(same) > 1:
+            raise ValueError(f"{path} is named twice, and its observations would count twice")
+    return files
+
+
+def find_alignment(
+    merged: pm.PrototypeMap, scene: pm.PrototypeMap, fixed_scale: bool = False, threads: int = 1
+) -> Alignment | None:
+    """How `scene` lies in the world of `merged`; None: in the same world, with the same ids.
+
+    Raises:
+        ValueError: common ids are the same landmarks in other places, or different landmarks and
+            nothing says how the maps lie in each other.
+    """
     common = np.intersect1d(merged.ids, scene.ids, assume_unique=True)
     if len(common) < _MIN_COMMON:
-        return
+        return _other_world(merged, scene, fixed_scale, threads)
+    if _same_landmarks(merged, scene, common):
+        return None
+    try:
+        found = align_maps(merged, scene, fixed_scale, threads)
+    except ValueError as error:
+        problem = str(error)
+    else:
+        if not (problem := found.problem):
+            return found
+    raise ValueError(
+        f"{len(common):,} ids are in an earlier map, too, but stand for other landmarks there, and "
+        f"it cannot be recognized in that map: {problem} (--renumber merges maps of one world that "
+        "number their landmarks each on its own)"
+    )
+
+
+def _other_world(
+    merged: pm.PrototypeMap, scene: pm.PrototypeMap, fixed_scale: bool, threads: int
+) -> Alignment | None:
+    """How `scene` lies in the world of `merged`, if that is certainly another one, else None.
+
+    Ids that differ are those of parts of one map, or of a job that numbers landmarks everywhere.
+    """
+    try:
+        found = align_maps(merged, scene, fixed_scale, threads, _PROBED)
+        if found.problem or found.stays:
+            return None
+        return align_maps(merged, scene, fixed_scale, threads)
+    except ValueError:
+        return None
+
+
+def _same_landmarks(merged: pm.PrototypeMap, scene: pm.PrototypeMap, common: Ids) -> bool:
+    """Whether landmarks of one id look alike; ValueError if they do and lie elsewhere."""
     ours, theirs = merged.prototypes(common), scene.prototypes(common)
     others = np.roll(theirs, len(common) // 2, axis=0)
     same, different = (((ours - codes) ** 2).sum(axis=1) for codes in (theirs, others))
     if (same < different).mean() < _MIN_ALIKE:
-        raise ValueError(
-            f"{len(common):,} ids are in an earlier map, too, but stand for other landmarks there, "
-            "as the prototypes show: --renumber merges maps that number their landmarks each on "
-            "its own; `protomark map IMAGES --into FOLDER` adds a scene's images to its map"
-        )
+        return False
     before, now = merged.positions(common), scene.positions(common)
     both = np.isfinite(before + now).all(axis=1)
     if both.sum() < _MIN_COMMON:
-        return
+        return True
     shift, reach = (
         np.median(np.linalg.norm(before[both] - to, axis=1))
         for to in (now[both], np.median(before[both], axis=0))
     )
     if shift > _MAX_SHIFT * reach:
         raise ValueError(
-            f"its landmarks lie elsewhere than in an earlier map ({shift:.3g} away, median), which "
-            "is in other coordinates or of another scale: bring both into one world first "
-            "(`set_positions`)"
+            f"its landmarks have the ids of an earlier map and lie elsewhere ({shift:.3g} away, "
+            "median): bring both into one world first (`protomark align`)"
         )
+    return True
+
+
+def _merge_aligned(merged: pm.PrototypeMap, scene: pm.PrototypeMap, found: Alignment) -> None:
+    ids = scene.ids
+    shift = _first_free(merged, scene)
+    into = ids + shift
+    into[np.searchsorted(ids, found.source)] = found.into
+    _merge_texts(merged, scene, shift)
+    has_frame = "frame" in merged.metadata
+    merged.merge_map(scene, into=into, source=ids)
+    if not has_frame:  # the other map's describes the world that it leaves
+        merged.metadata = {k: v for k, v in merged.metadata.items() if k != "frame"}
+    new = ~np.isin(ids, found.source)
+    merged.set_positions(into[new], found.similarity(scene.positions(ids[new])))
 
 
 def _merge_renumbered(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> None:
-    theirs, existing = scene.ids, merged.ids
-    if not (len(theirs) and len(existing)):
-        merged.merge_map(scene)
-        return
-    first = int(existing[-1]) + 1
-    if int(theirs[-1]) > MAX_ID - first:
+    theirs, shift = scene.ids, _first_free(merged, scene)
+    _merge_texts(merged, scene, shift)
+    merged.merge_map(scene, into=theirs + shift, source=theirs)
+
+
+def _first_free(merged: pm.PrototypeMap, scene: pm.PrototypeMap) -> int:
+    """What to add to the ids of a map so that they are above those of another one."""
+    existing, theirs = merged.ids, scene.ids
+    first = int(existing[-1]) + 1 if len(existing) else 0
+    if len(theirs) and int(theirs[-1]) > MAX_ID - first:
         raise ValueError(
             f"ids from {first} on leave no room for those up to {theirs[-1]}: use smaller ids"
         )
-    merged.merge_map(scene, into=theirs + first, source=theirs)
+    return first
+
+
+def _merge_texts(merged: pm.PrototypeMap, scene: pm.PrototypeMap, shift: int = 0) -> None:
+    merged.metadata = merged.metadata | joint_origin(merged.metadata, scene.metadata, shift)
+    if scene.metadata.get(cameras.KEY, "") not in ("", merged.metadata.get(cameras.KEY)):
+        text = cameras.joint_cameras(merged, scene)
+        merged.metadata = {**merged.metadata, cameras.KEY: text}

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 import protomark as pm
 from protomark.extras import optional
 from protomark.maps.build import build_map
-from protomark.maps.cameras import KEY, cameras_text
 from protomark.maps.info import is_tracks
 from protomark.maps.open import SCENE_MAP, STATE, open_learning_map
+from protomark.maps.origin import tracks_metadata
 from protomark.maps.selection import Views, select_landmarks
+from protomark.maps.sources import read_places
 from protomark.progress import Progress, silent
 from protomark.tracks.file import Tracks
 
@@ -61,10 +62,10 @@ def seal(
     request = request or SealRequest()
     progress("read the map", 0, 0)
     if is_tracks(source):
-        tracks = Tracks.load(source)
+        tracks = read_places([source])
         encoder = pm.Encoder.load(tracks.descriptor)
         scene = build_map(tracks, encoder, encoder.dim, threads=request.threads)
-        scene.metadata = {KEY: cameras_text(tracks.cameras.values())}
+        scene.metadata = tracks_metadata(tracks)
         return seal_map(
             scene, output, request, lambda: Views.of_tracks(tracks), observed(tracks), progress
         )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from protomark.features.descriptors import DESCRIPTORS, descriptor_kind
 from protomark.features.extractor import Features
 from protomark.files import hash_files
 from protomark.tracks.file import Tracks
+from protomark.tracks.sqlite import has_tables, open_database
 
 _MAX_PIXEL = 1e9  # a product of two such numbers is still a float32
 
@@ -27,6 +26,38 @@ def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
     digest = hash_files((path.name, path) for path in paths)
     options = {"descriptor": descriptor_kind(descriptor).name, "database": True}
     return {"options": options, "input": digest}
+
+
+def is_database(path: Path, head: bytes) -> bool:
+    """Whether a file that begins with `head` is a COLMAP database."""
+    return has_tables(path, head, ("images", "keypoints", "descriptors", "two_view_geometries"))
+
+
+def stored_descriptor(database: Path) -> str:
+    """The descriptor of a database, which only the length tells; of 32 bytes most are ORB.
+
+    COLMAP's column `type` does not tell: opened by COLMAP 4, an older database calls ORB SIFT.
+
+    Raises:
+        ValueError: there are no binary descriptors, or several kinds have that length.
+    """
+    with open_database(database, "a COLMAP database") as tables:
+        lengths = {cols for rows, cols in tables.rows("descriptors", "rows, cols") if rows}
+    if len(lengths) != 1:
+        raise ValueError(f"{database}: the database has no descriptors, or several kinds of them")
+    length = lengths.pop()
+    kinds = [kind.name for kind in DESCRIPTORS.values() if kind.bytes == length]
+    if not kinds:
+        raise ValueError(
+            f"{database} has descriptors of {length} bytes, of which no encoder ships (128: SIFT): "
+            "name the folder of the images in its place, which are described anew"
+        )
+    if len(kinds) > 1 and "orb" not in kinds:
+        raise ValueError(
+            f"{database} has descriptors of {length} bytes: name one of {', '.join(kinds)} with "
+            "--encoder"
+        )
+    return "orb" if "orb" in kinds else kinds[0]
 
 
 def tracks_from_database(
@@ -82,9 +113,13 @@ def tracks_from_database(
     keep = np.flatnonzero(count >= 2)
     number = np.full(len(positions) + 1, -1, np.int64)
     number[keep] = np.arange(len(keep))
+    made_from = provenance(database, model_path, descriptor)
+    with open_database(database, "a COLMAP database") as tables:
+        version = tables.user_version
     info = {
         "sequence": name,
-        **provenance(database, model_path, descriptor),
+        "source": {"program": "COLMAP", "version": version, "digest": made_from["input"]},
+        **made_from,
         "images_without_pose": model.unposed,
         "poses_refined": False,
     }
@@ -93,25 +128,10 @@ def tracks_from_database(
 
 def _read(database: Path, descriptor: str, width: int) -> dict[str, Features]:
     """Keypoints and descriptors by image name."""
-    # Read-only mode neither creates nor changes a database, which may be open elsewhere. COLMAP's
-    # own mode needs to write files beside it, unless nobody has it open.
-    busy = any(database.with_name(database.name + end).exists() for end in ("-wal", "-journal"))
-    uri = f"{database.resolve().as_uri()}?mode=ro{'' if busy else '&immutable=1'}"
-    try:
-        connection = sqlite3.connect(uri, uri=True)
-        try:
-            _check_tables(connection, database)
-            names = _by_image(connection, database, "images", "name")
-            keypoints = _by_image(connection, database, "keypoints", "rows, cols, data")
-            descriptors = _by_image(connection, database, "descriptors", "rows, cols, data")
-        finally:
-            connection.close()
-    except sqlite3.Error as error:
-        if "locked" in str(error):
-            raise ValueError(
-                f"{database} is locked: another process writes to it, wait for it"
-            ) from None
-        raise ValueError(f"{database}: not a COLMAP database, or a broken one ({error})") from None
+    with open_database(database, "a COLMAP database") as tables:
+        names = dict(tables.rows_by_id("images", "name", "image_id"))
+        keypoints = dict(tables.rows_by_id("keypoints", "rows, cols, data", "image_id"))
+        descriptors = dict(tables.rows_by_id("descriptors", "rows, cols, data", "image_id"))
     images: dict[str, Features] = {}
     empty = (None, None, None)
     for image_id, (name,) in names.items():
@@ -141,42 +161,6 @@ def _read(database: Path, descriptor: str, width: int) -> dict[str, Features]:
             raise ValueError(f"{database}: image {name} has keypoints far outside of any image")
         images[name] = _features(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
     return images
-
-
-def _by_image(
-    connection: sqlite3.Connection, database: Path, table: str, columns: str
-) -> dict[int, tuple[Any, ...]]:
-    """The rows of a table by image_id, which need not be unique in a malicious file.
-
-    This reads one table at a time, as a join on repeated ids would multiply rows.
-    """
-    # Rows of a malicious file may share their bytes, so that they exceed the file's size together.
-    room = math.prod(
-        connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size")
-    )
-    rows: dict[int, tuple[Any, ...]] = {}
-    for image_id, *row in connection.execute(f"SELECT image_id, {columns} FROM {table}"):
-        if type(image_id) is not int or image_id in rows:
-            raise ValueError(
-                f"{database}: not a COLMAP database, as in {table} the image_id "
-                f"{str(image_id)[:40]!r} {'occurs twice' if image_id in rows else 'is no number'}"
-            )
-        room -= sum(len(cell) for cell in row if isinstance(cell, (bytes, str)))
-        if room < 0:
-            raise ValueError(f"{database}: the rows of {table} exceed the size of the file")
-        rows[image_id] = tuple(row)
-    return rows
-
-
-def _check_tables(connection: sqlite3.Connection, database: Path) -> None:
-    """Raise ValueError for views and computed columns, which may be endless."""
-    for table in ("images", "keypoints", "descriptors"):
-        (kind,) = connection.execute(
-            "SELECT type FROM sqlite_master WHERE name = ?", (table,)
-        ).fetchone() or ("missing",)
-        columns = connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
-        if kind != "table" or any(hidden for *_, hidden in columns):
-            raise ValueError(f"{database}: not a COLMAP database, as {table} is no plain table")
 
 
 def _features(k: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Features:

@@ -1,0 +1,196 @@
+"""Merges maps with their frames: what `protomark merge` does with folders of `protomark map`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from protomark.files import only_writer
+from protomark.geometry.similarity import Similarity
+from protomark.mapping import adjustment
+from protomark.mapping.mapper import LOOP_LOSS_SCALE, Mapper
+from protomark.mapping.merging import merge_duplicates
+from protomark.mapping.outputs import write_outputs
+from protomark.mapping.prediction import MAX_STEP
+from protomark.mapping.state import STATE, load_state, save_state
+from protomark.maps.alignment import Alignment, Ids, align_maps
+from protomark.maps.merge import Merged, check_inputs, find_alignment
+from protomark.maps.open import SCENE_MAP
+from protomark.progress import Progress, silent, tracked
+from protomark.threads import one_blas_thread
+
+# Maps meet in so many other places at most; there they are off by at most this share of the reach.
+_MAX_LOOPS = 3
+_MAX_DRIFT = 0.1
+
+
+def merge_folders(
+    inputs: Sequence[Path],
+    output: Path,
+    *,
+    fixed_scale: bool = False,
+    seal: bool = True,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Merged:
+    """Merge maps with their frames, adjust all together, and write the folder of a map.
+
+    Args:
+        inputs: folders of `protomark map`, in this order; the world is that of the first.
+        output: the folder to write, new or empty.
+        fixed_scale: whether all maps have one scale already.
+        seal: whether to write a sealed map, too.
+        threads: threads to search on.
+        progress: told of each map.
+
+    Raises:
+        FileExistsError: the output holds files.
+        FileError, ValueError: an input is no finished map of `protomark map`, or is not of the
+            same place as those before it.
+    """
+    check_inputs(inputs)
+    for path in inputs:
+        if not (path / STATE).is_file():
+            raise ValueError(
+                f"{path} is no folder of a finished `protomark map`, whose frames can be merged: "
+                "name a file to write, such as -o merged.pmk, to merge the landmarks alone"
+            )
+    with only_writer(output), one_blas_thread():
+        if any(not path.name.startswith(".lock") for path in output.iterdir()):
+            raise FileExistsError(f"{output} holds files: name a new folder with -o")
+        first, *others = inputs
+        mapper, facts = load_state(first, threads)
+        result = Merged.begin(first, mapper.scene)
+        for path in tracked(others, progress, "merge"):
+            other, its = load_state(path, threads)
+            if again := set(facts.get("inputs", {})) & set(its.get("inputs", {})):
+                raise ValueError(
+                    f"{path}: its frames in {min(again)} are in an earlier map, too, and would "
+                    "count twice: `protomark map` adds new images of a folder with --into"
+                )
+            try:
+                found = find_alignment(mapper.scene, other.scene, fixed_scale, threads)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
+            if found is None:
+                raise ValueError(
+                    f"{path}: its landmarks have the ids of an earlier map, or too few are common "
+                    "to both: name a file to write, such as -o merged.pmk, to sum the maps"
+                )
+            before = len(mapper.scene) + len(other.scene)
+            result.note(path, other.scene, found, 0)
+            prefix = _insert(mapper, other, found, path.name)
+            inputs_of_other = {name: prefix + old for name, old in its.get("inputs", {}).items()}
+            facts = {**facts, "inputs": {**facts.get("inputs", {}), **inputs_of_other}}
+            result.facts["inputs"][-1]["in_common"] = before - len(mapper.scene)
+        mapper.finish(progress=progress)
+        progress("write", 0, 0)
+        names = " + ".join(path.name for path in inputs)
+        figures = write_outputs(mapper, output, names, finished=True, seal=seal)
+        save_state(mapper, output / STATE, facts)
+    result.facts |= {**figures, "bytes": (output / SCENE_MAP).stat().st_size}
+    return result
+
+
+def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
+    """Insert frames and landmarks of another map; returns the prefix of its frames' names."""
+    structure, motion = mapper.structure, found.similarity
+    if mapper.options.fixed_poses and other.options.fixed_poses and found.stays:
+        motion = Similarity(1.0, np.eye(3), np.zeros(3))  # all poses were given in one world
+    shift, count = len(structure.positions), len(structure.frames)
+    moved = other.structure
+    for field, values in (
+        ("positions", motion(moved.positions)),
+        ("directions", moved.directions @ motion.rotation.T),
+        ("views", moved.views),
+        ("distances", motion.scale * moved.distances),
+        ("born", moved.born + count),
+    ):
+        setattr(structure, field, np.concatenate([getattr(structure, field), values]))
+    prefix = _prefix(mapper, other, name)
+    first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
+    later = _time_shift(mapper, other)
+    cameras = {i: _camera_id(mapper, camera) for i, camera in moved.cameras.items()}
+    for frame in moved.frames:
+        frame.index += first
+        frame.name = prefix + frame.name
+        frame.time += later
+        frame.camera_id = cameras[frame.camera_id]
+        frame.pose = motion.move_poses(frame.pose)
+        frame.landmarks = np.where(frame.landmarks >= 0, frame.landmarks + shift, -1)
+        camera = structure.cameras[frame.camera_id]
+        frame.rays, frame.turns = camera.local_rays(frame.keypoints)
+    structure.frames += moved.frames
+    structure.recompute_views()
+    for record in other.history.records.values():
+        record = replace(record, name=prefix + record.name, index=record.index + first)
+        mapper.history.records[record.name] = record
+    ids = other.scene.ids
+    mapper.scene.merge_map(other.scene, into=ids + shift, source=ids)
+    merged = _merge_duplicates(mapper, found.into, found.source + shift)
+    merged += _close_loops(mapper, count)
+    mapper.history.events += [
+        *(f"{name}: {event}" for event in other.history.events),
+        f"{name}: merged by {found.agreeing} landmarks that agree, {merged} duplicates",
+    ]
+    return prefix
+
+
+def _merge_duplicates(mapper: Mapper, into: Ids, source: Ids) -> int:
+    """Merge landmarks that are one, and adjust all; returns their number."""
+    structure, options = mapper.structure, mapper.options
+    pairs = list(zip(into.tolist(), source.tolist(), strict=True))
+    merged = merge_duplicates(structure, mapper.memory, pairs, options.max_error, check=False)
+    if not options.fixed_poses:
+        adjustment.adjust_global_bundle(structure, 20, loss_scale=LOOP_LOSS_SCALE)
+    return merged
+
+
+def _close_loops(mapper: Mapper, count: int) -> int:
+    """Merge landmarks that only the first `count` frames see with those of the others, elsewhere.
+
+    Where two maps meet a second time, drift has kept their landmarks apart.
+    """
+    structure, scene, merged = mapper.structure, mapper.scene, 0
+    for _ in range(_MAX_LOOPS):
+        frames, landmarks = structure.pairs()
+        scene.set_positions(structure.ids, structure.positions[structure.ids])
+        first, second = (np.unique(landmarks[s]) for s in (frames < count, frames >= count))
+        alone = (np.setdiff1d(first, second), np.setdiff1d(second, first))
+        try:
+            found = align_maps(scene.part(alone[0]), scene.part(alone[1]))
+        except ValueError:
+            break
+        if found.problem or found.drift > _MAX_DRIFT * found.reach:
+            break
+        merged += _merge_duplicates(mapper, found.into, found.source)
+    return merged
+
+
+def _prefix(mapper: Mapper, other: Mapper, name: str) -> str:
+    """A prefix for the names of frames that differ from those in the map; "" if they do."""
+    records = mapper.history.records
+    prefixes = ["", f"{name}/", *(f"{name}-{i}/" for i in range(2, 1000))]
+    return next(p for p in prefixes if all(p + r not in records for r in other.history.records))
+
+
+def _time_shift(mapper: Mapper, other: Mapper) -> float:
+    """What to add to times so that those of two maps do not mix, unless both have seconds."""
+    old, new = ([frame.time for frame in m.structure.frames] for m in (mapper, other))
+    if not (old and new) or min(new) > max(old) or max(new) < min(old):
+        return 0.0
+    if set(new).isdisjoint(old) and any(time % 1 for time in (*old, *new)):
+        return 0.0
+    return math.ceil(1 + max(old) - min(new))
+
+
+def _camera_id(mapper: Mapper, camera: Any) -> int:
+    """The id of a camera that this one resembles, so that they are adjusted as one, or a new id."""
+    cameras = mapper.structure.cameras
+    known = (i for i, other in cameras.items() if other.resembles(camera))
+    return next(known, None) or mapper.id_of_camera(camera)

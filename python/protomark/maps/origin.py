@@ -1,0 +1,109 @@
+"""What a map was built from, and how its images were described, as JSON in its metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import protomark as pm
+from protomark.maps.cameras import KEY, cameras_text
+from protomark.report import first_of
+from protomark.tracks.file import Tracks
+from protomark.tracks.joining import shifted_ids
+
+SOURCES, DETECTOR = "sources", "detector"
+_COUNTED = ("keyframes", "landmarks", "observations")
+_MAX_BYTES = 1 << 16  # of a text in a map
+
+
+def tracks_metadata(tracks: Tracks) -> dict[str, str]:
+    """The metadata of a map of tracks that `protomark.maps.sources.read_places` read.
+
+    They name cameras, sources, and the detector if all sources had the same.
+    """
+    texts = {
+        KEY: cameras_text(tracks.cameras.values()),
+        SOURCES: _sources_text(tracks.info["sources"]),
+    }
+    detectors = {json.dumps(one, sort_keys=True) for one in tracks.info["detectors"]}
+    if len(detectors) == 1 and detectors != {"{}"}:
+        texts[DETECTOR] = detectors.pop()
+    return texts
+
+
+def joint_origin(
+    target: Mapping[str, str], source: Mapping[str, str], shift: int = 0
+) -> dict[str, str]:
+    """What a map says of its origin once another one is merged into it.
+
+    Args:
+        target: metadata of the map.
+        source: metadata of the other.
+        shift: what is added to the ids of the other.
+    """
+    texts = {}
+    sources = [*_sources(target), *(shifted_ids(one, shift) for one in _sources(source))]
+    if sources:
+        texts[SOURCES] = _sources_text([s for i, s in enumerate(sources) if s not in sources[:i]])
+    if target.get(DETECTOR) != source.get(DETECTOR):
+        texts[DETECTOR] = "{}"
+    return texts
+
+
+def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
+    """The sources as JSON, without details where there are too many for a text."""
+    for kept in (None, {"name", "program", "version", "ids"}, {"program"}):
+        rows = [{k: v for k, v in one.items() if kept is None or k in kept} for one in sources]
+        text = json.dumps(rows, ensure_ascii=False)
+        if len(text.encode()) <= _MAX_BYTES:
+            return text
+    return "[]"
+
+
+def map_sources(scene: pm.PrototypeMap | pm.SealedMap) -> list[dict[str, Any]]:
+    """What is known of each source that a map was built from; none if nobody stored them."""
+    return _sources(scene.metadata)
+
+
+def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
+    """The detector of the images that a map was built from, by name, with its settings.
+
+    Empty if nobody stored it, or if its sources had several.
+    """
+    found = _parsed(scene.metadata.get(DETECTOR, "{}"))
+    return found if isinstance(found, dict) else {}
+
+
+def source_rows(metadata: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Names of a map's sources, and what is known of each."""
+    for one in _sources(metadata):
+        yield f"source: {one.get('name', '')}", "; ".join(_source_words(one))
+
+
+def _sources(metadata: Mapping[str, str]) -> list[dict[str, Any]]:
+    found = _parsed(metadata.get(SOURCES, "[]"))
+    return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
+
+
+def _source_words(one: Mapping[str, Any]) -> Iterator[str]:
+    version = one.get("version", "unknown")
+    yield f"{one.get('program')} {'' if version == 'unknown' else version}".strip()
+    counts = [f"{one[k]:,} {k}" for k in _COUNTED if isinstance(one.get(k), int)]
+    if counts:
+        yield ", ".join(counts)
+    maps = one.get("maps")
+    if isinstance(maps, list) and len(maps) > 1:
+        yield f"{len(maps)} maps, each in coordinates of its own"
+    if "note" in one:
+        yield str(one["note"])
+    dropped = one.get("dropped")
+    if isinstance(dropped, dict) and dropped:
+        yield "left out: " + first_of([f"{n} {reason}" for reason, n in dropped.items()])
+
+
+def _parsed(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None  # somebody else's text under this name

@@ -1,0 +1,68 @@
+"""Reads maps of other programs as tracks, one module per format."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from protomark.tracks.file import Tracks
+
+# Asked in this order whether a file or folder is theirs.
+_MODULES = (
+    "orbslam3",
+    "osmap",
+    "stella",
+    "rtabmap",
+    "openmvg",
+    "opensfm",
+    "kapture",
+    "astrobee",
+)
+_HEAD = 4096  # bytes by which a file is recognized
+
+
+def find_importer(path: Path) -> ModuleType | None:
+    """The module that reads the map of another program at a path, None if none does.
+
+    Raises:
+        FileNotFoundError: there is no such file or folder.
+    """
+    head = file_head(path)
+    return next((m for m in _modules() if m.recognizes(path, head)), None)
+
+
+def read_source(path: Path) -> Tracks:
+    """Read the map of another program, which its content tells.
+
+    Raises:
+        FileNotFoundError: there is no such file or folder.
+        ValueError: no known program wrote it, or it is broken.
+    """
+    module = find_importer(path)
+    if module is None:
+        *programs, last = (m.PROGRAM for m in _modules())
+        raise ValueError(
+            f"{path} is no map that can be read: give tracks of `protomark tracks`, or a map of "
+            f"{', '.join(programs)} or {last}"
+        )
+    tracks: Tracks = module.read(path)
+    return tracks
+
+
+def file_head(path: Path) -> bytes:
+    """The first bytes of a file, none of a folder.
+
+    Raises:
+        FileNotFoundError: there is neither.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(_HEAD)
+
+
+def _modules() -> list[ModuleType]:
+    return [import_module(f"{__name__}.{name}") for name in _MODULES]

@@ -1,0 +1,175 @@
+"""Maps built of several sources, and of COLMAP databases with their model."""
+
+from __future__ import annotations
+
+import json
+import lzma
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import protomark as pm
+from conftest import protomark
+from protomark import sample
+from protomark.geometry.colmap import ColmapModel
+from protomark.maps.origin import joint_origin, map_detector, source_rows
+from protomark.maps.sources import find_sources, read_places
+from protomark.tracks.database import _read
+from protomark.tracks.file import Tracks
+from protomark.tracks.matching import View, match
+from protomark.tracks.triangulation import triangulate
+from tracks_scene import write_sequence
+
+DATABASES = sorted((Path(__file__).parent / "data" / "colmap").glob("*.db.xz"))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A COLMAP model of the three images of the databases, by their ORB keypoints."""
+    folder = tmp_path_factory.mktemp("toy3")
+    toy = sample.load()
+    database = unpacked(DATABASES[0], folder)
+    features = _read(database, "orb", 32)
+    rows = [toy.keyframe_names.index(name) for name in features]
+    poses = toy.cam_from_world[rows]
+    posed = ColmapModel(
+        toy.cameras, list(features), np.arange(1, 4), toy.keyframe_camera[rows], poses, []
+    )
+    camera = toy.cameras[int(toy.keyframe_camera[0])]
+    views = [
+        View(f.descriptors, camera.rays(f.keypoints), pose, camera.focal_length)
+        for f, pose in zip(features.values(), poses, strict=True)
+    ]
+    pairs = {(i, j): match(views[i], views[j], 0.9, 3.0) for i in range(3) for j in range(i + 1, 3)}
+    keypoints = [f.keypoints for f in features.values()]
+    reconstruction = triangulate(posed, keypoints, pairs, 3.0, 1.0)
+    (folder / "sparse").mkdir()
+    reconstruction.write(str(folder / "sparse"))
+    return folder / "sparse"
+
+
+def unpacked(packed: Path, folder: Path) -> Path:
+    path = folder / packed.stem
+    path.write_bytes(lzma.decompress(packed.read_bytes()))
+    return path
+
+
+@pytest.mark.parametrize("packed", DATABASES, ids=lambda path: path.stem)
+def test_databases_by_columns_and_not_by_type(packed: Path, model: Path, tmp_path: Path) -> None:
+    """COLMAP 4 calls the ORB descriptors of an older database SIFT when it opens that."""
+    database = unpacked(packed, tmp_path)
+    found = read_places([database, model])
+    assert (found.descriptor, len(found.keypoints)) == ("orb", 900)
+    assert len(found.landmark_ids) > 50
+    (facts,) = found.info["sources"]
+    assert facts["program"] == "COLMAP"
+    assert facts["version"] in ("3900", "4020100")
+    done = protomark("build", model, database, "-o", tmp_path / "scene.pmk")
+    assert done.returncode == 0, done.stderr
+    assert "COLMAP" in done.stdout
+    assert len(pm.open(tmp_path / "scene.pmk")) == len(found.landmark_ids)
+    assert len(DATABASES) == 5
+
+
+def test_databases_of_other_descriptors(model: Path, tmp_path: Path) -> None:
+    import sqlite3
+
+    database = unpacked(DATABASES[0], tmp_path)
+    for cols, message in ((128, "128: SIFT"), (64, "freak, brisk, beblid with --encoder")):
+        connection = sqlite3.connect(database)
+        connection.execute("UPDATE descriptors SET cols = ?", (cols,))
+        connection.commit()
+        connection.close()
+        with pytest.raises(ValueError, match=message):
+            read_places([database, model])
+
+
+def test_images_with_their_model(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "plane", count=5)
+    first, second = folder / "images", folder / "sparse"
+    by_folder = read_places([folder], "orb")
+    by_parts = read_places([second, first], "orb")
+    assert np.array_equal(by_folder.descriptors, by_parts.descriptors)
+    assert [s.name for s in find_sources([first, second])] == ["plane"]
+    for lonely in (first, second):
+        with pytest.raises(ValueError, match=f"{lonely.name} (are images|is a COLMAP model)"):
+            find_sources([lonely, sample.path()])
+
+
+def test_places_get_ids_apart_whatever_their_order(tmp_path: Path) -> None:
+    toy = sample.load()
+    later = toy.landmark_ids >= 2000
+    toy.save(tmp_path / "b.safetensors")
+    half = Tracks(**{**vars(toy), "landmark_ids": toy.landmark_ids[later]})
+    half.landmark_positions = toy.landmark_positions[later]
+    half.landmark_of_keypoint = np.where(
+        toy.landmark_of_keypoint >= 2000, toy.landmark_of_keypoint, -1
+    )
+    half.info = {**toy.info, "detector": {"name": "ORB-SLAM", "levels": 4}}
+    half.save(tmp_path / "a.safetensors")
+    paths = [tmp_path / "b.safetensors", tmp_path / "a.safetensors"]
+    joined = read_places(paths)
+    joined.check()
+    top = int(toy.landmark_ids[-1])
+    assert [one["ids"] for one in joined.info["sources"]] == [[2000, top], [top + 1, 2 * top + 1]]
+    assert joined.keyframe_names[0] == f"a.safetensors/{toy.keyframe_names[0]}"
+    other = read_places(paths[::-1])
+    for name in ("landmark_ids", "landmark_of_keypoint", "descriptors", "landmark_positions"):
+        assert np.array_equal(getattr(joined, name), getattr(other, name))
+    files = []
+    for order in (1, -1):
+        path = tmp_path / f"{order}.pmk"
+        done = protomark(
+            "build", *paths[::order], "-o", path, "--metadata", "created=2026-11-30T00:00:00Z"
+        )
+        assert done.returncode == 0, done.stderr
+        files.append(path.read_bytes())
+    assert files[0] == files[1]
+    scene = pm.open(path)
+    assert map_detector(scene) == {}  # they differ
+    assert len(scene) == len(half.landmark_ids) + len(toy.landmark_ids)
+    assert [name for name, _ in source_rows(scene.metadata)] == [
+        "source: a.safetensors",
+        "source: b.safetensors",
+    ]
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    other = sample.load()
+    other.descriptor = "latch"
+    other.descriptors = other.descriptors[:, :32].copy()
+    other.save(tmp_path / "latch.safetensors")
+    with pytest.raises(ValueError, match=r"freak descriptors, not latch: a map holds one kind"):
+        read_places([sample.path(), tmp_path / "latch.safetensors"])
+    with pytest.raises(ValueError, match="is named twice"):
+        read_places([sample.path(), sample.path()])
+    (tmp_path / "x.bin").write_bytes(b"nothing known")
+    with pytest.raises(ValueError, match=r"x\.bin is no map that can be read.*ORB-SLAM3"):
+        read_places([tmp_path / "x.bin"])
+    with pytest.raises(FileNotFoundError, match="no such file or folder"):
+        read_places([tmp_path / "y.bin"])
+
+
+def test_a_landmark_of_one_observation(tmp_path: Path) -> None:
+    """Is left out, unless its source has no other."""
+    toy = sample.load()
+    single = toy.where(toy.keyframe_of_keypoint == 0)
+    single.save(tmp_path / "single.safetensors")
+    found = read_places([sample.path(), tmp_path / "single.safetensors"])
+    assert len(found.observations) == len(toy.observations) + len(single.observations)
+    with pytest.raises(ValueError, match=r"single.*no landmark has 2 observations"):
+        read_places([tmp_path / "single.safetensors"], min_observations=2)
+
+
+def test_merged_maps_have_both_origins() -> None:
+    first = {"sources": json.dumps([{"name": "a", "ids": [0, 5]}]), "detector": '{"levels": 4}'}
+    second = {"sources": json.dumps([{"name": "b", "ids": [0, 7], "maps": [{"ids": [1, 2]}]}])}
+    texts = joint_origin(first, second, 6)
+    assert json.loads(texts["sources"]) == [
+        {"name": "a", "ids": [0, 5]},
+        {"name": "b", "ids": [6, 13], "maps": [{"ids": [7, 8]}]},
+    ]
+    assert texts["detector"] == "{}"
+    assert joint_origin(first, first)["sources"] == first["sources"]
+    assert joint_origin({}, {}) == {}
