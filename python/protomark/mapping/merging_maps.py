@@ -17,10 +17,10 @@ from protomark.mapping.mapper import LOOP_LOSS_SCALE, Mapper
 from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.outputs import write_outputs
 from protomark.mapping.prediction import MAX_STEP
-from protomark.mapping.state import STATE, load_state, save_state
+from protomark.mapping.state import load_state, save_state
 from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.merge import Merged, check_inputs, find_alignment
-from protomark.maps.open import SCENE_MAP
+from protomark.maps.open import SCENE_MAP, STATE
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import one_blas_thread
 
