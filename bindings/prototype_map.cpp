@@ -341,13 +341,13 @@ Args:
     descriptors: (n, bits / 8) uint8, or their codes, (n, dim) int8: the observations that the map
         was built from, as far as they are at hand. Prototypes are tuned by them, or else by the
         map's appearances if only one prototype per landmark fits.
-    bytes_per_landmark: bytes that a landmark may take on average for its prototypes, their number
-        and its count (not for position, id and index). None: the sealed map gives the answers of
+    bytes_per_landmark: bytes that a landmark may take on average for its prototypes and their
+        number (not for position, id and index). None: the sealed map gives the answers of
         this one: int8 numbers, every appearance (at most 255 per landmark). Otherwise prototypes
         are int8 numbers, too, if all of them fit; else words of one of the encoder's codebooks, and
         appearances are merged, over the whole map those first whose merging adds least to the
         squared distances of observations to their prototypes (Ward's criterion), until they fit.
-        It takes the most words that fit, or, if no observations tune it, the most that leave room
+        It takes the best words that fit, or, if no observations tune it, the best that leave room
         for 1.25 prototypes per landmark, from 48 numbers on.
     position_bits: bits per coordinate. With 32, positions are floats relative to the middle of the
         map; with 16 they take half the bytes, as steps of a grid over their bounding box, 65534
@@ -418,6 +418,10 @@ Raises:
     ValueError: "created" is no such time, or something is beyond the limits (docs/limits.md).)")
       .def_prop_ro("appearance_bits", &PrototypeMap::appearance_bits,
                    "Signs that tell the appearances of a landmark apart; 0: it has one prototype.")
+      .def("counts", bind_of_landmarks<PrototypeMap>(&PrototypeMap::counts), "landmark_ids"_a,
+           nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint32]"),
+           "Numbers of observations, over all appearances, (n,) uint32. Raises KeyError for an id "
+           "that is not in the map.")
       .def("appearance_counts", bind_of_landmark<PrototypeMap>(&PrototypeMap::appearance_counts),
            "landmark_id"_a,
            nb::sig("def appearance_counts(self, landmark_id: int) -> NDArray[numpy.uint32]"),

@@ -6,11 +6,13 @@
 
 namespace protomark::python {
 
-nb::dict from_summary(const MapSummary& summary) {
+nb::dict from_summary(const MapSummary& summary, bool counted) {
   nb::dict result;
-  result["observations"] = summary.observations;
-  const auto& counts = summary.count_histogram;
-  result["count_histogram"] = to_numpy(std::vector<std::int64_t>(counts.begin(), counts.end()));
+  if (counted) {
+    result["observations"] = summary.observations;
+    const auto& counts = summary.count_histogram;
+    result["count_histogram"] = to_numpy(std::vector<std::int64_t>(counts.begin(), counts.end()));
+  }
   result["landmarks_with_position"] = summary.landmarks_with_position;
   result["extent"] = nb::none();
   if (const auto& extent = summary.extent) {
@@ -37,8 +39,8 @@ void bind_sealed_map(nb::module_& m) {
       .def_prop_ro("tuned", &SealedMap::tuned,
                    "Whether prototypes were tuned against each other (PrototypeMap.seal).")
       .def_prop_ro("bytes_per_landmark", &SealedMap::bytes_per_landmark,
-                   "Bytes that a landmark takes on average for its prototypes, their number and "
-                   "its count, as PrototypeMap.seal counts them.")
+                   "Bytes that a landmark takes on average for its prototypes and their number, as "
+                   "PrototypeMap.seal counts them.")
       .def_prop_ro("position_bits", &SealedMap::position_bits,
                    "Bits per coordinate: 32 or 16, or 0 if no landmark has a position.")
       .def_prop_ro(

@@ -11,7 +11,7 @@
 
 namespace protomark::python {
 
-nb::dict from_summary(const MapSummary& summary);
+nb::dict from_summary(const MapSummary& summary, bool counted);
 
 // The ids of some landmarks, given as such or as a mask over all ids in ascending order.
 template <typename Map>
@@ -109,10 +109,6 @@ void bind_answers(nb::class_<Map>& map) {
            nb::sig("def positions(self, landmark_ids: ArrayLike) -> NDArray[numpy.float64]"),
            "World coordinates, (n, 3) float64, NaN where a landmark has none. Raises KeyError for "
            "an id that is not in the map.")
-      .def("counts", bind_of_landmarks<Map>(&Map::counts), "landmark_ids"_a,
-           nb::sig("def counts(self, landmark_ids: ArrayLike) -> NDArray[numpy.uint32]"),
-           "Numbers of observations, over all appearances, (n,) uint32; a sealed map gives at most "
-           "255. Raises KeyError for an id that is not in the map.")
       .def(
           "appearances", bind_of_landmark<Map>(&Map::appearances), "landmark_id"_a,
           nb::sig("def appearances(self, landmark_id: int) -> NDArray[numpy.float32]"),
@@ -121,14 +117,17 @@ void bind_answers(nb::class_<Map>& map) {
           "that is not in the map.")
       .def(
           "summary",
-          [](const Map& m) { return from_summary(without_gil([&] { return m.summary(); })); },
+          [](const Map& m) {
+            constexpr bool counted = requires { m.appearance_bits(); };  // a learning map
+            return from_summary(without_gil([&] { return m.summary(); }), counted);
+          },
           nb::sig("def summary(self) -> dict[str, Any]"),
           R"(The map at a glance, in one pass that keeps nothing in memory.
 
 Returns:
-    observations: their number; a sealed map counts at most 255 per landmark.
+    observations: their number; only of a learning map.
     count_histogram: (256,) int64, how many landmarks have i observations at index i, and that many
-        or more at the last index.
+        or more at the last index; only of a learning map.
     landmarks_with_position: their number.
     extent: (2, 3) float64, the lowest and highest coordinates; None if no landmark has a position.)")
       .def("search", bind_search<Map>(&descriptors, &Map::search), "descriptors"_a.none(),

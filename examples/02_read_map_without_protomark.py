@@ -132,7 +132,7 @@ class Map:
         ids: (n,) landmark ids, ascending.
         prototypes: (m, k) integers.
         landmarks: (m,) the landmark id of each prototype.
-        counts: observations, of each prototype in a learning map, of each landmark in a sealed one.
+        counts: (m,) observations of each prototype of a learning map, None of a sealed one.
         positions: (n, 3), NaN where there is none.
         metadata: texts by name.
     """
@@ -148,7 +148,7 @@ class Map:
         sealed_rows = np.frombuffer(parts.get("rows", bytes([1]) * n), "u1")
         rows = learning_rows(parts, n)[0] if learning else sealed_rows
         self.landmarks = np.repeat(self.ids, rows)
-        self.counts = np.frombuffer(parts["counts"], "u1")
+        self.counts = np.frombuffer(parts["counts"], "u1") if learning else None
         if learning:
             sums = learning_sums(parts, k)
             count = self.counts[:, None].astype(np.int64)

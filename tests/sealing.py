@@ -21,7 +21,7 @@ def in_words(scene: pm.PrototypeMap, prototypes: float | None = None) -> float:
         for subspaces, _, width in (codebook.shape for codebook in scene.encoder.codebooks)
         if scene.dim % width == 0 and subspaces * width >= scene.dim
     ]
-    return wanted * (scene.dim // min(widths)) + (2 if several else 1)
+    return wanted * (scene.dim // min(widths)) + (1 if several else 0)
 
 
 def decoded(words: NDArray[np.integer], codebook: NDArray[np.int8]) -> NDArray[np.int64]:

@@ -107,14 +107,13 @@ def test_words_and_search_equal_the_definition(
 ) -> None:
     dim, width = shape
     scene = filled(coders[width], dim, n, limit, seed)
-    sealed = scene.seal(folder / "s.pmk", bytes_per_landmark=dim // width + 1, tune=False)
+    sealed = scene.seal(folder / "s.pmk", bytes_per_landmark=dim // width, tune=False)
     pm.verify_file(folder / "s.pmk")
     means = rounded(scene.prototypes(scene.ids))
     expected = quantized(means, CODEBOOKS[width])
     np.testing.assert_array_equal(read_numbers(folder / "s.pmk", n, dim), expected)
     np.testing.assert_array_equal(sealed.prototypes(scene.ids), expected)
     np.testing.assert_array_equal(sealed.ids, scene.ids)
-    np.testing.assert_array_equal(sealed.counts(scene.ids), scene.counts(scene.ids))
     assert (len(sealed), sealed.dim, sealed.words) == (n, dim, dim // width)
 
     queries = np.random.default_rng(seed).integers(-128, 128, (35, dim)).astype(np.int8)
@@ -140,7 +139,7 @@ def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
     rng = np.random.default_rng(0)
     scene.add_codes(np.arange(3000), rng.integers(-127, 128, (3000, 21)).astype(np.int8))
     scene.set_positions([5], np.array([[1.0, 2.0, 3.0]]))
-    scene.seal(folder / "large.pmk", bytes_per_landmark=8, tune=False)
+    scene.seal(folder / "large.pmk", bytes_per_landmark=7, tune=False)
     sealed = pm.open(folder / "large.pmk")
     assert isinstance(sealed, pm.SealedMap)
     assert "7 words" in repr(sealed)
@@ -156,46 +155,44 @@ def test_search_across_chunks(coder: pm.Encoder, folder: Path) -> None:
 def test_bytes_per_landmark(coder: pm.Encoder, folder: Path) -> None:
     scene = pm.PrototypeMap(coder, dim=24)
     scene.add(np.arange(1600), random_descriptors(1600))
-    scene.seal(folder / "a.pmk", bytes_per_landmark=13)
+    scene.seal(folder / "a.pmk", bytes_per_landmark=12)
     sizes = dict(pm.file_sections(folder / "a.pmk"))
-    assert set(sizes) == {"encoder", "shape", "counts", "width", "protos"}
-    assert sizes["counts"] + sizes["protos"] == 1600 * (24 // 2 + 1)
+    assert set(sizes) == {"encoder", "shape", "width", "protos"}
+    assert sizes["protos"] == 1600 * 24 // 2
 
 
 def test_int8_where_it_fits(coder: pm.Encoder, folder: Path) -> None:
     scene = filled(coder, 12, 30, 100, 0)
     assert scene.seal(folder / "a.pmk").words == 0
-    assert scene.seal(folder / "b.pmk", bytes_per_landmark=26).words == 0
+    assert scene.seal(folder / "b.pmk", bytes_per_landmark=25).words == 0
     data = (folder / "a.pmk").read_bytes()
     assert data == (folder / "b.pmk").read_bytes()
-    names = ["encoder", "shape", "counts", "rows", "protos", "idblocks", "idgaps"]
+    names = ["encoder", "shape", "rows", "protos", "idblocks", "idgaps"]
     assert [name for name, _ in sections(data)] == names
-    assert scene.seal(folder / "b.pmk", bytes_per_landmark=25.99).words == 6
+    assert scene.seal(folder / "b.pmk", bytes_per_landmark=24.99).words == 6
     assert pm.PrototypeMap(coder).seal(folder / "a.pmk", bytes_per_landmark=25).words == 0
 
 
 @pytest.mark.parametrize(
     ("dim", "size", "expected"),
     [
-        (24, 24.9, (24, 12)),
-        (24, 13, (24, 12)),
-        # 8 words of 24 numbers rather than 6 of 12; of 21 numbers only words of three are whole.
-        (24, 12.9, (24, 8)),
-        (24, 8, (21, 7)),
-        # 6 words of 12 numbers by two; no 18 numbers.
-        (24, 7.5, (12, 6)),
-        (24, 5, (12, 4)),
-        (24, 4, (9, 3)),
-        (24, 3, (6, 2)),
-        (24, 2, (3, 1)),
-        (9, 6, (9, 3)),
-        (9, 4, (9, 3)),
+        (24, 23.9, (24, 12)),
+        (24, 12, (24, 12)),
+        (24, 11.9, (22, 11)),
+        (24, 9, (18, 9)),
+        # 8 words of three numbers rather than of two.
+        (24, 8.9, (24, 8)),
+        (24, 7.5, (21, 7)),
+        (24, 4, (12, 4)),
+        (24, 1, (3, 1)),
+        (9, 6, (8, 4)),
+        (9, 3, (9, 3)),
     ],
 )
-def test_the_most_words_that_fit(
+def test_the_best_words_that_fit(
     dim: int, size: float, expected: tuple[int, int], coder: pm.Encoder, tmp_path: Path
 ) -> None:
-    """Of as many words, those of more numbers; prototypes may have fewer than the map."""
+    """Words of three numbers, unless 1.1 times as many of two fit."""
     scene, codes = pm.PrototypeMap(coder, dim=dim), random_codes(dim)
     scene.add_codes(np.arange(400) % 90, codes)
     scene.set_positions([7], [[1.0, 2, 3]])
@@ -204,10 +201,9 @@ def test_the_most_words_that_fit(
     sealed = scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
     pm.verify_file(tmp_path / "s.pmk")
     assert (sealed.dim, sealed.words) == expected
-    assert sealed.bytes_per_landmark == expected[1] + 1
+    assert sealed.bytes_per_landmark == expected[1]
     assert (sealed.nlist, sealed.metadata["frame"], len(sealed)) == (5, "ENU", 90)
     np.testing.assert_array_equal(sealed.positions([7]), [[1, 2, 3]])
-    np.testing.assert_array_equal(sealed.counts(scene.ids), scene.counts(scene.ids))
     means = rounded(scene.prototypes(scene.ids))[:, : expected[0]]
     numbers = quantized(means, CODEBOOKS[expected[0] // expected[1]])
     np.testing.assert_array_equal(sealed.prototypes(scene.ids), numbers)
@@ -222,26 +218,26 @@ def random_codes(dim: int) -> NDArray[np.int8]:
     return np.random.default_rng(dim).integers(-127, 128, (400, dim)).astype(np.int8)
 
 
-@pytest.mark.parametrize("size", [-4, 0, 4.99, float("nan"), -float("inf")])
+@pytest.mark.parametrize("size", [-4, 0, 1.99, float("nan"), -float("inf")])
 def test_too_few_bytes_are_refused(size: float, encoder: pm.Encoder, tmp_path: Path) -> None:
     scene = filled(encoder, 12, 30, 100, 0)
-    with pytest.raises(ValueError, match="bytes_per_landmark must be at least 5 for this map"):
+    with pytest.raises(ValueError, match="bytes_per_landmark must be at least 2 for this map"):
         scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
     assert not (tmp_path / "s.pmk").exists()
-    scene.seal(tmp_path / "s.pmk", bytes_per_landmark=5)
+    scene.seal(tmp_path / "s.pmk", bytes_per_landmark=2)
 
 
 def test_encoders_without_codebooks(plain: pm.Encoder, tmp_path: Path) -> None:
     scene = filled(plain, 12, 30, 100, 0)
     message = "bytes_per_landmark needs codebooks, which encoder 't' does not have for this map"
-    for size in (0, 25.9):
+    for size in (0, 24.9):
         with pytest.raises(ValueError, match=message):
             scene.seal(tmp_path / "s.pmk", bytes_per_landmark=size)
     # Two numbers are no word of three.
     scene = filled(plain.with_codebooks([CODEBOOKS[3]]), 2, 30, 100, 0)
     with pytest.raises(ValueError, match=message):
         scene.seal(tmp_path / "s.pmk", bytes_per_landmark=5)
-    assert scene.seal(tmp_path / "s.pmk", bytes_per_landmark=10).words == 0
+    assert scene.seal(tmp_path / "s.pmk", bytes_per_landmark=9).words == 0
 
 
 def words(*values: int) -> bytes:
@@ -260,14 +256,13 @@ def words(*values: int) -> bytes:
         ("protos", bytes(64), "section 'protos' has the wrong size"),
         ("protos", b"", "section 'protos' has the wrong size"),
         ("protos", None, "it lacks the section 'protos'"),
-        ("counts", bytes(1), "section 'counts' has the wrong size"),
     ],
 )
 def test_hostile_sections_are_refused(
     section: str, content: bytes | None, message: str, coder: pm.Encoder, tmp_path: Path
 ) -> None:
     path = tmp_path / "s.pmk"
-    filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=4)
+    filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=3)
     parts = sections(path.read_bytes())
     assert container(parts) == path.read_bytes()
     changed = [(name, content if name == section else old) for name, old in parts]
@@ -279,7 +274,7 @@ def test_hostile_sections_are_refused(
 def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
     """The search never reads the padding, 12 of 32 rows."""
     path = tmp_path / "s.pmk"
-    sealed = filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=4)
+    sealed = filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=3)
     queries = np.random.default_rng(1).integers(-127, 128, (20, 9)).astype(np.int8)
     expected = sealed.search_codes(queries, k=20)
     parts = dict(sections(path.read_bytes()))
@@ -293,7 +288,7 @@ def test_padding(coder: pm.Encoder, tmp_path: Path) -> None:
 
 def test_later_formats_are_refused(coder: pm.Encoder, tmp_path: Path) -> None:
     path = tmp_path / "s.pmk"
-    filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=4)
+    filled(coder, 9, 20, 100, 0).seal(path, bytes_per_landmark=3)
     path.write_bytes(container(sections(path.read_bytes()), version=2))
     with pytest.raises(pm.FileError, match="format version 2, this Protomark reads version 1"):
         pm.open(path)

@@ -99,12 +99,13 @@ def test_unknown_instruction_set_is_named() -> None:
 
 def test_prefix_of_a_code(encoder: pm.Encoder) -> None:
     descriptors = random_descriptors(100)
-    np.testing.assert_array_equal(
-        encoder.encode(descriptors, dim=5), encoder.encode(descriptors)[:, :5]
-    )
+    for dim in range(1, 13):
+        np.testing.assert_array_equal(
+            encoder.encode(descriptors, dim=dim), encoder.encode(descriptors)[:, :dim]
+        )
     assert encoder.dims == [5, 12]
-    with pytest.raises(ValueError, match="gives 5, 12 dimensions, not 7"):
-        encoder.encode(descriptors, dim=7)
+    with pytest.raises(ValueError, match="gives 1 to 12 dimensions, not 13"):
+        encoder.encode(descriptors, dim=13)
 
 
 def test_strided_input_is_taken(encoder: pm.Encoder) -> None:

@@ -53,7 +53,6 @@ def test_sealed_map_answers_like_the_learning_one(scene: pm.PrototypeMap, tmp_pa
         assert len(m) == len(scene)
         assert m.dim == scene.dim
         np.testing.assert_array_equal(m.ids, ids)
-        np.testing.assert_array_equal(m.counts(ids), scene.counts(ids))
         np.testing.assert_array_equal(m.prototypes(ids), rounded(scene.prototypes(ids)))
         np.testing.assert_allclose(m.positions(ids), scene.positions(ids), atol=1e-5)
         for kwargs in ({"k": 3}, {"k": 1, "ratio": 0.9}, {"k": 2, "max_distance": 40_000}):
@@ -62,18 +61,16 @@ def test_sealed_map_answers_like_the_learning_one(scene: pm.PrototypeMap, tmp_pa
             ):
                 np.testing.assert_array_equal(a, b)
         with pytest.raises(KeyError, match="landmark 1 is not in the map"):
-            m.counts([1])
+            m.positions([1])
 
 
-def test_sealed_map_takes_dim_plus_one_bytes_a_landmark(
-    encoder: pm.Encoder, tmp_path: Path
-) -> None:
+def test_sealed_map_takes_dim_bytes_a_landmark(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene = pm.PrototypeMap(encoder)
     scene.add(np.arange(1600), random_descriptors(1600))
     scene.seal(tmp_path / "a.pmk")
     sections = dict(pm.file_sections(tmp_path / "a.pmk"))
-    assert set(sections) == {"encoder", "shape", "counts", "protos"}
-    assert sections["counts"] + sections["protos"] == 1600 * (12 + 1)
+    assert set(sections) == {"encoder", "shape", "protos"}
+    assert sections["protos"] == 1600 * 12
 
 
 def test_empty_and_single_maps(encoder: pm.Encoder, tmp_path: Path) -> None:

@@ -38,7 +38,8 @@ def read_map(path: Path) -> None:
         for options in ({"nprobe": 2}, {"recall": 0.9}):
             found, _ = read.search(random_descriptors(3, read.encoder.bits), **options)
             assert np.isin(found[found >= 0], ids).all()
-    read.counts(ids)
+    if isinstance(read, pm.PrototypeMap):
+        read.counts(ids)
     read.prototypes(ids)
     assert all(name for name in read.metadata)
     assert read.summary()["landmarks_with_position"] <= len(read)

@@ -50,7 +50,7 @@ def test_codebooks_shrink_prototypes_with_less_error_than_even_levels(tmp_path: 
     seen = views(500, 3)
     scene.add(np.repeat(np.arange(500), 4), seen.descriptors)
     exact = scene.seal(tmp_path / "a.pmk").prototypes(scene.ids)
-    for size, dim, even in ((13, 24, 8), (9, 24, 20)):
+    for size, dim, even in ((12, 24, 8), (8, 24, 20)):
         sealed = scene.seal(tmp_path / "b.pmk", bytes_per_landmark=size, tune=False)
         assert sealed.dim == dim
         found = sealed.prototypes(scene.ids)

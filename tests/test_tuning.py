@@ -212,5 +212,5 @@ def test_untuned_maps_have_room_for_second_prototypes(folder: Path) -> None:
             found[size, by is not None] = (sealed.dim, sealed.words)
             several = sealed.prototype_count / len(sealed)
             assert (several >= 1.25) == (size > 33 or (size > 17 and by is None))
-    assert [found[n, False] for n in (17, 25, 33, 49)] == [(48, 16), (48, 16), (48, 24), (64, 32)]
-    assert [found[n, True] for n in (17, 25, 33, 49)] == [(48, 16), (48, 24), (64, 32), (64, 32)]
+    assert [found[n, False] for n in (17, 25, 33, 49)] == [(51, 17), (57, 19), (50, 25), (64, 32)]
+    assert [found[n, True] for n in (17, 25, 33, 49)] == [(51, 17), (50, 25), (64, 32), (64, 32)]

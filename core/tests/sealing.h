@@ -26,7 +26,7 @@ inline SealOptions in_words(const PrototypeMap& map, std::optional<double> proto
                                            static_cast<double>(map.size());
   const double wanted = prototypes.value_or(all);
   return {.bytes_per_landmark =
-              wanted * static_cast<double>(most_words(map)) + (wanted > 1 && all > 1 ? 2 : 1)};
+              wanted * static_cast<double>(most_words(map)) + (wanted > 1 && all > 1 ? 1 : 0)};
 }
 
 }  // namespace protomark::test

@@ -34,8 +34,9 @@ struct Codebook {
   size_t width = 0;           // numbers per word, 1 to 4
   std::vector<int8_t> words;  // subspaces x kWords x width, -127 to 127
 
+  size_t subspaces() const { return words.size() / (kWords * width); }
   // Returns whether codes of `dim` numbers are whole words of this codebook.
-  bool covers(size_t dim) const { return dim % width == 0 && dim * kWords <= words.size(); }
+  bool covers(size_t dim) const { return dim % width == 0 && dim / width <= subspaces(); }
   bool operator==(const Codebook&) const = default;
 };
 
@@ -49,7 +50,7 @@ struct EncoderInfo {
 
 class PROTOMARK_API Encoder {
  public:
-  // `dims` are the lengths at which a code may be cut, ascending, the last one the number of
+  // `dims` are the lengths at which a code serves alone, ascending, the last one the number of
   // outputs; a code times `scale` is the real value; `codebooks` are of distinct widths. Throws
   // std::invalid_argument if layers or codebooks do not fit together, a sum could exceed 32 bits,
   // or a note is named like a field of EncoderInfo.
@@ -78,8 +79,9 @@ class PROTOMARK_API Encoder {
   // Multiply-adds per descriptor.
   size_t multiply_adds() const;
 
-  // Encodes descriptors (n x bytes) to codes (n x dim), where dim is one of dims(), or 0 for the
-  // full length. Throws std::invalid_argument if shapes do not fit.
+  // Encodes descriptors (n x bytes) to codes (n x dim), the first numbers of full ones; 0 stands
+  // for the full length, and dims() are those that serve best alone. Throws std::invalid_argument
+  // if shapes do not fit.
   Matrix<int8_t> encode(Descriptors descriptors, size_t dim = 0, int threads = 1) const;
   // Encodes into memory of the caller; dim is codes.columns.
   void encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads = 1) const;

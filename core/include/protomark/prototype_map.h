@@ -22,14 +22,14 @@ struct IndexOptions {
 };
 
 struct SealOptions {
-  // Bytes that a landmark may take on average for its prototypes, their number and its count (not
-  // for position, id and index). By default prototypes are int8 numbers and every appearance is
-  // kept, so that the sealed map gives the answers of the learning map. Otherwise they are, too, if
-  // all of them fit. Else they are words of one of the encoder's codebooks, and appearances are
-  // merged, those of least merge cost first (Ward's criterion: what merging adds to the squared
-  // distances of all observations to their prototypes), until they fit. It takes the most words
-  // that fit, or, if no observations tune it, the most that leave room for 1.25 prototypes per
-  // landmark, from 48 numbers on.
+  // Bytes that a landmark may take on average for its prototypes and their number (not for
+  // position, id and index). By default prototypes are int8 numbers and every appearance is kept,
+  // so that the sealed map gives the answers of the learning map. Otherwise they are, too, if all
+  // of them fit. Else they are words of one of the encoder's codebooks, and appearances are merged,
+  // those of least merge cost first (Ward's criterion: what merging adds to the squared distances
+  // of all observations to their prototypes), until they fit. It takes the best words that fit, or,
+  // if no observations tune it, the best that leave room for 1.25 prototypes per landmark, from 48
+  // numbers on. Words of fewer numbers are better from 1.1 times as many on.
   std::optional<double> bytes_per_landmark = std::nullopt;
   // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
   // bounding box, 65534 from end to end along each axis. 0: no positions.

@@ -11,9 +11,9 @@
 namespace protomark {
 
 // Bytes per landmark: dim per prototype (dimensions padded to a multiple of 4), or one for each
-// word of a codebook; one for its count; another one if landmarks have several prototypes; 12 or 6
-// for its position, if the map has positions; an eighth and the bits of the gaps between ids,
-// unless ids are 0 ... n - 1. Any number of threads may use a sealed map.
+// word of a codebook; one for their number if landmarks have several; 12 or 6 for its position, if
+// the map has positions; an eighth and the bits of the gaps between ids, unless ids are 0 ... n
+// - 1. Any number of threads may use a sealed map.
 class PROTOMARK_API SealedMap {
  public:
   // Maps a file. Does not read the large sections, which verify_file checks. Throws FileError.
@@ -34,8 +34,8 @@ class PROTOMARK_API SealedMap {
   size_t words() const;
   // Whether prototypes were tuned against each other (SealOptions).
   bool tuned() const;
-  // Bytes that a landmark takes on average for its prototypes, their number and its count, as
-  // SealOptions counts them; 0 for an empty map.
+  // Bytes that a landmark takes on average for its prototypes and their number, as SealOptions
+  // counts them; 0 for an empty map.
   double bytes_per_landmark() const;
   // Bits per coordinate: 32, 16, or 0 if no landmark has a position.
   int position_bits() const;
@@ -52,14 +52,14 @@ class PROTOMARK_API SealedMap {
   // when the map was sealed. Throws std::invalid_argument for another recall, and without an index.
   size_t nprobe(double recall) const;
 
-  // Return positions; numbers of observations, at most 255; and prototypes as stored (n x dim, in
-  // code units), of a landmark with several their plain mean. Throw UnknownLandmark.
+  // Return positions, and prototypes as stored (n x dim, in code units), of a landmark with several
+  // their plain mean. Throw UnknownLandmark.
   std::vector<Position> positions(std::span<const int64_t> ids) const;
-  std::vector<uint32_t> counts(std::span<const int64_t> ids) const;
   Matrix<float> prototypes(std::span<const int64_t> ids) const;
   // Returns the prototypes of a landmark (appearances x dim, in code units), with an index in no
   // particular order. Throws UnknownLandmark.
   Matrix<float> appearances(int64_t id) const;
+  // Returns a summary without observations, which a sealed map does not count.
   MapSummary summary() const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).

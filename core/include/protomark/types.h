@@ -96,7 +96,7 @@ inline constexpr size_t kMaxMetadataText = 1 << 16;  // bytes
 PROTOMARK_API void check_metadata(const Metadata& metadata);
 
 struct MapSummary {
-  uint64_t observations = 0;  // a sealed map counts at most 255 per landmark
+  uint64_t observations = 0;
   // Number of landmarks with i observations, at index i; with 255 or more at the last index.
   std::array<int64_t, 256> count_histogram{};
   size_t landmarks_with_position = 0;

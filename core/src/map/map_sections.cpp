@@ -102,7 +102,7 @@ Metadata read_metadata(const ContainerReader& file) {
 MapShape read_shape(const ContainerReader& file, const Encoder& encoder) {
   const auto shape = read_value<MapShape>(file, section::kShape);
   if (shape.landmarks > UINT32_MAX) file.fail("it claims more landmarks than a map can hold");
-  if (std::ranges::find(encoder.dims(), shape.dim) == encoder.dims().end()) {
+  if (shape.dim == 0 || shape.dim > encoder.dim()) {
     file.fail("its dimension does not fit its encoder");
   }
   if (!std::ranges::all_of(shape.origin, [](double x) { return std::isfinite(x); })) {

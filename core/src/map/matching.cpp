@@ -4,6 +4,7 @@
 #include <cmath>
 #include <functional>
 #include <locale>
+#include <map>
 #include <unordered_set>
 
 #include "base/text.h"
@@ -14,8 +15,9 @@ namespace {
 // A note has a line for each length of codes: the length and three weights.
 constexpr char kNote[] = "match_calibration", kTunedNote[] = "match_calibration_tuned";
 
+// Between lengths that a note has, weights are interpolated.
 std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
-  std::optional<MatchCalibration> found;
+  std::map<size_t, MatchCalibration> fitted;
   std::istringstream lines(note);
   for (std::string line; std::getline(lines, line);) {
     std::istringstream in(line);
@@ -28,7 +30,17 @@ std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
     if (in.fail() || in >> rest) {
       invalid("the model's note on ", kNote, " is broken: '", line.substr(0, 80), "'");
     }
-    if (length == dim) found = calibration;
+    fitted.emplace(length, calibration);
+  }
+  const auto next = fitted.lower_bound(dim);
+  if (next == fitted.end() || (next == fitted.begin() && next->first != dim)) return std::nullopt;
+  MatchCalibration found = next->second;
+  if (next->first == dim) return found;
+  const auto& [shorter, before] = *std::prev(next);
+  const double share =
+      static_cast<double>(dim - shorter) / static_cast<double>(next->first - shorter);
+  for (size_t i = 0; i < found.weights.size(); ++i) {
+    found.weights[i] = std::lerp(before.weights[i], found.weights[i], share);
   }
   return found;
 }

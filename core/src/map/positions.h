@@ -6,10 +6,8 @@
 
 namespace protomark {
 
-// Adds a landmark to the summary of its map; NaN means that it has no position.
-inline void add_to_summary(MapSummary& summary, uint32_t observations, const Position& position) {
-  summary.observations += observations;
-  ++summary.count_histogram[std::min(observations, 255u)];
+// Adds the position of a landmark to the summary of its map; NaN means that it has none.
+inline void add_to_summary(MapSummary& summary, const Position& position) {
   if (std::isnan(position[0])) return;
   ++summary.landmarks_with_position;
   if (!summary.extent) summary.extent = {position, position};

@@ -186,12 +186,14 @@ class SealedContent {
     const size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
     const ContainerWriter::Part prototypes{section::kPrototypes,
                                            store_.lists().blocks() * packer_.size()};
-    std::vector<ContainerWriter::Part> parts{{section::kCounts, n}};
+    std::vector<ContainerWriter::Part> parts;
     if (has_row_counts()) parts.push_back({section::kRows, n});
     if (codec_) parts.push_back({section::kPositions, n * codec_->size()});
     if (nlist == 0) parts.push_back(prototypes);
     if (ids_are_stored_) IdBlockWriter::add_to(parts, n);
-    file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
+    if (!parts.empty()) {
+      file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
+    }
     if (nlist == 0) return;
     const size_t words = packed_words(store_.row_end(), owner_bits(n));
     file.add_together({prototypes, {section::kOwners, packed_bytes(words, 64)}},
@@ -217,7 +219,6 @@ class SealedContent {
 
   void put_landmarks(Sinks sinks) {
     auto sink = sinks.begin();
-    const Sink& counts = *sink++;
     const Sink* row_counts = has_row_counts() ? &*sink++ : nullptr;
     const Sink* positions = codec_ ? &*sink++ : nullptr;
     std::optional<RowWriter> prototypes;
@@ -228,12 +229,6 @@ class SealedContent {
     if (ids_are_stored_) ids.emplace(sink[0], sink[1]);
     if (!prototypes && ids_are_stored_) landmarks_.emplace(store_);
     store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
-      const auto in_map = [&](LandmarkIndex l) {
-        return &store_ == &map_ ? l : map_.at(store_.id(l));
-      };
-      put_each<uint8_t>(counts, landmarks, [&](LandmarkIndex l) {
-        return static_cast<uint8_t>(std::min(map_.observations(in_map(l)), 255u));
-      });
       if (row_counts != nullptr) {
         put_each<uint8_t>(*row_counts, landmarks, [&](LandmarkIndex l) {
           return static_cast<uint8_t>(store_.row_count(l));
@@ -241,7 +236,8 @@ class SealedContent {
       }
       if (positions != nullptr) {
         put_values<std::byte>(*positions, landmarks.size(), codec_->size(), [&](auto i, auto* to) {
-          codec_->encode(map_.position(in_map(landmarks[i])), to);
+          const LandmarkIndex l = landmarks[i];
+          codec_->encode(map_.position(&store_ == &map_ ? l : map_.at(store_.id(l))), to);
         });
       }
       for (const LandmarkIndex landmark : landmarks) {

@@ -131,7 +131,11 @@ class PrototypeStore : public RowTable {
   }
   MapSummary summary() const {
     MapSummary result;
-    each_landmark([&](LandmarkIndex l) { add_to_summary(result, observations(l), position(l)); });
+    each_landmark([&](LandmarkIndex l) {
+      result.observations += observations(l);
+      ++result.count_histogram[std::min(observations(l), 255u)];
+      add_to_summary(result, position(l));
+    });
     return result;
   }
   int count(Row row) const { return counts_[row.value]; }

@@ -34,7 +34,6 @@ struct SealedMap::Content {
     if (file.has(section::kWidth)) read_codebook();
     const size_t size = packed_size(prototypes.rows, shape.dim, prototypes.width);
     prototypes.data = file.map<std::byte>(section::kPrototypes, size).data();
-    counts = file.map<uint8_t>(section::kCounts, n);
     ids = LandmarkIds(file, n);
     if (!file.has(section::kPositions)) return;
     codec.emplace(file, shape.origin);
@@ -166,7 +165,6 @@ struct SealedMap::Content {
   mutable std::once_flag rows_found;
   mutable std::vector<Row> rows;  // of prototypes by id
 
-  std::span<const uint8_t> counts;
   LandmarkIds ids;
   std::optional<PositionCodec> codec;
   std::span<const std::byte> positions;
@@ -229,15 +227,6 @@ std::optional<Position> SealedMap::position_error() const {
   return Position{step[0] / 2, step[1] / 2, step[2] / 2};
 }
 
-std::vector<uint32_t> SealedMap::counts(std::span<const int64_t> landmark_ids) const {
-  const Content& c = unchanged();
-  std::vector<uint32_t> result;
-  for (const int64_t id : landmark_ids) {
-    result.push_back(c.counts[c.ids.find(id).value]);
-  }
-  return result;
-}
-
 Matrix<float> SealedMap::prototypes(std::span<const int64_t> landmark_ids) const {
   const Content& c = unchanged();
   Matrix<float> means(landmark_ids.size(), dim());
@@ -280,7 +269,7 @@ MapSummary SealedMap::summary() const {
   const Content& c = unchanged();
   MapSummary result;
   for (size_t i = 0; i < size(); ++i) {
-    add_to_summary(result, c.counts[i], c.position(landmark_at(i)));
+    add_to_summary(result, c.position(landmark_at(i)));
   }
   return result;
 }

@@ -12,9 +12,10 @@ namespace {
 // A sealed map stores the number of a landmark's prototypes in a byte.
 constexpr size_t kMaxRows = 255;
 
-// Without observations to tune by, so many prototypes per landmark are worth more than longer ones
-// once these have so many numbers (measured on caliterra, viking and conch).
-constexpr double kWorthwhile = 1.25;
+// Measured on caliterra, viking and conch: words of fewer numbers are better from so many times as
+// many words on; and, without observations to tune by, so many prototypes per landmark are worth
+// more than longer ones once these have so many numbers.
+constexpr double kMoreWords = 1.1, kWorthwhile = 1.25;
 constexpr size_t kEnoughNumbers = 48;
 
 // Sums of the first `dim` numbers and counts of one landmark's rows.
@@ -182,6 +183,28 @@ class Clusters {
   std::vector<double> cost_;       // of merging with the partner
 };
 
+struct Words {
+  size_t numbers() const { return codebook == nullptr ? 0 : count * codebook->width; }
+
+  const Codebook* codebook = nullptr;
+  size_t count = 0;
+};
+
+// Returns the best words for up to `dim` numbers in so many bytes, none if they are too few for the
+// encoder's shortest codes.
+Words best_words(const Encoder& encoder, size_t dim, double bytes) {
+  Words best;
+  for (const Codebook& codebook : encoder.codebooks()) {
+    const size_t longest = std::min(dim / codebook.width, codebook.subspaces());
+    const auto count = static_cast<size_t>(std::clamp(bytes, 0.0, static_cast<double>(longest)));
+    if (count * codebook.width < encoder.dims().front()) continue;
+    const auto more = static_cast<double>(count), most = static_cast<double>(best.count);
+    const bool narrower = best.codebook == nullptr || codebook.width < best.codebook->width;
+    if (narrower ? more >= kMoreWords * most : most < kMoreWords * more) best = {&codebook, count};
+  }
+  return best;
+}
+
 }  // namespace
 
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
@@ -193,7 +216,7 @@ std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
 }
 
 size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes) {
-  return rows * row_bytes + landmarks * (rows > landmarks ? 2 : 1);
+  return rows * row_bytes + (rows > landmarks ? landmarks : 0);
 }
 
 int owner_bits(size_t landmarks) {
@@ -210,45 +233,39 @@ SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
   const SealFormat lossless{dim, nullptr, rows};
   if (!bytes_per_landmark) return lossless;
   // The rounding of products must not cost a prototype.
-  const double limit = *bytes_per_landmark * (1 + 1e-12), budget = limit * static_cast<double>(n);
-  // Returns how many prototypes of so many bytes fit.
+  const double limit = *bytes_per_landmark * (1 + 1e-12), landmarks = static_cast<double>(n);
+  // Returns how many prototypes of so many bytes fit, at least one per landmark.
   const auto fitting = [&](size_t row_bytes) {
-    if (static_cast<double>(sealed_bytes(n, rows, row_bytes)) <= budget) return rows;
-    if (static_cast<double>(sealed_bytes(n, n, row_bytes)) > budget) return size_t{0};
-    const double several = (budget - 2 * static_cast<double>(n)) / static_cast<double>(row_bytes);
+    if (static_cast<double>(sealed_bytes(n, rows, row_bytes)) <= limit * landmarks) return rows;
+    const double several = (limit - 1) * landmarks / static_cast<double>(row_bytes);
     return std::max(n, static_cast<size_t>(std::max(0.0, several)));
   };
-  const size_t worthwhile =
-      std::min(rows, static_cast<size_t>(kWorthwhile * static_cast<double>(n)));
-  size_t smallest = SIZE_MAX;
-  // The most words that fit, and the most that leave room for a worthwhile number of prototypes.
-  std::pair<size_t, SealFormat> most{0, lossless}, several{0, lossless};
-  for (const size_t of_codes : encoder.dims()) {
-    for (const Codebook& codebook : encoder.codebooks()) {
-      if (of_codes > dim || !codebook.covers(of_codes)) continue;
-      const size_t words = of_codes / codebook.width;
-      smallest = std::min(smallest, words);
-      if (static_cast<double>(words + 1) > limit) continue;
-      const std::pair found{words, SealFormat{of_codes, &codebook, fitting(words)}};
-      if (words >= most.first) most = found;
-      if (words >= several.first && !observed && of_codes >= kEnoughNumbers &&
-          found.second.row_limit >= std::max<size_t>(1, worthwhile)) {
-        several = found;
-      }
-    }
+  size_t smallest = 1;
+  while (smallest < packed_dim(dim) &&
+         best_words(encoder, dim, static_cast<double>(smallest)).count == 0) {
+    ++smallest;
   }
-  const bool enough = limit >= static_cast<double>(std::min(smallest, packed_dim(dim)) + 1);
-  if (enough && fitting(packed_dim(dim)) == rows) return lossless;
-  if (smallest == SIZE_MAX) {
+  const bool enough = limit >= static_cast<double>(smallest);
+  if (enough && static_cast<double>(sealed_bytes(n, rows, packed_dim(dim))) <= limit * landmarks) {
+    return lossless;
+  }
+  if (best_words(encoder, dim, static_cast<double>(dim)).count == 0) {
     invalid("bytes_per_landmark needs codebooks, which encoder '", encoder.info().name,
             "' does not have for this map: give it some, or seal the map as it is, without "
             "bytes_per_landmark");
   }
   if (!enough) {
-    invalid("bytes_per_landmark must be at least ", smallest + 1,
+    invalid("bytes_per_landmark must be at least ", smallest,
             " for this map, which one prototype of ", smallest, " words takes");
   }
-  return several.first != 0 ? several.second : most.second;
+  if (!observed && static_cast<double>(rows) >= kWorthwhile * landmarks) {
+    const Words several = best_words(encoder, dim, (limit - 1) / kWorthwhile);
+    if (several.numbers() >= kEnoughNumbers) {
+      return {several.numbers(), several.codebook, fitting(several.count)};
+    }
+  }
+  const Words most = best_words(encoder, dim, limit);
+  return {most.numbers(), most.codebook, fitting(most.count)};
 }
 
 std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t dim,

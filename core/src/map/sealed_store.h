@@ -18,7 +18,7 @@ struct SealFormat {
 SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
                        std::optional<double> bytes_per_landmark, bool observed);
 
-// Returns the bytes that prototypes of `row_bytes`, their number and the counts of landmarks take.
+// Returns the bytes that prototypes of `row_bytes` and their number take.
 size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes);
 
 // Returns the bits of a row's owner, which is a landmark or, for padding, the number of landmarks.

@@ -67,8 +67,9 @@ def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     several = facts["prototypes_per_landmark"]
     each = f"{several:.2f} prototypes" if several else "a prototype"
     yield "landmarks", f"{landmarks:,}, each with {each} of {facts['dim']} numbers"
-    bars = _bars(facts["count_histogram"])
-    yield "observations", f"{facts['observations']:,}; per landmark 1 {bars} 16 and more"
+    if facts["observations"] is not None:
+        bars = _bars(facts["count_histogram"] or [])
+        yield "observations", f"{facts['observations']:,}; per landmark 1 {bars} 16 and more"
     sections = facts["bytes_by_section"]
     each = (facts["bytes"] - sections["encoder"]) / max(landmarks, 1)
     yield (

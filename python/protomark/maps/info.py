@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import protomark as pm
 from protomark.maps.open import map_path
 from protomark.tracks.file import Tracks
@@ -65,9 +63,10 @@ def _describe_encoder(path: Path) -> dict[str, Any]:
 
 
 def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
-    """Bytes per landmark that matching needs in a sealed map: prototypes and count, without ids.
+    """Bytes per landmark for prototypes, without ids.
 
-    A learning map counts as if it were sealed without loss. The padding of a prototype to a
+    A learning map counts int8 prototypes, and a byte for the number of observations, by which it
+    learns. The padding of a prototype to a
     multiple of 4 bytes counts; the up to 15 rows that pad the whole section do not, as they do not
     grow with the map.
     """
@@ -111,8 +110,8 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "words": None if sealed is None else sealed.words or None,
         "nlist": scene.nlist or None,
         "index_bytes_per_landmark": _index_bytes(scene, sections),
-        "observations": summary["observations"],
-        "count_histogram": np.trim_zeros(summary["count_histogram"], "b").tolist(),
+        "observations": summary.get("observations"),
+        "count_histogram": None if sealed else summary["count_histogram"].tolist(),
         "landmarks_with_position": summary["landmarks_with_position"],
         "position_bits": None if sealed is None else sealed.position_bits or None,
         "position_error": None if error is None else error.tolist(),

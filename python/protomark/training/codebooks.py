@@ -25,10 +25,10 @@ def with_codebooks(
 ) -> pm.Encoder:
     """The encoder with codebooks that fit prototypes of these sequences, tuned as maps have them.
 
-    A codebook covers the longest codes whose length is a multiple of its width.
+    A codebook covers as many numbers of a code as are whole words.
     """
     prototypes = np.concatenate([tuned_prototypes(encoder, views) for views in sequences])
-    covered = {w: max((d for d in encoder.dims if d % w == 0), default=0) for w in WIDTHS}
+    covered = {w: encoder.dim // w * w for w in WIDTHS}
     parts = [(w, at) for w in WIDTHS for at in range(0, covered[w], w)]
     words = {
         (w, at): words_of(prototypes[:, at : at + w])
