@@ -140,7 +140,9 @@ def test_what_is_refused(tmp_path: Path) -> None:
     other.descriptor = "latch"
     other.descriptors = other.descriptors[:, :32].copy()
     other.save(tmp_path / "latch.safetensors")
-    with pytest.raises(ValueError, match=r"freak descriptors, not latch: a map holds one kind"):
+    with pytest.raises(
+        ValueError, match=r"freak descriptors, but others have latch: a map holds one"
+    ):
         read_places([sample.path(), tmp_path / "latch.safetensors"])
     with pytest.raises(ValueError, match="is named twice"):
         read_places([sample.path(), sample.path()])
