@@ -92,6 +92,9 @@ def _source_words(one: Mapping[str, Any]) -> Iterator[str]:
     counts = [f"{one[k]:,} {k}" for k in _COUNTED if isinstance(one.get(k), int)]
     if counts:
         yield ", ".join(counts)
+    cameras = one.get("cameras")
+    if isinstance(cameras, list):
+        yield f"{one.get('descriptor')} of {first_of([str(camera) for camera in cameras])}"
     maps = one.get("maps")
     if isinstance(maps, list) and len(maps) > 1:
         yield f"{len(maps)} maps, each in coordinates of its own"

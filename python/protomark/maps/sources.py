@@ -234,5 +234,8 @@ def _facts(name: str, tracks: Tracks) -> dict[str, Any]:
         "keyframes": len(tracks.keyframe_names),
         "landmarks": len(tracks.landmark_ids),
         "observations": len(tracks.observations),
+        "descriptor": tracks.descriptor,
+        "cameras": sorted({f"{c.model} {c.width}x{c.height}" for c in tracks.cameras.values()}),
+        **({"detector": detector} if (detector := tracks.info.get("detector")) else {}),
         "ids": tracks.landmark_ids[[0, -1]].tolist(),
     }

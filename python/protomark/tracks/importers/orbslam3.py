@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -195,13 +196,19 @@ def _camera(lens: Lens, bent: bool, atlas: Atlas) -> Camera:
     if lens.id not in atlas.cameras:
         raise ValueError(f"a keyframe names camera {lens.id}, which is missing")
     fisheye, params = atlas.cameras[lens.id]
+    params = _decimal(params)
     size = right - left, bottom - top
     if fisheye:
         return Camera.from_opencv(*size, params[:4], params[4:], fisheye=True)
-    pinhole = *lens.focal, *lens.center
+    pinhole = _decimal((*lens.focal, *lens.center))
     if bent:
-        return Camera.from_opencv(*_raw_size(lens), pinhole, lens.distortion)
+        return Camera.from_opencv(*_raw_size(lens), pinhole, _decimal(lens.distortion))
     return Camera.from_opencv(*size, pinhole)
+
+
+def _decimal(numbers: Sequence[float]) -> tuple[float, ...]:
+    """The shortest decimals that are these float32 numbers, as calibrations have them."""
+    return tuple(float(str(np.float32(number))) for number in numbers)
 
 
 def _raw_size(lens: Lens) -> tuple[int, int]:
@@ -240,6 +247,6 @@ def _bounds(lens: Lens, size: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _detector(keyframes: list[Keyframe]) -> dict[str, Any]:
-    kinds = Counter((k.levels, float(f"{k.scale_factor:.6g}")) for k in keyframes)
+    kinds = Counter((k.levels, *_decimal([k.scale_factor])) for k in keyframes)
     levels, scale_factor = kinds.most_common(1)[0][0]
     return {"name": "ORB-SLAM", "levels": levels, "scale_factor": scale_factor}
