@@ -253,7 +253,7 @@ def test_build_and_localize(two_maps: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene.pmk"
     done = protomark("build", two_maps, "-o", scene, "--json", tmp_path / "facts.json")
     assert done.returncode == 0, done.stderr
-    assert "2 maps, each in coordinates of its own" in done.stdout
+    assert "2 maps, each in coordinates of its own" in " ".join(done.stdout.split())
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert facts["sources"][0]["observations"] == 6949
     sealed = pm.open(tmp_path / "scene.sealed.pmk")
