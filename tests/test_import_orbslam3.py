@@ -14,6 +14,7 @@ import pytest
 import protomark as pm
 from conftest import protomark
 from foreign_scene import check_broken_files, counts, foreign, reprojection_errors
+from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 from protomark.maps.build import build_map
 from protomark.tracks.file import Tracks
@@ -230,6 +231,19 @@ def test_bad_and_contradicting_points(two_maps: Path) -> None:
     assert len(tracks.keyframe_names) == len(whole.keyframe_names) - 1
     assert bad.id not in tracks.landmark_ids
     tracks.check()
+
+
+def test_rectified_images(two_maps: Path) -> None:
+    """Keypoints are not distorted, whatever the coefficients say."""
+    atlas = AtlasReader(two_maps.read_bytes(), two_maps).atlas()
+    for one in atlas.maps:
+        for keyframe in one.keyframes:
+            keyframe.keypoints = keyframe.undistorted
+            keyframe.lens = keyframe.lens._replace(bounds=(0, 0, WIDTH, HEIGHT))
+    tracks = _tracks(atlas)
+    assert list(tracks.cameras.values()) == [Camera("PINHOLE", WIDTH, HEIGHT, (400, 400, 240, 180))]
+    assert "rectify query images alike" in tracks.info["source"]["note"]
+    assert np.median(np.linalg.norm(reprojection_errors(tracks), axis=1)) < 1
 
 
 def test_ids_of_maps_that_interleave(two_maps: Path) -> None:

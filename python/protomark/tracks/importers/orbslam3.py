@@ -79,7 +79,18 @@ def _tracks(atlas: Atlas) -> Tracks:
     positions = np.array([p.position for one in maps for p in one.points], np.float64)
     order = np.argsort(landmark_ids)
     features = np.concatenate([part for k in keyframes for part in (k.keypoints, k.right)])
-    names, numbers, poses, lengths, cameras = _images(keyframes, atlas)
+    bent = {k.lens for k in keyframes if (k.keypoints["xy"] != k.undistorted["xy"]).any()}
+    names, numbers, poses, lengths, cameras = _images(keyframes, bent, atlas)
+    source: dict[str, Any] = {
+        "program": PROGRAM,
+        "version": "unknown",
+        "archive": f"Boost {atlas.archive_version}",
+        "maps": summaries,
+    }
+    if dropped := +dropped:
+        source["dropped"] = dict(dropped)
+    if any(any(k.lens.distortion) and k.lens not in bent for k in keyframes):
+        source["note"] = "cameras are those of rectified images: rectify query images alike"
     return Tracks(
         descriptor="orb",
         cameras=cameras,
@@ -96,16 +107,7 @@ def _tracks(atlas: Atlas) -> Tracks:
         landmark_of_keypoint=labels,
         landmark_ids=landmark_ids[order],
         landmark_positions=positions[order],
-        info={
-            "source": {
-                "program": PROGRAM,
-                "version": "unknown",
-                "archive": f"Boost {atlas.archive_version}",
-                "maps": summaries,
-                **({"dropped": dict(dropped)} if (dropped := +dropped) else {}),
-            },
-            "detector": _detector(keyframes),
-        },
+        info={"source": source, "detector": _detector(keyframes)},
     )
 
 
@@ -156,11 +158,13 @@ def _observations(
 
 
 def _images(
-    keyframes: list[Keyframe], atlas: Atlas
+    keyframes: list[Keyframe], bent: set[Lens], atlas: Atlas
 ) -> tuple[list[str], NDArray[np.int32], NDArray[np.float64], list[int], dict[int, Camera]]:
-    """Names, camera ids, poses and numbers of keypoints of all images, and the cameras by id."""
-    # Images that the program has rectified keep the coefficients of those that it was given.
-    bent = {k.lens for k in keyframes if (k.keypoints["xy"] != k.undistorted["xy"]).any()}
+    """Names, camera ids, poses and numbers of keypoints of all images, and the cameras by id.
+
+    Keypoints of `bent` lenses are distorted. Images that the program has rectified keep the
+    coefficients of those that it was given, and are not.
+    """
     lenses = {lens: _camera(lens, lens in bent, atlas) for lens in {k.lens for k in keyframes}}
     found: dict[Camera, int] = {}
     taken: Counter[str] = Counter()
