@@ -17,6 +17,7 @@ from foreign_scene import check_broken_files, counts, foreign, reprojection_erro
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers
 from protomark.maps.build import build_map
+from protomark.maps.places import map_places
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers import orbslam3, read_source
 from protomark.tracks.importers.orbslam3 import _tracks, read, recognizes
@@ -288,6 +289,20 @@ def test_build_and_localize(two_maps: Path, tmp_path: Path) -> None:
         center = np.array([[float(row[f"center_{axis}"]) for axis in "xyz"]])
         expected = true_centers([row["image"].removesuffix(".jpg")])
         assert np.linalg.norm(moved(center, by) - expected) < 0.05
+
+
+def test_tracks_of_an_atlas(two_maps: Path, tmp_path: Path) -> None:
+    done = protomark("tracks", two_maps, "-o", tmp_path)
+    assert done.returncode == 0, done.stderr
+    saved, tracks = Tracks.load(tmp_path / "two_maps.orb.safetensors"), read(two_maps)
+    assert np.array_equal(saved.descriptors, tracks.descriptors)
+    assert saved.info["source"] == tracks.info["source"]
+    done = protomark("seal", tmp_path / "two_maps.orb.safetensors", "-o", tmp_path / "x.pmk")
+    assert done.returncode == 0, done.stderr
+    assert [place.name[-5:] for place in map_places(pm.open(tmp_path / "x.pmk"))] == [
+        "map 0",
+        "map 1",
+    ]
 
 
 def test_held_out_keyframes_are_found_as_by_hamming_distance(two_maps: Path) -> None:
