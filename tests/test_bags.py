@@ -18,6 +18,7 @@ from protomark.features.bag import bag_camera, bag_frames, image_topic, is_bag
 from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import read_model
 from protomark.geometry.pose import camera_centers
+from protomark.localization.batch import LocalizationRequest, localize_files
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
@@ -164,7 +165,7 @@ def test_broken_bags(kind: str, tmp_path: Path) -> None:
     assert [text for text in refused if str(path) not in text and "camera" not in text] == []
 
 
-def test_a_bag_is_mapped_with_its_camera(tmp_path: Path) -> None:
+def test_a_bag_is_mapped_and_localized_with_its_camera(tmp_path: Path) -> None:
     poses = walk(16)
     path = write_bag(tmp_path / "run.mcap", [show(pose) for pose in poses], info_values(PINHOLE))
     notes: list[str] = []
@@ -179,3 +180,14 @@ def test_a_bag_is_mapped_with_its_camera(tmp_path: Path) -> None:
     assert trajectory_rmse(model.centers, camera_centers(poses)) < 0.02
     times = np.loadtxt(tmp_path / "scene" / "trajectory.txt")[:, 0]
     np.testing.assert_allclose(times, START + STEP * np.arange(16), atol=1e-5)
+    later = write_bag(
+        tmp_path / "later.bag", [show(pose) for pose in walk(31)[::6]], info_values(PINHOLE)
+    )
+    request = LocalizationRequest(tmp_path / "scene", [later], topic=TOPIC, threads=1)
+    batch = localize_files(request, tmp_path / "found")
+    assert [image.time for image in batch.images] == pytest.approx(START + STEP * np.arange(6))
+    cameras = {image.found.camera for image in batch.images if image.found}
+    assert cameras == {PINHOLE}
+    assert sum(map(batch.accepted, batch.images)) >= 3  # the walk goes on beyond the map
+    trajectory = np.loadtxt(tmp_path / "found" / "trajectory.txt")
+    np.testing.assert_allclose(trajectory[0, 0], START, atol=1e-5)

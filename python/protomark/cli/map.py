@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from protomark.cli.options import (
+    BagTopic,
     CameraText,
     EncoderName,
     JsonFile,
@@ -56,13 +57,7 @@ def map_(
         typer.Option(help="Image that is black where the camera sees no scene, as in COLMAP."),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            help="Topic of a ROS bag's images; by default the only one. Its CameraInfo is the "
-            "camera unless --camera or --focal is given."
-        ),
-    ] = None,
+    topic: BagTopic = None,
     window: Annotated[
         int,
         typer.Option(

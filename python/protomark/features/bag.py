@@ -113,6 +113,20 @@ def bag_camera(path: Path, topic: str) -> Camera | None:
     return None
 
 
+def camera_of_size(path: Path, camera: Camera, width: int, height: int) -> Camera:
+    """A bag's camera at the size of its images.
+
+    Raises:
+        ValueError: the images have other proportions.
+    """
+    if abs(width * camera.height - height * camera.width) > max(width, height):
+        raise ValueError(
+            f"{path}: images of {width} x {height} pixels, but the bag's camera has "
+            f"{camera.width} x {camera.height}: give that of the images with --camera"
+        )
+    return camera.resized(width, height)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """Open a bag; whatever fails in it, here or in the block, is a ValueError."""

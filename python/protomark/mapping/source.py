@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protomark.features.bag import bag_camera, bag_frames, image_topic, is_bag
+from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
 from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray
 from protomark.features.video import Decode, check_video, video_frames
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
@@ -318,15 +318,7 @@ class Bag(Video):
             ValueError: the images have other proportions than that.
         """
         camera = bag_camera(self.path, self.topic)
-        if camera is None:
-            return None
-        width, height = self.size()
-        if abs(width * camera.height - height * camera.width) > max(width, height):
-            raise ValueError(
-                f"{self.path}: images of {width} x {height} pixels, but the bag's camera has "
-                f"{camera.width} x {camera.height}: give that of the images with --camera"
-            )
-        return camera.resized(width, height)
+        return camera and camera_of_size(self.path, camera, *self.size())
 
 
 def open_source(path: Path, every: int = 1, topic: str | None = None) -> FrameSource:
