@@ -12,8 +12,10 @@ from typing import Annotated, Any
 
 import typer
 
+from protomark.cli.align import align
 from protomark.cli.build import build
 from protomark.cli.calibrate import calibrate
+from protomark.cli.crop import crop
 from protomark.cli.demo import demo
 from protomark.cli.evaluate import evaluate
 from protomark.cli.info import info
@@ -44,6 +46,8 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "seal": seal,
     "merge": merge,
     "split": split,
+    "crop": crop,
+    "align": align,
     "info": info,
     "demo": demo,
     "evaluate": evaluate,
