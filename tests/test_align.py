@@ -21,6 +21,7 @@ from protomark.mapping.aligning import Target, align_scene
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.maps.open import open_learning_map
+from protomark.maps.split import crop_file
 from test_mapping import CAMERA, SETTINGS
 from test_mapping_continue import contents
 from test_similarity import assert_same, random_similarity
@@ -188,14 +189,15 @@ def test_maps_are_cropped(encoder: pm.Encoder, tmp_path: Path) -> None:
         np.testing.assert_array_equal(part.prototypes(kept), scene.prototypes(kept))
         assert part.metadata["frame"] == "metres"
     output.unlink()
-    for arguments, message in (
-        ([], "give one of --box and --near"),
-        (["--box", "1,2,3"], "--box needs six numbers"),
-        (["--box", "1,1,1,0,2,2"], "--box needs six numbers"),
-        (["--near", "1,2,3,-1"], "--near needs four numbers"),
-        (["--near", "1,2,x,1"], "is not a list of numbers"),
-        (["--near", "99,0,0,1"], "no landmark is there; the map has positions from 0,0,-8 to 8,16"),
+    for region, message in (
+        ({}, "give one of --box and --near"),
+        ({"box": (1, 2, 3)}, "--box needs six numbers"),
+        ({"box": (1, 1, 1, 0, 2, 2)}, "--box needs six numbers"),
+        ({"near": (1, 2, 3, -1)}, "--near needs four numbers"),
+        ({"near": (99, 0, 0, 1)}, "no landmark is there; the map has positions from 0,0,-8 to 8,"),
     ):
-        done = protomark("crop", tmp_path / "scene.pmk", *arguments, "-o", output)
-        assert (done.returncode, output.exists()) == (1, False)
-        assert message in done.stderr
+        with pytest.raises(ValueError, match=message):
+            crop_file(tmp_path / "scene.pmk", output, **region)
+    done = protomark("crop", tmp_path / "scene.pmk", "--near", "1,2,x,1", "-o", output)
+    assert "is not a list of numbers" in done.stderr
+    assert not output.exists()

@@ -27,9 +27,9 @@ _CELL = 8.0
 # other map has landmarks this share agrees; and if this share of the cubes in which both maps have
 # landmarks holds a pair that agrees (benchmarks/scripts/merge_halves.py). Places that only look
 # alike share some landmarks, and lack those around them.
-_MIN_AGREEING = 20
-_MIN_SHARE = 0.3
-_MIN_CUBES = 0.15
+_MIN_AGREEING = 15
+_MIN_SHARE = 0.15
+_MIN_CUBES = 0.1
 _SAMPLES = 200_000
 # A flat scene agrees with its mirror image, too, but hardly more.
 _MIRRORED = 1.1
