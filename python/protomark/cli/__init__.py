@@ -18,6 +18,7 @@ from protomark.cli.calibrate import calibrate
 from protomark.cli.crop import crop
 from protomark.cli.demo import demo
 from protomark.cli.evaluate import evaluate
+from protomark.cli.export import export
 from protomark.cli.info import info
 from protomark.cli.localize import localize
 from protomark.cli.map import map_
@@ -48,6 +49,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "split": split,
     "crop": crop,
     "align": align,
+    "export": export,
     "info": info,
     "demo": demo,
     "evaluate": evaluate,
