@@ -25,7 +25,9 @@ from protomark.progress import Progress, silent, tracked
 from protomark.threads import one_blas_thread
 
 # Maps meet in so many other places at most; there they are off by at most this share of the reach.
-_MAX_LOOPS = 3
+_MAX_LOOPS = 5
+_MIN_AGREEING = 15
+_MAX_CHANCE = -15.0
 _MAX_DRIFT = 0.1
 
 
@@ -162,7 +164,9 @@ def _close_loops(mapper: Mapper, count: int) -> int:
             found = align_maps(scene.part(alone[0]), scene.part(alone[1]))
         except ValueError:
             break
-        if found.problem or found.drift > _MAX_DRIFT * found.reach:
+        # That the maps are of one scene is known: little in common is enough.
+        unsure = found.agreeing < _MIN_AGREEING or found.chance > _MAX_CHANCE
+        if unsure or found.drift > _MAX_DRIFT * found.reach:
             break
         merged += _merge_duplicates(mapper, found.into, found.source)
     return merged

@@ -135,6 +135,8 @@ def align_maps(
             )
     sample = worlds[1].ids[:: -(-len(worlds[1].ids) // searched)]
     into, ours = _likely_pairs(*worlds, sample, threads)
+    if len(into) < _MIN_AGREEING:
+        raise ValueError(f"only {len(into)} landmarks look alike: the maps are of different places")
     to, start = target.positions(into), source.positions(ours)
     found, mirrored = (
         find_similarity(
