@@ -299,7 +299,7 @@ def test_tracks_of_an_atlas(two_maps: Path, tmp_path: Path) -> None:
     assert saved.info["source"] == tracks.info["source"]
     done = protomark("seal", tmp_path / "two_maps.orb.safetensors", "-o", tmp_path / "x.pmk")
     assert done.returncode == 0, done.stderr
-    assert [place.name[-5:] for place in map_places(pm.open(tmp_path / "x.pmk"))] == [
+    assert [place.name[-5:] for place in map_places(pm.open(tmp_path / "x.pmk").metadata)] == [
         "map 0",
         "map 1",
     ]
