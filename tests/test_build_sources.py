@@ -14,6 +14,7 @@ from conftest import protomark
 from protomark import sample
 from protomark.geometry.colmap import ColmapModel
 from protomark.maps.origin import joint_origin, map_detector, source_rows
+from protomark.maps.places import map_places, places_text
 from protomark.maps.sources import find_sources, read_places
 from protomark.tracks.database import _read
 from protomark.tracks.file import Tracks
@@ -140,7 +141,9 @@ def test_what_is_refused(tmp_path: Path) -> None:
     other.descriptor = "latch"
     other.descriptors = other.descriptors[:, :32].copy()
     other.save(tmp_path / "latch.safetensors")
-    with pytest.raises(ValueError, match=r"freak descriptors, not latch: a map holds one kind"):
+    with pytest.raises(
+        ValueError, match=r"freak descriptors, but others have latch: a map holds one"
+    ):
         read_places([sample.path(), tmp_path / "latch.safetensors"])
     with pytest.raises(ValueError, match="is named twice"):
         read_places([sample.path(), sample.path()])
@@ -173,3 +176,26 @@ def test_merged_maps_have_both_origins() -> None:
     assert texts["detector"] == "{}"
     assert joint_origin(first, first)["sources"] == first["sources"]
     assert joint_origin({}, {}) == {}
+
+
+def test_places_of_a_map() -> None:
+    sources = [
+        {"name": "a", "ids": [3, 9], "maps": [{"id": 0, "ids": [3, 5]}, {"id": 2, "ids": [6, 9]}]},
+        {"name": "b", "ids": [10, 11], "maps": [{"id": 0}]},
+    ]
+    text = places_text(sources)
+    places = map_places({"places": text})
+    assert [(p.name, p.first, p.last) for p in places] == [
+        ("a, map 0", 3, 5),
+        ("a, map 2", 6, 9),
+        ("b", 10, 11),
+    ]
+    assert places[1].holds(np.array([5, 6, 9, 10])).tolist() == [False, True, True, False]
+    assert places_text(sources[1:]) == ""
+    assert map_places({}) == []
+    for wrong in ("x", "[[1]]", '[["a", 0, 5], ["b", 5, 6]]', '[["a", 2, 1]]', '{"a": 1}', "3"):
+        with pytest.raises(ValueError, match="hold no list of name, first and last id"):
+            map_places({"places": wrong})
+    with pytest.raises(ValueError, match="several places, each with coordinates of its own"):
+        joint_origin({"places": text}, {})
+    assert joint_origin({"places": text}, {"places": text}) == {}

@@ -35,7 +35,7 @@ PAGES = [
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`protomark ([^`]+)`")
 # Quick on the sample; all other commands are only parsed.
-QUICK = {"build", "info", "localize", "merge", "seal", "split"}
+QUICK = {"align", "build", "crop", "export", "info", "localize", "merge", "seal", "split"}
 # Whose map is small enough to be made, of rendered images.
 MAPPED = "small-map.md"
 # Commands of protomark-bench, which need not be installed here.
@@ -107,6 +107,10 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene.seal(folder / "scene.sealed.pmk")
     for name, part in zip("ab", scene.split_by_id([2000]), strict=True):
         part.save(folder / f"{name}.pmk")
+    hall = pm.PrototypeMap(scene.encoder, scene.dim, scene.appearance_bits)
+    hall.merge_map(scene, into=scene.ids[-1] - scene.ids, source=scene.ids)
+    hall.set_positions(hall.ids, 2 * hall.positions(hall.ids)[:, [1, 2, 0]])
+    hall.save(folder / "hall.pmk")
     for name in ("kitchen", "new"):
         (folder / name).mkdir()
     shutil.copy(folder / "scene.pmk", folder / "kitchen")

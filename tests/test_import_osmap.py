@@ -15,7 +15,7 @@ from protomark.geometry.camera import Camera
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers import read_source
 from protomark.tracks.importers.binary import Reader
-from protomark.tracks.importers.osmap import read
+from protomark.tracks.importers.osmap import _size, read
 from protomark.tracks.importers.protobuf import fields, varint
 
 CAMERA = Camera("PINHOLE", 1280, 964, (923.8, 920.1, 640.5, 482.5))
@@ -106,6 +106,7 @@ def test_what_was_written_is_read(delimited: bool, tracks: Tracks, tmp_path: Pat
         found = read_source(path)
         assert found.info["source"]["program"] == "ORB-SLAM2 (osmap)"
         assert found.info["detector"] == {"name": "ORB-SLAM"}
+        assert (found.cameras[1].width, found.cameras[1].height) == (1280, 960)
         found.cameras = {1: Camera("PINHOLE", 1280, 964, found.cameras[1].params)}
         assert_same(found, tracks)
 
@@ -121,6 +122,16 @@ def test_one_descriptor_per_landmark(tracks: Tracks, tmp_path: Path) -> None:
     assert "has no keypoint of its own" in " ".join(done.stdout.split())
     scene = pm.open(tmp_path / "scene.pmk")
     assert np.array_equal(scene.ids, tracks.landmark_ids)
+
+
+def test_sizes_of_images_are_guessed() -> None:
+    for center, reach, size in (
+        ((325.1, 249.7), (625, 460), (640, 480)),  # TUM's second Freiburg camera
+        ((607.19, 185.2), (0, 0), (1215, 371)),
+        ((325.1, 249.7), (700, 460), (701, 500)),
+        ((100.0, 90.0), (0, 0), (200, 180)),
+    ):
+        assert _size(np.array(center), np.array(reach)) == size
 
 
 def test_the_real_one() -> None:

@@ -292,7 +292,7 @@ def test_focal_lengths_of_exif_data_are_refined(query: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["{q}/scene.pmk", "{q}/nowhere"], "no such image, folder or video"),
+        (["{q}/scene.pmk", "{q}/nowhere"], "no such image, folder, video or bag"),
         (["{q}/scene.pmk", "{q}/true"], "this folder holds no image"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "{q}/gone.txt"], "no cameras.txt"),
         (["{q}/scene.pmk", "{q}/images", "--camera", "PINHOLE 320 240 300"], "has 4 parameters"),

@@ -330,7 +330,10 @@ def test_refusals(images: Path, finished: Path, tmp_path: Path) -> None:
     (tmp_path / "mine" / "thesis.txt").write_text("important")
     fails(run(images, "-o", tmp_path / "mine"), "holds other files")
     fails(run(images), "-o", "--into")
-    fails(run(tmp_path / "nothing", "-o", tmp_path / "x"), "no such folder of images or video")
+    fails(
+        run(tmp_path / "nothing", "-o", tmp_path / "x"),
+        "no such folder of images, video file or ROS bag",
+    )
     fails(run(images, "--into", tmp_path / "mine"), "name a folder that `protomark map` wrote")
     fails(run(images, "-o", tmp_path / "x", "--resume"), "no interrupted map")
     fails(run(images, "-o", tmp_path / "x", "--dim", "17"), "--dim 17")

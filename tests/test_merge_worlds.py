@@ -149,7 +149,7 @@ def test_other_places_are_refused(
     other.set_positions(ids, rng.permutation(positions))
     other.save(shuffled)
     other.set_positions(ids, positions)
-    other.part(ids[:60:4]).save(few)
+    other.part(ids[:40:4]).save(few)
     other.set_positions(ids, np.full((len(ids), 3), np.nan))
     other.save(unplaced)
     random = pm.PrototypeMap(other.encoder, 32)
@@ -160,13 +160,13 @@ def test_other_places_are_refused(
     for path, reason in (
         (mirrored, "one is mirrored"),
         (shuffled, "landmarks that look alike too few agree"),
-        (noise, "landmarks that look alike too few agree"),
+        (noise, "only [0-9]+ landmarks look alike"),
         (unplaced, "0 landmarks of a map have a position"),
     ):
         with pytest.raises(ValueError, match=f"{path}: .*stand for other landmarks .*{reason}"):
             merge_files([even, path], output)
         assert not output.exists()
-    with pytest.raises(ValueError, match="15 landmarks of a map have a position, too few"):
+    with pytest.raises(ValueError, match="10 landmarks of a map have a position, too few"):
         align_maps(open_learning_map(even), open_learning_map(few))
 
 

@@ -16,6 +16,7 @@ _EXTRAS = {
     "pycolmap": ("pycolmap", "localize"),
     "rerun": ("the Rerun SDK (rerun-sdk)", "view"),
     "rich": ("Rich", "cli"),
+    "rosbags": ("rosbags", "ros"),
     "safetensors": ("safetensors", "map"),
     "torch": ("PyTorch", "train"),
     "typer": ("Typer", "cli"),

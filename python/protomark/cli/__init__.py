@@ -12,10 +12,13 @@ from typing import Annotated, Any
 
 import typer
 
+from protomark.cli.align import align
 from protomark.cli.build import build
 from protomark.cli.calibrate import calibrate
+from protomark.cli.crop import crop
 from protomark.cli.demo import demo
 from protomark.cli.evaluate import evaluate
+from protomark.cli.export import export
 from protomark.cli.info import info
 from protomark.cli.localize import localize
 from protomark.cli.map import map_
@@ -44,6 +47,9 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "seal": seal,
     "merge": merge,
     "split": split,
+    "crop": crop,
+    "align": align,
+    "export": export,
     "info": info,
     "demo": demo,
     "evaluate": evaluate,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import JsonFile, MaxKeypoints, MaxSize, Threads
+from protomark.cli.options import BagTopic, JsonFile, MaxKeypoints, MaxSize, Threads
 
 if TYPE_CHECKING:
     from protomark.localization.batch import LocalizationBatch
@@ -21,7 +21,7 @@ def localize(
         ),
     ],
     images: Annotated[
-        list[Path], typer.Argument(metavar="IMAGES", help="Images, folders, videos.")
+        list[Path], typer.Argument(metavar="IMAGES", help="Images, folders, videos, ROS bags.")
     ],
     output: Annotated[
         Path,
@@ -36,8 +36,9 @@ def localize(
         typer.Option(
             metavar="CAMERA",
             help="COLMAP's cameras.txt, a folder with a COLMAP model, or a camera written out: "
-            "PINHOLE:525,525,320,240. Without it: the camera that the map was made with, for "
-            "images of its size. 'estimate', and for other images: by EXIF data and matches.",
+            "PINHOLE:525,525,320,240. Without it: that of a ROS bag, or the camera that the map "
+            "was made with, for images of its size. 'estimate', and for other images: by EXIF data "
+            "and matches.",
         ),
     ] = None,
     refine_focal_length: Annotated[
@@ -71,6 +72,7 @@ def localize(
         ),
     ] = 0.9,
     every: Annotated[int, typer.Option(help="Take every n-th image or frame only.")] = 1,
+    topic: BagTopic = None,
     max_keypoints: MaxKeypoints = 2000,
     max_size: MaxSize = 1600,
     recall: Annotated[
@@ -91,17 +93,19 @@ def localize(
     protomark localize kitchen new-photos/
     """
     from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.features.bag import is_bag
     from protomark.features.images import passed_over
     from protomark.files import check_outputs, only_writer
     from protomark.localization.batch import LocalizationRequest, localize_files
 
     check_outputs(json_file, inputs=[scene, *images, camera, poses, priors], folder=output)
-    for line in filter(None, map(passed_over, images)):
+    for line in filter(None, (passed_over(path) for path in images if not is_bag(path))):
         note(line)
     request = LocalizationRequest(
         scene,
         images,
         every=every,
+        topic=topic,
         camera=camera,
         refine_focal_length=refine_focal_length,
         true_poses=poses,

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from protomark.cli.options import (
+    BagTopic,
     CameraText,
     EncoderName,
     JsonFile,
@@ -22,7 +23,11 @@ from protomark.cli.options import (
 def map_(
     ctx: typer.Context,
     images: Annotated[
-        Path, typer.Argument(metavar="IMAGES_OR_VIDEO", help="Folder of images, or a video file.")
+        Path,
+        typer.Argument(
+            metavar="IMAGES",
+            help="Folder of images, a video file, or a ROS bag (.bag, .mcap, .db3).",
+        ),
     ],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="New map's folder.")] = None,
     into: Annotated[Path | None, typer.Option("--into", help="Folder of a map to extend.")] = None,
@@ -52,6 +57,7 @@ def map_(
         typer.Option(help="Image that is black where the camera sees no scene, as in COLMAP."),
     ] = None,
     every: Annotated[int, typer.Option(help="Take every n-th frame only.")] = 1,
+    topic: BagTopic = None,
     window: Annotated[
         int,
         typer.Option(
@@ -69,7 +75,7 @@ def map_(
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
-    """Map a scene from images or a video: structure from motion.
+    """Map a scene from images, a video or a ROS bag: structure from motion.
 
     Matches frame by frame with the prototypes of the map, which learn from each match; only the
     latest keyframes keep descriptors. OUTPUT gets scene.pmk (the map, which learns),
@@ -77,6 +83,8 @@ def map_(
     model), trajectory.txt (TUM format), report.html and report.json.
 
     protomark map walk.mp4 -o kitchen
+
+    protomark map run.mcap --topic /camera/image_raw -o kitchen
 
     protomark map more-images/ --into kitchen
 
@@ -87,6 +95,7 @@ def map_(
     """
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.extras import optional
+    from protomark.features.bag import is_bag
     from protomark.features.images import passed_over
     from protomark.files import check_outputs
     from protomark.mapping.options import MappingOptions
@@ -100,7 +109,8 @@ def map_(
         )
     check_outputs(json_file, inputs=[images, camera, poses, mask, encoder], folder=scene)
     inner = images / "images"
-    if line := passed_over(inner if inner.is_dir() else images):
+    line = "" if is_bag(images) else passed_over(inner if inner.is_dir() else images)
+    if line:
         note(line)
     if view:
         optional("rerun")
@@ -120,6 +130,7 @@ def map_(
         poses=poses,
         mask=mask,
         every=every,
+        topic=topic,
         resume=resume,
         extend=into is not None,
         force=force,

@@ -31,6 +31,14 @@ CameraText = Annotated[
         "calibrated from EXIF data and matches.",
     ),
 ]
+BagTopic = Annotated[
+    str | None,
+    typer.Option(
+        "--topic",
+        help="Topic of a ROS bag's images; by default the only one. The CameraInfo beside it is "
+        "the camera, unless another is given.",
+    ),
+]
 MaxKeypoints = Annotated[
     int,
     typer.Option(min=4, help="Limit on keypoints per image: the strongest, spread over the image."),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -153,3 +154,18 @@ def comma_separated_numbers(option: str, text: str) -> tuple[int, ...]:
         return tuple(int(number) for number in comma_separated(text))
     except ValueError:
         raise ValueError(f"{option} {text!r} is not a list of numbers such as 8,16,32") from None
+
+
+def decimal_numbers(option: str, text: str) -> tuple[float, ...] | None:
+    """The numbers in a list such as 1.5,0,-2; None for an empty text.
+
+    Raises:
+        ValueError: the text is not such a list; the error names the option.
+    """
+    try:
+        numbers = tuple(float(number) for number in comma_separated(text))
+    except ValueError:
+        numbers = (math.nan,)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{option} {text!r} is not a list of numbers such as 1.5,0,-2")
+    return numbers or None

@@ -17,7 +17,8 @@ def tracks(
         list[Path],
         typer.Argument(
             metavar="FOLDER",
-            help="Sequences: each holds images/ and a COLMAP model in sparse/ or sparse/0/.",
+            help="Sequences: each holds images/ and a COLMAP model in sparse/ or sparse/0/. Or "
+            "maps of other programs, see `protomark build`.",
         ),
     ],
     output: Annotated[
@@ -84,14 +85,18 @@ def tracks(
 
     Reads images and their COLMAP model. Writes one file per sequence and descriptor with keypoints,
     descriptors, and the landmarks that they observe. A file that was made with these options from
-    this input is kept.
+    this input is kept. Maps of other programs keep the descriptors that they have.
 
     protomark tracks kitchen/ -o tracks -d freak -d orb
+
+    protomark tracks atlas.osa -o tracks
     """
     from protomark.cli.terminal import progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.tracks.extract import TracksOptions, find_sequence
-    from protomark.tracks.make import make_augmented_tracks, make_tracks
+    from protomark.tracks.file import sequence_name
+    from protomark.tracks.importers import find_importer
+    from protomark.tracks.make import import_tracks, make_augmented_tracks, make_tracks
 
     options = [
         TracksOptions(
@@ -114,8 +119,17 @@ def tracks(
         raise ValueError("--augmentations needs images, which --database does not read: drop one")
     if len(folders) > 1 and (images or model or database):
         raise ValueError("--images, --model and --database are for one FOLDER: give only one")
-    sources = [find_sequence(folder, images, model, database) for folder in folders]
-    names = [source.name for source in sources]
+    maps = [
+        path
+        for path in folders
+        if not (images or model or database or (path / "sparse").is_dir())
+        and path.exists()
+        and find_importer(path)
+    ]
+    sources = [
+        find_sequence(folder, images, model, database) for folder in folders if folder not in maps
+    ]
+    names = [source.name for source in sources] + [sequence_name(path.resolve()) for path in maps]
     if double := sorted({n for n in names if names.count(n) > 1}):
         raise ValueError(
             f"two folders are named {double[0]} and would write the same file: run the command for "
@@ -137,6 +151,10 @@ def tracks(
             for file in made:
                 facts.append(file.as_dict())
                 _show(facts[-1], file.tracks.info)
+    for path in maps:
+        file = import_tracks(path, output)
+        facts.append(file.as_dict())
+        _show(facts[-1], file.tracks.info)
     write_json(json_file, facts)
 
 

@@ -99,7 +99,12 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
         raise ValueError(
             f"{path}: the image is truncated, or its format is unknown: copy it anew, or convert it"
         )
-    if image.dtype == np.uint16:
+    return to_8_bits(image)
+
+
+def to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """An image of 8 bits, or of 16, of which the upper 8 of those that it uses are kept."""
+    if image.dtype.itemsize == 2:
         used = int(image.max()).bit_length()
         image = image >> next(bits - 8 for bits in (8, 10, 12, 14, 16) if used <= bits)
     return np.asarray(image, dtype=np.uint8)

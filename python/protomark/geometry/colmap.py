@@ -231,6 +231,38 @@ def new_reconstruction(
     return reconstruction
 
 
+def add_points(
+    reconstruction: Any,
+    image_ids: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    point_ids: NDArray[np.int64],
+    positions: NDArray[np.float64],
+) -> None:
+    """Add the points of o observations to a `pycolmap.Reconstruction` that has their images.
+
+    Args:
+        reconstruction: changes.
+        image_ids: (o,) the image of each observation.
+        rows: (o,) the keypoint in that image.
+        point_ids: (o,) the point.
+        positions: (p, 3) positions of the points, in ascending order of their ids.
+    """
+    # Access through the reconstruction takes longer than everything else per observation.
+    by_id = {int(i): reconstruction.images[int(i)] for i in np.unique(image_ids)}
+    order = np.argsort(point_ids, kind="stable")
+    ids, starts = np.unique(point_ids[order], return_index=True)
+    images, keypoints = image_ids[order].tolist(), rows[order].tolist()
+    ends = [*starts.tolist(), len(images)][1:]
+    for point_id, position, a, b in zip(
+        ids.tolist(), positions, starts.tolist(), ends, strict=True
+    ):
+        elements = [pycolmap.TrackElement(images[k], keypoints[k]) for k in range(a, b)]
+        point = pycolmap.Point3D(xyz=position, track=pycolmap.Track(elements))
+        reconstruction.add_point3D_with_id(point_id, point)
+        for k in range(a, b):
+            by_id[images[k]].set_point3D_for_point2D(keypoints[k], point_id)
+
+
 def read_model(folder: Path) -> ColmapModel:
     """Cameras and poses of a sparse model.
 

@@ -63,16 +63,17 @@ def near_points(
     """All pairs (i, j) for which first[i] and second[j], (n, 3) and (m, 3), are within a radius."""
     first, second = first / (2 * radius), second / (2 * radius)
     cell = cube_numbers(np.floor(second))
-    order = np.argsort(cell, kind="stable")
+    order = np.argsort(cell)
     cell = cell[order]
     # A ball reaches into the nearer of the two neighbouring cubes along each axis.
     corner = np.floor(first - 0.5)
     found = []
     for offset in np.ndindex(2, 2, 2):
         near = cube_numbers(corner + offset)
-        start = np.searchsorted(cell, near, side="left")
-        count = np.searchsorted(cell, near, side="right") - start
-        i = np.repeat(np.arange(len(first)), count)
+        rows = np.argsort(near)  # a search for sorted numbers is many times faster
+        start = np.searchsorted(cell, near[rows], side="left")
+        count = np.searchsorted(cell, near[rows], side="right") - start
+        i = np.repeat(rows, count)
         j = order[np.arange(len(i)) + np.repeat(start - np.cumsum(count) + count, count)]
         close = ((first[i] - second[j]) ** 2).sum(axis=1) <= 0.25
         found.append((i[close], j[close]))

@@ -67,6 +67,28 @@ def pose_error(estimate: Array, true: Array) -> tuple[float, float]:
     return float(distance), float(np.degrees(2 * np.arcsin(min(chord, 1.0))))
 
 
+def ground_plane(poses: Array) -> Array:
+    """Axes (2, 3) of the ground plane, x along the widest spread of cameras, from poses (n, 3, 4).
+
+    The up direction is the mean of the images' up directions. Cameras that mostly look one way, and
+    move less along it than along up, look down: then up is the opposite of their view.
+    """
+    centers = camera_centers(poses)
+    spread = centers - centers.mean(axis=0)
+    up, back = -poses[:, 1, :3].mean(axis=0), -poses[:, 2, :3].mean(axis=0)
+    if np.linalg.norm(back) > 0.7 and np.linalg.norm(spread @ back) < np.linalg.norm(spread @ up):
+        up = back
+    up = up / (np.linalg.norm(up) or 1.0)
+    spread = spread - np.outer(spread @ up, up)
+    # Without any spread the first right-singular vector is arbitrary and may contain `up`.
+    across = np.linalg.svd(spread, full_matrices=False)[2][0]
+    across = across - (across @ up) * up
+    if np.linalg.norm(across) < 1e-9:
+        across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across = across / np.linalg.norm(across)
+    return np.stack([across, np.cross(up, across)])
+
+
 def rotation_from_quaternion(quaternion: Array) -> Array:
     """Rotation matrix (3, 3) of a quaternion w, x, y, z.
 

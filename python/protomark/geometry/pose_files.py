@@ -147,6 +147,58 @@ def poses_of_images(
     return poses
 
 
+def read_positions(path: Path) -> PoseSet:
+    """Read camera positions: a text or CSV file of image name, x, y, z, or what `read_poses` reads.
+
+    A header may name the columns; latitude, longitude and altitude become metres east, north and
+    up of the first position. Poses of a file that has positions only are not rotated.
+
+    Raises:
+        FileNotFoundError, ValueError: see `read_poses`.
+    """
+    if path.is_dir() or not path.is_file():
+        return read_poses(path)
+    rows = [(number, ",".join(words).split(",")) for number, words in _rows(path) if words]
+    rows = [(number, [word for word in words if word]) for number, words in rows]
+    if not rows or any(len(words) != 4 for _, words in rows):
+        return read_poses(path)
+    header = [word.lower() for word in rows[0][1]] if not _is_number(rows[0][1][1]) else []
+    rows = rows[1:] if header else rows
+    if not rows:
+        raise ValueError(f"{path} holds no positions: write a line of image name, x, y, z for each")
+    at = np.array([_numbers(path, number, words[1:]) for number, words in rows])
+    columns = {name[:3]: i for i, name in enumerate(header[1:])}
+    if {"lat", "lon", "alt"} == set(columns):
+        at = east_north_up(*at[:, [columns[name] for name in ("lat", "lon", "alt")]].T)
+    names = [words[0] for _, words in rows]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{path}: image {twice} has two positions: leave one out")
+    return PoseSet({n: np.column_stack([np.eye(3), -p]) for n, p in zip(names, at, strict=True)})
+
+
+def east_north_up(
+    latitude: NDArray[np.float64], longitude: NDArray[np.float64], altitude: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Metres (n, 3) east, north and up of the first of n positions (degrees, metres), in WGS 84."""
+    a, e2 = 6378137.0, 6.69437999014e-3
+    lat, lon = np.radians(latitude), np.radians(longitude)
+    n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    x, y = ((n + altitude) * np.cos(lat) * f(lon) for f in (np.cos, np.sin))
+    earth = np.column_stack([x, y, (n * (1 - e2) + altitude) * np.sin(lat)])
+    (s, c), (sl, cl) = ((np.sin(v[0]), np.cos(v[0])) for v in (lat, lon))
+    axes = np.array([[-sl, cl, 0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
+    return np.asarray((earth - earth[0]) @ axes.T)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Numbers and words of the lines that are no comment."""
     try:

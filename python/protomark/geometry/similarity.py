@@ -11,6 +11,7 @@ Array = NDArray[np.float64]
 
 # Points on a line leave the rotation about it open: their second spread is below this share.
 _MIN_SPREAD = 1e-3
+_TRIPLES = 3000
 # A triple's sides may differ in scale by this factor, or it is no similar triangle.
 _TRIANGLE = 1.25
 # Triples of one batch, how many similar triangles of it are tried, how many of these should agree
@@ -91,10 +92,41 @@ def _fit(
     return scale, rotation, translation
 
 
-def on_a_line(points: Array) -> bool:
-    """Whether points (n, 3) lie on a line, so that the rotation about it stays open."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= _MIN_SPREAD * spread[0])
+def fit_robustly(
+    source: Array, target: Array, *, fixed_scale: bool = False
+) -> tuple[Similarity, NDArray[np.bool_]]:
+    """The similarity that brings most points (n, 3) close to others, and which points (n,) it does.
+
+    It is the least median of squares over triples (Rousseeuw, Least median of squares regression,
+    1984), refined on the points within 2.5 robust standard deviations.
+
+    Raises:
+        ValueError: as `fit_similarity`; or the points lie on a line, so that the rotation about it
+            stays open.
+    """
+    one = fit_similarity(source, target, fixed_scale=fixed_scale)
+    n = len(source)
+    for points in (source, target):
+        spread = np.linalg.svd(points - np.median(points, axis=0), compute_uv=False)
+        if spread[1] <= _MIN_SPREAD * spread[0]:
+            raise ValueError("the points lie on a line, so the rotation about it is undefined")
+    rows = np.random.default_rng(0).integers(0, n, (_TRIPLES, 3))
+    rows = rows[_similar_triangles(source[rows], target[rows], fixed_scale, 2.0)]
+    motions = _fit(source[rows], target[rows], np.ones(rows.shape), fixed_scale)
+    candidates = [Similarity(float(s), r, t) for s, r, t in zip(*motions, strict=True)]
+    medians = [np.median(np.linalg.norm(c(source) - target, axis=1)) for c in candidates]
+    if medians:
+        one = candidates[int(np.argmin(medians))]
+    inliers = np.ones(n, bool)
+    for _ in range(10):
+        errors = np.linalg.norm(one(source) - target, axis=1)
+        deviation = 1.4826 * (1 + 5 / max(n - 3, 1)) * float(np.median(errors))
+        now = errors <= 2.5 * deviation + 1e-9 * float(np.ptp(target, axis=0).max())
+        if now.sum() < 3 or (now == inliers).all():
+            break
+        inliers = now
+        one = fit_similarity(source[inliers], target[inliers], fixed_scale=fixed_scale)
+    return one, inliers
 
 
 @dataclass(frozen=True)
@@ -241,12 +273,14 @@ def _near_by_chance(points: Array, radius: float, sample: int = 1000) -> float:
     return (close + 1) / (len(some) * (len(some) - 1) + 1)
 
 
-def _similar_triangles(source: Array, target: Array, fixed_scale: bool) -> NDArray[np.bool_]:
+def _similar_triangles(
+    source: Array, target: Array, fixed_scale: bool, factor: float = _TRIANGLE
+) -> NDArray[np.bool_]:
     """Whether the triangles (h, 3, 3) of two worlds have sides of one scale."""
     a, b = (np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (source, target))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = b / a
-        similar = ratio.max(1) < _TRIANGLE * ratio.min(1)
+        similar = ratio.max(1) < factor * ratio.min(1)
         if fixed_scale:
-            similar &= (ratio.max(1) < _TRIANGLE) & (ratio.min(1) > 1 / _TRIANGLE)
+            similar &= (ratio.max(1) < factor) & (ratio.min(1) > 1 / factor)
     return np.asarray(similar & (a.min(1) > 0) & (b.min(1) > 0))

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
 from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
-from protomark.features.video import is_video, video_frames
+from protomark.features.video import Decode, is_video, video_frames
 from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength
 from protomark.geometry.camera import Camera
@@ -54,8 +55,9 @@ class LocalizationRequest:
     """What to localize, and how."""
 
     scene: Path  # a map file, or the folder that `protomark map` wrote
-    images: Sequence[Path]  # image files, folders of them, and videos
+    images: Sequence[Path]  # image files, folders of them, videos, and ROS bags
     every: int = 1  # take every n-th image and frame only
+    topic: str | None = None  # of a ROS bag's images; None: the only one with images
     # A cameras.txt, a folder with a COLMAP model, or a camera written out. None: those that the map
     # was made with, for images of their size; "estimate", and for other images: focal lengths come
     # from EXIF data and matches.
@@ -82,7 +84,7 @@ class ImageResult:
     found: Localization | None
     error: str = ""  # what is wrong with the image, else ""
     true_pose: NDArray[np.float64] | None = None  # (3, 4) cam_from_world, if it is known
-    time: float | None = None  # seconds since the video began that it is a frame of
+    time: float | None = None  # of a frame of a video or bag: seconds
 
     @property
     def true_error(self) -> tuple[float, float] | None:
@@ -288,7 +290,7 @@ def localize_files(
             fit, or no image can be localized.
         FileExistsError: the folder holds files that no earlier run wrote.
     """
-    queries = _list_queries(request.images, request.every)
+    queries = _list_queries(request.images, request.every, request.topic)
     _check_folder(output)
     localizer = Localizer(
         request.scene,
@@ -316,7 +318,7 @@ def localize_files(
     results: list[ImageResult] = []
     batch = LocalizationBatch(results, request.min_confidence)
     try:
-        results_ahead = map_ahead(localize, _with_frames(queries), request.threads)
+        results_ahead = map_ahead(localize, _with_frames(queries, request.topic), request.threads)
         with deferred_interrupt() as interrupted, closing(results_ahead):
             for result in tracked(results_ahead, progress, "localize", len(queries)):
                 results.append(result)
@@ -347,28 +349,34 @@ class _Query:
     """An image to localize."""
 
     name: str
-    path: Path  # its file, or the video that it is a frame of
-    time: float | None = None  # of a frame: seconds since the video began
+    path: Path  # its file, or the video or bag that it is a frame of
+    time: float | None = None  # of a frame: seconds
+    camera: Camera | None = None  # of a frame: the bag's
     image: NDArray[np.uint8] | None = None  # of a frame: what it shows
 
 
-def _list_queries(sources: Sequence[Path], every: int) -> list[_Query]:
+def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> list[_Query]:
     """Images, and frames that are not decoded yet, in natural order within each source.
 
     Raises:
         FileNotFoundError: a source is missing, or a folder holds no image.
-        ValueError: two images have the same name, or a video does not decode.
+        ValueError: two images have the same name, or a video or bag does not decode.
     """
     if every < 1:
         raise ValueError(f"--every {every}: it must be at least 1")
     found: dict[str, _Query] = {}
     for source in sources:
-        if source.is_dir():
+        if source.exists() and is_bag(source):
+            camera = bag_camera(source, image_topic(source, topic)[0])
+            queries = [
+                _Query(name, source, time, camera) for name, time, _ in _frames(source, topic)
+            ]
+        elif source.is_dir():
             queries = [_Query(name, source / name) for name in image_names(source)]
             if not queries:
                 raise FileNotFoundError(f"{source}: this folder holds no image")
         elif not source.is_file():
-            raise FileNotFoundError(f"{source}: no such image, folder or video")
+            raise FileNotFoundError(f"{source}: no such image, folder, video or bag")
         elif is_video(source):
             queries = [_Query(name, source, time) for name, time, _ in video_frames(source)]
         else:
@@ -385,14 +393,19 @@ def _list_queries(sources: Sequence[Path], every: int) -> list[_Query]:
     return list(found.values())[::every]
 
 
-def _with_frames(queries: Sequence[_Query]) -> Iterator[_Query]:
-    """The queries, with the images of those that are frames of a video."""
+def _frames(path: Path, topic: str | None) -> Iterator[tuple[str, float, Decode]]:
+    """The frames of a video or a bag."""
+    return bag_frames(path, image_topic(path, topic)[0]) if is_bag(path) else video_frames(path)
+
+
+def _with_frames(queries: Sequence[_Query], topic: str | None) -> Iterator[_Query]:
+    """The queries, with the images of those that are frames of a video or a bag."""
     for path, group in groupby(queries, key=lambda query: query.path):
         asked = {query.name: query for query in group}
         if next(iter(asked.values())).time is None:
             yield from asked.values()
             continue
-        for name, _, decode in video_frames(path):
+        for name, _, decode in _frames(path, topic):
             if name in asked:
                 yield replace(asked[name], image=decode())
 
@@ -412,7 +425,9 @@ def _localize(
         if image is None:
             raise ValueError("this frame does not decode")
         height, width = image.shape
-        if cameras is None:
+        if cameras is None and query.camera is not None and request.camera is None:
+            camera = camera_of_size(query.path, query.camera, width, height)
+        elif cameras is None:
             camera = None if request.camera else localizer.map_camera(width, height)
             if camera is None:
                 camera = None if query.image is not None else camera_from_exif(query.path)

@@ -93,7 +93,7 @@ class Localizer:
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
-        self.places = map_places(self.scene)
+        self.places = map_places(self.scene.metadata)
         tuned = isinstance(self.scene, pm.SealedMap) and self.scene.tuned
         self.calibration = self.scene.encoder.match_calibration(self.scene.dim, tuned)
 

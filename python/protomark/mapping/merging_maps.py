@@ -25,7 +25,9 @@ from protomark.progress import Progress, silent, tracked
 from protomark.threads import one_blas_thread
 
 # Maps meet in so many other places at most; there they are off by at most this share of the reach.
-_MAX_LOOPS = 3
+_MAX_LOOPS = 5
+_MIN_AGREEING = 15
+_MAX_CHANCE = -15.0
 _MAX_DRIFT = 0.1
 
 
@@ -104,14 +106,11 @@ def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
         motion = Similarity(1.0, np.eye(3), np.zeros(3))  # all poses were given in one world
     shift, count = len(structure.positions), len(structure.frames)
     moved = other.structure
-    for field, values in (
-        ("positions", motion(moved.positions)),
-        ("directions", moved.directions @ motion.rotation.T),
-        ("views", moved.views),
-        ("distances", motion.scale * moved.distances),
-        ("born", moved.born + count),
-    ):
-        setattr(structure, field, np.concatenate([getattr(structure, field), values]))
+    moved.move(motion)
+    moved.born += count
+    for name_of_array in ("positions", "directions", "views", "distances", "born"):
+        arrays = [getattr(one, name_of_array) for one in (structure, moved)]
+        setattr(structure, name_of_array, np.concatenate(arrays))
     prefix = _prefix(mapper, other, name)
     first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
     later = _time_shift(mapper, other)
@@ -121,7 +120,6 @@ def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
         frame.name = prefix + frame.name
         frame.time += later
         frame.camera_id = cameras[frame.camera_id]
-        frame.pose = motion.move_poses(frame.pose)
         frame.landmarks = np.where(frame.landmarks >= 0, frame.landmarks + shift, -1)
         camera = structure.cameras[frame.camera_id]
         frame.rays, frame.turns = camera.local_rays(frame.keypoints)
@@ -166,7 +164,9 @@ def _close_loops(mapper: Mapper, count: int) -> int:
             found = align_maps(scene.part(alone[0]), scene.part(alone[1]))
         except ValueError:
             break
-        if found.problem or found.drift > _MAX_DRIFT * found.reach:
+        # That the maps are of one scene is known: little in common is enough.
+        unsure = found.agreeing < _MIN_AGREEING or found.chance > _MAX_CHANCE
+        if unsure or found.drift > _MAX_DRIFT * found.reach:
             break
         merged += _merge_duplicates(mapper, found.into, found.source)
     return merged

@@ -40,12 +40,12 @@ def back_up(scene: Path) -> None:
             scene,
             folder,
             ignore=lambda path, names: [n for n in names if n in kept or n.startswith(".")],
-            copy_function=_link,
+            copy_function=link,
             dirs_exist_ok=True,
         )
 
 
-def _link(source: str, target: str) -> None:
+def link(source: str, target: str) -> None:
     """Files are replaced, never changed, so a link keeps the old one."""
     try:
         os.link(source, target)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from protomark.files import replacing_folder
-from protomark.geometry.colmap import new_reconstruction, pycolmap, quiet
+from protomark.geometry.colmap import add_points, new_reconstruction, quiet
 from protomark.mapping.structure import Observations, Structure
 
 
@@ -29,18 +29,8 @@ def to_reconstruction(structure: Structure, frames: Sequence[int], seen: Observa
         keypoints = frame.keypoints[seen.rows[rows]]
         images.append((i + 1, frame.name, frame.camera_id, keypoints, frame.pose))
     reconstruction = new_reconstruction(cameras, images)
-    # Access through the reconstruction takes longer than everything else per observation.
-    by_id = {i + 1: reconstruction.images[i + 1] for i in frames}
-    order = np.argsort(seen.landmarks, kind="stable")
-    ids, starts = np.unique(seen.landmarks[order], return_index=True)
-    image_ids, index = (seen.frames[order] + 1).tolist(), index[order].tolist()
-    ends = [*starts.tolist(), len(image_ids)][1:]
-    for landmark, a, b in zip(ids.tolist(), starts.tolist(), ends, strict=True):
-        elements = [pycolmap.TrackElement(image_ids[k], index[k]) for k in range(a, b)]
-        point = pycolmap.Point3D(xyz=structure.positions[landmark], track=pycolmap.Track(elements))
-        reconstruction.add_point3D_with_id(landmark, point)
-        for k in range(a, b):
-            by_id[image_ids[k]].set_point3D_for_point2D(index[k], landmark)
+    positions = structure.positions[np.unique(seen.landmarks)]
+    add_points(reconstruction, seen.frames + 1, index, seen.landmarks, positions)
     return reconstruction
 
 

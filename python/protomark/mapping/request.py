@@ -19,7 +19,7 @@ from protomark.maps.open import STATE
 class MapRequest:
     """What to map, and how."""
 
-    images: Path  # folder of images or video
+    images: Path  # folder of images, video or ROS bag
     output: Path  # folder of the map
     options: MappingOptions  # how to make it; a map that is resumed or extended keeps its own
     # A cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
@@ -28,6 +28,7 @@ class MapRequest:
     poses: Path | None = None  # file or folder of known poses
     mask: Path | None = None  # image that is black where the scene must not be looked at
     every: int = 1  # take every n-th frame only
+    topic: str | None = None  # of a ROS bag's images; None: the only one with images
     resume: bool = False  # whether to continue an interrupted map
     extend: bool = False  # whether to add the images to the existing map in `output`
     force: bool = False  # whether to replace an existing map
@@ -77,6 +78,7 @@ def request_facts(request: MapRequest, source: FrameSource) -> dict[str, Any]:
     return {
         "the input": str(source.path.resolve()),
         "--every": request.every,
+        "--topic": request.topic,
         "the images": hashlib.sha256(names.encode(errors="surrogateescape")).hexdigest()[:16],
         "--camera": request.camera,
         "--focal": request.focal,
@@ -130,8 +132,9 @@ def same_camera(request: MapRequest, cameras: Iterable[Camera], given: Camera) -
         if camera.resembles(given):
             return camera
     if sized:
+        told = f"--camera {request.camera}" if request.camera else f"the camera of {request.images}"
         raise ValueError(
-            f"--camera {request.camera}: {request.output} was made with {sized[-1]}: leave the "
+            f"{told}: {request.output} was made with {sized[-1]}: leave the "
             "option out, or, for images of another lens, give a COLMAP model that names their "
             "cameras"
         )

@@ -57,7 +57,7 @@ def make_map(
         Interrupted: Ctrl-C was pressed; the map so far is written.
         FileNotFoundError, FileExistsError, ValueError: the request cannot be met.
     """
-    source = open_source(request.images, request.every)
+    source = open_source(request.images, request.every, request.topic)
     # More threads of BLAS would change the order of sums.
     with only_writer(request.output), one_blas_thread():
         check_output(request)
@@ -132,7 +132,12 @@ class _Session:
         text = request.camera
         if text is None and request.poses is not None and request.poses.is_dir():
             text = str(request.poses)
-        return self.source.find_camera(read_cameras(text)) if text else None
+        if text:
+            return self.source.find_camera(read_cameras(text))
+        known = self.source.known_camera() if request.focal is None else None
+        if known is not None:
+            self.note(f"camera: that of {request.images.name}, {known}")
+        return known
 
     def _read_poses(self) -> None:
         source = self.source

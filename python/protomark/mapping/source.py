@@ -1,4 +1,4 @@
-"""Reads the frames of a folder of images or a video."""
+"""Reads the frames of a folder of images, a video or a ROS bag."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
 from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray
-from protomark.features.video import check_video, video_frames
+from protomark.features.video import Decode, check_video, video_frames
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif
 from protomark.geometry.pose_files import PoseSet, image_times
@@ -154,6 +155,10 @@ class FrameSource(ABC):
         self.cameras = {name: middle[camera] for name, camera in named.items()}
         return Counter(self.cameras.values()).most_common(1)[0][0]
 
+    def known_camera(self) -> Camera | None:
+        """The calibrated camera that comes with the frames, None if none does."""
+        return None
+
     def guess_camera(self, focal: float | None = None) -> tuple[Camera, str]:
         """A camera to start calibration with, and the origin of its focal length.
 
@@ -260,6 +265,10 @@ class Video(FrameSource):
         """See `FrameSource.listing`."""
         return [(f.name, f.time) for f in self._read_forward(0, None, decode=False)]
 
+    def _frames(self) -> Iterator[tuple[str, float, Decode]]:
+        """Names and times of the frames, and what decodes each until the next one comes."""
+        return video_frames(self.path, self._every)
+
     def _samples(self) -> Iterator[InputImage]:
         return islice((i for i in self._read_forward(0, None) if i.image is not None), 1)
 
@@ -280,7 +289,7 @@ class Video(FrameSource):
         chunk: set[int] | None = None,
         decode: bool = True,
     ) -> Iterator[InputImage]:
-        for index, (name, time, read) in enumerate(video_frames(self.path, self._every)):
+        for index, (name, time, read) in enumerate(self._frames()):
             if index < start or (only is not None and name not in only):
                 continue
             if chunk is not None and index not in chunk:
@@ -290,19 +299,45 @@ class Video(FrameSource):
             yield InputImage(index, name, time, image, problem=problem)
 
 
-def open_source(path: Path, every: int = 1) -> FrameSource:
-    """Open a folder of images, the folder of a sequence (with images/ in it), or a video.
+class Bag(Video):
+    """The images on a topic of a ROS bag, of which every n-th is taken."""
+
+    def __init__(self, path: Path, every: int = 1, topic: str | None = None) -> None:
+        FrameSource.__init__(self, path)
+        self._every = every
+        self.topic, count = image_topic(path, topic)
+        self._count = -(-count // every)
+
+    def _frames(self) -> Iterator[tuple[str, float, Decode]]:
+        return bag_frames(self.path, self.topic, self._every)
+
+    def known_camera(self) -> Camera | None:
+        """The camera of the bag's CameraInfo, at the images' size.
+
+        Raises:
+            ValueError: the images have other proportions than that.
+        """
+        camera = bag_camera(self.path, self.topic)
+        return camera and camera_of_size(self.path, camera, *self.size())
+
+
+def open_source(path: Path, every: int = 1, topic: str | None = None) -> FrameSource:
+    """Open a folder of images, the folder of a sequence (with images/ in it), a video, or a bag.
 
     Raises:
         FileNotFoundError: there is no such folder or file, or no image in it.
-        ValueError: the video does not decode.
+        ValueError: the video does not decode, or the topic is not one of the bag's.
     """
     if every < 1:
         raise ValueError(f"--every {every}: it must be at least 1")
+    if path.exists() and is_bag(path):
+        return Bag(path, every, topic)
+    if topic is not None:
+        raise ValueError(f"--topic {topic}: {path} is no ROS bag (.bag, .mcap, .db3)")
     if path.is_dir():
         return ImageFolder(path / "images" if (path / "images").is_dir() else path, every)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such folder of images or video file")
+        raise FileNotFoundError(f"{path}: no such folder of images, video file or ROS bag")
     return Video(path, every)
 
 

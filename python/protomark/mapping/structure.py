@@ -13,6 +13,7 @@ from protomark.features.extractor import MAX_SIZE, pixel_size
 from protomark.geometry.absolute_pose import reprojection_error
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
+from protomark.geometry.similarity import Similarity
 from protomark.geometry.triangulation import pixel_errors
 from protomark.mapping.frame import Array, Frame, Ids
 
@@ -136,6 +137,14 @@ class Structure:
         self.distances[:] = np.inf, 0.0
         for frame in self.frames:
             self._add_views(camera_centers(frame.pose)[None], frame.seen)
+
+    def move(self, motion: Similarity) -> None:
+        """Move frames and landmarks into another world."""
+        self.positions = motion(self.positions)
+        self.directions = self.directions @ motion.rotation.T
+        self.distances = motion.scale * self.distances
+        for frame in self.frames:
+            frame.pose = motion.move_poses(frame.pose)
 
     def remove(self, ids: Ids) -> None:
         """Remove landmarks and their observations."""

@@ -27,9 +27,9 @@ _CELL = 8.0
 # other map has landmarks this share agrees; and if this share of the cubes in which both maps have
 # landmarks holds a pair that agrees (benchmarks/scripts/merge_halves.py). Places that only look
 # alike share some landmarks, and lack those around them.
-_MIN_AGREEING = 20
-_MIN_SHARE = 0.3
-_MIN_CUBES = 0.15
+_MIN_AGREEING = 15
+_MIN_SHARE = 0.15
+_MIN_CUBES = 0.1
 _SAMPLES = 200_000
 # A flat scene agrees with its mirror image, too, but hardly more.
 _MIRRORED = 1.1
@@ -53,7 +53,8 @@ class Alignment:
             have one end where the other map has landmarks.
         agreeing: how many of these agree with the similarity.
         chance: log10 of how many such agreeing sets maps of different scenes would give.
-        cubes: number of cubes of space in which both maps have landmarks.
+        cubes: number of cubes of space in which both maps have landmarks, of this map such as were
+            searched in the other one.
         cube_share: share of these that hold a pair that agrees.
     """
 
@@ -132,7 +133,10 @@ def align_maps(
                 f"{len(world.ids)} landmarks of a map have a position, too few to find out how "
                 "maps lie in each other"
             )
-    into, ours = _likely_pairs(*worlds, searched, threads)
+    sample = worlds[1].ids[:: -(-len(worlds[1].ids) // searched)]
+    into, ours = _likely_pairs(*worlds, sample, threads)
+    if len(into) < _MIN_AGREEING:
+        raise ValueError(f"only {len(into)} landmarks look alike: the maps are of different places")
     to, start = target.positions(into), source.positions(ours)
     found, mirrored = (
         find_similarity(
@@ -157,10 +161,10 @@ def align_maps(
     agrees = np.linalg.norm(motion(start) - to, axis=1) <= radius
     edge = _CELL * radius
     ends = [cube_numbers(np.floor(p / edge)) for p in (to, motion(start))]
-    whole = (worlds[0].positions, motion(worlds[1].positions))
-    everywhere = [cube_numbers(np.floor(p / edge)) for p in whole]
-    near_other = np.isin(ends[0], everywhere[1]) | np.isin(ends[1], everywhere[0])
-    both = np.intersect1d(everywhere[0], everywhere[1])
+    every = (worlds[0].positions, motion(worlds[1].positions), motion(source.positions(sample)))
+    cubes = [cube_numbers(np.floor(p / edge)) for p in every]
+    near_other = np.isin(ends[0], cubes[1]) | np.isin(ends[1], cubes[0])
+    both = np.intersect1d(cubes[0], cubes[2])
     held = np.isin(both, np.concatenate([end[agrees] for end in ends]))
     duplicates = _duplicates(*worlds, motion, radius, into[agrees], ours[agrees])
     return Alignment(
@@ -205,9 +209,11 @@ class _World:
         return found[:, 0], calibration.probability(distances)
 
 
-def _likely_pairs(target: _World, source: _World, count: int, threads: int) -> tuple[Ids, Ids]:
-    """Landmarks that are each other's nearest and likely to be the same, the likeliest first."""
-    searched = source.ids[:: -(-len(source.ids) // count)]
+def _likely_pairs(target: _World, source: _World, searched: Ids, threads: int) -> tuple[Ids, Ids]:
+    """Landmarks of the target, and those of the searched that are likely the same, best first.
+
+    They are each other's nearest.
+    """
     there, forth = target.nearest(source.codes(searched), threads)
     likely = (forth >= MIN_PROBABILITY) & np.isin(there, target.ids)
     searched, there, forth = searched[likely], there[likely], forth[likely]

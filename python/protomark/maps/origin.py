@@ -8,24 +8,28 @@ from typing import Any
 
 import protomark as pm
 from protomark.maps.cameras import KEY, cameras_text
+from protomark.maps.places import KEY as PLACES
+from protomark.maps.places import MAX_TEXT, places_text
 from protomark.report import first_of
 from protomark.tracks.file import Tracks
 from protomark.tracks.joining import shifted_ids
 
 SOURCES, DETECTOR = "sources", "detector"
 _COUNTED = ("keyframes", "landmarks", "observations")
-_MAX_BYTES = 1 << 16  # of a text in a map
 
 
 def tracks_metadata(tracks: Tracks) -> dict[str, str]:
     """The metadata of a map of tracks that `protomark.maps.sources.read_places` read.
 
-    They name cameras, sources, and the detector if all sources had the same.
+    They name cameras, sources, places if there are several, and the detector if all sources had
+    the same.
     """
     texts = {
         KEY: cameras_text(tracks.cameras.values()),
         SOURCES: _sources_text(tracks.info["sources"]),
     }
+    if places := places_text(tracks.info["sources"]):
+        texts[PLACES] = places
     detectors = {json.dumps(one, sort_keys=True) for one in tracks.info["detectors"]}
     if len(detectors) == 1 and detectors != {"{}"}:
         texts[DETECTOR] = detectors.pop()
@@ -41,7 +45,15 @@ def joint_origin(
         target: metadata of the map.
         source: metadata of the other.
         shift: what is added to the ids of the other.
+
+    Raises:
+        ValueError: they have different places.
     """
+    if target.get(PLACES) != source.get(PLACES):
+        raise ValueError(
+            "a map of several places, each with coordinates of its own, can be merged with parts "
+            "of itself only: build a map of each place, and merge these"
+        )
     texts = {}
     sources = [*_sources(target), *(shifted_ids(one, shift) for one in _sources(source))]
     if sources:
@@ -56,14 +68,9 @@ def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
     for kept in (None, {"name", "program", "version", "ids"}, {"program"}):
         rows = [{k: v for k, v in one.items() if kept is None or k in kept} for one in sources]
         text = json.dumps(rows, ensure_ascii=False)
-        if len(text.encode()) <= _MAX_BYTES:
+        if len(text.encode()) <= MAX_TEXT:
             return text
     return "[]"
-
-
-def map_sources(scene: pm.PrototypeMap | pm.SealedMap) -> list[dict[str, Any]]:
-    """What is known of each source that a map was built from; none if nobody stored them."""
-    return _sources(scene.metadata)
 
 
 def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
@@ -92,6 +99,9 @@ def _source_words(one: Mapping[str, Any]) -> Iterator[str]:
     counts = [f"{one[k]:,} {k}" for k in _COUNTED if isinstance(one.get(k), int)]
     if counts:
         yield ", ".join(counts)
+    cameras = one.get("cameras")
+    if isinstance(cameras, list):
+        yield f"{one.get('descriptor')} of {first_of([str(camera) for camera in cameras])}"
     maps = one.get("maps")
     if isinstance(maps, list) and len(maps) > 1:
         yield f"{len(maps)} maps, each in coordinates of its own"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -10,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import protomark as pm
-from protomark.maps.origin import map_sources
+KEY = "places"
+MAX_TEXT = 1 << 16  # bytes of a text in a map
 
 
 @dataclass(frozen=True)
@@ -27,29 +28,38 @@ class Place:
         return (ids >= self.first) & (ids <= self.last)
 
 
-def map_places(scene: pm.PrototypeMap | pm.SealedMap) -> list[Place]:
-    """The places that a map was built of, by their ids; none if it is one, or nobody stored them.
-
-    Sources whose ids overlap, as of maps that were merged, are one place.
-    """
-    found = sorted(
-        (place for source in map_sources(scene) for place in _places(source)),
-        key=lambda place: (place.first, place.last),
-    )
-    if len(found) < 2 or any(a.last >= b.first for a, b in pairwise(found)):
-        return []
-    return found
+def places_text(sources: Sequence[Mapping[str, Any]]) -> str:
+    """The text of a map's metadata `KEY` by facts on its sources; "" if these are one place."""
+    places = [place for source in sources for place in _places(source)]
+    if len(places) < 2:
+        return ""
+    text = json.dumps([[p.name, p.first, p.last] for p in places], ensure_ascii=False)
+    if len(text.encode()) > MAX_TEXT:
+        text = json.dumps([["", p.first, p.last] for p in places])
+    return text
 
 
-def _places(source: dict[str, Any]) -> Iterator[Place]:
+def _places(source: Mapping[str, Any]) -> Iterator[Place]:
     """A source, or each map of it that has a world of its own."""
-    maps = source.get("maps")
-    parts = [m for m in maps if isinstance(m, dict)] if isinstance(maps, list) else []
+    parts = source.get("maps", [])
     if len(parts) > 1 and all("ids" in part for part in parts):
-        named = [(f"{source.get('name')}, map {part.get('id')}", part) for part in parts]
+        for part in parts:
+            yield Place(f"{source['name']}, map {part['id']}", *part["ids"])
     else:
-        named = [(str(source.get("name")), source)]
-    for name, part in named:
-        match part.get("ids"):
-            case [int(first), int(last)] if 0 <= first <= last:
-                yield Place(name, first, last)
+        yield Place(source["name"], *source["ids"])
+
+
+def map_places(metadata: Mapping[str, str]) -> list[Place]:
+    """The places of a map, by their ids, as its metadata tell; none if it is one place."""
+    try:
+        places = [Place(name, first, last) for name, first, last in json.loads(metadata[KEY])]
+        places.sort(key=lambda place: place.first)
+        fits = all(a.last < b.first for a, b in pairwise(places))
+        fits &= all(isinstance(p.name, str) and 0 <= p.first <= p.last for p in places)
+    except KeyError:
+        return []
+    except (TypeError, ValueError, RecursionError):
+        fits = False
+    if not fits:
+        raise ValueError(f"the map's metadata {KEY!r} hold no list of name, first and last id")
+    return places

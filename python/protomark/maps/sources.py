@@ -125,16 +125,17 @@ def read_sources(
         FileNotFoundError, ValueError: a source cannot be read, or they hold different descriptors.
     """
     read: dict[Source, Tracks] = {}
+    wanted = f"the encoder is for {descriptor}" if descriptor else ""
     # Those that may be of any descriptor come last.
     order = sorted(sources, key=lambda s: ("map", "tracks").count(s.kind) == 0)
     for source in tracked(order, progress, "read sources"):
         tracks = _read(source, descriptor, threads, progress)
         descriptor = descriptor or tracks.descriptor
-        plain = descriptor.removesuffix(SUFFIX)
-        if tracks.descriptor not in (plain, descriptor):
+        if tracks.descriptor not in (descriptor.removesuffix(SUFFIX), descriptor):
+            others = wanted or f"others have {descriptor}"
             raise ValueError(
-                f"{source.path} has {tracks.descriptor} descriptors, not {plain}: a map holds one "
-                "kind, so build a map of each kind"
+                f"{source.path} has {tracks.descriptor} descriptors, but {others}: a map holds one "
+                "kind, so build a map of each"
             )
         read[source] = tracks
     return [read[source] for source in sources]
@@ -233,5 +234,8 @@ def _facts(name: str, tracks: Tracks) -> dict[str, Any]:
         "keyframes": len(tracks.keyframe_names),
         "landmarks": len(tracks.landmark_ids),
         "observations": len(tracks.observations),
+        "descriptor": tracks.descriptor,
+        "cameras": sorted({f"{c.model} {c.width}x{c.height}" for c in tracks.cameras.values()}),
+        **({"detector": detector} if (detector := tracks.info.get("detector")) else {}),
         "ids": tracks.landmark_ids[[0, -1]].tolist(),
     }

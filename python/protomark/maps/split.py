@@ -1,13 +1,15 @@
-"""Splits a map into parts that can be served apart."""
+"""Splits a map into parts that can be served apart, or crops it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import protomark as pm
+from protomark.files import check_outputs
 from protomark.maps.open import map_path, open_learning_map
 from protomark.progress import Progress, silent, tracked
 
@@ -54,6 +56,50 @@ def split_file(
             }
         )
     return {"map": str(path), "landmarks": len(scene), "parts": written}
+
+
+def crop_file(
+    path: Path,
+    output: Path,
+    box: Sequence[float] | None = None,  # lowest x, y, z and highest x, y, z
+    near: Sequence[float] | None = None,  # x, y, z and a distance
+) -> dict[str, Any]:
+    """Write the landmarks within a box or near a point as a learning map; returns facts as JSON.
+
+    Raises:
+        ValueError: not exactly one of `box` and `near` is given, it is none, or it is empty.
+    """
+    if (box is None) == (near is None):
+        raise ValueError("give one of --box and --near to crop by")
+    check_outputs(output, inputs=[map_path(path, learning=True)])
+    scene = open_learning_map(path)
+    ids = scene.ids
+    positions = scene.positions(ids)
+    if box is not None:
+        low, high = np.array(box[:3]), np.array(box[3:])
+        if len(box) != 6 or not (low <= high).all():
+            raise ValueError("--box needs six numbers, the lowest x,y,z and the highest x,y,z")
+        inside = ((positions >= low) & (positions <= high)).all(axis=1)
+    else:
+        assert near is not None
+        if len(near) != 4 or not near[3] > 0:
+            raise ValueError("--near needs four numbers: x,y,z and a distance above 0")
+        inside = np.linalg.norm(positions - near[:3], axis=1) <= near[3]
+    if not inside.any():
+        known = np.isfinite(positions).all(axis=1)
+        extent = positions[known].min(axis=0), positions[known].max(axis=0)
+        told = " to ".join(",".join(f"{x:.4g}" for x in p) for p in extent) if known.any() else "no"
+        raise ValueError(f"{path}: no landmark is there; the map has positions from {told}")
+    part = scene.part(ids[inside])
+    part.metadata = scene.metadata
+    part.save(output)
+    return {
+        "map": str(path),
+        "landmarks": len(scene),
+        "without_position": int((~np.isfinite(positions).all(axis=1)).sum()),
+        "kept": len(part),
+        "bytes": output.stat().st_size,
+    }
 
 
 def _by_id(

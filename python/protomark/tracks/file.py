@@ -69,7 +69,9 @@ class Tracks:
         landmark_of_keypoint: (n,) int64, landmark id of each keypoint, -1 where there is none.
         landmark_ids: (l,) int64, ascending.
         landmark_positions: (l, 3) float64, in world coordinates.
-        info: what the tracks were made from, and how (JSON values).
+        info: what the tracks were made from, and how (JSON values). "source" has the program, its
+            version, a digest of its file, the maps in that, and counts of what was "dropped";
+            "detector" has the name and the settings of what described the images.
     """
 
     descriptor: str

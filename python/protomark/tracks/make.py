@@ -15,7 +15,8 @@ from protomark.progress import Progress, silent
 from protomark.tracks import database
 from protomark.tracks.augmentation import METHOD, add_augmentations
 from protomark.tracks.extract import SequenceFolder, TracksOptions, extract, provenance
-from protomark.tracks.file import Tracks
+from protomark.tracks.file import Tracks, sequence_name
+from protomark.tracks.importers import read_source
 from protomark.tracks.summary import summarise
 
 
@@ -56,6 +57,18 @@ def make_tracks(
         made_from = partial(provenance, sequence, options)
         make = partial(extract, sequence, options, threads, progress)
     return _make_unless_current(path, made_from, make, force)
+
+
+def import_tracks(path: Path, output: Path) -> TracksFile:
+    """Save the map of another program as NAME.DESCRIPTOR.safetensors."""
+    begin = time.perf_counter()
+    tracks = read_source(path)
+    tracks.info["sequence"] = sequence_name(path.resolve())
+    tracks.info["seconds"] = round(time.perf_counter() - begin, 1)
+    file = output / f"{tracks.info['sequence']}.{tracks.descriptor}.safetensors"
+    with only_writer(output, file.name):
+        tracks.save(file)
+    return TracksFile(file, tracks, skipped=False)
 
 
 def make_augmented_tracks(

@@ -40,7 +40,7 @@ def recognizes(path: Path, head: bytes) -> bool:
 def read(path: Path) -> Tracks:
     """Read an sfm_data, or the largest one in a folder and its folders.
 
-    Features are beside it, or in `matches/` there or in the folder above.
+    Features are beside it, or in a folder there or beside that, as `matches/` is.
 
     Raises:
         FileNotFoundError: there is no sfm_data.
@@ -61,19 +61,19 @@ def read(path: Path) -> Tracks:
     for view, (name, camera, pose) in sorted(
         scene.views.items(), key=lambda item: natural_key(item[1][0])
     ):
-        base = folder / Path(name.replace("\\", "/")).name
+        feat, desc = (folder / (_base(name) + suffix) for suffix in (".feat", ".desc"))
         if camera not in scene.cameras or pose not in scene.poses:
             dropped["keyframes without pose or camera"] += 1
             continue
-        if not base.with_suffix(".desc").is_file() or not base.with_suffix(".feat").is_file():
+        if not feat.is_file() or not desc.is_file():
             dropped["keyframes without features"] += 1
             continue
-        with unexpected(base.with_suffix(".desc"), "features"):
-            features = _features(base)
+        with unexpected(desc, "features"):
+            features = _features(feat, desc)
             rows, ids = labels.get(view, (np.zeros(0, np.int64), np.zeros(0, np.int64)))
             label = np.full(len(features), -1, np.int64)
             label[rows] = ids
-        files += [base.with_suffix(".feat"), base.with_suffix(".desc")]
+        files += [feat, desc]
         keyframes.append(Keyframe(name, camera + 1, scene.poses[pose], features, label))
     source = {
         **{"program": PROGRAM, "version": scene.version, "dropped": dict(dropped)},
@@ -94,8 +94,10 @@ def _scenes(folder: Path) -> list[Path]:
 def _features_folder(file: Path, scene: Scene) -> Path:
     """The folder with the features of a scene, which are AKAZE_MLDB's."""
     here = file.parent
-    for folder in (here, here / "matches", here.parent / "matches", here / "features"):
-        found = next(folder.glob("*.desc"), None)
+    names = [_base(name) + ".desc" for name, *_ in scene.views.values()]
+    places = [here, *sorted(here.glob("*/")), here.parent, *sorted(here.parent.glob("*/"))]
+    for folder in places:
+        found = next((folder / name for name in names if (folder / name).is_file()), None)
         if found is None:
             continue
         kind = _describer(folder)
@@ -109,9 +111,14 @@ def _features_folder(file: Path, scene: Scene) -> Path:
         raise refusal(file, PROGRAM, [kind])
     raise ValueError(
         f"{file}: the features of its {len(scene.views)} images (.feat and .desc) are neither "
-        "beside it nor in matches/: copy them there, or describe the images anew with `protomark "
-        "build images/ sparse/`, where sparse/ is this model exported to COLMAP"
+        "beside it nor in a folder there: copy them there, or describe the images anew with "
+        "`protomark build images/ sparse/`, where sparse/ is this model exported to COLMAP"
     )
+
+
+def _base(name: str) -> str:
+    """The name of an image's features, without a suffix."""
+    return Path(name.replace("\\", "/")).stem or "image"
 
 
 def _describer(folder: Path) -> str:
@@ -136,12 +143,12 @@ def _labels(scene: Scene) -> dict[int, tuple[NDArray[np.int64], NDArray[np.int64
     }
 
 
-def _features(base: Path) -> Features:
-    reader = Reader(base.with_suffix(".desc").read_bytes(), base.with_suffix(".desc"))
+def _features(feat: Path, desc: Path) -> Features:
+    reader = Reader(desc.read_bytes(), desc)
     rows = reader.array(np.uint8, reader.count(_ROW), _ROW)
     if len(reader):
         reader.fail(f"{len(reader):,} bytes follow the descriptors")
-    words = base.with_suffix(".feat").read_bytes().split()
+    words = feat.read_bytes().split()
     numbers = np.array(words, np.float64).reshape(-1, 4)
     used = rows[:, : descriptor_kind("akaze").bytes].copy()
     angles = np.degrees(numbers[:, 3]) % 360

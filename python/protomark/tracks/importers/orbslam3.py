@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,18 @@ def _tracks(atlas: Atlas) -> Tracks:
     positions = np.array([p.position for one in maps for p in one.points], np.float64)
     order = np.argsort(landmark_ids)
     features = np.concatenate([part for k in keyframes for part in (k.keypoints, k.right)])
-    names, numbers, poses, lengths, cameras = _images(keyframes, atlas)
+    bent = {k.lens for k in keyframes if (k.keypoints["xy"] != k.undistorted["xy"]).any()}
+    names, numbers, poses, lengths, cameras = _images(keyframes, bent, atlas)
+    source: dict[str, Any] = {
+        "program": PROGRAM,
+        "version": "unknown",
+        "archive": f"Boost {atlas.archive_version}",
+        "maps": summaries,
+    }
+    if dropped := +dropped:
+        source["dropped"] = dict(dropped)
+    if any(any(k.lens.distortion) and k.lens not in bent for k in keyframes):
+        source["note"] = "cameras are those of rectified images: rectify query images alike"
     return Tracks(
         descriptor="orb",
         cameras=cameras,
@@ -95,16 +107,7 @@ def _tracks(atlas: Atlas) -> Tracks:
         landmark_of_keypoint=labels,
         landmark_ids=landmark_ids[order],
         landmark_positions=positions[order],
-        info={
-            "source": {
-                "program": PROGRAM,
-                "version": "unknown",
-                "archive": f"Boost {atlas.archive_version}",
-                "maps": summaries,
-                **({"dropped": dict(dropped)} if (dropped := +dropped) else {}),
-            },
-            "detector": _detector(keyframes),
-        },
+        info={"source": source, "detector": _detector(keyframes)},
     )
 
 
@@ -155,11 +158,13 @@ def _observations(
 
 
 def _images(
-    keyframes: list[Keyframe], atlas: Atlas
+    keyframes: list[Keyframe], bent: set[Lens], atlas: Atlas
 ) -> tuple[list[str], NDArray[np.int32], NDArray[np.float64], list[int], dict[int, Camera]]:
-    """Names, camera ids, poses and numbers of keypoints of all images, and the cameras by id."""
-    # Images that the program has rectified keep the coefficients of those that it was given.
-    bent = {k.lens for k in keyframes if (k.keypoints["xy"] != k.undistorted["xy"]).any()}
+    """Names, camera ids, poses and numbers of keypoints of all images, and the cameras by id.
+
+    Keypoints of `bent` lenses are distorted. Images that the program has rectified keep the
+    coefficients of those that it was given, and are not.
+    """
     lenses = {lens: _camera(lens, lens in bent, atlas) for lens in {k.lens for k in keyframes}}
     found: dict[Camera, int] = {}
     taken: Counter[str] = Counter()
@@ -195,13 +200,19 @@ def _camera(lens: Lens, bent: bool, atlas: Atlas) -> Camera:
     if lens.id not in atlas.cameras:
         raise ValueError(f"a keyframe names camera {lens.id}, which is missing")
     fisheye, params = atlas.cameras[lens.id]
+    params = _decimal(params)
     size = right - left, bottom - top
     if fisheye:
         return Camera.from_opencv(*size, params[:4], params[4:], fisheye=True)
-    pinhole = *lens.focal, *lens.center
+    pinhole = _decimal((*lens.focal, *lens.center))
     if bent:
-        return Camera.from_opencv(*_raw_size(lens), pinhole, lens.distortion)
+        return Camera.from_opencv(*_raw_size(lens), pinhole, _decimal(lens.distortion))
     return Camera.from_opencv(*size, pinhole)
+
+
+def _decimal(numbers: Sequence[float]) -> tuple[float, ...]:
+    """The shortest decimals that are these float32 numbers, as calibrations have them."""
+    return tuple(float(str(np.float32(number))) for number in numbers)
 
 
 def _raw_size(lens: Lens) -> tuple[int, int]:
@@ -240,6 +251,6 @@ def _bounds(lens: Lens, size: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _detector(keyframes: list[Keyframe]) -> dict[str, Any]:
-    kinds = Counter((k.levels, float(f"{k.scale_factor:.6g}")) for k in keyframes)
+    kinds = Counter((k.levels, *_decimal([k.scale_factor])) for k in keyframes)
     levels, scale_factor = kinds.most_common(1)[0][0]
     return {"name": "ORB-SLAM", "levels": levels, "scale_factor": scale_factor}

@@ -29,6 +29,11 @@ _PATCH, _SCALE_FACTOR = 31.0, 1.2
 _DESCRIPTOR, _MAX_OCTAVE, _MAX_PIXEL = 32, 32, 1e5
 _MAX_ID = 2**63 - 1
 _MAX_SKEW = 0.01
+_USUAL_SIZES = (
+    *((320, 240), (640, 480), (752, 480), (848, 480)),
+    *((640, 360), (1280, 720), (1280, 800), (1280, 960), (1280, 1024), (1920, 1080)),
+)
+_SIZE_TOLERANCE = 0.05
 _BLOCK = 128  # landmarks that are projected at a time
 _F32, _F64, _POSE, _BYTES = (struct.Struct(f"<{form}") for form in ("f", "d", "12f", "32s"))
 
@@ -280,10 +285,7 @@ def _tracks(
 
 
 def _cameras(text: str, features: NDArray[Any] | None, numbers: NDArray[np.uint64]) -> list[Camera]:
-    """The cameras of undistorted images, whose size files lack: twice the principal point.
-
-    Keypoints to the right of or below that show that images are larger.
-    """
+    """The cameras of undistorted images."""
     try:
         params = [tuple(map(float, match)) for match in _CAMERA.findall(text)]
     except ValueError:
@@ -295,13 +297,21 @@ def _cameras(text: str, features: NDArray[Any] | None, numbers: NDArray[np.uint6
         if not (np.abs(features["xy"]) < _MAX_PIXEL).all():
             raise ValueError("keypoints lie outside any image")
         reach = features["xy"].max(axis=0)
-    sizes = [np.ceil(np.maximum(2 * np.array(one[2:]), reach + 1)) for one in params]
-    if not (np.array(sizes) < _MAX_PIXEL).all():
+    return [Camera.from_opencv(*_size(np.array(one[2:]), reach), one) for one in params]
+
+
+def _size(center: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[int, int]:
+    """Width and height of images, which files lack: about twice the principal point.
+
+    A usual size that is nearly that, or what holds all keypoints.
+    """
+    if not (np.abs(center) < _MAX_PIXEL).all():
         raise ValueError("a camera matrix has a principal point outside any image")
-    return [
-        Camera.from_opencv(int(size[0]), int(size[1]), one)
-        for one, size in zip(params, sizes, strict=True)
-    ]
+    usual = np.array(_USUAL_SIZES)
+    off = np.abs(2 * center / usual - 1).max(axis=1) + (reach > usual).any(axis=1)
+    best = usual[off.argmin()] if off.min() <= _SIZE_TOLERANCE else None
+    width, height = np.ceil(np.maximum(2 * center, reach + 1)) if best is None else best
+    return int(width), int(height)
 
 
 def _projected(

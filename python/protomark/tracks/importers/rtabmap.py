@@ -187,7 +187,8 @@ def _read_features(database: Database, version: str, detector: str) -> _Features
                 "was recorded"
             )
         raise ValueError(
-            f"{database.path}: this database of {PROGRAM} {version} has {nodes} nodes, but no "
+            f"{database.path}: this database of {PROGRAM} {version} has {nodes} node"
+            f"{'s' * (nodes > 1)}, but no "
             "features with descriptors, of which landmarks are made: record it with Kp/MaxFeatures "
             "at 0 or above, or export its images (rtabmap-export) and give them to `protomark map`"
         )

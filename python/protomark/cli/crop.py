@@ -1,0 +1,46 @@
+"""The command `protomark crop`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from protomark.cli.options import JsonFile
+
+
+def crop(
+    scene: Annotated[
+        Path, typer.Argument(metavar="MAP", help="A learning map, or a folder of `protomark map`.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
+    box: Annotated[
+        str,
+        typer.Option(
+            metavar="X,Y,Z,X,Y,Z", help="Keep landmarks from the lowest to the highest corner."
+        ),
+    ] = "",
+    near: Annotated[
+        str,
+        typer.Option(metavar="X,Y,Z,R", help="Keep landmarks within a distance of a point."),
+    ] = "",
+    json_file: JsonFile = None,
+) -> None:
+    """Keep the part of a map that is in a box, or near a point.
+
+    Reads a learning map and writes the landmarks there as one, which may be sealed or merged.
+
+    protomark crop kitchen --near 1.5,0,2,4 -o table.pmk
+    """
+    from protomark.cli.terminal import decimal_numbers, print_facts, write_json
+    from protomark.files import check_outputs
+    from protomark.maps.split import crop_file
+
+    check_outputs(output, json_file, inputs=[scene])
+    facts = crop_file(scene, output, decimal_numbers("--box", box), decimal_numbers("--near", near))
+    write_json(json_file, facts)
+    rows = [("kept", f"{facts['kept']:,} of {facts['landmarks']:,} landmarks")]
+    if facts["without_position"]:
+        rows.append(("left out", f"{facts['without_position']:,} landmarks without a position"))
+    print_facts([*rows, ("written", f"{facts['bytes']:,} bytes")])

@@ -1,0 +1,186 @@
+"""Moves a scene into another world: its map, sealed map, model and trajectory together."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import protomark as pm
+from protomark.files import only_writer, replacing_folder
+from protomark.geometry.pose import camera_centers, ground_plane
+from protomark.geometry.pose_files import PoseSet, match_names, read_positions
+from protomark.geometry.similarity import Similarity, fit_robustly
+from protomark.mapping.mapper import Mapper
+from protomark.mapping.outputs import link, write_outputs
+from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_state
+from protomark.maps.open import SEALED_MAP, open_learning_map
+from protomark.progress import Progress, silent
+from protomark.threads import one_blas_thread
+
+# Positions of other cameras fit worse than this share of their extent.
+_MAX_RESIDUAL = 0.1
+
+
+@dataclass(frozen=True)
+class Target:
+    """The world to move a scene into.
+
+    Attributes:
+        positions: file of camera positions, or folder of a model; None: the scene is only scaled or
+            turned.
+        scale: factor for all lengths; None: that of the positions, else 1.
+        up: whether to turn z up, as the images say.
+        frame: the new world, for the map's metadata.
+    """
+
+    positions: Path | None = None
+    scale: float | None = None
+    up: bool = False
+    frame: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.positions is None and self.scale is None and not self.up:
+            raise ValueError("name the world to move the scene into: --to, --scale or --up")
+        if self.positions is not None and (self.scale is not None or self.up):
+            raise ValueError("--to says how large the scene is and what is up: leave out the rest")
+        if self.scale is not None and not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"--scale {self.scale:g} is not above 0")
+
+
+def align_scene(path: Path, target: Target, progress: Progress = silent) -> dict[str, Any]:
+    """Move the scene in a folder of `protomark map`, or a learning map, in place; returns facts.
+
+    Either all of it is moved, or nothing is changed.
+
+    Raises:
+        FileNotFoundError, ValueError: there is no such scene, or nothing says where it belongs.
+    """
+    if path.is_dir():
+        return _align_folder(path.resolve(), target, progress)
+    if target.positions is not None or target.up:
+        raise ValueError(
+            f"{path} holds no cameras to align by: name the folder of `protomark map`, or --scale"
+        )
+    scene = open_learning_map(path)
+    motion = Similarity(target.scale or 1.0, np.eye(3), np.zeros(3))
+    scene.set_positions(scene.ids, motion(scene.positions(scene.ids)))
+    dropped = _describe_frame(scene, target.frame)
+    scene.save(path)
+    return _facts(motion) | {"dropped_frame": dropped}
+
+
+def _align_folder(folder: Path, target: Target, progress: Progress) -> dict[str, Any]:
+    with only_writer(folder), one_blas_thread():
+        if (folder / CHECKPOINT).is_dir():
+            raise ValueError(f"{folder} holds an interrupted map: finish it with --resume first")
+        if not (folder / STATE).is_file():
+            raise ValueError(
+                f"{folder} is no folder of a finished `protomark map`, whose files could be moved "
+                f"together: name its map file to scale that"
+            )
+        mapper, facts = load_state(folder)
+        motion, residuals = _motion(mapper, target)
+        mapper.structure.move(motion)
+        mapper.structure.recompute_views()
+        dropped = _describe_frame(mapper.scene, target.frame)
+        mapper.history.events.append(
+            f"aligned: scaled by {motion.scale:.6g}, turned by {motion.degrees:.1f} degrees"
+        )
+        progress("write", 0, 0)
+        with _copy(folder) as copy:
+            sealed = (copy / SEALED_MAP).is_file()
+            before = pm.open(copy / SEALED_MAP) if sealed else None
+            write_outputs(mapper, copy, folder.name, finished=True, seal=sealed)
+            if before is not None:
+                _check_sealed_alike(before, pm.open(copy / SEALED_MAP), folder)
+            save_state(mapper, copy / STATE, facts)
+    return _facts(motion) | residuals | {"dropped_frame": dropped}
+
+
+@contextmanager
+def _copy(folder: Path) -> Iterator[Path]:
+    """A copy of a folder, which replaces it when the block ends without an error.
+
+    Files are links, as all that are written anew are replaced, never changed.
+    """
+    with replacing_folder(folder) as copy:
+        hidden = shutil.ignore_patterns(".lock*")
+        shutil.copytree(folder, copy, ignore=hidden, copy_function=link, dirs_exist_ok=True)
+        yield copy
+
+
+def _check_sealed_alike(before: Any, after: Any, folder: Path) -> None:
+    names = ("words", "prototype_count", "bytes_per_landmark", "position_bits")
+    if len(before) != len(after) or any(getattr(before, n) != getattr(after, n) for n in names):
+        raise ValueError(
+            f"{folder / SEALED_MAP} was sealed otherwise than by `protomark map`: remove it, align "
+            "the scene and seal it again"
+        )
+
+
+def _describe_frame(scene: pm.PrototypeMap, frame: str | None) -> str | None:
+    """Say which world the map is in now; returns what it said before and nothing replaces."""
+    texts = dict(scene.metadata)
+    old = texts.pop("frame", None)
+    scene.metadata = texts if frame is None else {**texts, "frame": frame}
+    return old if frame is None else None
+
+
+def _motion(mapper: Mapper, target: Target) -> tuple[Similarity, dict[str, Any]]:
+    frames = mapper.structure.frames
+    poses = np.array([frame.pose for frame in frames])
+    if target.positions is not None:
+        given = read_positions(target.positions)
+        try:
+            return _fit(mapper, given)
+        except ValueError as error:
+            raise ValueError(f"{target.positions}: {error}") from None
+    rotation = np.eye(3)
+    if target.up:
+        across, along = ground_plane(poses)
+        rotation = np.stack([across, along, np.cross(across, along)])
+    return Similarity(target.scale or 1.0, rotation, np.zeros(3)), {}
+
+
+def _fit(mapper: Mapper, given: PoseSet) -> tuple[Similarity, dict[str, Any]]:
+    frames = mapper.structure.frames
+    named = match_names([frame.name for frame in frames], given.by_name)
+    found = [(f, given.find(named.get(f.name, f.name), f.time)) for f in frames]
+    pairs = [(frame, pose) for frame, pose in found if pose is not None]
+    if len(pairs) < 3:
+        raise ValueError(
+            f"{len(pairs)} of {len(frames)} images of the scene have a position, such as "
+            f"{given.example}, the scene {frames[0].name}: three are needed, under the same names"
+        )
+    centers = camera_centers(np.array([frame.pose for frame, _ in pairs]))
+    to = camera_centers(np.array([pose for _, pose in pairs]))
+    motion, inliers = fit_robustly(centers, to)
+    residuals = np.linalg.norm(motion(centers) - to, axis=1)
+    extent = float(np.linalg.norm(np.ptp(to, axis=0)))
+    if np.median(residuals) > _MAX_RESIDUAL * extent:
+        raise ValueError(
+            f"the positions are {np.median(residuals):.3g} from those of the scene (median), which "
+            f"is much of their extent of {extent:.3g}: are they those of these images?"
+        )
+    return motion, {
+        "images": len(pairs),
+        "inliers": int(inliers.sum()),
+        "residual_median": float(np.median(residuals)),
+        "residual_rmse_of_inliers": float(np.sqrt((residuals[inliers] ** 2).mean())),
+        "residuals": {f.name: float(r) for (f, _), r in zip(pairs, residuals, strict=True)},
+    }
+
+
+def _facts(motion: Similarity) -> dict[str, Any]:
+    return {
+        "scale": motion.scale,
+        "rotation": motion.rotation.tolist(),
+        "translation": motion.translation.tolist(),
+        "degrees": motion.degrees,
+    }

@@ -1,0 +1,203 @@
+"""Scenes that are moved into another world, all stations together, and cropped maps."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import protomark as pm
+from conftest import protomark, random_descriptors
+from mapping_scene import walk, write_images
+from protomark.geometry.colmap import find_model, read_model
+from protomark.geometry.pose import camera_centers
+from protomark.geometry.pose_files import read_poses, read_positions
+from protomark.geometry.similarity import Similarity, fit_robustly
+from protomark.mapping import aligning
+from protomark.mapping.aligning import Target, align_scene
+from protomark.mapping.request import MapRequest
+from protomark.mapping.session import make_map
+from protomark.maps.open import open_learning_map
+from protomark.maps.split import crop_file
+from test_mapping import CAMERA, SETTINGS
+from test_mapping_continue import contents
+from test_similarity import assert_same, random_similarity
+
+FRAMES = 9
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("map")
+    images = write_images(folder / "images", walk(FRAMES))
+    make_map(MapRequest(images, folder / "scene", SETTINGS, camera=CAMERA))
+    (folder / "scene" / "notes.txt").write_text("mine")
+    return folder / "scene"
+
+
+@pytest.fixture
+def scene(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "scene"))
+
+
+def stations(scene: Path) -> dict[str, np.ndarray]:
+    """Positions that each station of a scene knows, by name."""
+    learning, sealed = pm.open(scene / "scene.pmk"), pm.open(scene / "scene.sealed.pmk")
+    model = read_model(find_model(scene))
+    return {
+        "scene.pmk": learning.positions(learning.ids),
+        "scene.sealed.pmk": sealed.positions(sealed.ids),
+        "sparse": model.centers,
+        "trajectory.txt": camera_centers(read_poses(scene / "trajectory.txt").poses),
+    }
+
+
+def write_positions(path: Path, scene: Path, motion: Similarity, header: str = "") -> Path:
+    model = read_model(find_model(scene))
+    rng = np.random.default_rng(3)
+    to = motion(model.centers) + rng.normal(0, 1e-6, (len(model.names), 3))
+    to[2] += 7  # one is wrong
+    lines = [f"{n},{x:.9f},{y:.9f},{z:.9f}" for n, (x, y, z) in zip(model.names, to, strict=True)]
+    path.write_text(header + "\n".join(lines) + "\n")
+    return path
+
+
+def test_all_stations_move_together(scene: Path, tmp_path: Path) -> None:
+    motion = random_similarity(np.random.default_rng(0), scale=3)
+    before = stations(scene)
+    names = set(contents(scene))
+    file = write_positions(tmp_path / "gps.csv", scene, motion, "name,x,y,z\n")
+    report = tmp_path / "facts.json"
+    done = protomark("align", scene, "--to", file, "--frame", "ENU, metres", "--json", report)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(report.read_text())
+    assert (facts["images"], facts["inliers"]) == (FRAMES, FRAMES - 1)
+    assert "img3.png: 12.1" in done.stdout
+    for name, positions in stations(scene).items():
+        tolerance = 1e-3 if name == "scene.sealed.pmk" else 1e-4  # 16 bits per coordinate
+        np.testing.assert_allclose(positions, motion(before[name]), atol=tolerance, err_msg=name)
+    assert pm.open(scene).metadata["frame"] == "ENU, metres"
+    assert set(contents(scene)) == names
+    # The scene is a scene still: it takes more images, and moves back.
+    more = write_images(tmp_path / "more", walk(FRAMES + 2)[FRAMES:])
+    make_map(MapRequest(more, scene, SETTINGS, camera=CAMERA, extend=True))
+    back = write_positions(tmp_path / "back.txt", scene, Similarity(1, np.eye(3), np.zeros(3)))
+    align_scene(scene, Target(back))
+
+
+def test_a_scene_is_scaled_and_turned_up(scene: Path) -> None:
+    before = stations(scene)
+    facts = align_scene(scene, Target(scale=2, up=True))
+    motion = Similarity(2, np.array(facts["rotation"]), np.zeros(3))
+    for name, positions in stations(scene).items():
+        np.testing.assert_allclose(positions, motion(before[name]), atol=1e-3, err_msg=name)
+    model = read_model(find_model(scene))
+    up = -model.cam_from_world[:, 1, :3].mean(axis=0)
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-6)
+    file = scene / "scene.pmk"
+    assert protomark("align", file, "--scale", 0.5).returncode == 0
+    moved = open_learning_map(file)
+    np.testing.assert_allclose(moved.positions(moved.ids), motion(before["scene.pmk"]) / 2)
+
+
+def test_nothing_changes_on_an_error(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = contents(scene)
+    two, other, line, broken = (tmp_path / f"{name}.txt" for name in "tolb")
+    two.write_text("img1.png 1 2 3\nimg2.png 1 2 4\n")
+    rng = np.random.default_rng(1)
+    rows = [f"img{i}.png {x} {y} {z}" for i, (x, y, z) in enumerate(rng.normal(size=(9, 3)), 1)]
+    other.write_text("\n".join(rows))
+    line.write_text("\n".join(f"img{i}.png {i} {2 * i} 0" for i in range(1, 10)))
+    broken.write_text("img1.png 1 2 3\nimg2.png 1 nan 3\n")
+    for file, message in (
+        (two, "2 of 9 images of the scene have a position"),
+        (other, "are they those of these images"),
+        (line, "lie on a line"),
+        (broken, "line 2: a number of this pose is not finite"),
+        (tmp_path / "none.txt", "no such file"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            align_scene(scene, Target(file))
+    for target, message in (
+        ({}, "name the world"),
+        ({"scale": -1.0}, "is not above 0"),
+        ({"positions": two, "up": True}, "leave out the rest"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Target(**target)
+    with pytest.raises(ValueError, match="holds no cameras to align by"):
+        align_scene(scene / "scene.pmk", Target(up=True))
+
+    def fail(*_: object) -> None:
+        raise OSError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(aligning, "save_state", fail)
+        with pytest.raises(OSError, match="full"):
+            align_scene(scene, Target(scale=2))
+    assert contents(scene) == before
+    open_learning_map(scene).seal(scene / "scene.sealed.pmk", bytes_per_landmark=40)
+    before = contents(scene)
+    with pytest.raises(ValueError, match="was sealed otherwise"):
+        align_scene(scene, Target(scale=2))
+    assert contents(scene) == before
+
+
+def test_positions_on_the_globe(tmp_path: Path) -> None:
+    file = tmp_path / "gps.csv"
+    file.write_text(
+        "image, lat, lon, alt\na.jpg, 47, 8, 400\nb.jpg, 47.001, 8, 400\nc.jpg, 47, 8.001, 410\n"
+    )
+    poses = read_positions(file)
+    at = {name: -pose[:, 3] for name, pose in poses.by_name.items()}
+    np.testing.assert_allclose(at["a.jpg"], 0, atol=1e-6)
+    np.testing.assert_allclose(at["b.jpg"], [0, 111.17, 0], atol=0.05)
+    np.testing.assert_allclose(at["c.jpg"], [76.06, 0, 10], atol=0.05)
+
+
+def test_most_points_decide() -> None:
+    rng = np.random.default_rng(2)
+    points, true = rng.normal(size=(20, 3)), random_similarity(rng)
+    to = true(points)
+    to[:8] += rng.normal(0, 3 * true.scale, (8, 3))
+    found, inliers = fit_robustly(points, to)
+    assert_same(found, true, 1e-6)
+    assert inliers.tolist() == [False] * 8 + [True] * 12
+
+
+def test_maps_are_cropped(encoder: pm.Encoder, tmp_path: Path) -> None:
+    scene = pm.PrototypeMap(encoder)
+    scene.add(np.arange(10), random_descriptors(10))
+    scene.set_positions(np.arange(9), np.arange(9)[:, None] * [1.0, 2, -1])
+    scene.metadata = {"frame": "metres"}
+    scene.save(tmp_path / "scene.pmk")
+    output = tmp_path / "out.pmk"
+    for option, text, kept in (
+        ("--box", "1.5,0,-9,5,10,0", [2, 3, 4, 5]),
+        ("--near", "4,8,-4,2.5", [3, 4, 5]),
+    ):
+        done = protomark("crop", tmp_path / "scene.pmk", option, text, "-o", output)
+        assert done.returncode == 0, done.stderr
+        assert "1 landmarks without a position" in done.stdout
+        part = open_learning_map(output)
+        assert part.ids.tolist() == kept
+        np.testing.assert_array_equal(part.prototypes(kept), scene.prototypes(kept))
+        assert part.metadata["frame"] == "metres"
+    output.unlink()
+    for region, message in (
+        ({}, "give one of --box and --near"),
+        ({"box": (1, 2, 3)}, "--box needs six numbers"),
+        ({"box": (1, 1, 1, 0, 2, 2)}, "--box needs six numbers"),
+        ({"near": (1, 2, 3, -1)}, "--near needs four numbers"),
+        ({"near": (99, 0, 0, 1)}, "no landmark is there; the map has positions from 0,0,-8 to 8,"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            crop_file(tmp_path / "scene.pmk", output, **region)
+    done = protomark("crop", tmp_path / "scene.pmk", "--near", "1,2,x,1", "-o", output)
+    assert "is not a list of numbers" in done.stderr
+    assert not output.exists()
