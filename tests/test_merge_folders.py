@@ -18,7 +18,8 @@ from protomark.geometry.similarity import fit_similarity
 from protomark.mapping.merging_maps import merge_folders
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
-from protomark.mapping.state import STATE, load_state
+from protomark.mapping.state import load_state
+from protomark.maps.open import STATE
 from test_mapping import CAMERA, SETTINGS
 from test_mapping_continue import contents
 

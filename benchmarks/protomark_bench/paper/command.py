@@ -237,5 +237,5 @@ def _conditions(settings: PaperSettings, half: bool, seconds: list[float]) -> di
         "jobs": f"{settings.jobs} training(s) at a time with {settings.threads} thread(s) each, "
         f"matrix products in {'bfloat16' if half else 'float32'}",
         **machine.describe("torch", "numpy"),
-        "again": f"`protomark reproduce --scale {scale.name}`, see docs/reproduction.md",
+        "again": f"`protomark reproduce --scale {scale.name}`, see docs/results/paper.md",
     }

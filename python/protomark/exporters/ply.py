@@ -8,18 +8,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark import PrototypeMap
 from protomark.files import replacing
 from protomark.maps.open import open_map
 from protomark.tracks.file import Tracks
 
-Points = tuple[NDArray[np.float64], NDArray[np.int64]]
+Points = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 
 
 def landmarks_of(source: Path, tracks: Tracks | None) -> Points:
-    """Positions (l, 3), NaN where there is none, and numbers of observations (l,)."""
+    """Positions (l, 3), NaN where there is none, and numbers of observations (l,).
+
+    A sealed map does not count observations.
+    """
     if tracks is None:
         scene = open_map(source)
-        return scene.positions(scene.ids), scene.counts(scene.ids).astype(np.int64)
+        counts = scene.counts(scene.ids) if isinstance(scene, PrototypeMap) else None
+        return scene.positions(scene.ids), None if counts is None else counts.astype(np.int64)
     rows = np.searchsorted(tracks.landmark_ids, tracks.landmark_of_keypoint[tracks.observations])
     return tracks.landmark_positions, np.bincount(rows, minlength=len(tracks.landmark_ids))
 
@@ -27,7 +32,7 @@ def landmarks_of(source: Path, tracks: Tracks | None) -> Points:
 def write_ply(
     output: Path,
     positions: NDArray[np.float64],
-    counts: NDArray[np.int64],
+    counts: NDArray[np.int64] | None,
     colours: NDArray[np.uint8] | None = None,
 ) -> dict[str, Any]:
     """Write positions (l, 3), observations (l,) and colours (l, 3) of landmarks, binary.
@@ -39,13 +44,15 @@ def write_ply(
     if not placed.any():
         raise ValueError("no landmark has a position, so there is nothing to draw")
     columns = [("x", "<f8", "double"), ("y", "<f8", "double"), ("z", "<f8", "double")]
-    columns += [("count", "<u4", "uint")]
+    if counts is not None:
+        columns += [("count", "<u4", "uint")]
     if colours is not None:
         columns += [(name, "u1", "uchar") for name in ("red", "green", "blue")]
     vertices = np.zeros(int(placed.sum()), np.dtype([(name, kind) for name, kind, _ in columns]))
     for axis, name in enumerate("xyz"):
         vertices[name] = positions[placed, axis]
-    vertices["count"] = counts[placed]
+    if counts is not None:
+        vertices["count"] = counts[placed]
     if colours is not None:
         for channel, name in enumerate(("red", "green", "blue")):
             vertices[name] = colours[placed, channel]

@@ -18,8 +18,8 @@ from protomark.geometry.pose_files import PoseSet, match_names, read_positions
 from protomark.geometry.similarity import Similarity, fit_robustly
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.outputs import link, write_outputs
-from protomark.mapping.state import CHECKPOINT, STATE, load_state, save_state
-from protomark.maps.open import SEALED_MAP, open_learning_map
+from protomark.mapping.state import CHECKPOINT, load_state, save_state
+from protomark.maps.open import SEALED_MAP, STATE, open_learning_map
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread
 
