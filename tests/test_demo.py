@@ -17,7 +17,7 @@ from protomark import sample
 from protomark.cli.terminal import readable_size
 from protomark.evaluation.demo import LEARNING_MAP, PICTURE, SEALED_MAP, run_demo
 from protomark.evaluation.protocol import split
-from protomark.plot import ground_plane
+from protomark.geometry.pose import ground_plane
 from protomark.tracks.file import Tracks
 
 

@@ -160,7 +160,7 @@ def test_other_places_are_refused(
     for path, reason in (
         (mirrored, "one is mirrored"),
         (shuffled, "landmarks that look alike too few agree"),
-        (noise, "only [0-9]+ landmarks look alike"),
+        (noise, "landmarks (that )?look alike"),
         (unplaced, "0 landmarks of a map have a position"),
     ):
         with pytest.raises(ValueError, match=f"{path}: .*stand for other landmarks .*{reason}"):

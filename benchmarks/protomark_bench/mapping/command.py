@@ -14,9 +14,9 @@ import numpy as np
 import protomark as pm
 from protomark.cli.terminal import comma_separated, note, progress_bar
 from protomark.geometry.colmap import pycolmap
+from protomark.geometry.pose import ground_plane
 from protomark.mapping.memory import Memory
 from protomark.mapping.options import MappingOptions
-from protomark.plot import ground_plane
 from protomark.threads import one_blas_thread
 from protomark_bench import machine
 from protomark_bench.cache import ResultCache, key_of
