@@ -36,7 +36,8 @@ _MAX_PIXEL = 1e9
 def unexpected(path: Path, what: str) -> Iterator[None]:
     """Turn errors of unexpected values in the block into ValueErrors that say where they are."""
     try:
-        yield
+        with np.errstate(all="ignore"):  # what is not finite is refused where it is used
+            yield
     except KeyError as error:
         problem = f"it has no {str(error.args[0])[:40]}"
     except _UNEXPECTED as error:

@@ -86,7 +86,8 @@ def read(path: Path) -> Tracks:
             f"{path}: descriptors of {found.descriptors.shape[1]} bytes, of {detector}, are none "
             f"that Protomark knows: {_REMEDY}"
         )
-    landmarks = _find_landmarks(found, views, dropped)
+    with unexpected(path, "landmarks"):
+        landmarks = _find_landmarks(found, views, dropped)
     numbers: dict[Camera, int] = {}
     keyframes = []
     for view in views:
@@ -169,8 +170,7 @@ def _read_features(database: Database, version: str, detector: str) -> _Features
             cells = [cell or words.get(word, (None,))[0] for cell, word in pairs]
         blobs = list(map(blob, cells))
         sizes = set(map(len, blobs)) - {0}
-        with np.errstate(over="ignore"):  # infinity is refused below
-            numbers = np.array(columns[2:], np.float64).T.astype(np.float32)  # None becomes NaN
+        numbers = np.array(columns[2:], np.float64).T.astype(np.float32)  # None becomes NaN
         if "octave" not in optional:
             numbers = np.insert(numbers, 8, 0, axis=1)
         ids = np.array(columns[:2], np.int64)
