@@ -92,6 +92,25 @@ def test_a_map_is_recognized_and_moved(
     assert (tmp_path / "together.pmk").read_bytes() == output.read_bytes()
 
 
+def test_a_map_may_join_others_that_have_nothing_in_common(tracks: Tracks, tmp_path: Path) -> None:
+    count = len(tracks.keyframe_names)
+    paths = [tmp_path / f"{name}.pmk" for name in "abc"]
+    first, second = (half(tracks, frames) for frames in (range(0, 30), range(55, count)))
+    # Of one object seen all round, parts that are far apart.
+    second.remove(np.intersect1d(first.ids, second.ids))
+    ids = second.ids[::-1]
+    renumbered = pm.PrototypeMap(second.encoder, second.dim)
+    renumbered.merge_map(second, into=np.arange(len(ids)), source=ids)
+    renumbered.set_positions(np.arange(len(ids)), MOTION(second.positions(ids)))
+    first.save(paths[0])
+    renumbered.save(paths[1])
+    half(tracks, range(count), random_similarity(np.random.default_rng(11))).save(paths[2])
+    with pytest.raises(ValueError, match=f"{paths[1]}: .*cannot be recognized"):
+        merge_files(paths[:2], tmp_path / "out.pmk")
+    merged = merge_files(paths, tmp_path / "out.pmk")
+    assert [one["file"] for one in merged.facts["inputs"]] == [str(paths[i]) for i in (0, 2, 1)]
+
+
 def test_scale_is_kept_if_asked(halves: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be recognized"):
         merge_files(halves, tmp_path / "out.pmk", fixed_scale=True)

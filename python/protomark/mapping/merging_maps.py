@@ -19,9 +19,9 @@ from protomark.mapping.outputs import write_outputs
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.state import load_state, save_state
 from protomark.maps.alignment import Alignment, Ids, align_maps
-from protomark.maps.merge import Merged, check_inputs, find_alignment
+from protomark.maps.merge import Merged, check_inputs, find_alignment, merge_each
 from protomark.maps.open import SCENE_MAP, STATE
-from protomark.progress import Progress, silent, tracked
+from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread
 
 # Maps meet in so many other places at most; there they are off by at most this share of the reach.
@@ -43,7 +43,7 @@ def merge_folders(
     """Merge maps with their frames, adjust all together, and write the folder of a map.
 
     Args:
-        inputs: folders of `protomark map`, in this order; the world is that of the first.
+        inputs: folders of `protomark map`; the world is that of the first, see `merge_each`.
         output: the folder to write, new or empty.
         fixed_scale: whether all maps have one scale already.
         seal: whether to write a sealed map, too.
@@ -68,33 +68,34 @@ def merge_folders(
         first, *others = inputs
         mapper, facts = load_state(first, threads)
         result = Merged.begin(first, mapper.scene)
-        for path in tracked(others, progress, "merge"):
+        inputs_of_frames: dict[str, str] = dict(facts.get("inputs", {}))
+
+        def merge_one(path: Path) -> None:
             other, its = load_state(path, threads)
-            if again := set(facts.get("inputs", {})) & set(its.get("inputs", {})):
+            if again := set(inputs_of_frames) & set(its.get("inputs", {})):
                 raise ValueError(
-                    f"{path}: its frames in {min(again)} are in an earlier map, too, and would "
-                    "count twice: `protomark map` adds new images of a folder with --into"
+                    f"its frames in {min(again)} are in an earlier map, too, and would count "
+                    "twice: `protomark map` adds new images of a folder with --into"
                 )
-            try:
-                found = find_alignment(mapper.scene, other.scene, fixed_scale, threads)
-            except ValueError as error:
-                raise ValueError(f"{path}: {error}") from None
+            found = find_alignment(mapper.scene, other.scene, fixed_scale, threads)
             if found is None:
                 raise ValueError(
-                    f"{path}: its landmarks have the ids of an earlier map, or too few are common "
-                    "to both: name a file to write, such as -o merged.pmk, to sum the maps"
+                    "its landmarks have the ids of an earlier map, or too few are common to both: "
+                    "name a file to write, such as -o merged.pmk, to sum the maps"
                 )
             before = len(mapper.scene) + len(other.scene)
             result.note(path, other.scene, found, 0)
             prefix = _insert(mapper, other, found, path.name)
-            inputs_of_other = {name: prefix + old for name, old in its.get("inputs", {}).items()}
-            facts = {**facts, "inputs": {**facts.get("inputs", {}), **inputs_of_other}}
+            for name, old in its.get("inputs", {}).items():
+                inputs_of_frames[name] = prefix + old
             result.facts["inputs"][-1]["in_common"] = before - len(mapper.scene)
+
+        merge_each(others, merge_one, progress)
         mapper.finish(progress=progress)
         progress("write", 0, 0)
         names = " + ".join(path.name for path in inputs)
         figures = write_outputs(mapper, output, names, finished=True, seal=seal)
-        save_state(mapper, output / STATE, facts)
+        save_state(mapper, output / STATE, {**facts, "inputs": inputs_of_frames})
     result.facts |= {**figures, "bytes": (output / SCENE_MAP).stat().st_size}
     return result
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from protomark.maps import cameras
 from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.open import map_path, open_learning_map
 from protomark.maps.origin import joint_origin
-from protomark.progress import Progress, silent, tracked
+from protomark.progress import Progress, silent
 
 MAX_ID = 2**63 - 1
 # So many common ids tell whether they are the same landmarks in one world: then the prototypes of
@@ -79,7 +79,7 @@ def merge_files(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Merged:
-    """Merge learning maps, in this order, into the map file `output`.
+    """Merge learning maps, in the order that `merge_each` says, into the map file `output`.
 
     Landmarks of one id are one landmark, if the maps agree on that. Otherwise each map numbers its
     landmarks in a world of its own: it is moved into that of the first, and duplicates are merged.
@@ -97,20 +97,20 @@ def merge_files(
     first, *others = inputs
     merged = open_learning_map(first)
     result = Merged.begin(first, merged)
-    for path in tracked(others, progress, "merge"):
+
+    def merge_one(path: Path) -> None:
         scene, found = open_learning_map(path), None
         before = len(merged)
-        try:
-            if renumber:
-                _merge_renumbered(merged, scene)
-            elif (found := find_alignment(merged, scene, fixed_scale, threads)) is not None:
-                _merge_aligned(merged, scene, found)
-            else:
-                _merge_texts(merged, scene)
-                merged.merge_map(scene)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+        if renumber:
+            _merge_renumbered(merged, scene)
+        elif (found := find_alignment(merged, scene, fixed_scale, threads)) is not None:
+            _merge_aligned(merged, scene, found)
+        else:
+            _merge_texts(merged, scene)
+            merged.merge_map(scene)
         result.note(path, scene, found, before + len(scene) - len(merged))
+
+    merge_each(others, merge_one, progress)
     merged.save(output)
     result.facts |= {
         "kind": "learning map",
@@ -120,6 +120,32 @@ def merge_files(
         "bytes": output.stat().st_size,
     }
     return result
+
+
+def merge_each(
+    paths: Sequence[Path], merge_one: Callable[[Path], None], progress: Progress = silent
+) -> None:
+    """Merge maps in this order; those that cannot be are tried again after the others.
+
+    Two maps that have nothing in common may both overlap with a third.
+
+    Raises:
+        ValueError: a map cannot be merged after all that can; the error names it.
+    """
+    waiting = list(paths)
+    while waiting:
+        failed: list[tuple[Path, ValueError]] = []
+        for path in waiting:
+            progress("merge", len(paths) - len(waiting), len(paths))
+            try:
+                merge_one(path)
+            except ValueError as error:
+                failed.append((path, error))
+        if len(failed) == len(waiting):
+            path, problem = failed[0]
+            named = str(path) in str(problem)
+            raise problem if named else ValueError(f"{path}: {problem}") from None
+        waiting = [path for path, _ in failed]
 
 
 def check_inputs(inputs: Sequence[Path]) -> list[Path]:
