@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import protomark as pm
 from protomark.maps.open import map_path
 from protomark.tracks.file import Tracks
@@ -111,7 +113,9 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "nlist": scene.nlist or None,
         "index_bytes_per_landmark": _index_bytes(scene, sections),
         "observations": summary.get("observations"),
-        "count_histogram": None if sealed else summary["count_histogram"].tolist(),
+        "count_histogram": None
+        if sealed
+        else np.trim_zeros(summary["count_histogram"], "b").tolist(),
         "landmarks_with_position": summary["landmarks_with_position"],
         "position_bits": None if sealed is None else sealed.position_bits or None,
         "position_error": None if error is None else error.tolist(),
