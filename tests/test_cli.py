@@ -160,10 +160,10 @@ def test_seal_to_a_size(tracks: Tracks, model: Path, tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         return dict(json.loads(facts_file.read_text()))
 
-    # 12 dimensions in 6 words, a count, and ids, which are 0, 1, 2 and 7: a block of 16 bytes and
+    # 12 dimensions in 6 words, and ids, which are 0, 1, 2 and 7: a block of 16 bytes and
     # 8 bytes for all four.
-    facts = facts_of("--bytes", 7)
-    assert (facts["words"], facts["bytes_per_landmark_for_matching"]) == (6, 6 + 1 + 24 / 4)
+    facts = facts_of("--bytes", 6)
+    assert (facts["words"], facts["bytes_per_landmark_for_matching"]) == (6, 6 + 24 / 4)
     assert (facts["position_bits"], facts["landmarks"], facts["chosen_by"]) == (16, 4, None)
     learning = pm.open(scene)
     assert learning.prototype_count > len(learning)

@@ -96,6 +96,7 @@ def _index_bytes(scene: pm.PrototypeMap | pm.SealedMap, sections: dict[str, int]
 def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
     scene = pm.open(path)
     summary = scene.summary()
+    counts = summary.get("count_histogram")
     sealed = scene if isinstance(scene, pm.SealedMap) else None
     landmarks = max(1, len(scene))
     ids = sum(sections.get(name, 0) for name in ("idblocks", "idgaps")) / landmarks
@@ -113,9 +114,7 @@ def _describe_map(path: Path, sections: dict[str, int]) -> dict[str, Any]:
         "nlist": scene.nlist or None,
         "index_bytes_per_landmark": _index_bytes(scene, sections),
         "observations": summary.get("observations"),
-        "count_histogram": None
-        if sealed
-        else np.trim_zeros(summary["count_histogram"], "b").tolist(),
+        "count_histogram": None if counts is None else np.trim_zeros(counts, "b").tolist(),
         "landmarks_with_position": summary["landmarks_with_position"],
         "position_bits": None if sealed is None else sealed.position_bits or None,
         "position_error": None if error is None else error.tolist(),
