@@ -68,6 +68,8 @@ def write_positions(path: Path, scene: Path, motion: Similarity, header: str = "
 def test_all_stations_move_together(scene: Path, tmp_path: Path) -> None:
     motion = random_similarity(np.random.default_rng(0), scale=3)
     before = stations(scene)
+    (tmp_path / "photos").mkdir()
+    (scene / "photos").symlink_to(tmp_path / "photos")
     names = set(contents(scene))
     file = write_positions(tmp_path / "gps.csv", scene, motion, "name,x,y,z\n")
     report = tmp_path / "facts.json"
@@ -81,6 +83,7 @@ def test_all_stations_move_together(scene: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(positions, motion(before[name]), atol=tolerance, err_msg=name)
     assert pm.open(scene).metadata["frame"] == "ENU, metres"
     assert set(contents(scene)) == names
+    assert (scene / "photos").is_symlink()
     # The scene is a scene still: it takes more images, and moves back.
     more = write_images(tmp_path / "more", walk(FRAMES + 2)[FRAMES:])
     make_map(MapRequest(more, scene, SETTINGS, camera=CAMERA, extend=True))

@@ -61,6 +61,7 @@ def merge(
     protomark merge kitchen/ hall/ -o flat/
     """
     from protomark.cli.terminal import note, print_facts, progress_bar, write_json
+    from protomark.extras import optional
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
     from protomark.plot import check_suffix
@@ -68,6 +69,7 @@ def merge(
     to_folder = output.suffix != ".pmk"
     if draw is not None:
         check_suffix(draw)
+        optional("matplotlib")
     if to_folder:
         if renumber:
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
