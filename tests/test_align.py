@@ -173,6 +173,15 @@ def test_most_points_decide() -> None:
     assert inliers.tolist() == [False] * 8 + [True] * 12
 
 
+def test_a_line_is_no_orientation() -> None:
+    line = np.arange(12.0)[:, None] * [1, 2, 3]
+    line[3] += [5, -7, 1]  # whatever one wrong point says
+    to = 2 * line
+    to[3] += [9, 9, -4]
+    with pytest.raises(ValueError, match="on a line"):
+        fit_robustly(line, to)
+
+
 def test_maps_are_cropped(encoder: pm.Encoder, tmp_path: Path) -> None:
     scene = pm.PrototypeMap(encoder)
     scene.add(np.arange(10), random_descriptors(10))
