@@ -60,7 +60,8 @@ def merge(
 
     protomark merge kitchen/ hall/ -o flat/
     """
-    from protomark.cli.terminal import print_facts, progress_bar, write_json
+    from protomark.cli.terminal import note, print_facts, progress_bar, write_json
+    from protomark.extras import optional
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
     from protomark.plot import check_suffix
@@ -68,6 +69,7 @@ def merge(
     to_folder = output.suffix != ".pmk"
     if draw is not None:
         check_suffix(draw)
+        optional("matplotlib")
     if to_folder:
         if renumber:
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
@@ -108,7 +110,15 @@ def merge(
         if one["moved"]:
             rows.append(("", _moved(one["moved"])))
     rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
+    if not to_folder and any(path.is_dir() for path in maps):
+        rows.append(
+            ("left out", "frames and their poses: name a folder with -o to merge them, too")
+        )
     print_facts(rows)
+    for warning in facts.get("warnings", []):
+        note(f"cannot be trusted: {warning}")
+    if facts.get("warnings"):
+        raise typer.Exit(1)
 
 
 def _moved(facts: dict[str, Any]) -> str:

@@ -26,8 +26,6 @@ from protomark.threads import one_blas_thread
 
 # Maps meet in so many other places at most; there they are off by at most this share of the reach.
 _MAX_LOOPS = 5
-_MIN_AGREEING = 15
-_MAX_CHANCE = -15.0
 _MAX_DRIFT = 0.1
 
 
@@ -166,8 +164,7 @@ def _close_loops(mapper: Mapper, count: int) -> int:
         except ValueError:
             break
         # That the maps are of one scene is known: little in common is enough.
-        unsure = found.agreeing < _MIN_AGREEING or found.chance > _MAX_CHANCE
-        if unsure or found.drift > _MAX_DRIFT * found.reach:
+        if not found.is_significant or found.drift > _MAX_DRIFT * found.reach:
             break
         merged += _merge_duplicates(mapper, found.into, found.source)
     return merged
