@@ -33,6 +33,10 @@ def merge(
             "further map get new ids above all earlier ones. Positions must be of one world.",
         ),
     ] = False,
+    align: Annotated[
+        bool,
+        typer.Option("--align", help="Each map has a world of its own, whatever the ids say."),
+    ] = False,
     fixed_scale: Annotated[
         bool, typer.Option("--fixed-scale", help="The maps have one scale, such as metres.")
     ] = False,
@@ -83,6 +87,7 @@ def merge(
             merged = merge_folders(
                 maps,
                 output,
+                align=align,
                 fixed_scale=fixed_scale,
                 seal=not no_seal,
                 threads=threads,
@@ -93,6 +98,7 @@ def merge(
                 maps,
                 output,
                 renumber=renumber,
+                align=align,
                 fixed_scale=fixed_scale,
                 threads=threads,
                 progress=progress,
