@@ -148,8 +148,9 @@ class Map:
         sealed_rows = np.frombuffer(parts.get("rows", bytes([1]) * n), "u1")
         rows = learning_rows(parts, n)[0] if learning else sealed_rows
         self.landmarks = np.repeat(self.ids, rows)
-        self.counts = np.frombuffer(parts["counts"], "u1") if learning else None
+        self.counts: Any = None
         if learning:
+            self.counts = np.frombuffer(parts["counts"], "u1")
             sums = learning_sums(parts, k)
             count = self.counts[:, None].astype(np.int64)
             self.prototypes = np.sign(sums) * ((2 * abs(sums) + count) // (2 * count))
