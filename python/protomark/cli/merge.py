@@ -60,7 +60,7 @@ def merge(
 
     protomark merge kitchen/ hall/ -o flat/
     """
-    from protomark.cli.terminal import print_facts, progress_bar, write_json
+    from protomark.cli.terminal import note_outdated, print_facts, progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
     from protomark.plot import check_suffix
@@ -73,7 +73,7 @@ def merge(
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
         check_outputs(draw, json_file, inputs=maps, folder=output)
     else:
-        check_outputs(output, draw, json_file, inputs=maps)
+        check_outputs(draw, json_file, inputs=maps, maps=[output])
     with progress_bar() as progress:
         if to_folder:
             from protomark.mapping.merging_maps import merge_folders
@@ -104,11 +104,13 @@ def merge(
     rows = []
     for i, one in enumerate(facts["inputs"]):
         shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
-        rows.append((Path(one["file"]).name, f"{one['landmarks']:,} landmarks{shared}"))
+        rows.append((one["file"], f"{one['landmarks']:,} landmarks{shared}"))
         if one["moved"]:
             rows.append(("", _moved(one["moved"])))
     rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
     print_facts(rows)
+    if not to_folder:
+        note_outdated(output)
 
 
 def _moved(facts: dict[str, Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from protomark.files import check_outputs
+from protomark.files import check_elsewhere, check_outputs
 from protomark.maps.info import is_tracks
 from protomark.tracks.file import Tracks
 
@@ -29,6 +29,7 @@ def export(source: Path, output: Path, to: Format, images: Path | None = None) -
         check_outputs(output, inputs=[source])
     else:
         check_outputs(folder=output)
+        check_elsewhere(output)
         if output.exists() and any(output.iterdir()):
             raise FileExistsError(f"{output} holds files: name a new folder with -o")
     tracks = Tracks.load(source) if is_tracks(source) else None

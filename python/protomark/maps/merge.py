@@ -93,7 +93,7 @@ def merge_files(
         threads: threads to search on.
         progress: told of each map.
     """
-    check_outputs(output, inputs=check_inputs(inputs))
+    check_outputs(inputs=check_inputs(inputs), maps=[output])
     first, *others = inputs
     merged = open_learning_map(first)
     result = Merged.begin(first, merged)
