@@ -68,6 +68,8 @@ def write_positions(path: Path, scene: Path, motion: Similarity, header: str = "
 def test_all_stations_move_together(scene: Path, tmp_path: Path) -> None:
     motion = random_similarity(np.random.default_rng(0), scale=3)
     before = stations(scene)
+    (tmp_path / "photos").mkdir()
+    (scene / "photos").symlink_to(tmp_path / "photos")
     names = set(contents(scene))
     file = write_positions(tmp_path / "gps.csv", scene, motion, "name,x,y,z\n")
     report = tmp_path / "facts.json"
@@ -81,6 +83,7 @@ def test_all_stations_move_together(scene: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(positions, motion(before[name]), atol=tolerance, err_msg=name)
     assert pm.open(scene).metadata["frame"] == "ENU, metres"
     assert set(contents(scene)) == names
+    assert (scene / "photos").is_symlink()
     # The scene is a scene still: it takes more images, and moves back.
     more = write_images(tmp_path / "more", walk(FRAMES + 2)[FRAMES:])
     make_map(MapRequest(more, scene, SETTINGS, camera=CAMERA, extend=True))
@@ -170,6 +173,15 @@ def test_most_points_decide() -> None:
     found, inliers = fit_robustly(points, to)
     assert_same(found, true, 1e-6)
     assert inliers.tolist() == [False] * 8 + [True] * 12
+
+
+def test_a_line_is_no_orientation() -> None:
+    line = np.arange(12.0)[:, None] * [1, 2, 3]
+    line[3] += [5, -7, 1]  # whatever one wrong point says
+    to = 2 * line
+    to[3] += [9, 9, -4]
+    with pytest.raises(ValueError, match="on a line"):
+        fit_robustly(line, to)
 
 
 def test_maps_are_cropped(encoder: pm.Encoder, tmp_path: Path) -> None:

@@ -239,8 +239,8 @@ def test_wrong_calls_change_nothing(encoder: pm.Encoder, tmp_path: Path) -> None
         ),
         (
             ValueError,
-            "bytes_per_landmark must be at least 5 for this map",
-            lambda: scene.seal(tmp_path / "s.pmk", bytes_per_landmark=4.9),
+            "bytes_per_landmark must be at least 2 for this map",
+            lambda: scene.seal(tmp_path / "s.pmk", bytes_per_landmark=1.9),
         ),
     ]
     for error, message, call in calls:

@@ -46,7 +46,7 @@ def test_searches_name_what_they_refuse(scene: pm.PrototypeMap | pm.SealedMap) -
 def test_ids_are_named_as_they_are(scene: pm.PrototypeMap | pm.SealedMap) -> None:
     above = "landmark id 9223372036854775808 is above"
     refused(lambda: scene.appearances(2**63), ValueError, above)
-    refused(lambda: scene.counts(np.array([2**63], np.uint64)), ValueError, above)
+    refused(lambda: scene.positions(np.array([2**63], np.uint64)), ValueError, above)
 
 
 def test_lengths_of_codes(encoder: pm.Encoder) -> None:

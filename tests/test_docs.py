@@ -130,6 +130,7 @@ def write_foreign_maps(folder: Path) -> None:
     from protomark.geometry.camera import Camera
     from rtabmap_writer import write_rtabmap
     from stella_writer import write_msg
+    from tracks_scene import write_sequence
 
     tracks = orb_tracks(Camera("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0)))
     data = ROOT / "tests" / "data" / "orbslam3"
@@ -138,6 +139,7 @@ def write_foreign_maps(folder: Path) -> None:
     for path in data.glob("*.jpg"):
         shutil.copy(path, folder / "frames")
     write_msg(folder / "map.msg", tracks)
+    write_sequence(folder, count=5)
     write_rtabmap(folder / "rtabmap.db", tracks)
 
 

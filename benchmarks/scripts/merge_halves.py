@@ -112,12 +112,12 @@ def main() -> None:
             continue
         tried += 1
         try:
-            found = align_maps(open_learning_map(first), open_learning_map(second))
+            alike = align_maps(open_learning_map(first), open_learning_map(second))
         except ValueError:
             continue
-        if not found.problem:
+        if not alike.problem:
             false += 1
-            print(f"{first.name} and {second.name} are merged: {found.facts()}")
+            print(f"{first.name} and {second.name} are merged: {alike.facts()}")
     print(f"{false} of {tried} pairs of maps of different sequences are merged")
 
 

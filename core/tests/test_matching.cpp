@@ -31,7 +31,10 @@ void test_notes() {
     return check::throws<std::invalid_argument>([&] { MatchCalibration::of(e, dim); },
                                                 "protomark calibrate");
   };
-  CHECK(none(*encoder, 7));
+  // In between, weights are interpolated.
+  const MatchCalibration half = MatchCalibration::of(*encoder, 9);
+  CHECK(half.weights[0] == 0.75 && half.weights[1] == -0.75);
+  CHECK(none(*encoder, 5) && none(*encoder, 13));
   CHECK(none(*test::random_encoder(), 12));
   CHECK(none(*with_note(""), 12));
   for (const char* note :

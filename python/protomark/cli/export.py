@@ -18,10 +18,11 @@ def export(
         ),
     ],
     to: Annotated[
-        Literal["ply", "colmap", "nerfstudio", "stella"],
+        Literal["ply", "colmap", "kapture", "nerfstudio", "stella"],
         typer.Option(
             help="ply: landmarks for viewers. colmap: a model in sparse/0/. nerfstudio: "
-            "transforms.json. stella: a map of stella_vslam (.msg), of ORB tracks."
+            "transforms.json. kapture: a data set, of tracks. stella: a map of stella_vslam "
+            "(.msg), of ORB tracks."
         ),
     ],
     output: Annotated[

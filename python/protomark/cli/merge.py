@@ -33,6 +33,10 @@ def merge(
             "further map get new ids above all earlier ones. Positions must be of one world.",
         ),
     ] = False,
+    align: Annotated[
+        bool,
+        typer.Option("--align", help="Each map has a world of its own, whatever the ids say."),
+    ] = False,
     fixed_scale: Annotated[
         bool, typer.Option("--fixed-scale", help="The maps have one scale, such as metres.")
     ] = False,
@@ -60,7 +64,8 @@ def merge(
 
     protomark merge kitchen/ hall/ -o flat/
     """
-    from protomark.cli.terminal import note_outdated, print_facts, progress_bar, write_json
+    from protomark.cli.terminal import note, note_outdated, print_facts, progress_bar, write_json
+    from protomark.extras import optional
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
     from protomark.plot import check_suffix
@@ -68,6 +73,7 @@ def merge(
     to_folder = output.suffix != ".pmk"
     if draw is not None:
         check_suffix(draw)
+        optional("matplotlib")
     if to_folder:
         if renumber:
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
@@ -81,6 +87,7 @@ def merge(
             merged = merge_folders(
                 maps,
                 output,
+                align=align,
                 fixed_scale=fixed_scale,
                 seal=not no_seal,
                 threads=threads,
@@ -91,6 +98,7 @@ def merge(
                 maps,
                 output,
                 renumber=renumber,
+                align=align,
                 fixed_scale=fixed_scale,
                 threads=threads,
                 progress=progress,
@@ -104,13 +112,23 @@ def merge(
     rows = []
     for i, one in enumerate(facts["inputs"]):
         shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
-        rows.append((one["file"], f"{one['landmarks']:,} landmarks{shared}"))
+        file = Path(one["file"])
+        name = f"{file.parent.name}/{file.name}" if file.name == "scene.pmk" else file.name
+        rows.append((name, f"{one['landmarks']:,} landmarks{shared}"))
         if one["moved"]:
             rows.append(("", _moved(one["moved"])))
     rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
+    if not to_folder and any(path.is_dir() for path in maps):
+        rows.append(
+            ("left out", "frames and their poses: name a folder with -o to merge them, too")
+        )
     print_facts(rows)
     if not to_folder:
         note_outdated(output)
+    for warning in facts.get("warnings", []):
+        note(f"cannot be trusted: {warning}")
+    if facts.get("warnings"):
+        raise typer.Exit(1)
 
 
 def _moved(facts: dict[str, Any]) -> str:

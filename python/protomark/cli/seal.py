@@ -32,7 +32,7 @@ def seal(
         float,
         typer.Option(
             "--bytes",
-            help="Bytes per landmark for prototypes and count, on average. 0: as many as it takes "
+            help="Bytes per landmark for prototypes, on average. 0: as many as it takes "
             "to answer exactly as the learning map.",
         ),
     ] = 33.0,

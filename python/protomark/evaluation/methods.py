@@ -57,7 +57,7 @@ class MethodChoice:
 
 
 class PrototypeMethod(Method):
-    """A learning or a sealed map of prototypes, with a byte for each landmark's count."""
+    """A learning map of prototypes, with a byte for each landmark's count, or a sealed one."""
 
     def __init__(self, scene: pm.PrototypeMap | pm.SealedMap) -> None:
         self.map = scene

@@ -9,7 +9,7 @@ from protomark.files import check_elsewhere, check_outputs
 from protomark.maps.info import is_tracks
 from protomark.tracks.file import Tracks
 
-Format = Literal["ply", "colmap", "nerfstudio", "stella"]
+Format = Literal["ply", "colmap", "kapture", "nerfstudio", "stella"]
 
 
 def export(source: Path, output: Path, to: Format, images: Path | None = None) -> dict[str, Any]:
@@ -33,16 +33,24 @@ def export(source: Path, output: Path, to: Format, images: Path | None = None) -
         if output.exists() and any(output.iterdir()):
             raise FileExistsError(f"{output} holds files: name a new folder with -o")
     tracks = Tracks.load(source) if is_tracks(source) else None
-    if to == "stella":
-        from protomark.exporters.stella import write_stella
-
+    if to in ("stella", "kapture"):
+        program = "stella_vslam" if to == "stella" else to
         if images is not None:
-            raise ValueError("maps of stella_vslam have no colours: leave out --images")
+            raise ValueError(f"maps of {program} have no colours: leave out --images")
         if tracks is None:
-            raise ValueError(
-                f"{source} holds no descriptors, which stella_vslam needs: give tracks"
-            )
-        return write_stella(tracks, output)
+            raise ValueError(f"{source} holds no descriptors, which {program} needs: give tracks")
+        if to == "stella":
+            from protomark.exporters.stella import write_stella
+
+            return write_stella(tracks, output)
+        from protomark.tracks.importers.kapture import write_kapture
+
+        write_kapture(tracks, output)
+        return {
+            "keyframes": len(tracks.keyframe_names),
+            "landmarks": len(tracks.landmark_ids),
+            "observations": len(tracks.observations),
+        }
     if to == "ply" and images is None:
         from protomark.exporters.ply import landmarks_of, write_ply
 

@@ -106,10 +106,6 @@ def fit_robustly(
     """
     one = fit_similarity(source, target, fixed_scale=fixed_scale)
     n = len(source)
-    for points in (source, target):
-        spread = np.linalg.svd(points - np.median(points, axis=0), compute_uv=False)
-        if spread[1] <= _MIN_SPREAD * spread[0]:
-            raise ValueError("the points lie on a line, so the rotation about it is undefined")
     rows = np.random.default_rng(0).integers(0, n, (_TRIPLES, 3))
     rows = rows[_similar_triangles(source[rows], target[rows], fixed_scale, 2.0)]
     motions = _fit(source[rows], target[rows], np.ones(rows.shape), fixed_scale)
@@ -126,6 +122,10 @@ def fit_robustly(
             break
         inliers = now
         one = fit_similarity(source[inliers], target[inliers], fixed_scale=fixed_scale)
+    for points in (source[inliers], target[inliers]):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[1] <= _MIN_SPREAD * spread[0]:
+            raise ValueError("the points lie on a line, so the rotation about it is undefined")
     return one, inliers
 
 

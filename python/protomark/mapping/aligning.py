@@ -113,8 +113,14 @@ def _copy(folder: Path) -> Iterator[Path]:
     Files are links, as all that are written anew are replaced, never changed.
     """
     with replacing_folder(folder) as copy:
-        hidden = shutil.ignore_patterns(".lock*")
-        shutil.copytree(folder, copy, ignore=hidden, copy_function=link, dirs_exist_ok=True)
+        shutil.copytree(
+            folder,
+            copy,
+            symlinks=True,
+            ignore=shutil.ignore_patterns(".lock*"),
+            copy_function=link,
+            dirs_exist_ok=True,
+        )
         yield copy
 
 

@@ -26,8 +26,6 @@ from protomark.threads import one_blas_thread
 
 # Maps meet in so many other places at most; there they are off by at most this share of the reach.
 _MAX_LOOPS = 5
-_MIN_AGREEING = 15
-_MAX_CHANCE = -15.0
 _MAX_DRIFT = 0.1
 
 
@@ -35,6 +33,7 @@ def merge_folders(
     inputs: Sequence[Path],
     output: Path,
     *,
+    align: bool = False,
     fixed_scale: bool = False,
     seal: bool = True,
     threads: int = 1,
@@ -45,6 +44,7 @@ def merge_folders(
     Args:
         inputs: folders of `protomark map`; the world is that of the first, see `merge_each`.
         output: the folder to write, new or empty.
+        align: each map has a world of its own, whatever the ids say.
         fixed_scale: whether all maps have one scale already.
         seal: whether to write a sealed map, too.
         threads: threads to search on.
@@ -78,11 +78,14 @@ def merge_folders(
                     f"its frames in {min(again)} are in an earlier map, too, and would count "
                     "twice: `protomark map` adds new images of a folder with --into"
                 )
-            found = find_alignment(mapper.scene, other.scene, fixed_scale, threads)
+            found = find_alignment(
+                mapper.scene, other.scene, align=align, fixed_scale=fixed_scale, threads=threads
+            )
             if found is None:
                 raise ValueError(
                     "its landmarks have the ids of an earlier map, or too few are common to both: "
-                    "name a file to write, such as -o merged.pmk, to sum the maps"
+                    "name a file to write, such as -o merged.pmk, to sum the maps; --align says "
+                    "that each has a world of its own"
                 )
             before = len(mapper.scene) + len(other.scene)
             result.note(path, other.scene, found, 0)
@@ -168,8 +171,7 @@ def _close_loops(mapper: Mapper, count: int) -> int:
         except ValueError:
             break
         # That the maps are of one scene is known: little in common is enough.
-        unsure = found.agreeing < _MIN_AGREEING or found.chance > _MAX_CHANCE
-        if unsure or found.drift > _MAX_DRIFT * found.reach:
+        if not found.is_significant or found.drift > _MAX_DRIFT * found.reach:
             break
         merged += _merge_duplicates(mapper, found.into, found.source)
     return merged

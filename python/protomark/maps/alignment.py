@@ -23,11 +23,13 @@ _MAX_VOTING = 5_000
 _LIMITS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 # Landmarks are in one place if they are in the same cube, with edges of so many limits.
 _CELL = 8.0
-# Two maps are of one scene if so many pairs agree; if of the likely pairs with one end where the
-# other map has landmarks this share agrees; and if this share of the cubes in which both maps have
-# landmarks holds a pair that agrees (benchmarks/scripts/merge_halves.py). Places that only look
-# alike share some landmarks, and lack those around them.
+# Two maps are of one scene if so many pairs agree, and chance does that at most so often (log10);
+# if of the likely pairs with one end where the other map has landmarks this share agrees; and if
+# this share of the cubes in which both maps have landmarks holds a pair that agrees
+# (benchmarks/scripts/merge_halves.py). Places that only look alike share some landmarks, and lack
+# those around them.
 _MIN_AGREEING = 15
+_MAX_CHANCE = -12.0
 _MIN_SHARE = 0.15
 _MIN_CUBES = 0.1
 _SAMPLES = 200_000
@@ -76,10 +78,15 @@ class Alignment:
         return self.drift <= self.radius
 
     @property
+    def is_significant(self) -> bool:
+        """Whether chance alone does not explain the pairs that agree."""
+        return self.agreeing >= _MIN_AGREEING and self.chance <= _MAX_CHANCE
+
+    @property
     def problem(self) -> str:
         """Why the maps may be of different places, "" if they are of one."""
         share = self.agreeing / max(self.likely, 1)
-        if self.agreeing < _MIN_AGREEING:
+        if not self.is_significant:
             return f"only {self.agreeing} landmarks agree on how they lie in each other"
         if share < _MIN_SHARE:
             return (
@@ -128,10 +135,10 @@ def align_maps(
         raise ValueError("maps of different encoders or dimensions cannot be merged")
     worlds = _World.of(target), _World.of(source)
     for world in worlds:
-        if len(world.ids) < _MIN_AGREEING:
+        if len(world.ids) < _MIN_AGREEING or not world.reach > 0:
             raise ValueError(
-                f"{len(world.ids)} landmarks of a map have a position, too few to find out how "
-                "maps lie in each other"
+                f"{len(world.ids)} landmarks of a map have a position, too few, or all the same, "
+                "to find out how maps lie in each other"
             )
     sample = worlds[1].ids[:: -(-len(worlds[1].ids) // searched)]
     into, ours = _likely_pairs(*worlds, sample, threads)
@@ -149,7 +156,8 @@ def align_maps(
         )
         for axes, samples in (((1, 1, 1), _SAMPLES), ((1, 1, -1), _SAMPLES // 20))
     )
-    if mirrored is not None and (found is None or mirrored.chance < _MIRRORED * found.chance):
+    proper = _MAX_CHANCE if found is None else min(_MAX_CHANCE, _MIRRORED * found.chance)
+    if mirrored is not None and mirrored.chance < proper:
         raise ValueError("of the two maps one is mirrored, so its coordinates are left-handed")
     if found is None:
         raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +76,7 @@ def merge_files(
     output: Path,
     *,
     renumber: bool = False,
+    align: bool = False,
     fixed_scale: bool = False,
     threads: int = 1,
     progress: Progress = silent,
@@ -89,10 +91,13 @@ def merge_files(
         output: the map file to write.
         renumber: landmarks of different files differ, whatever their ids, in one world: those of
             each further file get new ids above all earlier ones.
+        align: each map has a world of its own, whatever the ids say.
         fixed_scale: whether all maps have one scale already.
         threads: threads to search on.
         progress: told of each map.
     """
+    if renumber and align:
+        raise ValueError("--renumber is for maps of one world, --align for others: choose one")
     check_outputs(inputs=check_inputs(inputs), maps=[output])
     first, *others = inputs
     merged = open_learning_map(first)
@@ -103,7 +108,11 @@ def merge_files(
         before = len(merged)
         if renumber:
             _merge_renumbered(merged, scene)
-        elif (found := find_alignment(merged, scene, fixed_scale, threads)) is not None:
+        elif (
+            found := find_alignment(
+                merged, scene, align=align, fixed_scale=fixed_scale, threads=threads
+            )
+        ) is not None:
             _merge_aligned(merged, scene, found)
         else:
             _merge_texts(merged, scene)
@@ -165,19 +174,34 @@ def check_inputs(inputs: Sequence[Path]) -> list[Path]:
 
 
 def find_alignment(
-    merged: pm.PrototypeMap, scene: pm.PrototypeMap, fixed_scale: bool = False, threads: int = 1
+    merged: pm.PrototypeMap,
+    scene: pm.PrototypeMap,
+    *,
+    align: bool = False,
+    fixed_scale: bool = False,
+    threads: int = 1,
 ) -> Alignment | None:
     """How `scene` lies in the world of `merged`; None: in the same world, with the same ids.
+
+    Maps with hardly any id in common are parts of one, or of a job that numbers all landmarks; a
+    warning says if they look otherwise. `align` says that they are not, whatever their ids.
 
     Raises:
         ValueError: common ids are the same landmarks in other places, or different landmarks and
             nothing says how the maps lie in each other.
     """
-    common = np.intersect1d(merged.ids, scene.ids, assume_unique=True)
-    if len(common) < _MIN_COMMON:
-        return _other_world(merged, scene, fixed_scale, threads)
-    if _same_landmarks(merged, scene, common):
-        return None
+    told = ""
+    if not align:
+        common = np.intersect1d(merged.ids, scene.ids, assume_unique=True)
+        if len(common) < _MIN_COMMON:
+            _warn_of_another_world(merged, scene, threads)
+            return None
+        if _same_landmarks(merged, scene, common):
+            return None
+        told = (
+            f"{len(common):,} ids are in an earlier map, too, but stand for other landmarks there, "
+            "and "
+        )
     try:
         found = align_maps(merged, scene, fixed_scale, threads)
     except ValueError as error:
@@ -186,26 +210,23 @@ def find_alignment(
         if not (problem := found.problem):
             return found
     raise ValueError(
-        f"{len(common):,} ids are in an earlier map, too, but stand for other landmarks there, and "
-        f"it cannot be recognized in that map: {problem} (--renumber merges maps of one world that "
-        "number their landmarks each on its own)"
+        f"{told}it cannot be recognized in an earlier map: {problem} (--renumber merges maps of "
+        "one world that number their landmarks each on its own)"
     )
 
 
-def _other_world(
-    merged: pm.PrototypeMap, scene: pm.PrototypeMap, fixed_scale: bool, threads: int
-) -> Alignment | None:
-    """How `scene` lies in the world of `merged`, if that is certainly another one, else None.
-
-    Ids that differ are those of parts of one map, or of a job that numbers landmarks everywhere.
-    """
+def _warn_of_another_world(merged: pm.PrototypeMap, scene: pm.PrototypeMap, threads: int) -> None:
     try:
-        found = align_maps(merged, scene, fixed_scale, threads, _PROBED)
-        if found.problem or found.stays:
-            return None
-        return align_maps(merged, scene, fixed_scale, threads)
+        found = align_maps(merged, scene, threads=threads, searched=_PROBED)
     except ValueError:
-        return None
+        return
+    if not (found.problem or found.stays):
+        warnings.warn(
+            f"{found.agreeing:,} landmarks of a map look like landmarks elsewhere in an earlier "
+            "one, with other ids: the maps are merged as parts of one world; if each has a world "
+            "of its own, --align moves it",
+            stacklevel=3,
+        )
 
 
 def _same_landmarks(merged: pm.PrototypeMap, scene: pm.PrototypeMap, common: Ids) -> bool:
@@ -226,7 +247,7 @@ def _same_landmarks(merged: pm.PrototypeMap, scene: pm.PrototypeMap, common: Ids
     if shift > _MAX_SHIFT * reach:
         raise ValueError(
             f"its landmarks have the ids of an earlier map and lie elsewhere ({shift:.3g} away, "
-            "median): bring both into one world first (`protomark align`)"
+            "median): --align moves them there, if each map has a world of its own"
         )
     return True
 

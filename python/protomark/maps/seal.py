@@ -40,7 +40,7 @@ _MIN_ALIKE = 0.75
 class SealRequest:
     """How large a sealed map may be, and what it holds."""
 
-    # For prototypes, their number and count, on average; None: lossless.
+    # For prototypes and their number, on average; None: lossless.
     bytes_per_landmark: float | None = BYTES_PER_LANDMARK
     megabytes: float | None = None  # of the whole file, 10^6 bytes; None: no limit
     landmarks: int | None = None  # how many to keep at most; None: all
