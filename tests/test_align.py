@@ -101,7 +101,9 @@ def test_a_scene_is_scaled_and_turned_up(scene: Path) -> None:
     up = -model.cam_from_world[:, 1, :3].mean(axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-6)
     file = scene / "scene.pmk"
-    assert protomark("align", file, "--scale", 0.5).returncode == 0
+    done = protomark("align", file, "--scale", 0.5)
+    assert done.returncode == 0
+    assert "scene.sealed.pmk was made of the map as it was before" in done.stderr
     moved = open_learning_map(file)
     np.testing.assert_allclose(moved.positions(moved.ids), motion(before["scene.pmk"]) / 2)
 

@@ -94,7 +94,7 @@ def test_images_with_their_model(tmp_path: Path) -> None:
     assert np.array_equal(by_folder.descriptors, by_parts.descriptors)
     assert [s.name for s in find_sources([first, second])] == ["plane"]
     for lonely in (first, second):
-        with pytest.raises(ValueError, match=f"{lonely.name} (are images|is a COLMAP model)"):
+        with pytest.raises(ValueError, match=f"{lonely.name} (holds images|is a COLMAP model)"):
             find_sources([lonely, sample.path()])
 
 
@@ -118,6 +118,9 @@ def test_places_get_ids_apart_whatever_their_order(tmp_path: Path) -> None:
     other = read_places(paths[::-1])
     for name in ("landmark_ids", "landmark_of_keypoint", "descriptors", "landmark_positions"):
         assert np.array_equal(getattr(joined, name), getattr(other, name))
+    counts = np.unique(toy.landmark_of_keypoint[toy.observations], return_counts=True)[1]
+    (long,) = read_places([sample.path()], min_observations=4).info["sources"]
+    assert long["dropped"] == {"landmarks of fewer observations than 4": (counts < 4).sum()}
     files = []
     for order in (1, -1):
         path = tmp_path / f"{order}.pmk"
@@ -147,6 +150,15 @@ def test_what_is_refused(tmp_path: Path) -> None:
         read_places([sample.path(), tmp_path / "latch.safetensors"])
     with pytest.raises(ValueError, match="is named twice"):
         read_places([sample.path(), sample.path()])
+    for name, content, message in (
+        ("cut.db", b"SQLite format 3\0 and no more", "cut.db is a database that is cut off"),
+        ("a.keyframes", b"\0", "a.keyframes is a part of a map that osmap saved"),
+        ("a.pmk", b"PROTOMRK", "a.pmk is a file of Protomark already"),
+        ("rigs.json", b'[{"cameras": [{"camera_id": 1}]}]', "rigs.json is no map"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            read_places([tmp_path / name])
     (tmp_path / "x.bin").write_bytes(b"nothing known")
     with pytest.raises(ValueError, match=r"x\.bin is no map that can be read.*ORB-SLAM3"):
         read_places([tmp_path / "x.bin"])

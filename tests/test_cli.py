@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import requires
@@ -179,6 +180,11 @@ def test_seal_to_a_size(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     ):
         done = protomark("seal", scene, "-o", sealed, *options)
         assert (done.returncode, message in done.stderr) == (1, True), done.stderr
+    before = scene.read_bytes()
+    shutil.copy(scene, other := tmp_path / "other.pmk")
+    done = protomark("seal", scene, "-o", other)
+    assert "other.pmk is a learning map" in done.stderr
+    assert other.read_bytes() == scene.read_bytes() == before
     done = protomark("seal", sealed, "-o", tmp_path / "again.pmk")
     assert "is a sealed map, which keeps no sums" in done.stderr
 
@@ -367,7 +373,9 @@ def test_output_that_the_terminal_cannot_show(
 ) -> None:
     tracks.save(tmp_path / "t.safetensors")
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    done = protomark("build", tmp_path / "t.safetensors", "-o", tmp_path / "m", "--encoder", model)
+    done = protomark(
+        "build", tmp_path / "t.safetensors", "-o", tmp_path / "m.pmk", "--encoder", model
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert "per landmark 1" in done.stdout
 

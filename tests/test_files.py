@@ -6,7 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from protomark.files import check_folder, check_outputs, only_writer, replacing, write_text
+from protomark.files import (
+    check_folder,
+    check_outputs,
+    only_writer,
+    replacing,
+    replacing_folder,
+    write_text,
+)
 from test_tracks_command import fails, run
 from tracks_scene import write_sequence
 
@@ -131,3 +138,30 @@ def test_a_folder_that_nobody_can_write_to_is_noticed_before_the_work(tmp_path: 
     with pytest.raises(NotADirectoryError, match="file is not a folder"):
         check_folder(tmp_path / "file" / "folder")
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_maps_and_other_files_do_not_replace_each_other(tmp_path: Path) -> None:
+    check_outputs(tmp_path / "facts.json", maps=[tmp_path / "scene.pmk", None])
+    with pytest.raises(ValueError, match=r"photo.jpg: a map's file ends in .pmk: name another"):
+        check_outputs(maps=[tmp_path / "photo.jpg"])
+    with pytest.raises(ValueError, match=r"scene.pmk: only a map's file ends in .pmk"):
+        check_outputs(tmp_path / "scene.pmk")
+
+
+def test_a_folder_that_cannot_be_replaced_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, rename = tmp_path / "scene", Path.rename
+    folder.mkdir()
+    (folder / "old.txt").touch()
+
+    def interrupted(self: Path, target: Path) -> Path:
+        if self.name != "scene" and not self.name.endswith(".old"):
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt), replacing_folder(folder):
+        pass
+    assert os.listdir(tmp_path) == ["scene"]
+    assert os.listdir(folder) == ["old.txt"]

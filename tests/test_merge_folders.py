@@ -15,6 +15,7 @@ from protomark.geometry.colmap import find_model, read_model
 from protomark.geometry.pose import camera_centers
 from protomark.geometry.pose_files import read_poses
 from protomark.geometry.similarity import fit_similarity
+from protomark.mapping import merging_maps
 from protomark.mapping.merging_maps import merge_folders
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
@@ -75,7 +76,13 @@ def test_frames_come_along(maps: tuple[Path, Path, Path], tmp_path: Path) -> Non
     assert figures["registered"] == 20
 
 
-def test_folders_that_cannot_be_merged(maps: tuple[Path, Path, Path], tmp_path: Path) -> None:
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_folders_that_cannot_be_merged(
+    maps: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     output, copy, bare = (tmp_path / name for name in ("merged", "copy", "bare"))
     shutil.copytree(maps[0], copy)
     shutil.copytree(maps[1], bare)
@@ -95,4 +102,8 @@ def test_folders_that_cannot_be_merged(maps: tuple[Path, Path, Path], tmp_path: 
         assert not output.exists()
     with pytest.raises(FileExistsError, match="name a new folder"):
         merge_folders(maps[:2], taken)
+    monkeypatch.setattr(merging_maps, "save_state", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        merge_folders(maps[:2], output)
+    assert not output.exists()
     assert contents(taken) == {"file": b"mine"}

@@ -11,7 +11,7 @@ import secrets
 import shutil
 import socket
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -65,6 +65,10 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(old, ignore_errors=True)
             folder.rename(old)
         temporary.rename(folder)
+    except BaseException:
+        if old.exists() and not folder.exists():  # between the two renames
+            old.rename(folder)
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
@@ -148,20 +152,27 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def check_outputs(
-    *outputs: Path | None, inputs: Iterable[object] = (), folder: Path | None = None
+    *outputs: Path | None,
+    inputs: Iterable[object] = (),
+    folder: Path | None = None,
+    maps: Sequence[Path | None] = (),
 ) -> None:
     """Raise before any work if a result could not be written after it, or would replace an input.
+
+    Maps end in .pmk and nothing else does, so that neither replaces the other by mistake.
 
     Args:
         outputs: files to write; None: not asked for.
         inputs: what the command reads: paths, texts that may be paths, or None.
         folder: folder of further files to write, see `check_folder`.
+        maps: map files to write; None: not asked for.
     """
     if folder is not None:
         check_folder(folder)
     written: list[Path] = []
     read = [Path(str(i)) for i in inputs if i is not None]
-    for path in outputs:
+    named = [(path, True) for path in maps] + [(path, False) for path in outputs]
+    for path, is_map in named:
         if path is None:
             continue
         if path.is_dir():
@@ -175,6 +186,9 @@ def check_outputs(
             raise ValueError(f"{path} is an input of this command: name another file to write")
         if any(_same_file(path, other) for other in written):
             raise ValueError(f"{path} would be written twice: name different files")
+        if (path.suffix == ".pmk") != is_map:
+            wanted = "a map's file ends" if is_map else "only a map's file ends"
+            raise ValueError(f"{path}: {wanted} in .pmk: name another file to write")
         written.append(path)
 
 
@@ -193,6 +207,12 @@ def check_folder(folder: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise OSError(f"{existing}: no file can be written to this folder ({reason})") from None
+
+
+def check_elsewhere(folder: Path) -> None:
+    """Raise if a folder to replace is the current one: the shell would stay in the old one."""
+    if folder.resolve() == Path.cwd():
+        raise ValueError(f"{folder} is the folder you are in, and is replaced: leave it first")
 
 
 def _same_file(path: Path, other: Path) -> bool:

@@ -45,7 +45,7 @@ def align(
 
     protomark align kitchen --up --scale 1.23
     """
-    from protomark.cli.terminal import print_facts, progress_bar, write_json
+    from protomark.cli.terminal import note_outdated, print_facts, progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.mapping.aligning import Target, align_scene
 
@@ -74,3 +74,5 @@ def align(
     if facts["dropped_frame"] is not None:
         rows.append(("frame", f"{facts['dropped_frame']!r} is true no more: --frame says what is"))
     print_facts(rows)
+    if scene.is_file():
+        note_outdated(scene)

@@ -75,7 +75,7 @@ def build(
     from protomark.maps.sources import read_places
 
     sealed = None if no_seal else sealed_path(output)
-    check_outputs(output, json_file, sealed, inputs=[*sources, encoder])
+    check_outputs(json_file, inputs=[*sources, encoder], maps=[output, sealed])
     texts = command_metadata(frame, metadata or [])
     with progress_bar() as progress:
         progress("read sources", 0, 0)

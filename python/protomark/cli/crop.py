@@ -33,14 +33,15 @@ def crop(
 
     protomark crop kitchen --near 1.5,0,2,4 -o table.pmk
     """
-    from protomark.cli.terminal import decimal_numbers, print_facts, write_json
+    from protomark.cli.terminal import decimal_numbers, note_outdated, print_facts, write_json
     from protomark.files import check_outputs
     from protomark.maps.split import crop_file
 
-    check_outputs(output, json_file, inputs=[scene])
+    check_outputs(json_file, inputs=[scene], maps=[output])
     facts = crop_file(scene, output, decimal_numbers("--box", box), decimal_numbers("--near", near))
     write_json(json_file, facts)
     rows = [("kept", f"{facts['kept']:,} of {facts['landmarks']:,} landmarks")]
     if facts["without_position"]:
         rows.append(("left out", f"{facts['without_position']:,} landmarks without a position"))
     print_facts([*rows, ("written", f"{facts['bytes']:,} bytes")])
+    note_outdated(output)

@@ -64,7 +64,7 @@ def merge(
 
     protomark merge kitchen/ hall/ -o flat/
     """
-    from protomark.cli.terminal import note, print_facts, progress_bar, write_json
+    from protomark.cli.terminal import note, note_outdated, print_facts, progress_bar, write_json
     from protomark.extras import optional
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
@@ -79,7 +79,7 @@ def merge(
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
         check_outputs(draw, json_file, inputs=maps, folder=output)
     else:
-        check_outputs(output, draw, json_file, inputs=maps)
+        check_outputs(draw, json_file, inputs=maps, maps=[output])
     with progress_bar() as progress:
         if to_folder:
             from protomark.mapping.merging_maps import merge_folders
@@ -112,7 +112,9 @@ def merge(
     rows = []
     for i, one in enumerate(facts["inputs"]):
         shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
-        rows.append((Path(one["file"]).name, f"{one['landmarks']:,} landmarks{shared}"))
+        file = Path(one["file"])
+        name = f"{file.parent.name}/{file.name}" if file.name == "scene.pmk" else file.name
+        rows.append((name, f"{one['landmarks']:,} landmarks{shared}"))
         if one["moved"]:
             rows.append(("", _moved(one["moved"])))
     rows.append(("merged", f"{facts['landmarks']:,} landmarks, {facts['bytes']:,} bytes"))
@@ -121,6 +123,8 @@ def merge(
             ("left out", "frames and their poses: name a folder with -o to merge them, too")
         )
     print_facts(rows)
+    if not to_folder:
+        note_outdated(output)
     for warning in facts.get("warnings", []):
         note(f"cannot be trusted: {warning}")
     if facts.get("warnings"):

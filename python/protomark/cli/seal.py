@@ -83,7 +83,7 @@ def seal(
     from protomark.maps.seal import SealRequest
     from protomark.maps.seal import seal as seal_source
 
-    check_outputs(output, json_file, inputs=[source, source / SCENE_MAP])
+    check_outputs(json_file, inputs=[source, source / SCENE_MAP], maps=[output])
     request = SealRequest(
         bytes_per_landmark=bytes_per_landmark or None,
         megabytes=megabytes,

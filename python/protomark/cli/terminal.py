@@ -49,6 +49,14 @@ def note(text: str) -> None:
     error_console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
 
+def note_outdated(path: Path) -> None:
+    """Say that the sealed map beside a learning map was made of what that was before, if any."""
+    from protomark.maps.seal import sealed_path
+
+    if (sealed := sealed_path(path)).is_file():
+        note(f"{sealed} was made of the map as it was before: remove it, or seal {path} again")
+
+
 @contextmanager
 def progress_bar(prefix: str = "") -> Iterator[Report]:
     """Yield a function that draws the progress of one stage after the other.

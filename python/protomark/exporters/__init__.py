@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from protomark.files import check_outputs
+from protomark.files import check_elsewhere, check_outputs, replacing_folder
 from protomark.maps.info import is_tracks
 from protomark.tracks.file import Tracks
 
@@ -29,6 +29,7 @@ def export(source: Path, output: Path, to: Format, images: Path | None = None) -
         check_outputs(output, inputs=[source])
     else:
         check_outputs(folder=output)
+        check_elsewhere(output)
         if output.exists() and any(output.iterdir()):
             raise FileExistsError(f"{output} holds files: name a new folder with -o")
     tracks = Tracks.load(source) if is_tracks(source) else None
@@ -44,7 +45,9 @@ def export(source: Path, output: Path, to: Format, images: Path | None = None) -
             return write_stella(tracks, output)
         from protomark.tracks.importers.kapture import write_kapture
 
-        write_kapture(tracks, output)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with replacing_folder(output.resolve()) as folder:
+            write_kapture(tracks, folder)
         return {
             "keyframes": len(tracks.keyframe_names),
             "landmarks": len(tracks.landmark_ids),

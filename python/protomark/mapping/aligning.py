@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import protomark as pm
-from protomark.files import only_writer, replacing_folder
+from protomark.files import check_elsewhere, check_folder, only_writer, replacing_folder
 from protomark.geometry.pose import camera_centers, ground_plane
 from protomark.geometry.pose_files import PoseSet, match_names, read_positions
 from protomark.geometry.similarity import Similarity, fit_robustly
@@ -76,6 +76,9 @@ def align_scene(path: Path, target: Target, progress: Progress = silent) -> dict
 
 
 def _align_folder(folder: Path, target: Target, progress: Progress) -> dict[str, Any]:
+    check_elsewhere(folder)
+    check_folder(folder)
+    check_folder(folder.parent)
     with only_writer(folder), one_blas_thread():
         if (folder / CHECKPOINT).is_dir():
             raise ValueError(f"{folder} holds an interrupted map: finish it with --resume first")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from protomark.files import only_writer
+from protomark.files import check_elsewhere, only_writer, replacing_folder
 from protomark.geometry.similarity import Similarity
 from protomark.mapping import adjustment
 from protomark.mapping.mapper import LOOP_LOSS_SCALE, Mapper
@@ -56,6 +56,7 @@ def merge_folders(
             same place as those before it.
     """
     check_inputs(inputs)
+    check_elsewhere(output)
     for path in inputs:
         if not (path / STATE).is_file():
             raise ValueError(
@@ -97,8 +98,9 @@ def merge_folders(
         mapper.finish(progress=progress)
         progress("write", 0, 0)
         names = " + ".join(path.name for path in inputs)
-        figures = write_outputs(mapper, output, names, finished=True, seal=seal)
-        save_state(mapper, output / STATE, {**facts, "inputs": inputs_of_frames})
+        with replacing_folder(output.resolve()) as folder:
+            figures = write_outputs(mapper, folder, names, finished=True, seal=seal)
+            save_state(mapper, folder / STATE, {**facts, "inputs": inputs_of_frames})
     result.facts |= {**figures, "bytes": (output / SCENE_MAP).stat().st_size}
     return result
 

@@ -98,7 +98,7 @@ def merge_files(
     """
     if renumber and align:
         raise ValueError("--renumber is for maps of one world, --align for others: choose one")
-    check_outputs(output, inputs=check_inputs(inputs))
+    check_outputs(inputs=check_inputs(inputs), maps=[output])
     first, *others = inputs
     merged = open_learning_map(first)
     result = Merged.begin(first, merged)

@@ -60,6 +60,11 @@ def seal(
 ) -> dict[str, Any]:
     """Seal a folder of `protomark map`, a learning map or tracks; returns facts, see `seal_map`."""
     request = request or SealRequest()
+    if output.is_file() and _learns(output):
+        raise ValueError(
+            f"{output} is a learning map, which a sealed one would replace: name another file, "
+            f"such as {sealed_path(output)}"
+        )
     progress("read the map", 0, 0)
     if is_tracks(source):
         tracks = read_places([source])
@@ -73,6 +78,14 @@ def seal(
     model = source / MODEL
     views = (lambda: Views.of_model(model)) if model.is_dir() else None
     return seal_map(scene, output, request, views, codes_of(source, scene), progress)
+
+
+def _learns(path: Path) -> bool:
+    """Whether a file is a learning map."""
+    try:
+        return "sums" in dict(pm.file_sections(path))
+    except (pm.FileError, OSError):
+        return False
 
 
 def codes_of(folder: Path, scene: pm.PrototypeMap) -> Observations | None:

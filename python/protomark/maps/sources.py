@@ -97,7 +97,7 @@ def _model_folder(path: Path) -> Path | None:
 
 def _lonely(source: Source) -> ValueError:
     lacking = {
-        "images": "are images without poses: name the folder of their COLMAP model after them, or "
+        "images": "holds images without poses: name the folder of their COLMAP model after it, or "
         "map them with `protomark map`",
         "database": "is a COLMAP database: name the folder of its model after it",
         "model": "is a COLMAP model: name the folder of its images, or its database, before it",
@@ -198,11 +198,12 @@ def read_places(
     ):
         try:
             one = renumbered(one, last)
-            parts.append(_often_seen(one, min_observations))
+            kept = _often_seen(one, min_observations)
         except ValueError as error:
             raise ValueError(f"{source.path}: {error}") from None
         last = int(one.landmark_ids[-1])
-        facts.append(_facts(source.name, one))
+        parts.append(kept)
+        facts.append(_facts(source.name, replace(one, info=kept.info)))
         detectors.append(one.info.get("detector", {}))
     info = {"sources": facts, "detectors": detectors}
     if len(parts) == 1:
@@ -223,7 +224,15 @@ def _often_seen(tracks: Tracks, min_observations: int | None) -> Tracks:
         )
     labels = tracks.landmark_of_keypoint.copy()
     labels[rows[counts[landmark] < limit]] = -1
-    return replace(tracks, landmark_of_keypoint=labels)
+    info = tracks.info
+    if short := int((counts < limit).sum()):
+        source = info["source"]
+        dropped = {
+            **source.get("dropped", {}),
+            f"landmarks of fewer observations than {limit}": short,
+        }
+        info = {**info, "source": {**source, "dropped": dropped}}
+    return replace(tracks, landmark_of_keypoint=labels, info=info)
 
 
 def _facts(name: str, tracks: Tracks) -> dict[str, Any]:

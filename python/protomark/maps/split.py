@@ -71,7 +71,7 @@ def crop_file(
     """
     if (box is None) == (near is None):
         raise ValueError("give one of --box and --near to crop by")
-    check_outputs(output, inputs=[map_path(path, learning=True)])
+    check_outputs(inputs=[map_path(path, learning=True)], maps=[output])
     scene = open_learning_map(path)
     ids = scene.ids
     positions = scene.positions(ids)

@@ -44,7 +44,11 @@ def stored_descriptor(database: Path) -> str:
     with open_database(database, "a COLMAP database") as tables:
         lengths = {cols for rows, cols in tables.rows("descriptors", "rows, cols") if rows}
     if len(lengths) != 1:
-        raise ValueError(f"{database}: the database has no descriptors, or several kinds of them")
+        what = f"descriptors of {len(lengths)} lengths" if lengths else "no descriptors"
+        raise ValueError(
+            f"{database}: the database has {what}: name the folder of the images in its place, "
+            "which are described anew"
+        )
     length = lengths.pop()
     kinds = [kind.name for kind in DESCRIPTORS.values() if kind.bytes == length]
     if not kinds:
@@ -87,7 +91,10 @@ def tracks_from_database(
     for image_id, image_name in zip(model.image_ids, model.names, strict=True):
         image = reconstruction.images[int(image_id)]
         if image_name not in by_name:
-            raise ValueError(f"{database}: image {image_name} of the model is not in the database")
+            raise ValueError(
+                f"{database}: image {image_name} of the model is not in the database: give the "
+                "database of this model"
+            )
         found = by_name[image_name]
         if len(found) != image.num_points2D():
             raise ValueError(

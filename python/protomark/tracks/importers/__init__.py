@@ -43,11 +43,23 @@ def read_source(path: Path) -> Tracks:
     if module is None:
         *programs, last = (m.PROGRAM for m in _modules())
         raise ValueError(
-            f"{path} is no map that can be read: give tracks of `protomark tracks`, or a map of "
+            f"{path} is {_guess(path)}: give tracks of `protomark tracks`, or a map of "
             f"{', '.join(programs)} or {last}"
         )
     tracks: Tracks = module.read(path)
     return tracks
+
+
+def _guess(path: Path) -> str:
+    """What a path that no module reads may be."""
+    head = file_head(path)
+    if head.startswith(b"PROTOMRK"):
+        return "a file of Protomark already, which `protomark seal` and `merge` take"
+    if head.startswith(b"SQLite format 3\0"):
+        return "a database that is cut off, broken, or of another program"
+    if path.suffix in (".mappoints", ".keyframes", ".features"):
+        return "a part of a map that osmap saved, whose .yaml names all of them"
+    return "no map that can be read"
 
 
 def file_head(path: Path) -> bytes:

@@ -8,6 +8,7 @@ units of its longer side, from its middle. Checked on a data set of it.
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from array import array
 from collections import Counter
@@ -30,6 +31,7 @@ from protomark.tracks.importers.keyframes import Keyframe, checked_features, joi
 PROGRAM = "OpenSfM"
 
 _FILE = "reconstruction.json"
+_CAMERAS = re.compile(rb'\s*\[.*"cameras"\s*:\s*\{', re.DOTALL)
 _MAX_DEFLATION = 1100  # zlib makes data at most this many times smaller
 
 
@@ -37,7 +39,7 @@ def recognizes(path: Path, head: bytes) -> bool:
     """Whether a folder, or a reconstruction.json in it, is a data set of OpenSfM."""
     if path.is_dir():
         return (path / _FILE).is_file()
-    return path.suffix == ".json" and head.lstrip()[:1] == b"[" and b'"cameras"' in head
+    return path.suffix == ".json" and _CAMERAS.match(head) is not None
 
 
 def read(path: Path) -> Tracks:
