@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from protomark import files
 from protomark.files import (
     check_folder,
     check_outputs,
@@ -160,8 +161,21 @@ def test_a_folder_that_cannot_be_replaced_stays(
             raise KeyboardInterrupt
         return rename(self, target)
 
+    monkeypatch.setattr(files, "_exchange", lambda *_: False)  # as on old kernels
     monkeypatch.setattr(Path, "rename", interrupted)
     with pytest.raises(KeyboardInterrupt), replacing_folder(folder):
         pass
     assert os.listdir(tmp_path) == ["scene"]
     assert os.listdir(folder) == ["old.txt"]
+
+
+def test_folders_are_swapped_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kill between two renames would leave neither."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "old").touch()
+    monkeypatch.setattr(Path, "rename", lambda *_: pytest.fail("two renames"))
+    with replacing_folder(folder) as new:
+        (new / "new").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+    assert [path.name for path in folder.iterdir()] == ["new"]

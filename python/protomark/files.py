@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import fcntl
 import hashlib
@@ -61,10 +62,12 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
     old = folder.with_name(f".{folder.name}.old")
     try:
         yield temporary
-        if folder.exists():
+        if not folder.exists():
+            temporary.rename(folder)
+        elif not _exchange(temporary, folder):
             shutil.rmtree(old, ignore_errors=True)
             folder.rename(old)
-        temporary.rename(folder)
+            temporary.rename(folder)
     except BaseException:
         if old.exists() and not folder.exists():  # between the two renames
             old.rename(folder)
@@ -72,6 +75,16 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swap two folders in one step, which no kill can interrupt; False where that cannot be."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    at_cwd, exchange = -100, 2
+    return (
+        rename is not None
+        and rename(at_cwd, os.fsencode(one), at_cwd, os.fsencode(other), exchange) == 0
+    )
 
 
 def _permissions(path: Path) -> int | None:
