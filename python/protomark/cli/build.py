@@ -90,6 +90,7 @@ def build(
         progress("write the map", 0, 0)
         scene.save(output)
         if sealed:
+            sealed.unlink(missing_ok=True)  # it would not be of this map
             request = SealRequest(threads=threads)
             seal_map(
                 scene, sealed, request, lambda: Views.of_tracks(seen), observed(seen), progress
