@@ -12,9 +12,9 @@ namespace {
 // A sealed map stores the number of a landmark's prototypes in a byte.
 constexpr size_t kMaxRows = 255;
 
-// Measured on caliterra, viking and conch: words of fewer numbers are better from so many times as
-// many words on; and, without observations to tune by, so many prototypes per landmark are worth
-// more than longer ones once these have so many numbers.
+// Words of fewer numbers are better from so many times as many on (measured on caliterra). Without
+// observations to tune by, so many prototypes per landmark are worth more than longer ones once
+// these have so many numbers (caliterra, viking and conch).
 constexpr double kMoreWords = 1.1, kWorthwhile = 1.25;
 constexpr size_t kEnoughNumbers = 48;
 
