@@ -1,4 +1,4 @@
-"""Writes images and their camera to ROS bags."""
+"""Writes images, their camera, and poses to ROS bags."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from protomark.geometry.camera import Camera
+from protomark.geometry.pose import quaternion_from_rotation
 
 TOPIC = "/camera/image_raw"
 START = 1305031102.25  # seconds
@@ -55,17 +56,23 @@ def write_bag(
     encoding: str = "mono8",
     topic: str = TOPIC,
     stamps: Iterable[float] | None = None,
+    poses: Iterable[tuple[str, float, str, str, NDArray[np.float64]]] = (),
 ) -> Path:
-    """Write images, "compressed" or in an encoding, and return the bag's path."""
+    """Write images, "compressed" or in an encoding, and return the bag's path.
+
+    `poses` are topic, seconds, parent, child and (3, 4) parent_from_child.
+    """
     ros1 = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    tree = "tf2_msgs/msg/TFMessage"
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tree))
     types = store.types
     kind = "sensor_msgs/msg/" + ("CompressedImage" if encoding == "compressed" else "Image")
 
-    def header(seconds: float) -> Any:
+    def header(seconds: float, frame: str = "camera") -> Any:
         stamp = types["builtin_interfaces/msg/Time"](int(seconds), round(seconds % 1 * 1e9))
         number = {"seq": 0} if ros1 else {}
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera", **number)
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **number)
 
     def message(image: NDArray[np.uint8], seconds: float) -> Any:
         if encoding == "compressed":
@@ -82,6 +89,28 @@ def write_bag(
         if ros1:
             values = {name.upper() if len(name) == 1 else name: v for name, v in values.items()}
         return types["sensor_msgs/msg/CameraInfo"](header=header(START), roi=roi, **values)
+
+    def placed(topic: str, seconds: float, parent: str, child: str, pose: Any) -> tuple[Any, str]:
+        w, *xyz = quaternion_from_rotation(pose[:, :3])
+        turn, at = types["geometry_msgs/msg/Quaternion"](*xyz, w), pose[:, 3].tolist()
+        if topic.startswith("/tf"):
+            moved = types["geometry_msgs/msg/Transform"](
+                types["geometry_msgs/msg/Vector3"](*at), turn
+            )
+            one = types["geometry_msgs/msg/TransformStamped"](header(seconds, parent), child, moved)
+            return types[tree]([one]), tree
+        its = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](*at), turn)
+        if not child:
+            kind = "geometry_msgs/msg/PoseStamped"
+            return types[kind](header(seconds, parent), its), kind
+        zero, noise = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)
+        still = types["geometry_msgs/msg/Twist"](zero, zero)
+        return types["nav_msgs/msg/Odometry"](
+            header(seconds, parent),
+            child,
+            types["geometry_msgs/msg/PoseWithCovariance"](its, noise),
+            types["geometry_msgs/msg/TwistWithCovariance"](still, noise),
+        ), "nav_msgs/msg/Odometry"
 
     serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     # ROS 2 bags are folders.
@@ -101,4 +130,10 @@ def write_bag(
             seconds = times[i] if times else received
             data = serialize(message(image, seconds), kind)
             writer.write(connection, int(received * 1e9), data)
+        connections: dict[str, Any] = {}
+        for topic, seconds, parent, child, pose in poses:
+            value, name = placed(topic, seconds, parent, child, pose)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            writer.write(connections[topic], int(seconds * 1e9), serialize(value, name))
     return path if ros1 else next(folder.glob(f"*{path.suffix}"))

@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader
+
 from bag_writer import START, STEP, TOPIC, info_values, write_bag
+from conftest import protomark
 from mapping_scene import show, walk
 from mutation import SEED, mutated
 from protomark.features.bag import bag_camera, bag_frames, image_topic, is_bag
 from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import read_model
-from protomark.geometry.pose import camera_centers
+from protomark.geometry.pose import camera_centers, compose, inverse, relative_pose
 from protomark.localization.batch import LocalizationRequest, localize_files
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
@@ -150,7 +153,7 @@ def test_topics(tmp_path: Path) -> None:
 def test_broken_bags(kind: str, tmp_path: Path) -> None:
     print(f"PROTOMARK_SEED={SEED}")
     rng = np.random.default_rng(SEED)
-    path = write_bag(tmp_path / f"run{kind}", IMAGES[:2], info_values(LENS))
+    path = write_bag(tmp_path / f"run{kind}", IMAGES[:2], info_values(LENS), poses=robot(3)[0])
     whole, refused = path.read_bytes(), []
     for _ in range(100):
         path.write_bytes(mutated(whole, rng))
@@ -158,11 +161,127 @@ def test_broken_bags(kind: str, tmp_path: Path) -> None:
             bag = open_source(path)
             bag.known_camera()
             list(bag.images())
+            bag.read_poses(Path("/tf"))
         except ValueError as error:
             refused.append(str(error))
     print(f"{len(refused)} of 100 refused")
     assert 5 < len(refused) < 100
     assert [text for text in refused if str(path) not in text and "camera" not in text] == []
+
+
+# The robot's camera looks forward, from where it is mounted on the base.
+MOUNT = np.array([[0, 0, 1, 0.3], [-1, 0, 0, 0.1], [0, -1, 0, 0.5]], np.float64)
+CORRECTION = np.array([[0, -1, 0, 5], [1, 0, 0, -3], [0, 0, 1, 0.0]])  # of odometry, in the map
+
+
+def robot(count: int) -> tuple[list[tuple[str, float, str, str, Any]], Any]:
+    """What a robot says whose camera walks, and (count, 3, 4) world_from_camera."""
+    truth = [inverse(pose) for pose in walk(count)]
+    back = inverse(MOUNT)
+    said = [("/tf_static", START - 9, "base", "/camera", MOUNT)]
+    for i, pose in enumerate(truth):
+        at, odometry = START + STEP * i, compose(inverse(CORRECTION), compose(pose, back))
+        said += [
+            ("/tf", at, "odom", "base", odometry),
+            ("/odom", at, "odom", "base", odometry),
+            ("/slam", at, "map", "", pose),
+        ]
+    said += [("/tf", START + d, "map", "odom", CORRECTION) for d in (-1, STEP * count)]
+    return said, np.array(truth)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_poses_of_a_bag(kind: str, tmp_path: Path) -> None:
+    said, truth = robot(6)
+    stamps = [START + STEP * (i + 0.5) for i in range(5)] + [START + 9]
+    path = write_bag(tmp_path / f"run{kind}", IMAGES + IMAGES[:1], stamps=stamps, poses=said)
+    bag = open_source(path, topic=TOPIC)
+    for topic, world in (("/tf", np.eye(3, 4)), ("/odom", inverse(CORRECTION)), ("/slam", None)):
+        poses = bag.read_poses(Path(topic))
+        found = [poses.find(name) for name in bag.names()]
+        assert found[5] is None, "nobody knows where the robot went"
+        for i, pose in enumerate(found[:5]):
+            assert pose is not None
+            between = truth[i : i + 2] if world is None else [compose(world, p) for p in truth[i:]]
+            centers = np.array([p[:, 3] for p in between[:2]])
+            # The base moves evenly, so the camera turns about it: less than a millimetre.
+            np.testing.assert_allclose(camera_centers(pose), centers.mean(axis=0), atol=1e-3)
+            turns = [relative_pose(pose, inverse(p))[0] for p in between[:2]]
+            np.testing.assert_allclose(turns[0], turns[1].T, atol=1e-7)
+    for topic, message in (
+        ("/odometry", "no poses on /odometry; topics with poses are /odom, /slam, /tf, /tf_static"),
+        (TOPIC, "no poses on /camera/image_raw"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bag.read_poses(Path(topic))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("poses", "topic", "message"),
+    [
+        (
+            [("/tf", START, "a", "camera", MOUNT), ("/tf", START, "camera", "a", MOUNT)],
+            "",
+            "itself",
+        ),
+        ([("/tf", START, "a", "b", MOUNT)], "", "nothing says where the images' frame 'camera' is"),
+        ([("/tf", START, "a", "b", MOUNT), ("/tf", START, "c", "b", MOUNT)], "", "has one parent"),
+        ([("/tf", START - 9, "a", "camera", MOUNT)], "", "of 5 images 0 were taken while /tf had"),
+        ([("/tf", START, "a", "camera", 0.5 * MOUNT)], "", "of 5 images 1"),
+        (
+            [("/odom", START, "odom", "wheel", MOUNT), ("/tf", START, "base", "camera", MOUNT)],
+            "/odom",
+            "/odom has the poses of 'wheel', and no transform",
+        ),
+    ],
+)
+def test_poses_that_do_not_lead_to_the_camera(
+    poses: list[Any], topic: str, message: str, tmp_path: Path
+) -> None:
+    bag = open_source(write_bag(tmp_path / "run.mcap", IMAGES, poses=poses))
+    with pytest.raises((ValueError, UserWarning), match=message):
+        bag.read_poses(Path(topic or "/tf"))
+
+
+def test_a_bag_is_mapped_with_its_poses_and_localized_into_an_mcap(tmp_path: Path) -> None:
+    said, truth = robot(16)
+    path = write_bag(
+        tmp_path / "run.mcap", [show(p) for p in walk(16)], info_values(PINHOLE), poses=said
+    )
+    scene, found = tmp_path / "scene", tmp_path / "found.mcap"
+    done = protomark(
+        *("map", path, "--topic", TOPIC, "--poses", "/tf", "-d", "orb", "-o", scene, "--no-seal"),
+        *("--max-keypoints", 600),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    np.testing.assert_allclose(read_model(scene / "sparse").centers, truth[:, :, 3], atol=1e-6)
+    done = protomark(
+        *("localize", scene, path, "--topic", TOPIC, "--poses", "/tf", "-o", tmp_path / "found"),
+        *("--every", 4, "--mcap", found),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "recall at 0.05, 5 degrees" in done.stdout
+    rows = np.loadtxt(tmp_path / "found" / "trajectory.txt")
+    assert len(rows) == 4
+    with AnyReader([found]) as reader:
+        assert {c.topic: c.msgtype for c in reader.connections} == {
+            "/localized/pose": "geometry_msgs/msg/PoseStamped",
+            "/tf": "tf2_msgs/msg/TFMessage",
+        }
+        read = [
+            (c.topic, t / 1e9, reader.deserialize(d, c.msgtype)) for c, t, d in reader.messages()
+        ]
+    stamped = [(time, message) for topic, time, message in read if topic == "/localized/pose"]
+    for (time, message), row in zip(stamped, rows, strict=True):
+        at, turn = message.pose.position, message.pose.orientation
+        values = [time, at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w]
+        np.testing.assert_allclose(values, row, atol=1e-6)
+        assert message.header.frame_id == "map"
+    links = [message.transforms[0] for topic, _, message in read if topic == "/tf"]
+    assert [link.transform.translation.x for link in links] == pytest.approx(rows[:, 1])
+    done = protomark("localize", scene, path, "--mcap", tmp_path / "found.bag")
+    assert "name a file that ends in .mcap" in done.stderr
 
 
 def test_a_bag_is_mapped_and_localized_with_its_camera(tmp_path: Path) -> None:

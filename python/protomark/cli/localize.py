@@ -51,7 +51,7 @@ def localize(
         Path | None,
         typer.Option(
             help="True poses in the map's world, to measure recall: a COLMAP images.txt or model, "
-            "or a TUM trajectory whose time stamps are the images' names."
+            "a TUM trajectory whose time stamps are the images' names, or a bag's topic (/tf)."
         ),
     ] = None,
     priors: Annotated[
@@ -83,6 +83,10 @@ def localize(
         ),
     ] = None,
     threads: Threads = 0,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(help="Also write the poses to this MCAP file, for Foxglove and ROS 2."),
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Find where images were taken in a map, and how sure that is.
@@ -93,12 +97,18 @@ def localize(
     protomark localize kitchen new-photos/
     """
     from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.extras import optional
     from protomark.features.bag import is_bag
+    from protomark.features.bag_poses import write_poses
     from protomark.features.images import passed_over
     from protomark.files import check_outputs, only_writer
     from protomark.localization.batch import LocalizationRequest, localize_files
 
-    check_outputs(json_file, inputs=[scene, *images, camera, poses, priors], folder=output)
+    check_outputs(json_file, mcap, inputs=[scene, *images, camera, poses, priors], folder=output)
+    if mcap is not None:
+        if mcap.suffix != ".mcap":
+            raise ValueError(f"--mcap {mcap}: name a file that ends in .mcap")
+        optional("rosbags")
     for line in filter(None, (passed_over(path) for path in images if not is_bag(path))):
         note(line)
     request = LocalizationRequest(
@@ -120,6 +130,8 @@ def localize(
     )
     with only_writer(output), progress_bar() as progress:
         batch = localize_files(request, output, progress)
+    if mcap is not None:
+        write_poses(mcap, *batch.trajectory())
     write_json(json_file, batch.as_dict())
     _show(batch, output)
     if batch.interrupted:

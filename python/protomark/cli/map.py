@@ -49,7 +49,7 @@ def map_(
         Path | None,
         typer.Option(
             help="Known poses, which are not adjusted: a COLMAP model folder or images.txt, or a "
-            "TUM trajectory."
+            "TUM trajectory, or a bag's topic: /tf, or one of odometry or the camera's poses."
         ),
     ] = None,
     mask: Annotated[

@@ -50,7 +50,7 @@ def image_topic(path: Path, topic: str | None = None) -> tuple[str, int]:
     Raises:
         ValueError: there is no such topic, or it is not the only one; or the bag is broken.
     """
-    with _opened(path) as bag:
+    with opened(path) as bag:
         found = {
             name: info.msgcount for name, info in bag.topics.items() if info.msgtype in _IMAGES
         }
@@ -75,16 +75,14 @@ def bag_frames(path: Path, topic: str, every: int = 1) -> Iterator[tuple[str, fl
         ValueError: the bag is broken.
     """
     time = -np.inf
-    with _opened(path) as bag:
+    with opened(path) as bag:
         connections = [c for c in bag.connections if c.topic == topic]
         for number, (connection, received, data) in enumerate(bag.messages(connections)):
             if number % every:
                 continue
             message = bag.deserialize(data, connection.msgtype)
-            stamp = message.header.stamp
-            shown = float(stamp.sec) + float(stamp.nanosec) / 1e9
-            # Some drivers leave the stamp out; a clock may be set back.
-            time = max(shown or received / 1e9, np.nextafter(time, np.inf))
+            # A clock may be set back.
+            time = max(seconds(message.header.stamp, received), np.nextafter(time, np.inf))
             yield f"{path.stem}-{number:06d}", time, lambda m=message: _decode(path, m)  # type: ignore[misc]
 
 
@@ -98,7 +96,7 @@ def bag_camera(path: Path, topic: str) -> Camera | None:
         ValueError: it is of a model that COLMAP does not have; or the bag is broken.
     """
     base, _, name = topic.removesuffix("/compressed").rpartition("/")
-    with _opened(path) as bag:
+    with opened(path) as bag:
         connections = [
             c for c in bag.connections if c.topic == f"{base}/camera_info" and c.msgtype == _INFO
         ]
@@ -127,8 +125,13 @@ def camera_of_size(path: Path, camera: Camera, width: int, height: int) -> Camer
     return camera.resized(width, height)
 
 
+def seconds(stamp: Any, received: int) -> float:
+    """The time of a message's header; some drivers leave it out: that of its receipt, then."""
+    return float(stamp.sec) + float(stamp.nanosec) / 1e9 or received / 1e9
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
     """Open a bag; whatever fails in it, here or in the block, is a ValueError."""
     highlevel, typesys = optional("rosbags.highlevel"), optional("rosbags.typesys")
     # ROS 2 bags in SQLite do not say what their messages hold.

@@ -90,18 +90,21 @@ def ground_plane(poses: Array) -> Array:
 
 
 def rotation_from_quaternion(quaternion: Array) -> Array:
-    """Rotation matrix (3, 3) of a quaternion w, x, y, z.
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) w, x, y, z.
 
     Raises:
-        ValueError: the quaternion's length is not 1 (within 5 %).
+        ValueError: the length of a quaternion is not 1 (within 5 %).
     """
-    norm = np.linalg.norm(quaternion)
-    if not np.isfinite(norm) or abs(norm - 1) > 0.05:
-        raise ValueError(f"the length of quaternion {quaternion.tolist()} is not 1")
-    w, *v = quaternion / norm
-    x = np.array(v)
-    cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
-    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
+    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    unlike = ~(np.abs(norm - 1) <= 0.05)[..., 0]
+    if unlike.any():
+        first = np.asarray(quaternion)[unlike][0].tolist()
+        raise ValueError(f"the length of quaternion {first} is not 1")
+    w, x, y, z = np.moveaxis(quaternion / norm, -1, 0)
+    zero = np.zeros_like(w)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    cross = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.asarray(np.eye(3) + 2 * w[..., None, None] * cross + 2 * cross @ cross)
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
+from protomark.features.bag_poses import bag_poses
 from protomark.features.extractor import MAX_SIZE
 from protomark.features.images import image_names, read_gray
 from protomark.features.video import Decode, is_video, video_frames
@@ -64,8 +65,9 @@ class LocalizationRequest:
     camera: str | None = None
     # Whether focal lengths of given cameras are refined for each image.
     refine_focal_length: bool = False
-    true_poses: Path | None = None  # file or folder of poses to measure errors against
-    priors: Path | None = None  # file or folder of rough poses; None: the whole map is searched
+    # File, folder or topic of a bag, of poses to measure errors against.
+    true_poses: Path | None = None
+    priors: Path | None = None  # the same of rough poses; None: the whole map is searched
     prior_distance: float = 1.0  # largest error of a prior's position, in world units
     prior_degrees: float = 15.0  # largest error of a prior's orientation
     min_confidence: float = 0.9  # smallest probability of an accepted pose
@@ -195,10 +197,7 @@ class LocalizationBatch:
         return {**self.summary(), "each": [i.as_dict() for i in self.images]}
 
     def write(self, folder: Path) -> None:
-        """Write a COLMAP model and a TUM trajectory of accepted poses, and a table of all images.
-
-        Times of the trajectory are those of the frames of one video, else of `image_times`.
-        """
+        """Write a COLMAP model and a trajectory of accepted poses, and a table of all images."""
         folder.mkdir(parents=True, exist_ok=True)
         camera_lines: dict[str, int] = {}
         poses, camera_ids = {}, {}
@@ -214,19 +213,21 @@ class LocalizationBatch:
         write_text(folder / POSES, images_txt(poses, camera_ids))
         write_text(folder / POINTS, "# The landmarks are in the map\n")
         write_text(folder / TABLE, self.table())
-        seconds = [i.time for i in self.images if i.time is not None]
+        write_text(folder / TRAJECTORY, tum_trajectory(*self.trajectory()))
+
+    def trajectory(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (n,) and cam_from_world (n, 3, 4) of accepted poses.
+
+        Times are those of the frames of one video or bag, else of `image_times`.
+        """
         times, _ = image_times([image.name for image in self.images])
+        seconds = [i.time for i in self.images if i.time is not None]
         if len(seconds) == len(times) and (np.diff(seconds) > 0).all():
             times = seconds
-        posed = [
-            (time, poses[image.name])
-            for time, image in zip(times, self.images, strict=True)
-            if image.name in poses
-        ]
-        write_text(
-            folder / TRAJECTORY,
-            tum_trajectory(np.array([t for t, _ in posed]), np.array([p for _, p in posed])),
-        )
+        found = [(t, self.pose(image)) for t, image in zip(times, self.images, strict=True)]
+        posed = [(time, pose) for time, pose in found if pose is not None]
+        poses = np.array([pose for _, pose in posed]).reshape(-1, 3, 4)
+        return np.array([time for time, _ in posed]), poses
 
     def table(self) -> str:
         """All images as CSV; a pose is the camera's centre in the world, and its orientation.
@@ -302,7 +303,7 @@ def localize_files(
     names = [query.name for query in queries]
     cameras = read_cameras(request.camera).for_images(names) if given and request.camera else None
     true_poses, priors = (
-        poses_of_images(path, names, [query.time for query in queries]) if path else PoseSet({})
+        _given_poses(path, queries, request.topic) if path else PoseSet({})
         for path in (request.true_poses, request.priors)
     )
 
@@ -391,6 +392,17 @@ def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> lis
                 )
             found[query.name] = query
     return list(found.values())[::every]
+
+
+def _given_poses(path: Path, queries: Sequence[_Query], topic: str | None) -> PoseSet:
+    """The poses of images in a file or folder, or on a topic of their bag."""
+    names, source = [query.name for query in queries], queries[0].path
+    if is_bag(source) and all(query.path == source for query in queries):
+        frames = [(query.name, query.time or 0.0) for query in queries]
+        given = bag_poses(source, str(path), image_topic(source, topic)[0], frames)
+        if given is not None:
+            return given
+    return poses_of_images(path, names, [query.time for query in queries])
 
 
 def _frames(path: Path, topic: str | None) -> Iterator[tuple[str, float, Decode]]:

@@ -25,7 +25,7 @@ class MapRequest:
     # A cameras.txt, a COLMAP model, or a camera written out; None: calibrate while mapping.
     camera: str | None = None
     focal: float | None = None  # focal length to start calibration with, pixels
-    poses: Path | None = None  # file or folder of known poses
+    poses: Path | None = None  # file, folder or topic of known poses
     mask: Path | None = None  # image that is black where the scene must not be looked at
     every: int = 1  # take every n-th frame only
     topic: str | None = None  # of a ROS bag's images; None: the only one with images

@@ -14,7 +14,6 @@ from protomark.files import only_writer
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.given_poses import misfit
-from protomark.geometry.pose_files import poses_of_images
 from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
@@ -140,11 +139,8 @@ class _Session:
         return known
 
     def _read_poses(self) -> None:
-        source = self.source
         if self.request.poses:
-            names, times = zip(*source.listing(), strict=True)
-            seconds = times if source.timed else None
-            source.poses = poses_of_images(self.request.poses, names, seconds)
+            self.source.poses = self.source.read_poses(self.request.poses)
 
     def _start(self) -> None:
         request, options = self.request, self.request.options

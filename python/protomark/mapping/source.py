@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
+from protomark.features.bag_poses import bag_poses
 from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray
 from protomark.features.video import Decode, check_video, video_frames
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif
-from protomark.geometry.pose_files import PoseSet, image_times
+from protomark.geometry.pose_files import PoseSet, image_times, poses_of_images
 from protomark.mapping.frame import InputImage
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.structure import Structure
@@ -69,6 +70,11 @@ class FrameSource(ABC):
     @abstractmethod
     def listing(self) -> list[tuple[str, float]]:
         """Names of all frames, without the prefix, and their times."""
+
+    def read_poses(self, poses: Path) -> PoseSet:
+        """The known poses of the frames in a file or folder, or on a topic of a bag."""
+        names, times = zip(*self.listing(), strict=True)
+        return poses_of_images(poses, names, times if self.timed else None)
 
     def names(self) -> list[str]:
         """Names of all frames, without the prefix."""
@@ -310,6 +316,11 @@ class Bag(Video):
 
     def _frames(self) -> Iterator[tuple[str, float, Decode]]:
         return bag_frames(self.path, self.topic, self._every)
+
+    def read_poses(self, poses: Path) -> PoseSet:
+        """See `FrameSource.read_poses`."""
+        given = bag_poses(self.path, str(poses), self.topic, self.listing())
+        return super().read_poses(poses) if given is None else given
 
     def known_camera(self) -> Camera | None:
         """The camera of the bag's CameraInfo, at the images' size.
