@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +15,16 @@ import pytest
 import protomark as pm
 from conftest import protomark, random_descriptors
 from mapping_scene import walk, write_images
+from protomark import files
+from protomark.cli import terminal
+from protomark.cli.align import align
+from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import find_model, read_model
-from protomark.geometry.pose import camera_centers
+from protomark.geometry.control_points import read_control_points
+from protomark.geometry.pose import camera_centers, transform
 from protomark.geometry.pose_files import read_poses, read_positions
 from protomark.geometry.similarity import Similarity, fit_robustly
+from protomark.interrupt import Interrupted
 from protomark.mapping import aligning
 from protomark.mapping.aligning import Target, align_scene
 from protomark.mapping.request import MapRequest
@@ -76,7 +85,7 @@ def test_all_stations_move_together(scene: Path, tmp_path: Path) -> None:
     done = protomark("align", scene, "--to", file, "--frame", "ENU, metres", "--json", report)
     assert done.returncode == 0, done.stderr
     facts = json.loads(report.read_text())
-    assert (facts["images"], facts["inliers"]) == (FRAMES, FRAMES - 1)
+    assert (facts["given"], facts["inliers"]) == (FRAMES, FRAMES - 1)
     assert "img3.png: 12.1" in done.stdout
     for name, positions in stations(scene).items():
         tolerance = 1e-3 if name == "scene.sealed.pmk" else 1e-4  # 16 bits per coordinate
@@ -123,7 +132,7 @@ def test_nothing_changes_on_an_error(
         (two, "2 of 9 images of the scene have a position"),
         (other, "are they those of these images"),
         (line, "lie on a line"),
-        (broken, "line 2: a number of this pose is not finite"),
+        (broken, "line 2: a number is not finite"),
         (tmp_path / "none.txt", "no such file"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
@@ -151,6 +160,109 @@ def test_nothing_changes_on_an_error(
     with pytest.raises(ValueError, match="was sealed otherwise"):
         align_scene(scene, Target(scale=2))
     assert contents(scene) == before
+
+
+def test_a_scene_that_may_only_be_read_is_refused(finished: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        scene = Path(shutil.copytree(finished, Path(folder) / "scene"))
+        before = contents(scene)
+        for closed in (scene, scene.parent):  # it is replaced as a whole
+            mode = closed.stat().st_mode
+            closed.chmod(0o555)
+            try:
+                if os.getuid() == 0:  # who may write everywhere
+                    os.chown(scene, 65534, -1)
+                    os.seteuid(65534)
+                with pytest.raises(OSError, match=f"{closed}: no file can be written"):
+                    align_scene(scene, Target(scale=2))
+            finally:
+                os.seteuid(os.getuid())
+                closed.chmod(mode)
+        assert contents(scene) == before
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "station"),
+    [
+        (aligning, "save_state", ""),
+        (files, "_exchange", ""),
+        (terminal, "print_facts", ""),
+        (terminal, "print_facts", "scene.pmk"),
+    ],
+)
+def test_ctrl_c_says_whether_the_scene_has_moved(
+    module: Any, function: str, station: str, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, before = scene / station, stations(scene)["scene.pmk"]
+    original = getattr(module, function)
+
+    def stop(*arguments: Any) -> Any:
+        result = original(*arguments)
+        if module is files and arguments[1].name != "scene":
+            return result  # its model was written
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, function, stop)
+    moved = module is not aligning
+    expected = Interrupted if moved else KeyboardInterrupt
+    with pytest.raises(expected, match=f"all of {path} had moved" if moved else "^$"):
+        align(path, scale=2.0)
+    after = stations(scene)["scene.pmk"]
+    np.testing.assert_allclose(after, before * (2 if moved else 1))
+
+
+def write_marks(path: Path, scene: Path, motion: Similarity, form: str) -> Path:
+    """Marks of six landmarks, in two to four images."""
+    model, learning = read_model(find_model(scene)), open_learning_map(scene)
+    seen = learning.ids[:: len(learning) // 6][:6]
+    camera, lines = Camera.parse("PINHOLE 320 240 300 300 160 120"), []
+    for number, at in enumerate(learning.positions(seen)):
+        x, y, z = motion(at[None])[0] + [7 * (number == 4), 0, 0]  # one is wrong
+        for i in (0, 4, 6, 8)[: 2 + number % 3]:
+            u, v = camera.project(transform(model.cam_from_world[i], at[None]))[0]
+            values = {"image": model.names[i], "u": u, "v": v, "x": x, "y": y, "z": z}
+            lines.append(form.format(**values, name=f"p{number}"))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "form", ["{image},{u},{v},{x},{y},{z},{name}", "{x} {y} {z} {u} {v} {image} {name}"]
+)
+def test_a_scene_is_moved_to_control_points(scene: Path, form: str, tmp_path: Path) -> None:
+    motion = random_similarity(np.random.default_rng(5), scale=3)
+    before = stations(scene)
+    file = write_marks(tmp_path / "marks.csv", scene, motion, form)
+    done = protomark("align", scene, "--to", file)
+    assert done.returncode == 0, done.stderr
+    assert "control points that fit  5 of 6" in done.stdout
+    assert "p4: 7" in done.stdout
+    for name in ("scene.pmk", "sparse"):
+        np.testing.assert_allclose(stations(scene)[name], motion(before[name]), atol=1e-4)
+    file.write_text("".join(file.read_text().splitlines(keepends=True)[:5]))
+    done = protomark("align", scene, "--to", file)
+    assert "2 of 2 control points are marked in two images" in done.stderr
+
+
+def test_control_points_on_the_globe(tmp_path: Path) -> None:
+    file = tmp_path / "gcp_list.txt"
+    marks = "8 47 400 10 20 a.jpg p1\n8.001 47 410 11 21 a.jpg\n8 47 400 12 22 b.jpg p1\n"
+    for header, distance in (("WGS84", 76.06), ("EPSG:4326", 76.06), ("WGS84 UTM 32N", 0.001)):
+        file.write_text(f"{header}\n{marks}")
+        found = read_control_points(file)
+        assert found is not None
+        np.testing.assert_allclose(
+            found.positions[1] - found.positions[0], [distance, 0, 10], atol=0.05
+        )
+        assert found.points.tolist() == [0, 1, 0]
+        assert found.names == ["p1", "line 3"]
+        assert found.pixels.tolist() == [[10, 20], [11, 21], [12, 22]]
+    file.write_text("a.jpg 1 2 3\n")
+    assert read_control_points(file) is None
+    file.write_text("a.jpg 1 2 3 nan 5\n")
+    with pytest.raises(ValueError, match="line 1: a number is not finite"):
+        read_control_points(file)
 
 
 def test_positions_on_the_globe(tmp_path: Path) -> None:

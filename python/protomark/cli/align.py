@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,7 +22,8 @@ def align(
         Path | None,
         typer.Option(
             help="Camera positions: a text or CSV file of image name, x, y, z (or, with a header, "
-            "lat, lon, alt), a COLMAP model or images.txt, or a TUM trajectory."
+            "lat, lon, alt), a COLMAP model or images.txt, or a TUM trajectory. Or control points: "
+            "image name, x, y in pixels, X, Y, Z and maybe a name, or a gcp_list.txt (OpenSfM)."
         ),
     ] = None,
     scale: Annotated[
@@ -38,22 +40,39 @@ def align(
 ) -> None:
     """Move a scene into another world, in place.
 
-    The similarity that brings most cameras close to the given positions moves the learning map,
+    The similarity that brings most cameras, or control points that two images show, close to their
+    given positions moves the learning map,
     the sealed map, the COLMAP model and the trajectory together, or nothing at all.
 
     protomark align kitchen --to gps.csv
 
     protomark align kitchen --up --scale 1.23
     """
-    from protomark.cli.terminal import note_outdated, print_facts, progress_bar, write_json
+    from protomark.cli.terminal import note_outdated, progress_bar, write_json
     from protomark.files import check_outputs
+    from protomark.interrupt import Interrupted
     from protomark.mapping.aligning import Target, align_scene
 
     target = Target(to, scale, up, frame)
     check_outputs(json_file, inputs=[scene, to])
-    with progress_bar() as progress:
-        facts = align_scene(scene, target, progress)
-    write_json(json_file, facts)
+    before = os.stat(scene).st_ino if scene.exists() else 0
+    try:
+        with progress_bar() as progress:
+            facts = align_scene(scene, target, progress)
+        write_json(json_file, facts)
+        _show(facts)
+        if scene.is_file():
+            note_outdated(scene)
+    except KeyboardInterrupt:
+        # A scene moves by one rename at the end.
+        if os.stat(scene).st_ino != before:
+            raise Interrupted(f"stopped after all of {scene} had moved") from None
+        raise
+
+
+def _show(facts: dict[str, Any]) -> None:
+    from protomark.cli.terminal import print_facts
+
     x, y, z = facts["translation"]
     rows = [
         ("scaled by", f"{facts['scale']:.6g}"),
@@ -63,7 +82,7 @@ def align(
     if residuals := facts.get("residuals"):
         worst = sorted(residuals, key=residuals.__getitem__, reverse=True)[:3]
         rows += [
-            ("cameras that fit", f"{facts['inliers']} of {facts['images']}"),
+            (f"{facts['fitted']} that fit", f"{facts['inliers']} of {facts['given']}"),
             (
                 "residuals",
                 f"median {facts['residual_median']:.4g}, root mean square of those that fit "
@@ -74,5 +93,3 @@ def align(
     if facts["dropped_frame"] is not None:
         rows.append(("frame", f"{facts['dropped_frame']!r} is true no more: --frame says what is"))
     print_facts(rows)
-    if scene.is_file():
-        note_outdated(scene)

@@ -158,15 +158,14 @@ def read_positions(path: Path) -> PoseSet:
     """
     if path.is_dir() or not path.is_file():
         return read_poses(path)
-    rows = [(number, ",".join(words).split(",")) for number, words in _rows(path) if words]
-    rows = [(number, [word for word in words if word]) for number, words in rows]
+    rows = table(path)
     if not rows or any(len(words) != 4 for _, words in rows):
         return read_poses(path)
-    header = [word.lower() for word in rows[0][1]] if not _is_number(rows[0][1][1]) else []
+    header = [word.lower() for word in rows[0][1]] if not is_number(rows[0][1][1]) else []
     rows = rows[1:] if header else rows
     if not rows:
         raise ValueError(f"{path} holds no positions: write a line of image name, x, y, z for each")
-    at = np.array([_numbers(path, number, words[1:]) for number, words in rows])
+    at = np.array([numbers(path, number, words[1:]) for number, words in rows])
     columns = {name[:3]: i for i, name in enumerate(header[1:])}
     if {"lat", "lon", "alt"} == set(columns):
         at = east_north_up(*at[:, [columns[name] for name in ("lat", "lon", "alt")]].T)
@@ -191,7 +190,15 @@ def east_north_up(
     return np.asarray((earth - earth[0]) @ axes.T)
 
 
-def _is_number(word: str) -> bool:
+def table(path: Path) -> list[tuple[int, list[str]]]:
+    """Numbers and words of the lines of a text or CSV file that are neither empty nor a comment."""
+    rows = [(number, ",".join(words).split(",")) for number, words in _rows(path)]
+    cells = [(number, [word for word in words if word]) for number, words in rows]
+    return [(number, words) for number, words in cells if words]
+
+
+def is_number(word: str) -> bool:
+    """Whether a word is a number."""
     try:
         float(word)
     except ValueError:
@@ -214,7 +221,7 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
 def _read_tum(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
     times, poses = [], []
     for number, words in rows:
-        values = _numbers(path, number, words)
+        values = numbers(path, number, words)
         times.append(values[0])
         rotation = _rotation(path, number, values[[7, 4, 5, 6]]).T
         poses.append(np.column_stack([rotation, -rotation @ values[1:4]]))
@@ -230,7 +237,7 @@ def _read_images_txt(path: Path, rows: list[tuple[int, list[str]]]) -> PoseSet:
                 f"{path}, line {number}: write a line of COLMAP's images.txt or of a TUM "
                 "trajectory (time tx ty tz qx qy qz qw)"
             )
-        values = _numbers(path, number, words[1:8])
+        values = numbers(path, number, words[1:8])
         rotation = _rotation(path, number, values[:4])
         by_name[" ".join(words[9:])] = np.column_stack([rotation, values[4:7]])
     if not by_name:
@@ -259,13 +266,14 @@ def _image_rows(path: Path, rows: list[tuple[int, list[str]]]) -> Iterator[tuple
             )
 
 
-def _numbers(path: Path, line: int, words: list[str]) -> NDArray[np.float64]:
+def numbers(path: Path, line: int, words: list[str]) -> NDArray[np.float64]:
+    """The finite numbers that words of a line are; ValueError if one is none."""
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
-        raise ValueError(f"{path}, line {line}: a word of this pose is not a number") from None
+        raise ValueError(f"{path}, line {line}: a word is not a number") from None
     if not np.isfinite(values).all():
-        raise ValueError(f"{path}, line {line}: a number of this pose is not finite")
+        raise ValueError(f"{path}, line {line}: a number is not finite")
     return values
 
 

@@ -13,9 +13,15 @@ import numpy as np
 
 import protomark as pm
 from protomark.files import check_elsewhere, check_folder, only_writer, replacing_folder
+from protomark.geometry.camera import Camera
+from protomark.geometry.control_points import (
+    ControlPoints,
+    read_control_points,
+    triangulate_marks,
+)
 from protomark.geometry.pose import camera_centers, ground_plane
 from protomark.geometry.pose_files import PoseSet, match_names, read_positions
-from protomark.geometry.similarity import Similarity, fit_robustly
+from protomark.geometry.similarity import Array, Similarity, fit_robustly
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.outputs import link, write_outputs
 from protomark.mapping.state import CHECKPOINT, load_state, save_state
@@ -32,8 +38,8 @@ class Target:
     """The world to move a scene into.
 
     Attributes:
-        positions: file of camera positions, or folder of a model; None: the scene is only scaled or
-            turned.
+        positions: file of camera positions or control points, or folder of a model; None: the scene
+            is only scaled or turned.
         scale: factor for all lengths; None: that of the positions, else 1.
         up: whether to turn z up, as the images say.
         frame: the new world, for the map's metadata.
@@ -142,22 +148,25 @@ def _describe_frame(scene: pm.PrototypeMap, frame: str | None) -> str | None:
 
 
 def _motion(mapper: Mapper, target: Target) -> tuple[Similarity, dict[str, Any]]:
-    frames = mapper.structure.frames
-    poses = np.array([frame.pose for frame in frames])
-    if target.positions is not None:
-        given = read_positions(target.positions)
+    file, frames = target.positions, mapper.structure.frames
+    if file is not None:
+        marks = read_control_points(file) if file.is_file() else None
         try:
-            return _fit(mapper, given)
+            if marks is not None:
+                return _fit(*_measured(mapper, marks), "control points")
+            return _fit(*_cameras(mapper, read_positions(file)), "cameras")
         except ValueError as error:
-            raise ValueError(f"{target.positions}: {error}") from None
+            told = str(error)
+            raise ValueError(told if str(file) in told else f"{file}: {told}") from None
     rotation = np.eye(3)
     if target.up:
-        across, along = ground_plane(poses)
+        across, along = ground_plane(np.array([frame.pose for frame in frames]))
         rotation = np.stack([across, along, np.cross(across, along)])
     return Similarity(target.scale or 1.0, rotation, np.zeros(3)), {}
 
 
-def _fit(mapper: Mapper, given: PoseSet) -> tuple[Similarity, dict[str, Any]]:
+def _cameras(mapper: Mapper, given: PoseSet) -> tuple[list[str], Array, Array]:
+    """Names (n,), positions (n, 3) and given positions (n, 3) of cameras."""
     frames = mapper.structure.frames
     named = match_names([frame.name for frame in frames], given.by_name)
     found = [(f, given.find(named.get(f.name, f.name), f.time)) for f in frames]
@@ -167,10 +176,37 @@ def _fit(mapper: Mapper, given: PoseSet) -> tuple[Similarity, dict[str, Any]]:
             f"{len(pairs)} of {len(frames)} images of the scene have a position, such as "
             f"{given.example}, the scene {frames[0].name}: three are needed, under the same names"
         )
-    centers = camera_centers(np.array([frame.pose for frame, _ in pairs]))
-    to = camera_centers(np.array([pose for _, pose in pairs]))
-    motion, inliers = fit_robustly(centers, to)
-    residuals = np.linalg.norm(motion(centers) - to, axis=1)
+    at, to = (
+        camera_centers(np.array(poses))
+        for poses in ([frame.pose for frame, _ in pairs], [pose for _, pose in pairs])
+    )
+    return [frame.name for frame, _ in pairs], at, to
+
+
+def _measured(mapper: Mapper, given: ControlPoints) -> tuple[list[str], Array, Array]:
+    """Names (n,), positions (n, 3) and given positions (n, 3) of control points."""
+    structure = mapper.structure
+    frames = {frame.name: frame for frame in structure.frames}
+    named = match_names(set(given.images), frames)
+
+    def view(image: str) -> tuple[Camera, Array] | None:
+        frame = frames[named[image]] if image in named else None
+        return None if frame is None else (structure.cameras[frame.camera_id], frame.pose)
+
+    at = triangulate_marks(given, view)
+    seen = np.flatnonzero(np.isfinite(at[:, 0]))
+    if len(seen) < 3:
+        raise ValueError(
+            f"{len(seen)} of {len(at)} control points are marked in two images of the scene that "
+            f"see them from different sides: three are needed, in images such as "
+            f"{structure.frames[0].name}"
+        )
+    return [given.names[i] for i in seen], at[seen], given.positions[seen]
+
+
+def _fit(names: list[str], at: Array, to: Array, kind: str) -> tuple[Similarity, dict[str, Any]]:
+    motion, inliers = fit_robustly(at, to)
+    residuals = np.linalg.norm(motion(at) - to, axis=1)
     extent = float(np.linalg.norm(np.ptp(to, axis=0)))
     if np.median(residuals) > _MAX_RESIDUAL * extent:
         raise ValueError(
@@ -178,11 +214,12 @@ def _fit(mapper: Mapper, given: PoseSet) -> tuple[Similarity, dict[str, Any]]:
             f"is much of their extent of {extent:.3g}: are they those of these images?"
         )
     return motion, {
-        "images": len(pairs),
+        "fitted": kind,
+        "given": len(names),
         "inliers": int(inliers.sum()),
         "residual_median": float(np.median(residuals)),
         "residual_rmse_of_inliers": float(np.sqrt((residuals[inliers] ** 2).mean())),
-        "residuals": {f.name: float(r) for (f, _), r in zip(pairs, residuals, strict=True)},
+        "residuals": dict(zip(names, residuals.tolist(), strict=True)),
     }
 
 
