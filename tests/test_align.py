@@ -29,6 +29,7 @@ from protomark.mapping import aligning
 from protomark.mapping.aligning import Target, align_scene
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
+from protomark.mapping.state import load_state
 from protomark.maps.open import open_learning_map
 from protomark.maps.split import crop_file
 from test_mapping import CAMERA, SETTINGS
@@ -316,7 +317,7 @@ def test_maps_are_cropped(encoder: pm.Encoder, tmp_path: Path) -> None:
         assert part.metadata["frame"] == "metres"
     output.unlink()
     for region, message in (
-        ({}, "give one of --box and --near"),
+        ({}, "give one of --box, --near and --images"),
         ({"box": (1, 2, 3)}, "--box needs six numbers"),
         ({"box": (1, 1, 1, 0, 2, 2)}, "--box needs six numbers"),
         ({"near": (1, 2, 3, -1)}, "--near needs four numbers"),
@@ -324,6 +325,23 @@ def test_maps_are_cropped(encoder: pm.Encoder, tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             crop_file(tmp_path / "scene.pmk", output, **region)
+    with pytest.raises(ValueError, match="does not know which images saw its landmarks"):
+        crop_file(tmp_path / "scene.pmk", output, images=["a.jpg"])
     done = protomark("crop", tmp_path / "scene.pmk", "--near", "1,2,x,1", "-o", output)
     assert "is not a list of numbers" in done.stderr
     assert not output.exists()
+
+
+def test_a_map_is_cropped_to_what_images_see(finished: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.pmk"
+    done = protomark(
+        "crop", finished, "--images", "img[12].png", "--images", "img9.png", "-o", output
+    )
+    assert done.returncode == 0, done.stderr
+    frames = load_state(finished)[0].structure.frames
+    seen = [f.seen for f in frames if f.name in ("img1.png", "img2.png", "img9.png")]
+    kept = open_learning_map(output).ids
+    assert kept.tolist() == np.unique(np.concatenate(seen)).tolist()
+    assert 0 < len(kept) < len(open_learning_map(finished))
+    with pytest.raises(ValueError, match="no image of the map has such a name; the first is img1"):
+        crop_file(finished, output, images=["img1.jpg"])

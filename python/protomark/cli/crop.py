@@ -25,9 +25,17 @@ def crop(
         str,
         typer.Option(metavar="X,Y,Z,R", help="Keep landmarks within a distance of a point."),
     ] = "",
+    images: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Keep landmarks that images see, by name in a folder of `protomark map`, or by a "
+            "pattern such as 'hall/*'; may be repeated.",
+        ),
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Keep the part of a map that is in a box, or near a point.
+    """Keep the part of a map that is in a box, near a point, or seen in some images.
 
     Reads a learning map and writes the landmarks there as one, which may be sealed or merged.
 
@@ -38,7 +46,8 @@ def crop(
     from protomark.maps.split import crop_file
 
     check_outputs(json_file, inputs=[scene], maps=[output])
-    facts = crop_file(scene, output, decimal_numbers("--box", box), decimal_numbers("--near", near))
+    corners, ball = decimal_numbers("--box", box), decimal_numbers("--near", near)
+    facts = crop_file(scene, output, corners, ball, images or None)
     write_json(json_file, facts)
     rows = [("kept", f"{facts['kept']:,} of {facts['landmarks']:,} landmarks")]
     if facts["without_position"]:

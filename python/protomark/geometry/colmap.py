@@ -205,6 +205,14 @@ def read_observations(
     )
 
 
+def landmarks_by_image(path: Path) -> dict[str, NDArray[np.int64]]:
+    """The point ids (n,) that each image of a sparse model sees, by its name."""
+    return {
+        image.name: np.array([p.point3D_id for p in image.points2D if p.has_point3D()], np.int64)
+        for image in read_reconstruction(path).images.values()
+    }
+
+
 def new_reconstruction(
     cameras: Mapping[int, Camera],
     images: Iterable[tuple[int, str, int, NDArray[Any], NDArray[np.float64]]],

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.files import check_outputs
+from protomark.geometry.colmap import find_model, landmarks_by_image
 from protomark.maps.open import map_path, open_learning_map
 from protomark.progress import Progress, silent, tracked
 
@@ -63,19 +66,23 @@ def crop_file(
     output: Path,
     box: Sequence[float] | None = None,  # lowest x, y, z and highest x, y, z
     near: Sequence[float] | None = None,  # x, y, z and a distance
+    images: Sequence[str] | None = None,  # names of images, or patterns of names
 ) -> dict[str, Any]:
-    """Write the landmarks within a box or near a point as a learning map; returns facts as JSON.
+    """Write the landmarks in a box, near a point, or that images see, as a map; returns facts.
 
     Raises:
-        ValueError: not exactly one of `box` and `near` is given, it is none, or it is empty.
+        ValueError: not exactly one of `box`, `near` and `images` is given, it is none, or it holds
+            no landmark.
     """
-    if (box is None) == (near is None):
-        raise ValueError("give one of --box and --near to crop by")
+    if sum(region is not None for region in (box, near, images)) != 1:
+        raise ValueError("give one of --box, --near and --images to crop by")
     check_outputs(inputs=[map_path(path, learning=True)], maps=[output])
     scene = open_learning_map(path)
     ids = scene.ids
     positions = scene.positions(ids)
-    if box is not None:
+    if images is not None:
+        inside = np.isin(ids, _seen_in(path, images))
+    elif box is not None:
         low, high = np.array(box[:3]), np.array(box[3:])
         if len(box) != 6 or not (low <= high).all():
             raise ValueError("--box needs six numbers, the lowest x,y,z and the highest x,y,z")
@@ -85,10 +92,12 @@ def crop_file(
         if len(near) != 4 or not near[3] > 0:
             raise ValueError("--near needs four numbers: x,y,z and a distance above 0")
         inside = np.linalg.norm(positions - near[:3], axis=1) <= near[3]
+    placed = np.isfinite(positions).all(axis=1)
     if not inside.any():
-        known = np.isfinite(positions).all(axis=1)
-        extent = positions[known].min(axis=0), positions[known].max(axis=0)
-        told = " to ".join(",".join(f"{x:.4g}" for x in p) for p in extent) if known.any() else "no"
+        extent = positions[placed].min(axis=0), positions[placed].max(axis=0)
+        told = (
+            " to ".join(",".join(f"{x:.4g}" for x in p) for p in extent) if placed.any() else "no"
+        )
         raise ValueError(f"{path}: no landmark is there; the map has positions from {told}")
     part = scene.part(ids[inside])
     part.metadata = scene.metadata
@@ -96,10 +105,29 @@ def crop_file(
     return {
         "map": str(path),
         "landmarks": len(scene),
-        "without_position": int((~np.isfinite(positions).all(axis=1)).sum()),
+        "without_position": 0 if images is not None else int((~placed).sum()),
         "kept": len(part),
         "bytes": output.stat().st_size,
     }
+
+
+def _seen_in(folder: Path, patterns: Sequence[str]) -> NDArray[np.int64]:
+    """Landmarks that images of a folder's model see."""
+    if not folder.is_dir():
+        raise ValueError(
+            f"{folder} does not know which images saw its landmarks: name the folder of "
+            "`protomark map` for --images"
+        )
+    seen = landmarks_by_image(find_model(folder))
+    chosen: set[str] = set()
+    for pattern in patterns:
+        found = {name for name in seen if name == pattern or fnmatchcase(name, pattern)}
+        if not found:
+            raise ValueError(
+                f"--images {pattern}: no image of the map has such a name; the first is {min(seen)}"
+            )
+        chosen |= found
+    return np.concatenate([seen[name] for name in chosen])
 
 
 def _by_id(
