@@ -174,7 +174,9 @@ def test_seal_to_a_size(tracks: Tracks, model: Path, tmp_path: Path) -> None:
     assert (facts["position_bits"], facts["nlist"]) == (32, 1)
     assert facts_of("--no-positions")["position_bits"] is None
     for options, message in (
-        (["--bytes", 1], "bytes_per_landmark must be at least 2"),
+        (["--bytes", 1], "--bytes must be at least 2"),
+        (["--position-bits", 5], "--position-bits must be 32, 16 or 0"),
+        (["--megabytes", "nan"], "--megabytes nan is not above 0"),
         (["--landmarks", 5], "5 landmarks cannot be kept: the map has 4"),
         (["--megabytes", 0.001], "0.001 MB are too few: 4 landmarks and the encoder take 0.0"),
     ):

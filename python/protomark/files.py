@@ -241,7 +241,7 @@ def hash_files(named: Iterable[tuple[str, Path]]) -> str:
     for name, path in named:
         digest.update(f"{name}\0{path.stat().st_size}\0".encode(errors="surrogateescape"))
         with path.open("rb") as file:
-            while block := file.read(1 << 20):
+            while block := file.read(1 << 16):
                 digest.update(block)
     return digest.hexdigest()
 

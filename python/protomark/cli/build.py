@@ -64,7 +64,7 @@ def build(
     """
     from protomark import Encoder
     from protomark.cli.info import show
-    from protomark.cli.terminal import progress_bar, write_json
+    from protomark.cli.terminal import note_replaced, progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.maps.build import build_map, tracks_for
     from protomark.maps.info import describe
@@ -76,6 +76,7 @@ def build(
 
     sealed = None if no_seal else sealed_path(output)
     check_outputs(json_file, inputs=[*sources, encoder], maps=[output, sealed])
+    note_replaced(output, sealed)
     texts = command_metadata(frame, metadata or [])
     with progress_bar() as progress:
         progress("read sources", 0, 0)

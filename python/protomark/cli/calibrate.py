@@ -30,12 +30,20 @@ def calibrate(
     protomark calibrate freak.pme tracks/*.freak.safetensors
     """
     from protomark import Encoder
-    from protomark.cli.terminal import console, progress_bar, say, table_of, write_json
+    from protomark.cli.terminal import (
+        console,
+        note_replaced,
+        progress_bar,
+        say,
+        table_of,
+        write_json,
+    )
     from protomark.files import check_outputs
     from protomark.matching import MIN_PROBABILITY
     from protomark.training.match_calibration import calibrate as fit
 
     check_outputs(output or model, json_file, inputs=tracks)
+    note_replaced(output)
     with progress_bar() as progress:
         encoder, quality = fit(Encoder.load(model), tracks, threads, progress)
     encoder.save(output or model)

@@ -41,11 +41,18 @@ def crop(
 
     protomark crop kitchen --near 1.5,0,2,4 -o table.pmk
     """
-    from protomark.cli.terminal import decimal_numbers, note_outdated, print_facts, write_json
+    from protomark.cli.terminal import (
+        decimal_numbers,
+        note_outdated,
+        note_replaced,
+        print_facts,
+        write_json,
+    )
     from protomark.files import check_outputs
     from protomark.maps.split import crop_file
 
     check_outputs(json_file, inputs=[scene], maps=[output])
+    note_replaced(output)
     corners, ball = decimal_numbers("--box", box), decimal_numbers("--near", near)
     facts = crop_file(scene, output, corners, ball, images or None)
     write_json(json_file, facts)

@@ -61,8 +61,13 @@ def localize(
             "searched."
         ),
     ] = None,
-    prior_distance: Annotated[float, typer.Option(help="Largest error in the map's unit.")] = 1.0,
-    prior_degrees: Annotated[float, typer.Option(help="Largest error in degrees.")] = 15.0,
+    prior_distance: Annotated[
+        float | None,
+        typer.Option(help="Largest error in the map's unit.", show_default="1"),
+    ] = None,
+    prior_degrees: Annotated[
+        float | None, typer.Option(help="Largest error in degrees.", show_default="15")
+    ] = None,
     min_confidence: Annotated[
         float,
         typer.Option(
@@ -105,6 +110,8 @@ def localize(
     from protomark.localization.batch import LocalizationRequest, localize_files
 
     check_outputs(json_file, mcap, inputs=[scene, *images, camera, poses, priors], folder=output)
+    if priors is None and (prior_distance is not None or prior_degrees is not None):
+        raise ValueError("--prior-distance and --prior-degrees are of --priors, which is missing")
     if mcap is not None:
         if mcap.suffix != ".mcap":
             raise ValueError(f"--mcap {mcap}: name a file that ends in .mcap")
@@ -120,8 +127,8 @@ def localize(
         refine_focal_length=refine_focal_length,
         true_poses=poses,
         priors=priors,
-        prior_distance=prior_distance,
-        prior_degrees=prior_degrees,
+        prior_distance=1.0 if prior_distance is None else prior_distance,
+        prior_degrees=15.0 if prior_degrees is None else prior_degrees,
         min_confidence=min_confidence,
         max_keypoints=max_keypoints,
         max_size=max_size,

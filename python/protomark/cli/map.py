@@ -107,6 +107,8 @@ def map_(
         raise ValueError(
             "name either a folder for a new map with -o, or a map to extend with --into"
         )
+    if force and (resume or into is not None):
+        raise ValueError("--force makes a map anew: leave out --resume and --into")
     check_outputs(json_file, inputs=[images, camera, poses, mask, encoder], folder=scene)
     inner = images / "images"
     line = "" if is_bag(images) else passed_over(inner if inner.is_dir() else images)

@@ -64,7 +64,14 @@ def merge(
 
     protomark merge kitchen/ hall/ -o flat/
     """
-    from protomark.cli.terminal import note, note_outdated, print_facts, progress_bar, write_json
+    from protomark.cli.terminal import (
+        note,
+        note_outdated,
+        note_replaced,
+        print_facts,
+        progress_bar,
+        write_json,
+    )
     from protomark.extras import optional
     from protomark.files import check_outputs
     from protomark.maps.merge import merge_files
@@ -74,12 +81,15 @@ def merge(
     if draw is not None:
         check_suffix(draw)
         optional("matplotlib")
+    if not to_folder and no_seal:
+        raise ValueError("--no-seal is for folders: a merged map file has no sealed one beside it")
     if to_folder:
         if renumber:
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
         check_outputs(draw, json_file, inputs=maps, folder=output)
     else:
         check_outputs(draw, json_file, inputs=maps, maps=[output])
+        note_replaced(output)
     with progress_bar() as progress:
         if to_folder:
             from protomark.mapping.merging_maps import merge_folders

@@ -76,7 +76,7 @@ def seal(
     protomark seal kitchen -o kitchen.sealed.pmk --megabytes 1
     """
     from protomark.cli.info import show
-    from protomark.cli.terminal import note, progress_bar, write_json
+    from protomark.cli.terminal import note, note_replaced, progress_bar, write_json
     from protomark.files import check_outputs
     from protomark.maps.info import describe
     from protomark.maps.open import SCENE_MAP
@@ -84,6 +84,7 @@ def seal(
     from protomark.maps.seal import seal as seal_source
 
     check_outputs(json_file, inputs=[source, source / SCENE_MAP], maps=[output])
+    note_replaced(output)
     request = SealRequest(
         bytes_per_landmark=bytes_per_landmark or None,
         megabytes=megabytes,

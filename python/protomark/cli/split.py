@@ -43,6 +43,7 @@ def split(
     """
     from protomark.cli.terminal import (
         comma_separated_numbers,
+        note,
         print_facts,
         progress_bar,
         write_json,
@@ -55,6 +56,8 @@ def split(
     with progress_bar() as progress:
         facts = split_file(file, output, boundaries, parts, cell_size, sealed, progress)
     write_json(json_file, facts)
+    if replaced := facts["replaced"]:
+        note(f"{len(replaced)} files were replaced, such as {replaced[0]}")
     rows = []
     for part in facts["parts"]:
         first, last = part["ids"]

@@ -49,6 +49,13 @@ def note(text: str) -> None:
     error_console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
 
+def note_replaced(*paths: Path | None) -> None:
+    """Say which of the files to write exist and will be replaced."""
+    for path in paths:
+        if path is not None and path.exists():
+            note(f"{path} exists and will be replaced")
+
+
 def note_outdated(path: Path) -> None:
     """Say that the sealed map beside a learning map was made of what that was before, if any."""
     from protomark.maps.seal import sealed_path

@@ -95,7 +95,7 @@ def tracks(
     from protomark.files import check_outputs
     from protomark.tracks.extract import TracksOptions, find_sequence
     from protomark.tracks.file import sequence_name
-    from protomark.tracks.importers import find_importer
+    from protomark.tracks.importers import check_below, find_importer
     from protomark.tracks.make import import_tracks, make_augmented_tracks, make_tracks
 
     options = [
@@ -126,6 +126,14 @@ def tracks(
         and path.exists()
         and find_importer(path)
     ]
+    if maps == folders and (descriptors or augmentations):
+        raise ValueError(
+            "--descriptor and --augmentations are for images: maps of other programs keep the "
+            "descriptors that they have"
+        )
+    for folder in folders:
+        if not (images or folder in maps or (folder / "images").is_dir()):
+            check_below(folder)
     sources = [
         find_sequence(folder, images, model, database) for folder in folders if folder not in maps
     ]

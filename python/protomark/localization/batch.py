@@ -36,6 +36,7 @@ from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
 from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import Localization
+from protomark.maps.open import is_map
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import map_ahead
 
@@ -263,6 +264,8 @@ class LocalizationBatch:
 
 def _check_folder(output: Path) -> None:
     """Raise FileExistsError if files would be replaced that no earlier run wrote."""
+    if is_map(output):
+        raise FileExistsError(f"{output} is the folder of a map: name another folder with -o")
     table = output / TABLE
     if table.is_file():
         with table.open("rb") as file:
@@ -291,6 +294,8 @@ def localize_files(
             fit, or no image can be localized.
         FileExistsError: the folder holds files that no earlier run wrote.
     """
+    if not is_map(request.scene) and (maps := [path for path in request.images if is_map(path)]):
+        raise ValueError(f"{maps[0]} is a map: name it first, and then the images")
     queries = _list_queries(request.images, request.every, request.topic)
     _check_folder(output)
     localizer = Localizer(
@@ -365,6 +370,8 @@ def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> lis
     """
     if every < 1:
         raise ValueError(f"--every {every}: it must be at least 1")
+    if topic is not None and not any(is_bag(source) for source in sources):
+        raise ValueError(f"--topic {topic}: no ROS bag (.bag, .mcap, .db3) is among the images")
     found: dict[str, _Query] = {}
     for source in sources:
         if source.exists() and is_bag(source):

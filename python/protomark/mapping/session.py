@@ -131,6 +131,8 @@ class _Session:
         text = request.camera
         if text is None and request.poses is not None and request.poses.is_dir():
             text = str(request.poses)
+        if text and request.focal is not None:
+            raise ValueError("--focal begins a calibration, but the camera is given: leave it out")
         if text:
             return self.source.find_camera(read_cameras(text))
         known = self.source.known_camera() if request.focal is None else None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, overload
 
 from protomark import _core
-from protomark._core import PrototypeMap, SealedMap
+from protomark._core import FileError, PrototypeMap, SealedMap
 
 # The maps in the folder that `protomark map` writes: the one that learns, and the one that ships.
 SCENE_MAP = "scene.pmk"
@@ -24,14 +24,39 @@ def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
 
     Raises:
         FileNotFoundError: the folder holds no such map.
+        FileError: it is a map of another program.
     """
     path = Path(path)
     if not path.is_dir():
+        _check_own(path)
         return path
     for name in (SCENE_MAP,) if learning else (SEALED_MAP, SCENE_MAP):
         if (path / name).is_file():
             return path / name
+    _check_own(path)
     raise FileNotFoundError(f"{path} holds no {SCENE_MAP}: name a map file")
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path is a map file by its suffix, or the folder of a map."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in (SCENE_MAP, SEALED_MAP))
+    return path.suffix == ".pmk"
+
+
+def _check_own(path: Path) -> None:
+    """Raise FileError if a path that may hold no map of Protomark holds one of another program."""
+    from protomark.tracks.importers import MAGIC, file_head, find_importer
+
+    try:
+        its = None if file_head(path).startswith(MAGIC) else find_importer(path)
+    except OSError:
+        return  # whoever opens it says what is wrong
+    if its is not None:
+        raise FileError(
+            f"{path} is a map of {its.PROGRAM}: `protomark build {path} -o scene.pmk` makes one of "
+            "Protomark of it"
+        )
 
 
 @overload

@@ -161,6 +161,8 @@ def seal_map(
     progress("seal", 0, 0)
     count = limit
     if request.megabytes is not None:
+        if not request.megabytes > 0:
+            raise ValueError(f"--megabytes {request.megabytes:g} is not above 0")
         with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
             path = Path(folder) / "map.pmk"
             untuned = replace(request, tune=False)
@@ -190,14 +192,18 @@ def _seal_once(
         scene.build_index(threads=request.threads)
     elif request.index == "no":
         scene.drop_index()
-    scene.seal(
-        path,
-        *(observations or (None, None)),
-        bytes_per_landmark=request.bytes_per_landmark,
-        position_bits=request.position_bits,
-        tune=request.tune,
-        threads=request.threads,
-    )
+    try:
+        scene.seal(
+            path,
+            *(observations or (None, None)),
+            bytes_per_landmark=request.bytes_per_landmark,
+            position_bits=request.position_bits,
+            tune=request.tune,
+            threads=request.threads,
+        )
+    except ValueError as error:
+        told = str(error).replace("bytes_per_landmark", "--bytes")
+        raise ValueError(told.replace("position_bits", "--position-bits")) from None
     return path.stat().st_size
 
 

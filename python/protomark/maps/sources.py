@@ -18,7 +18,7 @@ from protomark.progress import Progress, silent, tracked
 from protomark.tracks.database import is_database, stored_descriptor, tracks_from_database
 from protomark.tracks.extract import SequenceFolder, TracksOptions, extract, find_sequence
 from protomark.tracks.file import Tracks
-from protomark.tracks.importers import file_head, find_importer, read_source
+from protomark.tracks.importers import check_below, file_head, find_importer, read_source
 from protomark.tracks.joining import join_tracks, renumbered
 
 _DESCRIPTOR = "freak"  # of images, where neither encoder nor other sources tell
@@ -96,6 +96,8 @@ def _model_folder(path: Path) -> Path | None:
 
 
 def _lonely(source: Source) -> ValueError:
+    if source.kind == "images":
+        check_below(source.path)
     lacking = {
         "images": "holds images without poses: name the folder of their COLMAP model after it, or "
         "map them with `protomark map`",

@@ -43,6 +43,7 @@ def split_file(
         if file.exists() and file.samefile(path):
             raise ValueError(f"{file} is the map itself: name another folder")
     folder.mkdir(parents=True, exist_ok=True)
+    replaced = [str(file) for file, _ in files if file.exists()]
     written = []
     for file, part in tracked(files, progress, "write"):
         if sealed:
@@ -58,7 +59,7 @@ def split_file(
                 "bytes": file.stat().st_size,
             }
         )
-    return {"map": str(path), "landmarks": len(scene), "parts": written}
+    return {"map": str(path), "landmarks": len(scene), "parts": written, "replaced": replaced}
 
 
 def crop_file(
@@ -80,13 +81,14 @@ def crop_file(
     scene = open_learning_map(path)
     ids = scene.ids
     positions = scene.positions(ids)
+    inside: NDArray[np.bool_]
     if images is not None:
         inside = np.isin(ids, _seen_in(path, images))
     elif box is not None:
         low, high = np.array(box[:3]), np.array(box[3:])
         if len(box) != 6 or not (low <= high).all():
             raise ValueError("--box needs six numbers, the lowest x,y,z and the highest x,y,z")
-        inside = ((positions >= low) & (positions <= high)).all(axis=1)
+        inside = np.asarray(((positions >= low) & (positions <= high)).all(axis=1))
     else:
         assert near is not None
         if len(near) != 4 or not near[3] > 0:

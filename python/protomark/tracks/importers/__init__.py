@@ -20,6 +20,7 @@ _MODULES = (
     "astrobee",
 )
 _HEAD = 4096  # bytes by which a file is recognized
+MAGIC = b"PROTOMRK"  # with which the files of Protomark begin
 
 
 def find_importer(path: Path) -> ModuleType | None:
@@ -41,6 +42,7 @@ def read_source(path: Path) -> Tracks:
     """
     module = find_importer(path)
     if module is None:
+        check_below(path)
         *programs, last = (m.PROGRAM for m in _modules())
         raise ValueError(
             f"{path} is {_guess(path)}: give tracks of `protomark tracks`, or a map of "
@@ -50,10 +52,17 @@ def read_source(path: Path) -> Tracks:
     return tracks
 
 
+def check_below(folder: Path) -> None:
+    """Raise ValueError if a folder's first folder with a map of another program is to be named."""
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.is_dir() and (module := find_importer(path)):
+            raise ValueError(f"{folder} holds a map of {module.PROGRAM} in {path.name}/: name that")
+
+
 def _guess(path: Path) -> str:
     """What a path that no module reads may be."""
     head = file_head(path)
-    if head.startswith(b"PROTOMRK"):
+    if head.startswith(MAGIC):
         return "a file of Protomark already, which `protomark seal` and `merge` take"
     if head.startswith(b"SQLite format 3\0"):
         return "a database that is cut off, broken, or of another program"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,20 +34,31 @@ _USUAL_SIZES = (
     *((640, 360), (1280, 720), (1280, 800), (1280, 960), (1280, 1024), (1920, 1080)),
 )
 _SIZE_TOLERANCE = 0.05
-_BLOCK = 128  # landmarks that are projected at a time
+_BLOCK = 32  # landmarks that are projected at a time
 _F32, _F64, _POSE, _BYTES = (struct.Struct(f"<{form}") for form in ("f", "d", "12f", "32s"))
 
-# Three numbers, each after the number and the wire type of its field.
-_XYZ, _XYZ_KEYS = struct.Struct("<BfBfBf"), [axis << 3 | FIXED32 for axis in (1, 2, 3)]
+# Landmarks and features as osmap writes nearly all, in one step: `_point` and `_feature` read any.
+_ID, _FLOAT, _DESCRIPTOR_FIELD = rb"([\x80-\xff]{0,8}[\0-\x7f])", rb"(.{4})", rb"\"\n (.{32})"
+_USUAL_POINT = re.compile(
+    rb"\x08%b\x12\x0f\r%b\x15%b\x1d%b(?:[\x1d%%].{4}){0,2}\*%b"
+    % (_ID, _FLOAT, _FLOAT, _FLOAT, _DESCRIPTOR_FIELD),
+    re.DOTALL,
+)
+_USUAL_FEATURE = re.compile(
+    rb"\n(.)\r%b\x15%b(?:\x18([\0-\x1f]))?(?:%%%b)?()(?:\x10%b)?\x1a%b"
+    % (_FLOAT, _FLOAT, _FLOAT, _ID, _DESCRIPTOR_FIELD),
+    re.DOTALL,
+)
 
 _KEYFRAMES = struct.Struct("<QQd12f")
 _KEYFRAME = np.dtype([("id", "<u8"), ("camera", "<u8"), ("time", "<f8"), ("pose", "<f4", (3, 4))])
 _POINTS = struct.Struct("<Q3f32s")
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f4", 3), ("descriptor", "u1", _DESCRIPTOR)])
-_FEATURES = struct.Struct("<QQQ3f32s")
+_FEATURES = struct.Struct("<QQB3f32s")
 _FEATURE = np.dtype(
     [
-        *((name, "<u8") for name in ("keyframe", "point", "octave")),
+        *((name, "<u8") for name in ("keyframe", "point")),
+        ("octave", "u1"),
         ("xy", "<f4", 2),
         ("angle", "<f4"),
         ("descriptor", "u1", _DESCRIPTOR),
@@ -131,27 +142,38 @@ def _keyframes(path: Path) -> NDArray[Any]:
 def _points(path: Path) -> NDArray[Any]:
     reader, out = Reader(path.read_bytes(), path), bytearray()
     for size in _messages(reader):
-        point, descriptor = 0, b""
-        xyz: Sequence[float] = (0.0, 0.0, 0.0)
-        for number, wire, value in fields(reader, size):
-            if (number, wire) == (1, VARINT):
-                point = value
-            elif (number, wire) == (2, BYTES):
-                xyz = _position(reader, value)
-            elif (number, wire) == (5, BYTES):
-                descriptor = b"".join(_packed(reader, value, _BYTES))
-        reader.expect(descriptor, f"landmark {point} has no descriptor")
-        out += _POINTS.pack(point, *xyz, descriptor)
+        begin = reader.offset
+        if usual := _USUAL_POINT.fullmatch(reader.data, begin, begin + size):
+            number, *values = usual.groups()
+            out += b"".join((_id(number), *values))
+        else:
+            out += _point(reader, size)
     return np.frombuffer(out, _POINT)
 
 
-def _position(reader: Reader, size: int) -> Sequence[float]:
+def _id(varint: bytes | None) -> bytes:
+    """Eight bytes of a number of up to 63 bits that is 7 bits in each byte; 0 without."""
+    value = 0
+    for shift, byte in enumerate(varint or b""):
+        value |= (byte & 127) << 7 * shift
+    return value.to_bytes(8, "little")
+
+
+def _point(reader: Reader, size: int) -> bytes:
+    point, descriptor, xyz = 0, b"", [0.0, 0.0, 0.0]
+    for number, wire, value in fields(reader, size):
+        if (number, wire) == (1, VARINT):
+            point = value
+        elif (number, wire) == (2, BYTES):
+            xyz = _position(reader, value)
+        elif (number, wire) == (5, BYTES):
+            descriptor = b"".join(_packed(reader, value, _BYTES))
+    reader.expect(descriptor, f"landmark {point} has no descriptor")
+    return _POINTS.pack(point, *xyz, descriptor)
+
+
+def _position(reader: Reader, size: int) -> list[float]:
     """x, y and z, of which zeros may be left out."""
-    if size == _XYZ.size:
-        keys_and_numbers = list(reader.unpack(_XYZ))
-        if keys_and_numbers[::2] == _XYZ_KEYS:
-            return keys_and_numbers[1::2]
-        reader.offset -= size
     xyz = [0.0, 0.0, 0.0]
     for axis, wire, number in fields(reader, size):
         reader.expect(axis <= 3 and wire == FIXED32, "a position is not x, y, z")
@@ -182,18 +204,25 @@ def _features(path: Path, text: str) -> NDArray[Any]:
 
 def _add_features(reader: Reader, size: int, out: bytearray) -> None:
     """Add the features of a keyframe; wire types tell most of their fields."""
-    keyframe, rows = 0, []
+    keyframe, rows = 0, bytearray()
     for _, wire, value in fields(reader, size):
         if wire == VARINT:
             keyframe = value
         elif wire == BYTES:
-            rows.append(_feature(reader, value))
-    for row in rows:
-        out += _FEATURES.pack(keyframe, *row)
+            begin = reader.offset
+            usual = _USUAL_FEATURE.fullmatch(reader.data, begin, begin + value)
+            if usual and usual[1][0] == usual.start(6) - begin - 2:
+                _, x, y, octave, angle, _, point, descriptor = usual.groups()
+                numbers = (octave or b"\0", x, y, angle or bytes(4), descriptor)
+                rows += b"".join((bytes(8), _id(point), *numbers))
+            else:
+                rows += _feature(reader, value)
+    added = np.frombuffer(rows, _FEATURE)
+    added["keyframe"] = keyframe
+    out += rows
 
 
-def _feature(reader: Reader, size: int) -> tuple[int, int, float, float, float, bytes]:
-    """Landmark (0: none), octave, x, y, angle and descriptor."""
+def _feature(reader: Reader, size: int) -> bytes:
     point = octave = 0
     floats = [0.0, 0.0, 0.0]
     descriptor = b""
@@ -209,7 +238,7 @@ def _feature(reader: Reader, size: int) -> tuple[int, int, float, float, float, 
                 elif kind == FIXED32:
                     (floats[min(number - 1, 2)],) = _F32.unpack(inner)
     reader.expect(descriptor and octave < _MAX_OCTAVE, "a keypoint has no descriptor or octave")
-    return (point, octave, floats[0], floats[1], floats[2], descriptor)
+    return _FEATURES.pack(0, point, octave, *floats, descriptor)
 
 
 def _messages(reader: Reader) -> Iterator[int]:
@@ -236,7 +265,7 @@ def _tracks(
     for kind, table in (("keyframes", keyframes), ("landmarks", points)):
         if len(np.unique(table["id"])) < len(table) or table["id"].max() > _MAX_ID:
             raise ValueError(f"two {kind} have the same id, or one an id that is too large")
-    keyframes, points = (table[np.argsort(table["id"])] for table in (keyframes, points))
+    keyframes, points = (_ascending(table) for table in (keyframes, points))
     poses = keyframes["pose"].astype(np.float64)
     turns = poses[:, :, :3]
     if not (np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)) < _MAX_SKEW).all():  # or NaN
@@ -245,22 +274,23 @@ def _tracks(
     numbers = keyframes["camera"] if len(_CAMERA.findall(text)) > 1 else 0 * keyframes["camera"]
     cameras = _cameras(text, features, numbers)
     source: dict[str, Any] = {"program": PROGRAM, "version": "unknown"}
+    columns: Any = features
     if features is None:
-        features = _projected(keyframes, points, cameras, numbers, dropped)
+        columns = _projected(keyframes, points, cameras, numbers, dropped)
         source["note"] = (
             "no .features: the one descriptor of each landmark has no keypoint of its own"
         )
-    row = np.searchsorted(keyframes["id"], features["keyframe"])
+    row = np.searchsorted(keyframes["id"], columns["keyframe"])
     row = np.minimum(row, len(keyframes) - 1)
-    present = keyframes["id"][row] == features["keyframe"]
+    present = keyframes["id"][row] == columns["keyframe"]
     dropped["keypoints of keyframes that are not in the file"] = int((~present).sum())
     order = np.flatnonzero(present)[np.argsort(row[present], kind="stable")]
-    features, row = features[order], row[order]
-    known = np.isin(features["point"], points["id"])
-    dropped["observations of landmarks that are not in the file"] = int(
-        (~known & (features["point"] > 0)).sum()
-    )
-    angles = np.where(features["angle"] >= 0, features["angle"] % np.float32(360), -1)
+    row, seen, octaves = row[order], columns["point"][order], columns["octave"][order]
+    at = np.minimum(np.searchsorted(points["id"], seen), len(points) - 1)
+    known = points["id"][at] == seen
+    dropped["observations of landmarks that are not in the file"] = int((~known & (seen > 0)).sum())
+    angles = columns["angle"][order]
+    angles = np.where(angles >= 0, angles % np.float32(360), np.float32(-1))
     return Tracks(
         descriptor="orb",
         cameras={number + 1: camera for number, camera in enumerate(cameras)},
@@ -268,13 +298,13 @@ def _tracks(
         keyframe_camera=(numbers + 1).astype(np.int32),
         cam_from_world=poses,
         offsets=np.searchsorted(row, np.arange(len(keyframes) + 1)).astype(np.int64),
-        keypoints=features["xy"] + np.float32(0.5),
-        sizes=(_PATCH * _SCALE_FACTOR ** features["octave"]).astype(np.float32),
-        angles=angles.astype(np.float32),
-        responses=np.zeros(len(features), np.float32),
-        octaves=features["octave"].astype(np.int32),
-        descriptors=features["descriptor"].copy(),
-        landmark_of_keypoint=np.where(known, features["point"].astype(np.int64), -1),
+        keypoints=columns["xy"][order] + np.float32(0.5),
+        sizes=(_PATCH * _SCALE_FACTOR ** octaves.astype(np.float64)).astype(np.float32),
+        angles=angles,
+        responses=np.zeros(len(order), np.float32),
+        octaves=octaves.astype(np.int32),
+        descriptors=columns["descriptor"][order],
+        landmark_of_keypoint=np.where(known, seen.astype(np.int64), -1),
         landmark_ids=points["id"].astype(np.int64),
         landmark_positions=points["xyz"].astype(np.float64),
         info={
@@ -282,6 +312,12 @@ def _tracks(
             "detector": {"name": "ORB-SLAM"},
         },
     )
+
+
+def _ascending(table: NDArray[Any]) -> NDArray[Any]:
+    """The rows of a table by id; most tables are sorted already."""
+    ids = table["id"]
+    return table if (ids[1:] > ids[:-1]).all() else table[np.argsort(ids)]
 
 
 def _cameras(text: str, features: NDArray[Any] | None, numbers: NDArray[np.uint64]) -> list[Camera]:
@@ -320,12 +356,14 @@ def _projected(
     cameras: list[Camera],
     numbers: NDArray[np.uint64],
     dropped: Counter[str],
-) -> NDArray[Any]:
-    """Each landmark as a keypoint of the keyframe whose axis passes it at the smallest angle."""
+) -> dict[str, NDArray[Any]]:
+    """Each landmark as a keypoint of the keyframe whose axis passes it at the smallest angle.
+
+    The columns are those of `_FEATURE`.
+    """
     poses = keyframes["pose"].astype(np.float64)
     centers, params = camera_centers(poses), np.array([cameras[int(n)].params for n in numbers])
-    found = np.zeros(len(points), _FEATURE)
-    found["point"], found["descriptor"], found["angle"] = points["id"], points["descriptor"], -1
+    keyframe, xy = np.zeros(len(points), np.uint64), np.zeros((len(points), 2), np.float32)
     seen = np.zeros(len(points), bool)
     for begin in range(0, len(points), _BLOCK):
         rows = slice(begin, begin + _BLOCK)
@@ -336,8 +374,16 @@ def _projected(
         nearest = facing.argmax(axis=1)
         local, lens = transform(poses[nearest], xyz), params[nearest]
         with np.errstate(divide="ignore", invalid="ignore"):
-            xy = local[:, :2] / local[:, 2:] * lens[:, :2] + lens[:, 2:] - 0.5
-        seen[rows] = (facing.max(axis=1) > 0) & (np.abs(xy) < _MAX_PIXEL).all(axis=1)
-        found["keyframe"][rows], found["xy"][rows] = keyframes["id"][nearest], xy
+            pixels = local[:, :2] / local[:, 2:] * lens[:, :2] + lens[:, 2:] - 0.5
+        seen[rows] = (facing.max(axis=1) > 0) & (np.abs(pixels) < _MAX_PIXEL).all(axis=1)
+        keyframe[rows], xy[rows] = keyframes["id"][nearest], pixels
     dropped["descriptors of landmarks that no keyframe faces"] = int((~seen).sum())
-    return found[seen]
+    kept = points if seen.all() else points[seen]
+    return {
+        "keyframe": keyframe[seen],
+        "point": kept["id"],
+        "octave": np.zeros(len(kept), np.uint8),
+        "xy": xy[seen],
+        "angle": np.full(len(kept), -1, np.float32),
+        "descriptor": kept["descriptor"],
+    }
