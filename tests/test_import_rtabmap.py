@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from foreign_scene import (
 )
 from protomark.geometry.pose import rotation_from_quaternion
 from protomark.maps.build import build_map
+from protomark.maps.places import places_text
+from protomark.maps.sources import read_places
 from protomark.tracks.file import Tracks
 from protomark.tracks.importers.rtabmap import read, recognizes
 from rtabmap_writer import VERSIONS, write_rtabmap
@@ -95,7 +98,12 @@ def test_sessions_that_nothing_connects_are_maps_of_their_own(tmp_path: Path) ->
     )
     assert not first & second
     assert {i % 2**32 for i in first | second} == set(tracks.landmark_ids.tolist())
-    assert [m["keyframes"] for m in found.info["source"]["maps"]] == [2, 2]
+    maps = found.info["source"]["maps"]
+    assert [m["keyframes"] for m in maps] == [2, 2]
+    assert [m["ids"] for m in maps] == [[min(ids), max(ids)] for ids in (first, second)]
+    assert max(first) < min(second)
+    places = json.loads(places_text(read_places([tmp_path / "map.db"]).info["sources"]))
+    assert [name for name, *_ in places] == ["map.db, map 1", "map.db, map 2"]
     assert len(found.observations) == len(tracks.observations)
 
 

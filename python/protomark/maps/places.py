@@ -41,8 +41,8 @@ def places_text(sources: Sequence[Mapping[str, Any]]) -> str:
 
 def _places(source: Mapping[str, Any]) -> Iterator[Place]:
     """A source, or each map of it that has a world of its own."""
-    parts = source.get("maps", [])
-    if len(parts) > 1 and all("ids" in part for part in parts):
+    parts = [part for part in source.get("maps", []) if "ids" in part]
+    if len(parts) > 1:
         for part in parts:
             yield Place(f"{source['name']}, map {part['id']}", *part["ids"])
     else:

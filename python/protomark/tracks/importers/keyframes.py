@@ -94,18 +94,20 @@ def join(
     order = np.argsort(ids, kind="stable")
     ids, positions = ids[order], positions[order]
     dropped: Counter[str] = Counter(info["source"].get("dropped", {}))
-    labels = []
     for keyframe in keyframes:
         check_pose(keyframe.cam_from_world, path, keyframe.name)
-        label = np.where(keyframe.landmarks < 0, -1, keyframe.landmarks)
-        lost = ~np.isin(label, ids) & (label >= 0)
-        dropped["observations of missing landmarks"] += int(lost.sum())
-        label[lost] = -1
-        seen = np.flatnonzero(label >= 0)
-        again = np.delete(seen, np.unique(label[seen], return_index=True)[1])
-        dropped["observations of a landmark twice in a keyframe"] += len(again)
-        label[again] = -1
-        labels.append(label)
+    labels = np.concatenate([k.landmarks for k in keyframes])
+    known = np.append(ids, -1)[np.searchsorted(ids, labels)] == labels
+    dropped["observations of missing landmarks"] += int((~known & (labels >= 0)).sum())
+    seen = np.flatnonzero(known & (labels >= 0))
+    in_keyframe = np.repeat(np.arange(len(keyframes)), [len(k.landmarks) for k in keyframes])
+    order = seen[np.lexsort((labels[seen], in_keyframe[seen]))]
+    first = np.ones(len(order), bool)
+    first[1:] = (np.diff(labels[order]) != 0) | (np.diff(in_keyframe[order]) != 0)
+    dropped["observations of a landmark twice in a keyframe"] += int((~first).sum())
+    kept = order[first]
+    observed = np.full(len(labels), -1)
+    observed[kept] = labels[kept]
     if dropped := +dropped:
         info["source"]["dropped"] = dict(dropped)
     arrays = {}
@@ -123,7 +125,7 @@ def join(
         cam_from_world=np.array([k.cam_from_world for k in keyframes], np.float64),
         offsets=np.cumsum([0, *map(len, features)], dtype=np.int64),
         **arrays,
-        landmark_of_keypoint=np.concatenate(labels),
+        landmark_of_keypoint=observed,
         landmark_ids=ids,
         landmark_positions=positions,
         info=info,

@@ -63,8 +63,9 @@ def recognizes(path: Path, head: bytes) -> bool:
 def read(path: Path) -> Tracks:
     """Read a database.
 
-    A landmark has the id of its word; further ones of the same word have it plus a multiple of
-    2**32. Poses are those of the optimized graph, if the database holds it.
+    A landmark has the id of its word; further ones of the same word, and those of further worlds,
+    have it plus a multiple of 2**32. Poses are those of the optimized graph, if the database holds
+    it; `info` has the range of ids in each world.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -279,7 +280,7 @@ def _read_views(
     return views
 
 
-def _summaries(found: _Features, views: list[_View]) -> list[dict[str, int]]:
+def _summaries(found: _Features, views: list[_View]) -> list[dict[str, Any]]:
     """Counts of each world."""
     out = []
     for world in sorted({view.world for view in views}):
@@ -287,7 +288,8 @@ def _summaries(found: _Features, views: list[_View]) -> list[dict[str, int]]:
         label = np.concatenate([found.label[view.rows] for view in mine])
         seen = label[label >= 0]
         counts = {"landmarks": len(np.unique(seen)), "observations": len(seen)}
-        out.append({"id": world, "keyframes": len(mine), **counts})
+        ids = {"ids": [int(seen.min()), int(seen.max())]} if len(seen) else {}
+        out.append({"id": world, "keyframes": len(mine), **counts, **ids})
     return out
 
 
@@ -328,9 +330,9 @@ def _find_landmarks(
     dropped["observations of words that are at two places"] += int((ambiguous | lost).sum())
     rows, place, word = (a[~(ambiguous | lost)] for a in (rows, place, word))
     places, landmark = np.unique(words[word] * _MAX_PLACES + place, return_inverse=True)
-    owner = places // (_MAX_PLACES * len(views))
-    starts, lengths = runs(owner)
-    ids = owner + 2**32 * (np.arange(len(places)) - np.repeat(starts, lengths))
+    owner, own_place = np.divmod(places, _MAX_PLACES)
+    owner, own_world = np.divmod(owner, len(views))
+    ids = owner + 2**32 * (own_place + _MAX_PLACES * own_world)
     count = np.bincount(landmark, minlength=len(ids))[:, None]
     sums = [np.bincount(landmark, axis, len(ids)) for axis in world[rows].T]
     positions = np.column_stack(sums) / count if len(ids) else np.zeros((0, 3))
