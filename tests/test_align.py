@@ -20,7 +20,7 @@ from protomark.cli import terminal
 from protomark.cli.align import align
 from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import find_model, read_model
-from protomark.geometry.control_points import read_control_points
+from protomark.geometry.control_points import ControlPoints, read_control_points, triangulate_marks
 from protomark.geometry.pose import camera_centers, transform
 from protomark.geometry.pose_files import read_poses, read_positions
 from protomark.geometry.similarity import Similarity, fit_robustly
@@ -244,6 +244,22 @@ def test_a_scene_is_moved_to_control_points(scene: Path, form: str, tmp_path: Pa
     file.write_text("".join(file.read_text().splitlines(keepends=True)[:5]))
     done = protomark("align", scene, "--to", file)
     assert "2 of 2 control points are marked in two images" in done.stderr
+
+
+@pytest.mark.parametrize("model", ["PINHOLE 320 240 150 150", "OPENCV_FISHEYE 320 240 150 150"])
+def test_marks_are_triangulated(model: str) -> None:
+    camera = Camera.parse(f"{model} 160 120" + " 0" * 4 * ("FISHEYE" in model))
+    poses = {f"{i}.jpg": pose for i, pose in enumerate(walk(3, step=0.5))}
+    at = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 3], (4, 3))
+    marks = [(i, name) for i in range(4) for name in poses if i < 3 or name == "1.jpg"]
+    pixels = [camera.project(transform(poses[name], at[i : i + 1]))[0] for i, name in marks]
+    names = [*(name for _, name in marks), "other.jpg"]
+    given = ControlPoints(
+        list("abcd"), at, names, np.array([*pixels, [9, 9]]), np.array([*(i for i, _ in marks), 3])
+    )
+    found = triangulate_marks(given, lambda name: (camera, poses[name]) if name in poses else None)
+    np.testing.assert_allclose(found[:3], at[:3], atol=1e-6)
+    assert np.isnan(found[3]).all()
 
 
 def test_control_points_on_the_globe(tmp_path: Path) -> None:

@@ -44,7 +44,10 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     ("command", "message"),
     [
         *(
-            (command, "atlas.osa is a map of ORB-SLAM3: `protomark build atlas.osa -o scene.pmk`")
+            (
+                command,
+                "atlas.osa is a map of ORB-SLAM3, which `protomark build atlas.osa -o scene.pmk`",
+            )
             for command in (
                 "info atlas.osa",
                 "seal atlas.osa -o s.pmk",
@@ -55,7 +58,11 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
                 "export atlas.osa --to ply -o s.ply",
             )
         ),
-        ("info data/kapture", "data/kapture is a map of kapture: `protomark build data/kapture"),
+        ("evaluate atlas.osa", "ORB-SLAM3, which `protomark tracks atlas.osa -o tracks` reads"),
+        (
+            "info data/kapture",
+            "data/kapture is a map of kapture, which `protomark build data/kapture",
+        ),
         ("build data -o s.pmk", "data holds a map of kapture in kapture/: name that"),
         ("tracks data -o t", "data holds a map of kapture in kapture/: name that"),
         ("tracks atlas.osa -d freak -o t", "--descriptor and --augmentations are for images"),

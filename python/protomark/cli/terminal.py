@@ -50,7 +50,7 @@ def note(text: str) -> None:
 
 
 def note_replaced(*paths: Path | None) -> None:
-    """Say which of the files to write exist and will be replaced."""
+    """Say which of the files that -o names exist and will be replaced."""
     for path in paths:
         if path is not None and path.exists():
             note(f"{path} exists and will be replaced")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,12 +99,13 @@ class _Link:
 
     parent: str
     static: bool  # whether the last motion is that of all times
-    times: list[float] = field(default_factory=list)
-    motions: list[list[float]] = field(default_factory=list)  # x, y, z and quaternion w, x, y, z
+    times: array[float] = field(default_factory=lambda: array("d"))
+    # x, y, z and quaternion w, x, y, z of each time.
+    motions: array[float] = field(default_factory=lambda: array("d"))
 
     def at(self, times: Array) -> Array:
         """Poses parent_from_frame (n, 3, 4) at times (n,), NaN outside of those that are known."""
-        motions = np.array(self.motions)
+        motions = np.array(self.motions).reshape(-1, 7)
         if self.static:
             one = np.column_stack([rotation_from_quaternion(motions[-1, 3:]), motions[-1, :3]])
             return np.tile(one, (len(times), 1, 1))
@@ -148,7 +150,7 @@ def _read_links(path: Path, bag: Any, topics: Sequence[str], camera: str = "") -
                     "transforms has one parent"
                 )
             link.times.append(seconds(one.header.stamp, received))
-            link.motions.append(_numbers(one))
+            link.motions.extend(_numbers(one))
     return links
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, overload
 
 from protomark import _core
-from protomark._core import FileError, PrototypeMap, SealedMap
+from protomark._core import PrototypeMap, SealedMap
 
 # The maps in the folder that `protomark map` writes: the one that learns, and the one that ships.
 SCENE_MAP = "scene.pmk"
@@ -45,18 +45,9 @@ def is_map(path: Path) -> bool:
 
 
 def _check_own(path: Path) -> None:
-    """Raise FileError if a path that may hold no map of Protomark holds one of another program."""
-    from protomark.tracks.importers import MAGIC, file_head, find_importer
+    from protomark.tracks.importers import check_own
 
-    try:
-        its = None if file_head(path).startswith(MAGIC) else find_importer(path)
-    except OSError:
-        return  # whoever opens it says what is wrong
-    if its is not None:
-        raise FileError(
-            f"{path} is a map of {its.PROGRAM}: `protomark build {path} -o scene.pmk` makes one of "
-            "Protomark of it"
-        )
+    check_own(path, "build {} -o scene.pmk")
 
 
 @overload

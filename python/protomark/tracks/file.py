@@ -273,6 +273,9 @@ class Tracks:
             )
             tracks.check()
         except safetensors.SafetensorError as error:
+            from protomark.tracks.importers import check_own
+
+            check_own(path, "tracks {} -o tracks")
             raise ValueError(f"{path}: not a tracks file, or a broken one ({error})") from None
         except (KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ValueError(f"{path}: broken tracks file ({error!r})") from None

@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+from protomark._core import FileError
 from protomark.tracks.file import Tracks
 
 # Asked in this order whether a file or folder is theirs.
@@ -50,6 +51,18 @@ def read_source(path: Path) -> Tracks:
         )
     tracks: Tracks = module.read(path)
     return tracks
+
+
+def check_own(path: Path, command: str) -> None:
+    """Raise FileError if a path holds a map of another program, which a command reads."""
+    try:
+        module = None if file_head(path).startswith(MAGIC) else find_importer(path)
+    except OSError:
+        return  # whoever opens it says what is wrong
+    if module is not None:
+        raise FileError(
+            f"{path} is a map of {module.PROGRAM}, which `protomark {command.format(path)}` reads"
+        )
 
 
 def check_below(folder: Path) -> None:
