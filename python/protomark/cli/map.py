@@ -17,6 +17,7 @@ from protomark.cli.options import (
     MaxSize,
     NoSeal,
     Threads,
+    chosen_options,
 )
 
 
@@ -139,7 +140,7 @@ def map_(
         record=view,
         seal=not no_seal,
         threads=threads,
-        chosen=frozenset(name for name in ctx.params if _is_chosen(ctx, name)),
+        chosen=chosen_options(ctx),
     )
     with progress_bar() as progress:
         figures = make_map(request, progress, note)
@@ -147,11 +148,6 @@ def map_(
     _show(figures, scene)
     if figures["warnings"]:
         raise typer.Exit(1)
-
-
-def _is_chosen(ctx: typer.Context, name: str) -> bool:
-    source = ctx.get_parameter_source(name)
-    return source is not None and source.name != "DEFAULT"
 
 
 def _show(figures: dict[str, Any], scene: Path) -> None:

@@ -66,3 +66,9 @@ TracksFiles = Annotated[
         metavar="TRACKS", help="Tracks files that `protomark tracks` wrote, one per sequence."
     ),
 ]
+
+
+def chosen_options(ctx: typer.Context) -> frozenset[str]:
+    """Names of the options that the user gave, not left at their defaults."""
+    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
+    return frozenset(n for n, s in sources.items() if s is not None and s.name != "DEFAULT")

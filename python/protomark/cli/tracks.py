@@ -7,12 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from protomark.cli.options import JsonFile, MaxKeypoints, MaxSize, Threads
+from protomark.cli.options import JsonFile, MaxKeypoints, MaxSize, Threads, chosen_options
 
 _BAR = 30  # characters
+# Options for images, which a database and maps of other programs do without.
+_OF_IMAGES = {
+    *("max_keypoints", "max_size", "partners", "ratio", "max_error", "min_angle", "min_length"),
+    *("refine_poses", "max_unlabelled", "augmentations"),
+}
 
 
 def tracks(
+    ctx: typer.Context,
     folders: Annotated[
         list[Path],
         typer.Argument(
@@ -115,8 +121,6 @@ def tracks(
     ]
     if augmentations < 0:
         raise ValueError(f"--augmentations {augmentations}: give a number of copies, 0 for none")
-    if augmentations and database:
-        raise ValueError("--augmentations needs images, which --database does not read: drop one")
     if len(folders) > 1 and (images or model or database):
         raise ValueError("--images, --model and --database are for one FOLDER: give only one")
     maps = [
@@ -126,10 +130,14 @@ def tracks(
         and path.exists()
         and find_importer(path)
     ]
-    if maps == folders and (descriptors or augmentations):
+    unread = (
+        [] if database is None and maps != folders else sorted(chosen_options(ctx) & _OF_IMAGES)
+    )
+    if descriptors and maps == folders:
+        unread.append("descriptor")
+    if unread:
         raise ValueError(
-            "--descriptor and --augmentations are for images: maps of other programs keep the "
-            "descriptors that they have"
+            f"--{unread[0].replace('_', '-')} is for images, which are not read: leave it out"
         )
     for folder in folders:
         if not (images or folder in maps or (folder / "images").is_dir()):

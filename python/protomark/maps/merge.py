@@ -96,8 +96,9 @@ def merge_files(
         threads: threads to search on.
         progress: told of each map.
     """
-    if renumber and align:
-        raise ValueError("--renumber is for maps of one world, --align for others: choose one")
+    if renumber and (align or fixed_scale):
+        told = "--align" if align else "--fixed-scale"
+        raise ValueError(f"--renumber is for maps of one world, {told} for others: choose one")
     check_outputs(inputs=check_inputs(inputs), maps=[output])
     first, *others = inputs
     merged = open_learning_map(first)

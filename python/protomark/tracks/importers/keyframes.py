@@ -96,18 +96,7 @@ def join(
     dropped: Counter[str] = Counter(info["source"].get("dropped", {}))
     for keyframe in keyframes:
         check_pose(keyframe.cam_from_world, path, keyframe.name)
-    labels = np.concatenate([k.landmarks for k in keyframes])
-    known = np.append(ids, -1)[np.searchsorted(ids, labels)] == labels
-    dropped["observations of missing landmarks"] += int((~known & (labels >= 0)).sum())
-    seen = np.flatnonzero(known & (labels >= 0))
-    in_keyframe = np.repeat(np.arange(len(keyframes)), [len(k.landmarks) for k in keyframes])
-    order = seen[np.lexsort((labels[seen], in_keyframe[seen]))]
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(labels[order]) != 0) | (np.diff(in_keyframe[order]) != 0)
-    dropped["observations of a landmark twice in a keyframe"] += int((~first).sum())
-    kept = order[first]
-    observed = np.full(len(labels), -1)
-    observed[kept] = labels[kept]
+    observed = _observed(keyframes, ids, dropped)
     if dropped := +dropped:
         info["source"]["dropped"] = dict(dropped)
     arrays = {}
@@ -135,6 +124,24 @@ def join(
     except ValueError as error:
         raise ValueError(f"{path}: {str(error).removeprefix('tracks: ')}: a broken map") from None
     return tracks
+
+
+def _observed(
+    keyframes: list[Keyframe], ids: NDArray[np.int64], dropped: Counter[str]
+) -> NDArray[np.int64]:
+    """The landmark of each keypoint (n,), one of the ascending `ids` or -1; counts what is lost."""
+    labels = np.concatenate([k.landmarks for k in keyframes])
+    known = np.append(ids, -1)[np.searchsorted(ids, labels)] == labels
+    dropped["observations of missing landmarks"] += int((~known & (labels >= 0)).sum())
+    seen = np.flatnonzero(known & (labels >= 0))
+    in_keyframe = np.repeat(np.arange(len(keyframes)), [len(k.landmarks) for k in keyframes])
+    order = seen[np.lexsort((labels[seen], in_keyframe[seen]))]
+    first = np.ones(len(order), bool)
+    first[1:] = (np.diff(labels[order]) != 0) | (np.diff(in_keyframe[order]) != 0)
+    dropped["observations of a landmark twice in a keyframe"] += int((~first).sum())
+    observed = np.full(len(labels), -1)
+    observed[order[first]] = labels[order[first]]
+    return observed
 
 
 def check_pose(pose: NDArray[np.float64], path: Path, name: object) -> None:
