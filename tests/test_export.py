@@ -223,6 +223,9 @@ def test_what_cannot_be_exported(tracks: Tracks, encoder: pm.Encoder, tmp_path: 
     replace(tracks, descriptor="freak").save(freak)
     camera = Camera("FOV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.5))
     replace(tracks, cameras={**tracks.cameras, 2: camera}).save(fisheye)
+    mixed, lens = tmp_path / "mixed.safetensors", (500.0, 500.0, 320.0, 240.0, 0.1, 0, 0, 0)
+    camera = Camera("OPENCV_FISHEYE", 640, 480, lens)
+    replace(tracks, cameras={**tracks.cameras, 2: camera}).save(mixed)
     taken, output = tmp_path / "taken", tmp_path / "out"
     taken.mkdir()
     (taken / "file").write_text("mine")
@@ -232,6 +235,7 @@ def test_what_cannot_be_exported(tracks: Tracks, encoder: pm.Encoder, tmp_path: 
         (freak, "stella", None, "reads ORB only"),
         (fisheye, "stella", None, "has no camera FOV"),
         (fisheye, "nerfstudio", None, "has no camera FOV"),
+        (mixed, "nerfstudio", None, "fisheyes or none, and this scene has both"),
         (source, "colmap", tmp_path, "a.png: no such image"),
         (source, "stella", tmp_path, "no colours"),
         (tmp_path, "colmap", None, "no COLMAP model"),

@@ -14,15 +14,17 @@ def export(
     scene: Annotated[
         Path,
         typer.Argument(
-            metavar="SCENE", help="A folder of `protomark map`, tracks, or, for ply, a map file."
+            metavar="SCENE",
+            help="A folder of `protomark map`, tracks, a map of another program, or, for ply, a "
+            "map file.",
         ),
     ],
     to: Annotated[
-        Literal["ply", "colmap", "kapture", "nerfstudio", "stella"],
+        Literal["ply", "colmap", "kapture", "nerfstudio", "orbslam3", "stella"],
         typer.Option(
             help="ply: landmarks for viewers. colmap: a model in sparse/0/. nerfstudio: "
-            "transforms.json. kapture: a data set, of tracks. stella: a map of stella_vslam "
-            "(.msg), of ORB tracks."
+            "transforms.json. kapture: a data set, of tracks. orbslam3: an atlas (.osa), smaller. "
+            "stella: a map of stella_vslam (.msg), of ORB tracks."
         ),
     ],
     output: Annotated[

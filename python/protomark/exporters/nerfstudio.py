@@ -37,7 +37,7 @@ def write_nerfstudio(reconstruction: Any, output: Path, images: Path | None) -> 
     Images are named in `images`, or in images/ beside transforms.json.
 
     Raises:
-        ValueError: nerfstudio has no such camera.
+        ValueError: nerfstudio has no such camera, or not both kinds in one scene.
     """
     model = model_from_reconstruction(reconstruction, output)
     folder_of_images = "images" if images is None else images.resolve().as_posix()
@@ -53,6 +53,11 @@ def write_nerfstudio(reconstruction: Any, output: Path, images: Path | None) -> 
                 "transform_matrix": world_from_cam.tolist(),
                 **_intrinsics(model.cameras[camera_id]),
             }
+        )
+    if len({frame["camera_model"] for frame in frames}) > 1:
+        raise ValueError(
+            "nerfstudio takes all cameras for fisheyes or none, and this scene has both: export "
+            "the images of each on their own"
         )
     # Fields of all frames stand once if they have one camera.
     shared = _intrinsics(model.cameras[int(model.camera_ids[0])]) if frames else {}

@@ -69,7 +69,7 @@ def _tracks(atlas: Atlas) -> Tracks:
             )
         own = np.array(own_ids, np.int64)
         end = first_keyframe + len(one.keyframes)
-        rows, owners = _observations(one, starts[first_keyframe:end], own, dropped)
+        rows, owners = observations(one, starts[first_keyframe:end], own, dropped)
         labels[rows] = owners + shift
         ids.append(own + shift)
         last, first_keyframe = int(ids[-1].max()), end
@@ -123,7 +123,7 @@ def _without_bad(one: Map, dropped: Counter[str]) -> Map:
     return Map(one.id, keyframes, points)
 
 
-def _observations(
+def observations(
     one: Map, starts: NDArray[np.int64], ids: NDArray[np.int64], dropped: Counter[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of keypoints that observe a landmark of a map, and its id.

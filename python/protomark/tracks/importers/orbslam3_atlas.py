@@ -173,17 +173,17 @@ class AtlasReader(Archive):
         number, _, time, *head = self.unpack(_KEYFRAME_HEAD)
         fx, fy, _, _, cx, cy = head[5:11]
         distortion = tuple(self._matrix().ravel().tolist())
-        count = self.i32()
+        count = self._count()
         keypoints, undistorted = self._keypoints(), self._keypoints()
-        self.numbers("<f4"), self.numbers("<f4")  # x in the right image, depth
-        descriptors = self._matrix()
+        self._per_keypoint("<f4"), self._per_keypoint("<f4")  # x in the right image, depth
+        descriptors = self._descriptors()
         self.begin("BowVector")
         self.pairs("I", "d")
         self.begin("FeatureVector")
         for _ in self.items("map of node to keypoints", 12):
             self.begin("pair of node to keypoints")
             self.skip(4)
-            self.numbers("<u4")
+            self._keypoints_of_node()
         self.skip(7 * 4)  # pose before a loop was closed
         levels, scale_factor, _ = self.unpack(_SCALES)
         for _ in range(3):
@@ -191,7 +191,7 @@ class AtlasReader(Archive):
         left, top, right_end, bottom = self.array("<i4", 4).tolist()
         self.skip(9 * 4)  # camera matrix
         pose = self._pose()
-        points = self.numbers("<i8")
+        points = self._per_keypoint("<i8")
         self._grid()
         self.pairs("Q", "i")  # covisible keyframes
         self.unpack(_PARENT)
@@ -212,10 +212,11 @@ class AtlasReader(Archive):
         fits = rows == count == len(points) and len(keypoints) == len(undistorted)
         fits = fits and (lefts, rights) in ((-1, -1), (len(keypoints), len(right)))
         fits = fits and descriptors.shape == (rows, DESCRIPTOR_BYTES if rows else 0)
+        fits = fits and descriptors.dtype == np.uint8
         self.expect(
             fits,
-            f"{rows:,} keypoints, {len(points):,} labels and descriptors of shape "
-            f"{descriptors.shape} do not fit together",
+            f"{rows:,} keypoints, {len(points):,} labels and {descriptors.dtype} descriptors of "
+            f"shape {descriptors.shape} do not fit together",
         )
         self.expect(
             np.isfinite([time, fx, fy, cx, cy, *distortion]).all() and 1 < scale_factor < 10,
@@ -228,13 +229,32 @@ class AtlasReader(Archive):
 
     def _point(self) -> Point:
         head = self.unpack(_POINT_HEAD)
-        left = self.pairs("Q", "i")
-        right = self.pairs("Q", "i")
-        kind, rows, columns = self._matrix_shape()  # of one of its descriptors
-        self.skip(kind.itemsize * rows * columns)
+        left, right = self._named(), self._named()
+        self._descriptors()  # one of its keypoints'
         _, bad, *_ = self.unpack(_POINT_TAIL)
         self.expect(bad <= 1, "a truth value is neither 0 nor 1")
         return Point(head[0], head[4:7], bool(bad), left, right)
+
+    # What a writer of atlases changes is read by methods of its own.
+
+    def _count(self) -> int:
+        """The number of a keyframe's keypoints."""
+        return self.i32()
+
+    def _per_keypoint(self, dtype: str) -> NDArray[Any]:
+        """A number of each keypoint."""
+        return self.numbers(dtype)
+
+    def _descriptors(self) -> NDArray[Any]:
+        return self._matrix()
+
+    def _keypoints_of_node(self) -> NDArray[np.uint32]:
+        """The rows of keypoints that a node of the vocabulary has."""
+        return self.numbers("<u4")
+
+    def _named(self) -> memoryview:
+        """The keypoints that a point names, bytes of `NAMED`."""
+        return self.pairs("Q", "i")
 
     def _matrix(self) -> NDArray[Any]:
         """A cv::Mat of one channel (rows, columns)."""
