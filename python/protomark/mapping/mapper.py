@@ -126,12 +126,21 @@ class Mapper:
     def _register(self, frame: Frame, record: FrameRecord) -> None:
         """Track or relocalize a frame, and update the map with it."""
         found = self._track_or_relocalize(frame)
-        if found is None or trust.is_uncertain(self.structure, frame, found.pose, found.matches):
+        if found is None or self._is_uncertain(frame, found):
             self.lost_in_row += 1
             record.outcome = trust.NOT_FOUND if found is None else trust.UNCERTAIN
             return
         self.lost_in_row = 0
         self._insert_frame(frame, found)
+
+    def _is_uncertain(self, frame: Frame, found: TrackedPose) -> bool:
+        return trust.is_uncertain(self.structure, frame, found.pose, found.matches)
+
+    def shows(self, image: InputImage) -> bool:
+        """Whether a frame is found in the map, which does not take it."""
+        frame = self._detect(image, FrameRecord(image.index, image.name, ""))
+        found = None if frame is None else self._track_or_relocalize(frame)
+        return frame is not None and found is not None and not self._is_uncertain(frame, found)
 
     def _insert_frame(self, frame: Frame, found: TrackedPose) -> None:
         """Update the landmarks that a frame observes (Eq. 2); extend the map by a keyframe."""

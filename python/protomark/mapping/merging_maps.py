@@ -89,7 +89,7 @@ def merge_folders(
                 )
             before = len(mapper.scene) + len(other.scene)
             result.note(path, other.scene, found, 0)
-            prefix = _insert(mapper, other, found, path.name)
+            prefix = insert_map(mapper, other, found, path.name)
             for name, old in its.get("inputs", {}).items():
                 inputs_of_frames[name] = prefix + old
             result.facts["inputs"][-1]["in_common"] = before - len(mapper.scene)
@@ -105,7 +105,7 @@ def merge_folders(
     return result
 
 
-def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
+def insert_map(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
     """Insert frames and landmarks of another map; returns the prefix of its frames' names."""
     structure, motion = mapper.structure, found.similarity
     if mapper.options.fixed_poses and other.options.fixed_poses and found.stays:
