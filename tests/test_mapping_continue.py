@@ -163,7 +163,7 @@ def test_times_are_shifted_only_if_they_would_mix(
         for i, (name, time) in enumerate(first.listing())
         if first.prefix + name in old
     ]
-    structure = Structure({1: PINHOLE}, 1600)
+    structure = Structure({1: PINHOLE})
     structure.frames = frames
     second.follow(structure, [frame.name for frame in frames])
     assert second.time_shift == shift
