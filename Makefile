@@ -36,8 +36,9 @@ bench: .venv-bench/installed
 
 test: test-cpp test-python
 
+# One thread each, as there is a process for each core; a file's tests share what they made.
 test-python: .venv-test/installed .venv-test/bench
-	.venv-test/bin/python -m pytest
+	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n $(JOBS) --dist loadfile
 
 test-cpp: .venv-test/installed
 	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import io
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from itertools import pairwise
 from typing import Any
 
@@ -23,13 +26,25 @@ settings.register_profile("protomark", deadline=None)
 settings.load_profile("protomark")
 
 
-def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
+def program(*arguments: Any) -> subprocess.CompletedProcess[str]:
     """The command as users run it."""
-    return subprocess.run(
-        [sys.executable, "-m", "protomark", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-    )
+    words = [sys.executable, "-m", "protomark", *map(str, arguments)]
+    return subprocess.run(words, capture_output=True, text=True)
+
+
+def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    """The command in this process, which saves the time to start another."""
+    from protomark.cli import main
+
+    words = ["protomark", *map(str, arguments)]
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", words)
+        try:
+            main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 def random_layers(
@@ -90,6 +105,14 @@ def random_descriptors(n: int, bits: int = 64, seed: int = 0) -> NDArray[np.uint
 def rounded(means: Any) -> Any:
     """Rounds to integers, halves away from zero."""
     return (np.sign(means) * np.floor(np.abs(means) + 0.5)).astype(np.int64)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_drawing() -> Iterator[None]:
+    """Reports have no pictures, which would take most of the time of mapping a few frames."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("protomark.report.svg_text", lambda figure: "<svg></svg>")
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 
 import protomark as pm
-from conftest import balanced_encoder, protomark, random_descriptors, random_layers
+from conftest import balanced_encoder, program, protomark, random_descriptors, random_layers
 from protomark import sample
 from protomark.cli import terminal
 from protomark.geometry.camera import Camera
@@ -90,14 +90,14 @@ def test_other_distributions_add_commands(tmp_path: Path) -> None:
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(tmp_path))
-        assert protomark("greet", "you").stdout == "hello you\n"
-        assert protomark("greet", "nobody").stderr == "error: nobody is there\n"
-        assert "Says hello." in protomark("greet", "--help").stdout
+        assert program("greet", "you").stdout == "hello you\n"
+        assert program("greet", "nobody").stderr == "error: nobody is there\n"
+        assert "Says hello." in program("greet", "--help").stdout
         # The package's own command of the same name goes first.
-        assert "Describe what a file holds" in protomark("info", "--help").stdout
-        listed = protomark("--help")
+        assert "Describe what a file holds" in program("info", "--help").stdout
+        listed = program("--help")
         assert "Says hello." in listed.stdout
-        broken = protomark("broken")
+        broken = program("broken")
     assert (broken.returncode, broken.stderr) == (
         1,
         "error: the command broken of another distribution cannot be loaded: No module named "
@@ -375,7 +375,7 @@ def test_output_that_the_terminal_cannot_show(
 ) -> None:
     tracks.save(tmp_path / "t.safetensors")
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    done = protomark(
+    done = program(
         "build", tmp_path / "t.safetensors", "-o", tmp_path / "m.pmk", "--encoder", model
     )
     assert (done.returncode, done.stderr) == (0, "")

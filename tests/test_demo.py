@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import protomark as pm
+from conftest import protomark
 from evaluation_scene import looking_inwards, ring_scene
 from protomark import sample
 from protomark.cli.terminal import readable_size
@@ -21,17 +19,13 @@ from protomark.geometry.pose import ground_plane
 from protomark.tracks.file import Tracks
 
 
-def demo(*arguments: Any, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "protomark", "demo", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-    )
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
 def test_on_the_sample(tmp_path: Path) -> None:
-    done = demo("--json", "figures.json", cwd=tmp_path)
+    done = protomark("demo", "--json", "figures.json")
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "figures.json").read_text())
     rows = {row["name"]: row for row in facts["table"]}
@@ -95,7 +89,7 @@ def test_what_it_did_not_write_stays(ring: Path, model: str, tmp_path: Path, nam
     output = tmp_path / "demo"
     output.mkdir()
     (output / name).write_bytes(b"mine")
-    done = demo("--tracks", ring, "--encoder", model, cwd=tmp_path)
+    done = protomark("demo", "--tracks", ring, "--encoder", model)
     assert done.returncode == 1
     assert f"{name} was not written by `protomark demo`" in done.stderr
     assert (output / name).read_bytes() == b"mine"
@@ -136,7 +130,7 @@ def test_mistakes_are_one_sentence(ring: Path, model: str, tmp_path: Path) -> No
         (["--tracks", ring, "--encoder", "none"], "none: neither a model file nor a bundled"),
         (["--json", "no/such.json"], "no: no such folder"),
     ):
-        done = demo(*arguments, cwd=tmp_path)
+        done = protomark("demo", *arguments)
         assert done.returncode == 1
         assert message in done.stderr
         assert "Traceback" not in done.stderr

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
+from conftest import protomark
 from evaluation_scene import ring_scene
 from protomark.evaluation.protocol import split
 from protomark.evaluation.results import MethodResult
@@ -20,11 +20,7 @@ from protomark.tracks.file import sequence_name
 
 
 def evaluate(*arguments: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "protomark", "evaluate", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-    )
+    return protomark("evaluate", *arguments)
 
 
 @pytest.fixture

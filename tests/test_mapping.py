@@ -14,6 +14,7 @@ import pytest
 
 import protomark as pm
 from mapping_scene import interrupted_at, show, turn_and_approach, walk, write_images
+from protomark import report
 from protomark.geometry.colmap import pycolmap
 from protomark.geometry.pose import camera_centers, quaternion_from_rotation
 from protomark.geometry.pose_files import read_poses
@@ -26,6 +27,8 @@ from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.mapping.state import load_state
+from protomark.mapping.summary import map_pictures
+from protomark.plot import svg_text
 from test_tracks_command import fails
 from test_tracks_command import run as run_tracks
 from tracks_scene import PINHOLE
@@ -93,7 +96,14 @@ def test_what_is_written_agrees(finished: Path) -> None:
     assert figures["landmarks"] == len(ids)
     assert figures["observations"] == model.compute_num_observations()
     assert len(figures["history"]) == COUNT
-    assert (finished / "report.html").read_text().count("<svg") == 3
+
+
+def test_the_report_has_pictures(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "svg_text", svg_text)
+    figures = json.loads((finished / "report.json").read_text())
+    page = report.map_page(figures, map_pictures(load_state(finished)[0], figures), "Map")
+    assert page.count("<svg") == 3
+    assert len(page) > 50_000
 
 
 def test_prototypes_are_what_building_at_once_gives() -> None:
@@ -211,13 +221,24 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_images(tmp_path_factory.mktemp("turn") / "images", turn_and_approach(18))
 
 
+@pytest.fixture(scope="module")
+def restarted(turning: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map that starts with a wrong focal length, and again with what it finds."""
+    scene = tmp_path_factory.mktemp("restarted") / "scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "elect_focal_length", lambda pairs, size: None)
+        make_map(MapRequest(turning, scene, SETTINGS))
+    return scene
+
+
 @pytest.mark.parametrize("elected", [True, False])
 def test_an_unknown_camera_is_calibrated_along_the_way(
-    elected: bool, turning: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    elected: bool, turning: Path, restarted: Path, tmp_path: Path
 ) -> None:
-    if not elected:
-        monkeypatch.setattr(session, "elect_focal_length", lambda pairs, size: None)
-    figures = make_map(MapRequest(turning, tmp_path / "scene", SETTINGS))
+    scene = tmp_path / "scene" if elected else restarted
+    if elected:
+        make_map(MapRequest(turning, scene, SETTINGS))
+    figures = json.loads((scene / "report.json").read_text())
     assert figures["registered"] == 18
     assert figures["camera"]["model"] == "SIMPLE_RADIAL"
     assert figures["camera"]["params"][0] == pytest.approx(300, rel=0.03)
@@ -227,17 +248,20 @@ def test_an_unknown_camera_is_calibrated_along_the_way(
     restarts = [event for event in figures["events"] if "restarts" in event]
     assert len(restarts) in ((0,) if elected else (1, 2))
     assert elected or "not 384 pixels" in restarts[0]
-    frames = json.loads((tmp_path / "scene/report.json").read_text())["history"]
-    last = sum(frame["seconds"]["triangulate"] for frame in frames)
+    last = sum(frame["seconds"]["triangulate"] for frame in figures["history"])
     assert (figures["seconds"]["triangulate"] > 1.3 * last) != elected, (
         "the first start counts, too"
     )
-    assert error_of(tmp_path / "scene", turn_and_approach(18)) < 0.02
+    assert error_of(scene, turn_and_approach(18)) < 0.02
 
 
 @pytest.mark.parametrize("beginning", [1, 2])
 def test_resumed_with_an_unknown_camera(
-    beginning: int, turning: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    beginning: int,
+    turning: Path,
+    restarted: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ctrl-C comes before or after the map starts again."""
     monkeypatch.setattr(session, "elect_focal_length", lambda pairs, size: None)
@@ -251,15 +275,13 @@ def test_resumed_with_an_unknown_camera(
             os.kill(os.getpid(), signal.SIGINT)
         return add(self, picture)
 
-    make_map(MapRequest(turning, tmp_path / "whole", SETTINGS))
     monkeypatch.setattr(Mapper, "add", stop_after)
     with pytest.raises(Interrupted):
         make_map(MapRequest(turning, tmp_path / "scene", SETTINGS))
     monkeypatch.setattr(Mapper, "add", add)
     make_map(MapRequest(turning, tmp_path / "scene", SETTINGS, resume=True))
     for name in ("scene.pmk", "trajectory.txt"):
-        whole = (tmp_path / "whole" / name).read_bytes()
-        assert (tmp_path / "scene" / name).read_bytes() == whole
+        assert (tmp_path / "scene" / name).read_bytes() == (restarted / name).read_bytes()
 
 
 def test_two_threads_make_the_same_map(images: Path, finished: Path, tmp_path: Path) -> None:

@@ -14,6 +14,9 @@ from safetensors.numpy import load, save
 import protomark as pm
 from mapping_scene import PINHOLE, interrupted_at, walk, write_images
 from protomark import interrupt
+from protomark.geometry.colmap import find_model, read_model
+from protomark.geometry.pose import camera_centers
+from protomark.geometry.similarity import fit_similarity
 from protomark.mapping import session
 from protomark.mapping.frame import Frame
 from protomark.mapping.prediction import MAX_STEP
@@ -27,6 +30,9 @@ from test_mapping import CAMERA, SETTINGS, run
 from test_tracks_command import fails
 
 FRAMES = 9
+# A walk that starts where the map has nothing, and ends in it.
+FAR = walk(18, step=0.25)[:2:-1]
+FAR_NAMES = [f"img{i}.png" for i in range(1, len(FAR) + 1)]
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +163,7 @@ def test_times_are_shifted_only_if_they_would_mix(
         for i, (name, time) in enumerate(first.listing())
         if first.prefix + name in old
     ]
-    structure = Structure({1: PINHOLE}, 1600)
+    structure = Structure({1: PINHOLE})
     structure.frames = frames
     second.follow(structure, [frame.name for frame in frames])
     assert second.time_shift == shift
@@ -198,3 +204,39 @@ def test_the_sealed_map_is_tuned_by_what_observed_its_landmarks(
     (extended / STATE).write_bytes(save(arrays)[:-1])
     with pytest.raises(ValueError, match=f"{STATE}: broken .*, or map the images anew"):
         seal(extended, again)
+
+
+def test_a_session_that_starts_elsewhere_is_mapped_apart_and_merged(
+    extended: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, notes = contents(extended), list[str]()
+    far_images = write_images(tmp_path / "far", FAR)
+    request = MapRequest(far_images, extended, SETTINGS, extend=True)
+    interrupted_at(5, request, monkeypatch, notes)
+    assert {name: contents(extended)[name] for name in before} == before
+    assert not (extended / "previous").exists()
+    assert "scene shows none of the first frames: they are mapped apart, to be merged" in notes
+    figures = make_map(replace(request, resume=True), note=notes.append)
+    assert notes[-1].startswith("far: merged by ")
+    assert contents(extended / "previous") == before
+    assert figures["registered"] == FRAMES + len(FAR)
+    model = read_model(find_model(extended))
+    names = [*(f"img{i}.png" for i in range(1, FRAMES + 1)), *(f"far/{n}" for n in FAR_NAMES)]
+    centers = model.centers[[model.names.index(name) for name in names]]
+    true = camera_centers(np.concatenate([walk(FRAMES), FAR]))
+    motion = fit_similarity(centers, true)
+    assert np.linalg.norm(motion(centers) - true, axis=1).max() < 0.15
+    assert len(model.cameras) == 1
+    fails(run(far_images, "--into", extended), "are in this map already")
+
+
+def test_frames_of_which_no_map_can_be_made_are_added_one_by_one(
+    extended: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "_LOOKED_FOR", 1)
+    notes = list[str]()
+    more = write_images(tmp_path / "more", FAR[[0, -1]])
+    figures = make_map(MapRequest(more, extended, SETTINGS, extend=True), note=notes.append)
+    assert figures["registered"] == FRAMES + 1
+    assert notes[-2].startswith("not merged: ")
+    assert notes[-1].startswith("the map has frames of these times")

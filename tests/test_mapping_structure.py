@@ -16,6 +16,7 @@ from protomark.mapping.adjustment import adjust, adjust_global_bundle
 from protomark.mapping.culling import cull
 from protomark.mapping.frame import Frame
 from protomark.mapping.memory import Prototypes
+from protomark.mapping.options import MappingOptions
 from protomark.mapping.prediction import predict
 from protomark.mapping.structure import Structure
 from protomark.mapping.triangulation import update_prototypes
@@ -24,7 +25,7 @@ from tracks_scene import PINHOLE
 ENCODER = pm.Encoder(
     random_layers([64, 24, 12]), dims=[12], name="tiny", descriptor="test", scale=0.02
 )
-MAX_ERROR, MIN_ANGLE = 0.01, 1.0
+OPTIONS = MappingOptions(max_error=0.01)
 POINTS = 60
 
 
@@ -34,7 +35,7 @@ def scene(noise: float = 0.0, seed: int = 0) -> tuple[Structure, Prototypes]:
     points = np.column_stack(
         [rng.uniform(-0.6, 0.5, POINTS), rng.uniform(-0.5, 0.5, POINTS), rng.uniform(2, 3, POINTS)]
     )
-    structure, memory = Structure({1: PINHOLE}), Prototypes(ENCODER, 12)
+    structure, memory = Structure({1: PINHOLE}, OPTIONS), Prototypes(ENCODER, 12)
     ids = structure.create(points)
     for i, pose in enumerate(walk(8)):
         pixels = PINHOLE.project(transform(pose, points)) + noise * rng.normal(size=(POINTS, 2))
@@ -97,7 +98,7 @@ def test_culling_takes_observations_back_exactly_and_weak_landmarks_out() -> Non
     for frame in structure.frames[1:]:
         memory.subtract(frame.landmarks[7:8], frame.encoded[7:8])
         frame.landmarks[7] = -1
-    gone = cull(structure, memory, list(range(8)), MAX_ERROR, MIN_ANGLE)
+    gone = cull(structure, memory, list(range(8)))
     assert gone == 1
     assert off.landmarks[4] == -1
     assert 8 not in structure.ids
@@ -110,10 +111,10 @@ def test_landmarks_seen_twice_go_when_the_window_has_left_them_behind() -> None:
     for frame in structure.frames[2:]:
         memory.subtract(frame.landmarks[:5], frame.encoded[:5])
         frame.landmarks[:5] = -1
-    assert cull(structure, memory, list(range(8)), MAX_ERROR, MIN_ANGLE) == 0
+    assert cull(structure, memory, list(range(8))) == 0
     for frame in structure.frames[:2]:
         frame.descriptors = frame.encoded = None
-    assert cull(structure, memory, list(range(8)), MAX_ERROR, MIN_ANGLE) == 5
+    assert cull(structure, memory, list(range(8))) == 5
     assert structure.ids.tolist() == list(range(6, POINTS + 1))
 
 
@@ -128,7 +129,7 @@ def test_merging_joins_what_no_frame_tells_apart_and_one_position_fits() -> None
             update_prototypes(memory, frame, np.array([row]))
     a, b = double.tolist()
     pairs = [(3, a), (b, 5), (10, 11), (20, 20)]
-    assert merging.merge_duplicates(structure, memory, pairs, MAX_ERROR) == 2
+    assert merging.merge_duplicates(structure, memory, pairs) == 2
     assert all(frame.landmarks.tolist() == list(range(1, POINTS + 1)) for frame in structure.frames)
     check_memory(structure, memory)
     assert (memory.map.counts(memory.map.ids) == 8).all()
@@ -140,7 +141,7 @@ def test_merging_joins_what_no_frame_tells_apart_and_one_position_fits() -> None
             PINHOLE.project(transform(frame.pose, structure.positions[far]))
         )[0]
         structure.observe(frame, np.array([29]), far)
-    assert merging.merge_duplicates(structure, memory, [(30, int(far[0]))], MAX_ERROR) == 0
+    assert merging.merge_duplicates(structure, memory, [(30, int(far[0]))]) == 0
 
 
 def test_adjustment_finds_back_to_what_was_seen() -> None:

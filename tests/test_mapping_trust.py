@@ -138,7 +138,7 @@ def test_what_cannot_be_determined_is_said(tmp_path: Path) -> None:
 def structure_of(poses: np.ndarray, points: np.ndarray) -> Structure:
     """Frames that all see the same points, exactly."""
     rng = np.random.default_rng(0)
-    structure = Structure({1: PINHOLE})
+    structure = Structure({1: PINHOLE}, MappingOptions(max_error=0.01))
     ids = structure.create(points)
     for i, pose in enumerate(poses):
         pixels = PINHOLE.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
@@ -423,7 +423,7 @@ def test_rivals_for_the_first_pair_are_adjusted_before_they_are_compared() -> No
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.8, 0.8, (250, 2)), rng.uniform(2, 2.4, 250)])
     structure, poses = structure_of(walk(6, step=0.03), points), walk(6, step=0.03)
-    initialiser = Initialiser(structure, 0.01)
+    initialiser = Initialiser(structure)
     initialiser.waiting = structure.frames
     one, other = structure.frames[0], structure.frames[5]
     rows = np.repeat(np.arange(250)[:, None], 2, axis=1)
@@ -462,7 +462,7 @@ def test_a_zoomed_frame_is_named() -> None:
         camera = zoomed if i == 14 else PINHOLE
         mapper.add(InputImage(i, f"{i}.png", float(i), show(pose, camera)))
     mapper.finish()
-    assert other_lenses(mapper.structure, mapper.options.max_error) == ["14.png"]
+    assert other_lenses(mapper.structure) == ["14.png"]
 
 
 def test_frames_that_leave_the_focal_length_open_are_of_no_other_lens(
@@ -478,4 +478,4 @@ def test_frames_that_leave_the_focal_length_open_are_of_no_other_lens(
         trust, "free_lens", lambda pose, *_: FreeLens(pose, 0.0, 0.01, next(stretches), 0.01)
     )
     names = [frame.name for frame in mapper.structure.frames]
-    assert other_lenses(mapper.structure, mapper.options.max_error) == names[-1:]
+    assert other_lenses(mapper.structure) == names[-1:]

@@ -36,7 +36,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     for name, frames, seed in (
         ("hall", range(9), 0),
         ("room", range(6, FRAMES), 0),
-        ("else", range(9), 100),
+        ("else", range(6), 100),
     ):
         images = write_images(folder / f"{name}-images", POSES[list(frames)], seed=seed)
         make_map(MapRequest(images, folder / name, SETTINGS, camera=CAMERA))

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import shutil
 import subprocess
-import sys
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from protomark.cli import main
+from conftest import program, protomark
 from protomark.tracks.file import Tracks
 from tracks_scene import PINHOLE, poses, write_model, write_sequence
 
@@ -22,16 +19,7 @@ FAST = ["--max-keypoints", "300", "--threads", "1"]
 
 
 def run(*arguments: object, command: str = "tracks") -> subprocess.CompletedProcess[str]:
-    """Runs the command in this process, which saves the time of a new one."""
-    words = ["protomark", command, *map(str, arguments)]
-    out, err, code = io.StringIO(), io.StringIO(), 0
-    with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", words)
-        try:
-            main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+    return protomark(command, *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +73,7 @@ def test_writes_summary_json_and_skips_on_rerun(sequence: Path, tmp_path: Path) 
 
 def test_as_a_program(copy: Path, tmp_path: Path) -> None:
     (copy / "images" / "img2.png").unlink()
-    command = [sys.executable, "-m", "protomark", "tracks", copy, "-o", tmp_path / "out"]
-    fails(subprocess.run(command, capture_output=True, text=True, check=False), "img2.png")
+    fails(program("tracks", copy, "-o", tmp_path / "out"), "img2.png")
 
 
 def test_other_layouts(sequence: Path, tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
+from conftest import program
 from protomark import sample
 from protomark.tracks import Tracks
 from protomark_bench import _ceilings
@@ -379,12 +378,7 @@ def test_figures_outlive_a_section_that_fails(
 
 
 def test_quick_run_from_end_to_end(tmp_path: Path) -> None:
-    arguments = ["bench", "--scale", "quick", "--landmarks", "1000", "-o", tmp_path]
-    done = subprocess.run(
-        [sys.executable, "-m", "protomark", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-    )
+    done = program("bench", "--scale", "quick", "--landmarks", "1000", "-o", tmp_path)
     assert done.returncode == 0, done.stderr
     results = BenchResults.load(tmp_path / "benchmarks.json")
     sections = {contest.section for contest in results.contests}

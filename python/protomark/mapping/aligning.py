@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from protomark.geometry.pose import camera_centers, ground_plane
 from protomark.geometry.pose_files import PoseSet, match_names, read_positions
 from protomark.geometry.similarity import Array, Similarity, fit_robustly
 from protomark.mapping.mapper import Mapper
-from protomark.mapping.outputs import link, write_outputs
+from protomark.mapping.outputs import link_files, write_outputs
 from protomark.mapping.state import CHECKPOINT, load_state, save_state
 from protomark.maps.open import SEALED_MAP, STATE, open_learning_map
 from protomark.progress import Progress, silent
@@ -114,19 +113,9 @@ def _align_folder(folder: Path, target: Target, progress: Progress) -> dict[str,
 
 @contextmanager
 def _copy(folder: Path) -> Iterator[Path]:
-    """A copy of a folder, which replaces it when the block ends without an error.
-
-    Files are links, as all that are written anew are replaced, never changed.
-    """
+    """A copy of a folder, which replaces it when the block ends without an error."""
     with replacing_folder(folder) as copy:
-        shutil.copytree(
-            folder,
-            copy,
-            symlinks=True,
-            ignore=shutil.ignore_patterns(".lock*"),
-            copy_function=link,
-            dirs_exist_ok=True,
-        )
+        link_files(folder, copy, ".lock*")
         yield copy
 
 

@@ -19,13 +19,7 @@ _ANGLE_SHARE = 0.6
 _MANY = 5
 
 
-def cull(
-    structure: Structure,
-    memory: Memory,
-    frames: list[int],
-    max_error: float,  # as a share of the image's longer side
-    min_angle: float,  # of a new landmark, degrees
-) -> int:
+def cull(structure: Structure, memory: Memory, frames: list[int]) -> int:
     """Remove observations with a large error, and landmarks with too few or too narrow rays.
 
     Returns the number of removed landmarks.
@@ -34,12 +28,10 @@ def cull(
     other frames no longer exist: their observations leave the geometry, but stay in the prototype.
     """
     seen = structure.observations(frames)
-    limit = np.array(
-        [structure.tolerance(f.camera_id, max_error) for f in structure.frames], np.float64
-    )
+    limit = np.array([structure.max_error(f.camera_id) for f in structure.frames], np.float64)
     outlier = structure.errors(seen) > limit[seen.frames]
     remove_observations(structure, memory, seen.where(outlier))
-    return cull_landmarks(structure, memory, np.unique(seen.landmarks), min_angle)
+    return cull_landmarks(structure, memory, np.unique(seen.landmarks))
 
 
 def remove_observations(structure: Structure, memory: Memory, seen: Observations) -> None:
@@ -52,7 +44,7 @@ def remove_observations(structure: Structure, memory: Memory, seen: Observations
         frame.landmarks[rows] = -1
 
 
-def cull_landmarks(structure: Structure, memory: Memory, ids: Ids, min_angle: float) -> int:
+def cull_landmarks(structure: Structure, memory: Memory, ids: Ids) -> int:
     """Remove landmarks with one keyframe, without confirmation, or with a narrow angle."""
     counts = structure.counts()
     weak = counts[ids] < 2
@@ -60,7 +52,8 @@ def cull_landmarks(structure: Structure, memory: Memory, ids: Ids, min_angle: fl
     window_start = next((i for i, frame in enumerate(frames) if frame.in_window), len(frames))
     weak |= (structure.born[ids] <= window_start) & (counts[ids] < _MIN_CONFIRMED)
     few = ids[counts[ids] < _MANY]
-    weak |= np.isin(ids, few[_angles(structure, few) < np.radians(_ANGLE_SHARE * min_angle)])
+    narrow = _angles(structure, few) < np.radians(_ANGLE_SHARE * structure.options.min_angle)
+    weak |= np.isin(ids, few[narrow])
     removed = ids[weak & structure.existing[ids]]
     if len(removed):
         # A landmark whose observations were all subtracted has left the memory already.

@@ -56,8 +56,8 @@ class Initialiser:
     frames, the witnesses, decide: landmarks of a wrong pose do not project where these see them.
     """
 
-    def __init__(self, structure: Structure, max_error: float) -> None:
-        self._structure, self._max_error = structure, max_error
+    def __init__(self, structure: Structure) -> None:
+        self._structure = structure
         self.waiting: list[Frame] = []
         self.best_parallax = 0.0
         self._use(next(iter(structure.cameras)))
@@ -66,7 +66,7 @@ class Initialiser:
     def _use(self, camera_id: int) -> None:
         """Judge frames of this camera."""
         self.camera = self._structure.cameras[camera_id]
-        self.max_error = self._structure.tolerance(camera_id, self._max_error)
+        self.max_error = self._structure.max_error(camera_id)
         self._focal = self.camera.focal_length
 
     def push(self, frame: Frame) -> TwoViewPose | None:

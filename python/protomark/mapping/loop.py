@@ -7,7 +7,6 @@ import numpy as np
 from protomark.extras import optional
 from protomark.geometry.pose import camera_centers
 from protomark.mapping.frame import Array, Frame, Ids
-from protomark.mapping.memory import Memory
 from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.prediction import MAX_STEP, predict
 from protomark.mapping.structure import Structure
@@ -24,9 +23,7 @@ _MIN_SHARE = 0.25
 _DRIFT = 3.0
 
 
-def close_loop(
-    structure: Structure, memory: Memory, tracker: Tracker, newest: int, max_error: float
-) -> tuple[int, bool]:
+def close_loop(tracker: Tracker, newest: int) -> tuple[int, bool]:
     """Search for the newest keyframe among landmarks that no recent keyframe observes.
 
     If old landmarks give it a pose, the new landmarks that it observes are merged with the old
@@ -36,6 +33,7 @@ def close_loop(
     Returns:
         Number of merged landmarks, and whether drift was corrected.
     """
+    structure, memory = tracker.structure, tracker.memory
     recent = np.zeros(len(structure.positions), bool)
     keyframes = structure.keyframes()
     for i in keyframes[-RECENT:]:
@@ -49,12 +47,12 @@ def close_loop(
         found = tracker.track_local_map(frame, found.pose, old)
     enough = max(_MIN_INLIERS, _MIN_SHARE * len(frame.seen))
     if found is None or len(found.matches) < enough:
-        found = _across_gap(structure, tracker, newest, old)
+        found = _across_gap(tracker, newest, old)
     if found is None:
         return 0, False
     matches = found.matches
     off = structure.median_error(found.pose, frame, frame.observed, frame.seen)
-    drift = off > _DRIFT * structure.tolerance(frame.camera_id, max_error)
+    drift = off > _DRIFT * structure.max_error(frame.camera_id)
     if drift:
         _correct_drift(structure, newest, found.pose, matches.rows, matches.ids)
     seen = frame.landmarks[matches.rows]
@@ -63,13 +61,12 @@ def close_loop(
     update_prototypes(memory, frame, matches.rows[fresh])
     duplicate = (seen >= 0) & (seen != matches.ids)
     pairs = list(zip(seen[duplicate].tolist(), matches.ids[duplicate].tolist(), strict=True))
-    return merge_duplicates(structure, memory, pairs, max_error, check=not drift), drift
+    return merge_duplicates(structure, memory, pairs, check=not drift), drift
 
 
-def _across_gap(
-    structure: Structure, tracker: Tracker, newest: int, old: Ids
-) -> TrackedPose | None:
+def _across_gap(tracker: Tracker, newest: int, old: Ids) -> TrackedPose | None:
     """The pose that the frames on the other side of a gap in the input predict, refined."""
+    structure = tracker.structure
     frame = structure.frames[newest]
     recent = set(structure.keyframes()[-RECENT:])
     others = [other for i, other in enumerate(structure.frames) if i not in recent]

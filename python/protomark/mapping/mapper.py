@@ -59,7 +59,7 @@ class Mapper:
     ) -> None:
         self.options, self.threads = options, threads
         self._new_memory = new_memory
-        self.structure = Structure({1: camera}, options.max_size)
+        self.structure = Structure({1: camera}, options)
         self.memory = new_memory(options)
         self.history = History()
         self.clock = Clock()
@@ -89,8 +89,7 @@ class Mapper:
     @property
     def tracker(self) -> Tracker:
         """Finds frames in the current map."""
-        o = self.options
-        return Tracker(self.structure, self.memory, o.max_error, o.min_inliers, self.threads)
+        return Tracker(self.structure, self.memory, self.threads)
 
     @property
     def descriptor_bytes(self) -> int:
@@ -126,12 +125,21 @@ class Mapper:
     def _register(self, frame: Frame, record: FrameRecord) -> None:
         """Track or relocalize a frame, and update the map with it."""
         found = self._track_or_relocalize(frame)
-        if found is None or trust.is_uncertain(self.structure, frame, found.pose, found.matches):
+        if found is None or self._is_uncertain(frame, found):
             self.lost_in_row += 1
             record.outcome = trust.NOT_FOUND if found is None else trust.UNCERTAIN
             return
         self.lost_in_row = 0
         self._insert_frame(frame, found)
+
+    def _is_uncertain(self, frame: Frame, found: TrackedPose) -> bool:
+        return trust.is_uncertain(self.structure, frame, found.pose, found.matches)
+
+    def shows(self, image: InputImage) -> bool:
+        """Whether a frame is found in the map, which does not take it."""
+        frame = self._detect(image, FrameRecord(image.index, image.name, ""))
+        found = None if frame is None else self._track_or_relocalize(frame)
+        return frame is not None and found is not None and not self._is_uncertain(frame, found)
 
     def _insert_frame(self, frame: Frame, found: TrackedPose) -> None:
         """Update the landmarks that a frame observes (Eq. 2); extend the map by a keyframe."""
@@ -222,13 +230,10 @@ class Mapper:
 
     def _triangulate(self, index: int) -> None:
         """Create landmarks from the descriptors of the window (Eq. 1), and merge duplicates."""
-        o = self.options
         with self.clock.stage("triangulate"):
             window = [i for i in self._window() if i != index]
-            duplicates = triangulate(
-                self.structure, self.memory, index, window, o.max_error, o.min_angle
-            )
-            merge_duplicates(self.structure, self.memory, duplicates, o.max_error)
+            duplicates = triangulate(self.structure, self.memory, index, window)
+            merge_duplicates(self.structure, self.memory, duplicates)
 
     def _adjust_local_bundle(self, index: int) -> list[int]:
         """Adjust the keyframes around a new one; returns their indices."""
@@ -243,9 +248,8 @@ class Mapper:
 
     def _cull(self, frames: list[int]) -> None:
         """Remove observations of these frames, and landmarks, that do not fit."""
-        o = self.options
         with self.clock.stage("adjust"):
-            culling.cull(self.structure, self.memory, frames, o.max_error, o.min_angle)
+            culling.cull(self.structure, self.memory, frames)
 
     def _shrink_window(self) -> None:
         """Drop the descriptors of all but the latest keyframes."""
@@ -258,9 +262,7 @@ class Mapper:
         if self.options.fixed_poses or len(self.structure.keyframes()) % interval:
             return
         with self.clock.stage("match"):
-            merged, drift = loop.close_loop(
-                self.structure, self.memory, self.tracker, index, self.options.max_error
-            )
+            merged, drift = loop.close_loop(self.tracker, index)
         if merged or drift:
             self.history.events.append(
                 f"{self.structure.frames[index].name}: a place seen before, {merged} landmarks "
@@ -300,7 +302,7 @@ class Mapper:
             rows = frame.observed
             if not frame.keyframe and len(rows) >= 6:
                 matched = structure.matched(frame, rows, frame.seen)
-                limit = structure.tolerance(frame.camera_id, self.options.max_error)
+                limit = structure.max_error(frame.camera_id)
                 frame.pose, _ = refine_pose(frame.pose, *matched, limit)
 
     def _window(self) -> list[int]:
@@ -327,7 +329,7 @@ class Mapper:
     # Initialisation.
 
     def _reset_initialiser(self) -> None:
-        self.initialiser = Initialiser(self.structure, self.options.max_error)
+        self.initialiser = Initialiser(self.structure)
 
     def _initialise(self, frame: Frame, record: FrameRecord) -> None:
         """Start the map with two frames once a pair has enough parallax."""
@@ -387,7 +389,7 @@ class Mapper:
             old.outcome, old.inliers, old.keyframe = f"initialised wrongly: {reason}", 0, False
         record.outcome = reason
         waiting = self.initialiser.waiting[-1:]
-        self.structure = Structure(self.structure.cameras, self.options.max_size)
+        self.structure = Structure(self.structure.cameras, self.options)
         self.memory = self._new_memory(self.options)
         self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
         self._reset_initialiser()
@@ -441,9 +443,7 @@ class Mapper:
             frame.descriptors = None
         # With an empty window every landmark counts as old, and unconfirmed ones are culled.
         with self.clock.stage("adjust"):
-            culling.cull_landmarks(
-                self.structure, self.memory, self.structure.ids, self.options.min_angle
-            )
+            culling.cull_landmarks(self.structure, self.memory, self.structure.ids)
         if self.structure.frames:
             self._adjust_global_bundle(1)
         for frame in self.structure.frames:

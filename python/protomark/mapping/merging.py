@@ -18,7 +18,6 @@ def merge_duplicates(
     structure: Structure,
     memory: Memory,
     pairs: list[tuple[int, int]],
-    max_error: float,  # as a share of the image's longer side
     check: bool = True,  # whether one position must fit; not before a loop is closed
 ) -> int:
     """Merge pairs of landmarks that no frame observes together and that one position fits.
@@ -34,7 +33,7 @@ def merge_duplicates(
     fits = ~_observed_together(structure, chosen)
     into, source = chosen[fits].T
     if check and len(into):
-        positions, good = _joint_positions(structure, into, source, max_error)
+        positions, good = _joint_positions(structure, into, source)
         into, source = into[good], source[good]
         structure.positions[into] = positions[good]
     structure.merge(into, source)
@@ -68,7 +67,7 @@ def _observed_together(structure: Structure, pairs: Ids) -> NDArray[np.bool_]:
 
 
 def _joint_positions(
-    structure: Structure, into: Ids, source: Ids, max_error: float
+    structure: Structure, into: Ids, source: Ids
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Joint positions (n, 3), and whether each fits its observations."""
     number = np.full(len(structure.positions), -1)
@@ -82,7 +81,7 @@ def _joint_positions(
     start = weight * structure.positions[into] + (1 - weight) * structure.positions[source]
     joint = refine_points(start, which, seen.poses, seen.rays, seen.focal)
     errors = pixel_errors(joint[which], seen.poses, seen.rays, seen.focal)
-    limit = np.array([structure.tolerance(f.camera_id, max_error) for f in structure.frames])
+    limit = np.array([structure.max_error(f.camera_id) for f in structure.frames])
     fits = errors <= limit[seen.frames]
     total = np.bincount(which, minlength=len(into))
     share = np.bincount(which, fits, minlength=len(into)) / np.maximum(total, 1)

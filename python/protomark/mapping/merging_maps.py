@@ -18,6 +18,7 @@ from protomark.mapping.merging import merge_duplicates
 from protomark.mapping.outputs import write_outputs
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.state import load_state, save_state
+from protomark.mapping.structure import PER_LANDMARK
 from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.merge import Merged, check_inputs, find_alignment, merge_each
 from protomark.maps.open import SCENE_MAP, STATE
@@ -89,7 +90,7 @@ def merge_folders(
                 )
             before = len(mapper.scene) + len(other.scene)
             result.note(path, other.scene, found, 0)
-            prefix = _insert(mapper, other, found, path.name)
+            prefix = insert_map(mapper, other, found, path.name)
             for name, old in its.get("inputs", {}).items():
                 inputs_of_frames[name] = prefix + old
             result.facts["inputs"][-1]["in_common"] = before - len(mapper.scene)
@@ -105,7 +106,7 @@ def merge_folders(
     return result
 
 
-def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
+def insert_map(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
     """Insert frames and landmarks of another map; returns the prefix of its frames' names."""
     structure, motion = mapper.structure, found.similarity
     if mapper.options.fixed_poses and other.options.fixed_poses and found.stays:
@@ -114,9 +115,7 @@ def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
     moved = other.structure
     moved.move(motion)
     moved.born += count
-    for name_of_array in ("positions", "directions", "views", "distances", "born"):
-        arrays = [getattr(one, name_of_array) for one in (structure, moved)]
-        setattr(structure, name_of_array, np.concatenate(arrays))
+    structure.append(*(getattr(moved, array) for array in PER_LANDMARK))
     prefix = _prefix(mapper, other, name)
     first = 1 + MAX_STEP + max((f.index for f in structure.frames), default=-1)
     later = _time_shift(mapper, other)
@@ -147,10 +146,10 @@ def _insert(mapper: Mapper, other: Mapper, found: Alignment, name: str) -> str:
 
 def _merge_duplicates(mapper: Mapper, into: Ids, source: Ids) -> int:
     """Merge landmarks that are one, and adjust all; returns their number."""
-    structure, options = mapper.structure, mapper.options
+    structure = mapper.structure
     pairs = list(zip(into.tolist(), source.tolist(), strict=True))
-    merged = merge_duplicates(structure, mapper.memory, pairs, options.max_error, check=False)
-    if not options.fixed_poses:
+    merged = merge_duplicates(structure, mapper.memory, pairs, check=False)
+    if not mapper.options.fixed_poses:
         adjustment.adjust_global_bundle(structure, 20, loss_scale=LOOP_LOSS_SCALE)
     return merged
 

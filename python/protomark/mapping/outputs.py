@@ -34,19 +34,19 @@ def back_up(scene: Path) -> None:
     figures = scene / FIGURES
     if figures.is_file() and not json.loads(figures.read_text()).get("finished", True):
         return
-    kept = (PREVIOUS, CHECKPOINT)
     with replacing_folder(scene / PREVIOUS) as folder:
-        shutil.copytree(
-            scene,
-            folder,
-            ignore=lambda path, names: [n for n in names if n in kept or n.startswith(".")],
-            copy_function=link,
-            dirs_exist_ok=True,
-        )
+        link_files(scene, folder, PREVIOUS, CHECKPOINT, ".*")
 
 
-def link(source: str, target: str) -> None:
-    """Files are replaced, never changed, so a link keeps the old one."""
+def link_files(scene: Path, folder: Path, *left_out: str) -> None:
+    """Fill a folder with links to a scene's files, which are replaced, never changed."""
+    ignored = shutil.ignore_patterns(*left_out)
+    shutil.copytree(
+        scene, folder, symlinks=True, ignore=ignored, copy_function=_link, dirs_exist_ok=True
+    )
+
+
+def _link(source: str, target: str) -> None:
     try:
         os.link(source, target)
     except OSError:

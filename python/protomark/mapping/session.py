@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 from protomark.features.extractor import Features, pixel_size
@@ -17,6 +18,7 @@ from protomark.geometry.given_poses import misfit
 from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
+from protomark.mapping.merging_maps import insert_map
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.ordering import matching_order
 from protomark.mapping.outputs import back_up, write_outputs
@@ -34,6 +36,7 @@ from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open
 from protomark.mapping.state import CHECKPOINT, load_state, save_checkpoint, save_state
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import are_elsewhere, no_map
+from protomark.maps.alignment import align_maps
 from protomark.maps.open import STATE
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread, read_ahead
@@ -43,6 +46,8 @@ RECORDING = "recording.rrd"
 _CHECKPOINT_INTERVAL = 20.0
 # For so few, another order is looked for even if most match the next one.
 _FEW_PHOTOS = 60
+# A session is mapped apart if none of its first so many frames that moved is found in the map.
+_LOOKED_FOR = 5
 
 
 def make_map(
@@ -67,17 +72,18 @@ def _make_map(
     request: MapRequest, source: FrameSource, progress: Progress, note: Callable[[str], None]
 ) -> dict[str, Any]:
     session = _Session(request, source, progress, note)
-    finished = session.add_frames()
-    mapper, checkpoint = session.mapper, request.output / CHECKPOINT
+    checkpoint = request.output / CHECKPOINT
     resume = "the same command with --resume continues it"
-    if finished:
+    while finished := session.add_frames():
         try:
-            mapper.finish(
-                lambda names, backward: source.images(only=names, backward=backward), progress
-            )
+            if session.finish():
+                break
         except KeyboardInterrupt:
             raise Interrupted(f"stopped before the last adjustment of the map: {resume}") from None
-        known = session.known
+    mapper, known = session.mapper, session.known
+    if session.apart and not finished:
+        raise Interrupted(f"stopped: {request.output} is still as it was; {resume}")
+    if finished:
         elsewhere = known > 0 and are_elsewhere(mapper, source)
         if not len(mapper.structure.ids) or len(mapper.structure.frames) <= known or elsewhere:
             shutil.rmtree(checkpoint, ignore_errors=True)
@@ -104,6 +110,8 @@ class _Session:
         facts: what a later run needs to continue the map: the request, and the inputs so far with
             the prefixes of their frames' names.
         known: number of frames that the map had before this run.
+        apart: whether the frames are mapped on their own, to merge their map with the one in the
+            output at the end.
     """
 
     def __init__(
@@ -116,6 +124,7 @@ class _Session:
         self.request, self.source = request, source
         self.progress, self.note = progress, note
         self.cursor = self.known = 0
+        self.apart = False
         self._order: list[str] = []  # names of photos that had none
         self.facts: dict[str, Any] = {}
         if request.resume:
@@ -152,10 +161,7 @@ class _Session:
             options = replace(options, fixed_poses=True)
             if camera is None:
                 raise ValueError("--poses needs the camera of the images: give it with --camera")
-        surveyed = self._survey(options)
-        source, few = self.source, len(self.source) <= _FEW_PHOTOS
-        if isinstance(source, ImageFolder) and not source.timed and (few or not surveyed.ordered):
-            surveyed = self._reordered(source, options, surveyed)
+        surveyed = self._in_order(options, self._survey(options))
         origin = ""
         if camera is None:
             camera, origin = self._guess_camera(surveyed)
@@ -200,10 +206,12 @@ class _Session:
         self._read_poses()
         self._camera()  # for the source to know those of its images
         self.cursor, self.known = int(facts["cursor"]), int(facts["known"])
+        self.apart = bool(facts["apart"])
         self._prepare(self._survey(self.mapper.options), str(facts["prefix"]), facts["inputs"])
         self.source.shift(*facts["shift"])
 
-    def _extend(self) -> None:
+    def _extend(self, by_frame: bool = False) -> None:
+        """Add the frames to a map, or map them apart if it shows none of the first."""
         request = self.request
         self.mapper, facts = load_state(request.output, request.threads)
         check_same_options(request, self.mapper.options)
@@ -214,10 +222,15 @@ class _Session:
         self._read_poses()
         inputs: dict[str, str] = facts.get("inputs", {})
         prefix = _prefix(self.mapper, self.source, inputs)
-        self.known = len(self.mapper.structure.frames)
+        self.known, self.cursor = len(self.mapper.structure.frames), 0
         surveyed = self._survey(self.mapper.options)
         self._check_poses(surveyed, self.mapper.camera, self.mapper.options)
         self._prepare(surveyed, prefix, inputs)
+        again = str(self.source.path.resolve()) in inputs
+        self.apart = not (by_frame or again or self.source.poses or self._is_found())
+        if self.apart:
+            self._start_apart(surveyed, prefix, inputs)
+            return
         self.source.follow(self.mapper.structure, self.mapper.history.records)
         if shift := self.source.time_shift:
             told = (
@@ -226,9 +239,68 @@ class _Session:
             self.mapper.history.events.append(f"{told} by {shift:g}")
             self.note(self.mapper.history.events[-1])
 
-    def _reordered(self, source: ImageFolder, options: MappingOptions, surveyed: Survey) -> Survey:
+    def _is_found(self) -> bool:
+        """Whether the map shows one of the first frames."""
+        self.progress("look for the first frames in the map", 0, 0)
+        names = set(islice(self.mapper.features, _LOOKED_FOR))
+        return any(map(self.mapper.shows, islice(self.source.images(only=names), len(names))))
+
+    def _start_apart(self, surveyed: Survey, prefix: str, inputs: dict[str, str]) -> None:
+        """Start a map of the frames alone, with the options of the map and, if it fits, camera."""
+        name, base = self.request.output.name, self.mapper
+        self.note(f"{name} shows none of the first frames: they are mapped apart, to be merged")
+        options, camera = base.options, base.camera
+        surveyed = self._in_order(options, surveyed)
+        if (camera.width, camera.height) != self.source.size():
+            camera, _ = self._guess_camera(surveyed)
+            options = replace(options, calibrate=True)
+        self.known = 0
+        self.mapper = Mapper(options, camera, self.request.threads)
+        self._prepare(surveyed, prefix, inputs)
+
+    def finish(self) -> bool:
+        """Adjust the whole map; False if it cannot be merged: its frames are to be added again."""
+        source = self.source
+        self.mapper.finish(
+            lambda names, backward: source.images(only=names, backward=backward), self.progress
+        )
+        if not self.apart:
+            return True
+        try:
+            self._merge()
+        except ValueError as problem:
+            self.note(f"not merged: {problem}; frames are now looked for in the map one by one")
+            self._extend(by_frame=True)
+            return False
+        return True
+
+    def _merge(self) -> None:
+        """Merge the map of the frames alone with the one in the output.
+
+        Raises:
+            ValueError: it is empty, or not of the same place.
+        """
+        own, request = self.mapper, self.request
+        if not len(own.structure.ids):
+            raise ValueError(no_map(own, self.source))
+        self.progress("merge", 0, 0)
+        mapper, _ = load_state(request.output, request.threads)
+        own.scene.set_positions(own.structure.ids, own.structure.positions[own.structure.ids])
+        found = align_maps(mapper.scene, own.scene, threads=request.threads)
+        if found.problem:
+            raise ValueError(found.problem)
+        self.known = len(mapper.structure.frames)
+        insert_map(mapper, own, found, self.source.path.name)
+        mapper.finish(progress=self.progress)
+        self.mapper = mapper
+        self.note(mapper.history.events[-1])
+
+    def _in_order(self, options: MappingOptions, surveyed: Survey) -> Survey:
         """What the first frames show in the order in which they match, if that is another one."""
-        known = surveyed.features
+        source, known = self.source, surveyed.features
+        few = len(source) <= _FEW_PHOTOS
+        if not isinstance(source, ImageFolder) or source.timed or (surveyed.ordered and not few):
+            return surveyed
         images, count = source.images(), len(source)
         self._order = matching_order(images, count, options.extractor(), known, self.progress)
         if not self._order:
@@ -344,6 +416,7 @@ class _Session:
             **self.facts,
             "cursor": self.cursor,
             "known": self.known,
+            "apart": self.apart,
             "shift": [self.source.first_index, self.source.time_shift],
         }
         save_checkpoint(self.mapper, self.request.output, facts)

@@ -24,6 +24,7 @@ from protomark.mapping.mapper import Mapper
 from protomark.mapping.memory import Prototypes
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.self_calibration import Calibration
+from protomark.mapping.structure import PER_LANDMARK, Structure
 from protomark.maps.open import SCENE_MAP, STATE, open_learning_map
 
 CHECKPOINT = "checkpoint"
@@ -47,11 +48,7 @@ def save_state(mapper: Mapper, path: Path, facts: dict[str, Any]) -> None:
     no_descriptors = np.zeros((0, mapper.descriptor_bytes), np.uint8)
     codes = [f.encoded for f in frames if not f.in_window and f.encoded is not None]
     arrays: dict[str, NDArray[Any]] = {
-        "positions": structure.positions,
-        "directions": structure.directions,
-        "views": structure.views,
-        "distances": structure.distances,
-        "born": structure.born,
+        **{name: getattr(structure, name) for name in PER_LANDMARK},
         "poses": np.array([f.pose for f in frames]).reshape(-1, 3, 4),
         "offsets": np.cumsum([0, *(len(f.keypoints) for f in every)]),
         "keypoints": np.concatenate([np.zeros((0, 2), np.float32), *(f.keypoints for f in every)]),
@@ -128,14 +125,9 @@ def _restore_structure(
     mapper: Mapper, arrays: dict[str, NDArray[Any]], state: dict[str, Any]
 ) -> None:
     count = len(arrays["positions"])
-    shapes: dict[str, tuple[int, ...]] = {
-        "positions": (count, 3),
-        "directions": (count, 3),
-        "views": (count,),
-        "distances": (count, 2),
-        "born": (count,),
-        "poses": (len(state["frames"]), 3, 4),
-    }
+    empty = Structure()
+    shapes = {name: (count, *getattr(empty, name).shape[1:]) for name in PER_LANDMARK}
+    shapes["poses"] = (len(state["frames"]), 3, 4)
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, expected {shape}")
@@ -146,7 +138,7 @@ def _restore_structure(
     for name in {*shapes, *types, "sigma"}:
         if arrays[name].dtype != types.get(name, "float64"):
             raise ValueError(f"{name} has the wrong type {arrays[name].dtype}")
-    for name in ("positions", "directions", "views", "distances", "born"):
+    for name in PER_LANDMARK:
         setattr(mapper.structure, name, arrays[name])
     if not mapper.memory.contains(mapper.structure.ids).all():
         raise ValueError("its landmarks are not those of the map beside it")

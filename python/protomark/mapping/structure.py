@@ -9,18 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.features.extractor import MAX_SIZE, pixel_size
+from protomark.features.extractor import pixel_size
 from protomark.geometry.absolute_pose import reprojection_error
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, transform
 from protomark.geometry.similarity import Similarity
 from protomark.geometry.triangulation import pixel_errors
 from protomark.mapping.frame import Array, Frame, Ids
+from protomark.mapping.options import MappingOptions
 
 # Descriptors match in views within this angle of the mean direction that a landmark was observed
 # from, and at distances that differ by at most this factor.
 _MAX_VIEWING_COSINE = np.cos(np.radians(60))
 _MAX_SCALE_CHANGE = 2.0
+# What a structure has of each landmark.
+PER_LANDMARK = ("positions", "directions", "views", "distances", "born")
 # Keypoints are at best this accurate (pixels), however small the image.
 _MIN_TOLERANCE = 2.5
 
@@ -42,6 +45,12 @@ class Observations:
         return Observations(*(values[keep] for values in vars(self).values()))
 
 
+_NOTHING: tuple[NDArray[Any], ...] = (
+    *[np.zeros(0, np.int64)] * 3,
+    *(np.zeros((0, *shape)) for shape in ((3, 4), (2,), (), ())),
+)
+
+
 @dataclass
 class Structure:
     """Frames in the order in which they were registered, and landmarks by id.
@@ -50,7 +59,7 @@ class Structure:
     """
 
     cameras: dict[int, Camera] = field(default_factory=dict)  # cameras by id
-    max_size: int = MAX_SIZE  # see `MappingOptions`
+    options: MappingOptions = field(default_factory=MappingOptions)
     frames: list[Frame] = field(default_factory=list)  # frames with a pose
     # (l, 3) float64, NaN for ids of removed landmarks and for id 0.
     positions: Array = field(default_factory=lambda: np.full((1, 3), np.nan))
@@ -83,10 +92,14 @@ class Structure:
         least = _MIN_TOLERANCE * self.pixel(camera_id)
         return max(share * max(camera.width, camera.height), least)
 
+    def max_error(self, camera_id: int) -> float:
+        """Largest reprojection error of an observation in pixels."""
+        return self.tolerance(camera_id, self.options.max_error)
+
     def pixel(self, camera_id: int) -> float:
         """See `pixel_size`: keypoints of a camera are so accurate."""
         camera = self.cameras[camera_id]
-        return pixel_size((camera.width, camera.height), self.max_size)
+        return pixel_size((camera.width, camera.height), self.options.max_size)
 
     def matched(self, frame: Frame, rows: Ids, ids: Ids) -> tuple[Array, Array, Camera]:
         """Pixels (n, 2) of a frame's keypoints, positions (n, 3) of landmarks, and its camera."""
@@ -110,12 +123,15 @@ class Structure:
     def create(self, positions: Array) -> Ids:
         """Add landmarks at positions (n, 3); returns their ids (n,)."""
         start, count = len(self.positions), len(positions)
-        self.positions = np.concatenate([self.positions, positions])
-        self.directions = np.concatenate([self.directions, np.zeros((count, 3))])
-        self.views = np.concatenate([self.views, np.zeros(count, np.int64)])
-        self.distances = np.concatenate([self.distances, np.tile([np.inf, 0.0], (count, 1))])
-        self.born = np.concatenate([self.born, np.full(count, len(self.frames), np.int64)])
+        views, born = (np.full(count, value, np.int64) for value in (0, len(self.frames)))
+        distances = np.tile([np.inf, 0.0], (count, 1))
+        self.append(positions, np.zeros((count, 3)), views, distances, born)
         return np.arange(start, start + count)
+
+    def append(self, *arrays: NDArray[Any]) -> None:
+        """Append what there is of further landmarks, as `PER_LANDMARK` says."""
+        for name, array in zip(PER_LANDMARK, arrays, strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name), array]))
 
     def observe(self, frame: Frame, rows: Ids, ids: Ids) -> None:
         """Record that keypoints of a frame (by row) observe landmarks."""
@@ -226,27 +242,14 @@ class Structure:
 
     def observations(self, frames: Sequence[int] | None = None) -> Observations:
         """Observations of these frames; None: of all keyframes."""
-        chosen = self.keyframes() if frames is None else list(frames)
-        rows = [self.frames[i].observed for i in chosen]
-        counts = [len(r) for r in rows]
-        chosen_frames = [self.frames[i] for i in chosen]
-        poses = [
-            np.broadcast_to(f.local_poses(r), (len(r), 3, 4))
-            for f, r in zip(chosen_frames, rows, strict=True)
-        ]
-        focal = np.array([self.focal(f.camera_id) for f in chosen_frames])
-        rays = [f.rays[r] for f, r in zip(chosen_frames, rows, strict=True)]
-        return Observations(
-            np.repeat(np.array(chosen, np.int64), counts),
-            np.concatenate([np.zeros(0, np.int64), *rows]),
-            np.concatenate([np.zeros(0, np.int64), *(f.seen for f in chosen_frames)]),
-            np.concatenate([np.zeros((0, 3, 4)), *poses]),
-            np.concatenate([np.zeros((0, 2)), *rays]),
-            np.repeat(focal, counts),
-            np.concatenate(
-                [np.zeros(0), *(f.sigma[r] for f, r in zip(chosen_frames, rows, strict=True))]
-            ),
-        )
+        parts = [_NOTHING]
+        for i in self.keyframes() if frames is None else frames:
+            frame, rows = self.frames[i], self.frames[i].observed
+            n, focal = len(rows), self.focal(frame.camera_id)
+            poses = np.broadcast_to(frame.local_poses(rows), (n, 3, 4))
+            seen = np.full(n, i), rows, frame.landmarks[rows]
+            parts.append((*seen, poses, frame.rays[rows], np.full(n, focal), frame.sigma[rows]))
+        return Observations(*map(np.concatenate, zip(*parts, strict=True)))
 
     def errors(self, seen: Observations) -> Array:
         """Reprojection errors in pixels of the undistorted image, infinite behind a camera."""

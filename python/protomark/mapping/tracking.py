@@ -57,16 +57,9 @@ class TrackedPose:
 class Tracker:
     """Finds frames in a map."""
 
-    def __init__(
-        self,
-        structure: Structure,
-        memory: Memory,
-        max_error: float,  # as a share of the image's longer side
-        min_inliers: int,  # matches that must agree with a pose
-        threads: int = 1,
-    ) -> None:
-        self.structure, self.memory = structure, memory
-        self.max_error, self.min_inliers, self.threads = max_error, min_inliers, threads
+    def __init__(self, structure: Structure, memory: Memory, threads: int = 1) -> None:
+        self.structure, self.memory, self.threads = structure, memory, threads
+        self.min_inliers = structure.options.min_inliers  # matches that must agree with a pose
 
     def track(self, frame: Frame, predicted: Array) -> TrackedPose | None:
         """The pose of a frame near a predicted one (ORB-SLAM's motion model)."""
@@ -160,7 +153,7 @@ class Tracker:
             return None
         found = estimate_pose(
             *self.structure.matched(frame, matches.rows, matches.ids),
-            self.structure.tolerance(frame.camera_id, self.max_error),
+            self.structure.max_error(frame.camera_id),
         )
         if found is None or found.inliers.sum() < self.min_inliers:
             return None
@@ -172,7 +165,7 @@ class Tracker:
         return refine_pose(
             pose,
             *self.structure.matched(frame, matches.rows, matches.ids),
-            self.structure.tolerance(frame.camera_id, self.max_error),
+            self.structure.max_error(frame.camera_id),
             self.structure.weights(pose, matches.ids),
         )
 

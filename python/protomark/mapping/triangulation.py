@@ -14,12 +14,7 @@ from protomark.tracks.matching import View, match
 
 
 def triangulate(
-    structure: Structure,
-    memory: Memory,
-    newest: int,
-    window: list[int],
-    max_error: float,
-    min_angle: float,
+    structure: Structure, memory: Memory, newest: int, window: list[int]
 ) -> list[tuple[int, int]]:
     """Match a frame with those of the window, create landmarks, and continue existing tracks.
 
@@ -33,28 +28,19 @@ def triangulate(
     frame = structure.frames[newest]
     duplicates: list[tuple[int, int]] = []
     for i in sorted(window):
-        duplicates += _pair(structure, memory, structure.frames[i], frame, max_error, min_angle)
+        duplicates += _pair(structure, memory, structure.frames[i], frame)
     return duplicates
 
 
-def _pair(
-    structure: Structure,
-    memory: Memory,
-    old: Frame,
-    new: Frame,
-    max_error: float,
-    min_angle: float,
-) -> list[tuple[int, int]]:
+def _pair(structure: Structure, memory: Memory, old: Frame, new: Frame) -> list[tuple[int, int]]:
     views = [_view(structure, frame) for frame in (old, new)]
-    limit = structure.tolerance(new.camera_id, max_error)
-    rows = match(views[0], views[1], RATIO, limit).rows
-    a, b = rows[:, 0], rows[:, 1]
+    a, b = match(views[0], views[1], RATIO, structure.max_error(new.camera_id)).rows.T
     landmark_a, landmark_b = old.landmarks[a], new.landmarks[b]
     fresh = (landmark_a < 0) & (landmark_b < 0)
-    _create_landmarks(structure, memory, old, new, a[fresh], b[fresh], max_error, min_angle)
+    _create_landmarks(structure, memory, old, new, a[fresh], b[fresh])
     only_a, only_b = (landmark_a >= 0) & (landmark_b < 0), (landmark_a < 0) & (landmark_b >= 0)
-    _continue_tracks(structure, memory, new, b[only_a], landmark_a[only_a], limit)
-    _continue_tracks(structure, memory, old, a[only_b], landmark_b[only_b], limit)
+    _continue_tracks(structure, memory, new, b[only_a], landmark_a[only_a])
+    _continue_tracks(structure, memory, old, a[only_b], landmark_b[only_b])
     both = (landmark_a >= 0) & (landmark_b >= 0) & (landmark_a != landmark_b)
     return list(zip(landmark_a[both].tolist(), landmark_b[both].tolist(), strict=True))
 
@@ -67,20 +53,13 @@ def _view(structure: Structure, frame: Frame) -> View:
 
 
 def _create_landmarks(
-    structure: Structure,
-    memory: Memory,
-    old: Frame,
-    new: Frame,
-    a: Ids,
-    b: Ids,
-    max_error: float,
-    min_angle: float,
+    structure: Structure, memory: Memory, old: Frame, new: Frame, a: Ids, b: Ids
 ) -> None:
     if not len(a):
         return
     relative = relative_pose(old.local_poses(a), new.local_poses(b))
     depth, angle = depth_of_first(*relative, old.rays[a], new.rays[b])
-    wide = (depth > 0) & (angle > np.radians(min_angle))
+    wide = (depth > 0) & (angle > np.radians(structure.options.min_angle))
     a, b, depth = a[wide], b[wide], depth[wide]
     points = old.points(a, depth)
     count = len(points)
@@ -92,7 +71,7 @@ def _create_landmarks(
     which, pixel = np.tile(np.arange(count), 2), structure.pixel(new.camera_id)
     points = refine_points(points, which, poses, seen, focal, iterations=2, huber=pixel)
     errors = pixel_errors(np.tile(points, (2, 1)), poses, seen, focal)
-    limits = np.repeat([structure.tolerance(f.camera_id, max_error) for f in (old, new)], count)
+    limits = np.repeat([structure.max_error(f.camera_id) for f in (old, new)], count)
     fits = (errors <= limits).reshape(2, count).all(0)
     a, b = a[fits], b[fits]
     ids = structure.create(points[fits])
@@ -102,7 +81,7 @@ def _create_landmarks(
 
 
 def _continue_tracks(
-    structure: Structure, memory: Memory, frame: Frame, rows: Ids, ids: Ids, limit: float
+    structure: Structure, memory: Memory, frame: Frame, rows: Ids, ids: Ids
 ) -> None:
     """Let keypoints observe landmarks that project to them and are new to the frame."""
     if not len(rows):
@@ -111,7 +90,7 @@ def _continue_tracks(
     focal = structure.focal(frame.camera_id)
     errors = pixel_errors(structure.positions[ids], poses, frame.rays[rows], focal)
     # Landmarks may have been created, and keypoints assigned, since the match.
-    fits = (errors <= limit) & (frame.landmarks[rows] < 0)
+    fits = (errors <= structure.max_error(frame.camera_id)) & (frame.landmarks[rows] < 0)
     fits &= ~np.isin(ids, frame.seen)
     rows, ids = rows[fits], ids[fits]
     _, first = np.unique(ids, return_index=True)

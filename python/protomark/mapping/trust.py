@@ -183,7 +183,7 @@ def wrong_focal_lengths(structure: Structure) -> list[str]:
     return out
 
 
-def other_lenses(structure: Structure, max_error: float) -> list[str]:
+def other_lenses(structure: Structure) -> list[str]:
     """Names of frames that fit another focal length than most: a zoom, another camera."""
     found: dict[int, list[tuple[str, float, float]]] = {}
     for frame in structure.frames:
@@ -191,8 +191,7 @@ def other_lenses(structure: Structure, max_error: float) -> list[str]:
         if camera.wide or len(rows) < _MIN_LANDMARKS:
             continue
         matched = structure.matched(frame, rows, frame.seen)
-        tolerance = structure.tolerance(frame.camera_id, max_error)
-        free = free_lens(frame.pose, *matched, tolerance)
+        free = free_lens(frame.pose, *matched, structure.max_error(frame.camera_id))
         one = frame.name, float(np.log(free.stretch)), free.deviation
         found.setdefault(frame.camera_id, []).append(one)
     names: list[str] = []
@@ -250,7 +249,7 @@ def warnings(mapper: Mapper) -> list[str]:
             f"parts of the map flew away, and {thrown} frames were taken out with them: what "
             "connects these parts has too little depth or overlap"
         )
-    zoomed = other_lenses(mapper.structure, mapper.options.max_error)
+    zoomed = other_lenses(mapper.structure)
     if zoomed and not mapper.options.fixed_poses:
         out.append(
             f"{len(zoomed)} frames, such as {zoomed[0]}, fit better with another focal length: was "
