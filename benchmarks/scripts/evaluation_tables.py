@@ -252,6 +252,35 @@ def upright_table(plain: Sequence[SequenceResult], upright: Sequence[SequenceRes
     return f"{title}\n\n{ReportTable(heads, rows).markdown()}"
 
 
+def corners_table(
+    oriented: Sequence[SequenceResult],
+    by_orb: Sequence[SequenceResult],
+    by_own: Sequence[SequenceResult],
+) -> str:
+    """Shares of the unaggregated precision of RTAB-Map's ORB by both encoders, beside usual ORB."""
+    sizes = [f"sealed-{size}" for size in SIZES if size != 25]
+    columns = [{r.sequence: r for r in same} for same in (oriented, by_orb, by_own)]
+    rows = []
+    for sequence in columns[1]:
+        found = [
+            {row.name: row for row in same[sequence].rows()} if sequence in same else {}
+            for same in columns
+        ]
+        precision = [number(f["unaggregated"].precision) if f else "–" for f in found[:2]]
+        shares = [
+            ", ".join(number(f[name].ratio) if name in f else "–" for f in found) for name in sizes
+        ]
+        rows.append([sequence, set_of(sequence), ", ".join(precision), *shares])
+    heads = ["sequence", "set", "all: ORB, GFTT"]
+    heads += [f"{COLUMNS[name].strip('*')}: ORB, `orb`, **`orb-gftt`**" for name in sizes]
+    title = (
+        "Share of the unaggregated precision: ORB as above, and upright ORB at GFTT corners "
+        "(`benchmarks/scripts/gftt_tracks.py`) by the encoders `orb` and `orb-gftt`. *All* is the "
+        "unaggregated precision of both."
+    )
+    return f"{title}\n\n{ReportTable(heads, rows, words=3).markdown()}"
+
+
 def main() -> None:
     """Writes the tables."""
     paths = [Path(p) for p in sys.argv[1:]] or sorted(RESULTS.glob("evaluation.*.json"))
@@ -282,6 +311,12 @@ def main() -> None:
             parts += [f"### Cameras that do not roll: `{descriptor}-upright`", table]
             card = MODELS / f"{descriptor}-upright.md"
             replace_tables(card, f"## Beside the plain encoder\n\n{table}")
+        corners = [RESULTS / f"gftt.{name}.json" for name in (descriptor, f"{descriptor}-gftt")]
+        if all(path.is_file() for path in corners):
+            table = corners_table(same, *map(load_results, corners))
+            parts += [f"### RTAB-Map's GFTT/ORB: `{descriptor}-gftt`", table]
+            card = MODELS / f"{descriptor}-gftt.md"
+            replace_tables(card, f"## Beside the encoder `{descriptor}`\n\n{table}")
     replace_tables(DOCUMENT, "\n\n".join(part for part in parts if part))
 
 

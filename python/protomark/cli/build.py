@@ -83,7 +83,7 @@ def build(
         network = Encoder.load(encoder) if encoder else None
         descriptor = network.descriptor if network else None
         seen = read_places(sources, descriptor, min_observations, threads, progress)
-        network = network or Encoder.load(seen.descriptor)
+        network = network or Encoder.load(seen.encoder_name)
         seen = tracks_for(network, seen)
         progress("build the map", 0, 0)
         scene = build_map(seen, network, dim, min_observations=1, threads=threads)

@@ -77,11 +77,11 @@ def encoders_for(
 ) -> list[pm.Encoder]:
     """The encoders that take the descriptors of the tracks, or their upright form.
 
-    Unless the user gave them, only the encoder with the descriptor's name counts.
+    Unless the user gave them, only the one for what described the images counts.
     """
     descriptor, bits = tracks.descriptor, tracks.bits
     if not given:
-        encoders = [encoder for encoder in encoders if encoder.name == descriptor]
+        encoders = [encoder for encoder in encoders if encoder.name == tracks.encoder_name]
     fitting = [e for e in encoders if (e.descriptor, e.bits) == (descriptor, bits)]
     return fitting + [e for e in encoders if e.descriptor == descriptor + SUFFIX]
 

@@ -68,7 +68,7 @@ def seal(
     progress("read the map", 0, 0)
     if is_tracks(source):
         tracks = read_places([source])
-        encoder = pm.Encoder.load(tracks.descriptor)
+        encoder = pm.Encoder.load(tracks.encoder_name)
         scene = build_map(tracks, encoder, encoder.dim, threads=request.threads)
         scene.metadata = tracks_metadata(tracks)
         return seal_map(

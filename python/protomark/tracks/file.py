@@ -133,6 +133,13 @@ class Tracks:
         return 8 * int(self.descriptors.shape[1])
 
     @property
+    def encoder_name(self) -> str:
+        """Name of the encoder that ships for what described the images."""
+        detectors = self.info.get("detectors", [self.info.get("detector", {})])
+        corners = all(str(one.get("name")).startswith("GFTT") for one in detectors)
+        return "orb-gftt" if corners and self.descriptor == "orb" else self.descriptor
+
+    @property
     def keyframe_of_keypoint(self) -> NDArray[np.int64]:
         """(n,) int64, index of each keypoint's keyframe."""
         return np.repeat(np.arange(len(self.keyframe_names)), np.diff(self.offsets))
