@@ -36,9 +36,9 @@ void sort_unique(std::vector<T>& values) {
 template <typename Index>
 using VisitPiece = std::function<void(std::span<const Index>)>;
 
-// Calls visit for pieces of n indices (Row or LandmarkIndex) that together
-// hold all of them by ascending key(index), which differs between them. `each(take)` calls
-// take(index) for all indices. Takes 5 bits per index, and calls `each` about eight times.
+// Calls visit for pieces of n indices (Row or LandmarkIndex), which together hold all of them by
+// ascending key(index), which differs between them. `each(take)` calls take(index) for all indices.
+// Takes 5 bits per index, and calls `each` about eight times.
 template <typename Index, typename Each, typename Key>
 void visit_sorted(size_t n, const Each& each, const Key& key, const VisitPiece<Index>& visit) {
   constexpr size_t kPieces = 8, kMinPiece = 1 << 13;

@@ -22,7 +22,6 @@ Metadata read_metadata(const ContainerReader& file);
 Metadata merged(const Metadata& into, const Metadata& other);
 // Returns the centroids of inverted lists (nlist x dim); none without an index.
 Matrix<int8_t> read_centroids(const ContainerReader& file, size_t dim);
-// Fails unless ids ascend and are not negative.
 void check_ids(const ContainerReader& file, std::span<const int64_t> ids);
 
 }  // namespace protomark

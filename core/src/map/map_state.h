@@ -10,7 +10,6 @@
 
 namespace protomark {
 
-// What to do if a search lacks an index.
 inline constexpr char kBuildIndex[] = "call build_index first";
 
 struct MeasuredRecall {
@@ -48,7 +47,6 @@ struct MapState {
   // released while the recall table is measured.
   size_t nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads);
 
-  // Returns a map of these landmarks.
   PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;
 
   // Throws std::invalid_argument without a journal.

@@ -21,7 +21,6 @@ void write_mean(const PrototypeStore& store, std::span<const Row> rows, float* m
   }
 }
 
-// Returns value_of(landmark) of each landmark.
 template <typename ValueOf>
 auto values_of(MapState& state, std::span<const int64_t> ids, const ValueOf& value_of) {
   const std::shared_lock lock(state.searching);

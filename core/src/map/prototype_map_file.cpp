@@ -284,7 +284,6 @@ ContainerWriter file_of(const MapState& state) {
   return file;
 }
 
-// Adds the changes to the record of a commit, and returns its bytes.
 std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
                                  const Uncommitted& changes) {
   const auto& changed = changes.landmarks.ids();

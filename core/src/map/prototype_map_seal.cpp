@@ -169,7 +169,7 @@ class SealedContent {
     ids_are_stored_ = IdBlockWriter::needed(store.landmark_count(), largest);
   }
 
-  // Adds the sections to a file that is written while this exists.
+  // The file must be written while this exists.
   void add_to(ContainerWriter& file) {
     const size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
     const ContainerWriter::Part prototypes{section::kPrototypes,

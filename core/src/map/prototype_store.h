@@ -176,8 +176,7 @@ class PrototypeStore : public RowTable {
       if (is_row(row)) take(row);
     }
   }
-  // Visit all landmarks by ascending id, or the rows of a list by key, piece by piece
-  // (sorted_pieces.h).
+  // Visit all landmarks by ascending id, or the rows of a list by key, piece by piece (rows.h).
   void visit_sorted_landmarks(const VisitPiece<LandmarkIndex>& visit) const {
     const auto each = [&](const auto& take) { each_landmark(take); };
     visit_sorted<LandmarkIndex>(
@@ -288,7 +287,6 @@ class PrototypeStore : public RowTable {
       std::fill_n(v.data() + row.value * width, width, padding);
     });
   }
-  // Moves a row to a padding row, and leaves padding.
   void relocate(Row from, Row to) {
     relink(from, to);
     copy_row(from, to);

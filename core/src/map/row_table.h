@@ -146,7 +146,6 @@ class RowTable {
     if (!positions_.empty()) positions_.push_back(kNoPosition);
     add_row(landmark, row, appearance);
   }
-  // Makes a padding row one more of a landmark.
   void add_row(LandmarkIndex landmark, Row row, uint16_t appearance) {
     appearances_[row.value] = appearance;
     owners_[row.value] = landmark;

@@ -1,4 +1,4 @@
-// Chooses how a map is sealed: numbers of a prototype, their words, and which prototypes.
+// Chooses how a map is sealed: numbers of a prototype, their words, and which prototypes, tuned.
 #pragma once
 
 #include "map/prototype_store.h"
