@@ -27,11 +27,11 @@ class Neighbours {
   const int64_t* ids(size_t query) const { return ids_.data() + query * k_; }
   const int32_t* distances(size_t query) const { return distances_.data() + query * k_; }
 
-  // Takes a candidate whose id may be among the nearest already, at another distance.
-  void offer(size_t query, int32_t distance, int64_t id) {
+  // Takes a candidate; if ids come again, its id may be among the nearest, at another distance.
+  void offer(size_t query, int32_t distance, int64_t id, bool again) {
     const size_t first = query * k_, last = first + k_ - 1;
     if (!before(distance, id, last)) return;
-    size_t i = first;
+    size_t i = again ? first : last;
     while (i < last && ids_[i] != id) ++i;
     if (ids_[i] == id && distance >= distances_[i]) return;
     for (; i > first && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
@@ -47,7 +47,7 @@ class Neighbours {
   // Takes the neighbours of `part`, whose queries begin with `first`.
   void merge(size_t first, const Neighbours& part) {
     for (size_t i = 0; i < part.ids_.size(); ++i) {
-      if (part.ids_[i] >= 0) offer(first + i / k_, part.distances_[i], part.ids_[i]);
+      if (part.ids_[i] >= 0) offer(first + i / k_, part.distances_[i], part.ids_[i], true);
     }
   }
 

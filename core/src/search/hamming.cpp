@@ -65,8 +65,8 @@ void scan(Descriptors queries, Descriptors database, Range rows, const int64_t* 
         [&](size_t q) { return nearest.limit(q); },
         [&](size_t q, int32_t distance, size_t row) {
           const size_t at = begin + row;
-          nearest.offer(q, distance,
-                        landmarks != nullptr ? landmarks[at] : static_cast<int64_t>(at));
+          const bool again = landmarks != nullptr;
+          nearest.offer(q, distance, again ? landmarks[at] : static_cast<int64_t>(at), again);
         });
   }
 }

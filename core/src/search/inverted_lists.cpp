@@ -60,7 +60,7 @@ class Selection {
           row, std::min(kPackedRows, centroids_.rows - row),
           [&](size_t q) { return sample.limit(q); },
           [&](size_t q, int32_t distance, size_t list) {
-            sample.offer(q, distance, static_cast<int64_t>(list));
+            sample.offer(q, distance, static_cast<int64_t>(list), false);
           });
     }
     for (size_t q = 0; q < limits_.size(); ++q) limits_[q] = sample.limit(q);

@@ -212,7 +212,7 @@ class PrototypeScan {
     }
     if (landmark >= end || (among != nullptr && !(*among)[landmark.value])) return;
     const int64_t id = ids != nullptr ? ids[landmark.value] : int64_t{landmark.value};
-    if (id >= 0) nearest_.offer(query, distance, id);
+    if (id >= 0) nearest_.offer(query, distance, id, of_row != nullptr || look_up);
   }
 
   const PackedPrototypes& prototypes_;
