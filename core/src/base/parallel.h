@@ -28,9 +28,9 @@ inline Range range_of(size_t n, size_t ranges, size_t i, size_t grain) {
 // the last have a multiple of `grain` elements.
 template <typename Body>
 void parallel_for(int threads, size_t n, size_t grain, const Body& body) {
+  if (threads == 1 && n > 0) return body(size_t{0}, n);
   // With several ranges per thread, others take over from a thread that is held up.
-  const size_t wanted = threads == 1 ? 1 : 4 * static_cast<size_t>(threads);
-  const size_t ranges = std::min((n + grain - 1) / grain, wanted);
+  const size_t ranges = std::min((n + grain - 1) / grain, 4 * static_cast<size_t>(threads));
   run_tasks(threads, ranges, [&](size_t i) {
     const Range range = range_of(n, ranges, i, grain);
     body(range.begin, range.end);
