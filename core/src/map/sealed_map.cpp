@@ -159,7 +159,7 @@ struct SealedMap::Content {
     return table[d * Codebook::kWords + static_cast<uint8_t>(word)];
   }
 
-  static constexpr size_t kFirstRowStep = 64;  // landmarks
+  static constexpr size_t kFirstRowStep = 16;  // landmarks
 
   std::unique_ptr<MappedFile> mapped;  // nullptr if the caller keeps the bytes
   ContainerReader file;
