@@ -58,7 +58,7 @@ def exponential(i: int) -> int:
 def model(
     prototypes: NDArray[np.int64], counts: Any, queries: NDArray[np.int64], own: Any
 ) -> NDArray[np.int64]:
-    """`tune_prototypes` of core/src/map/tuning.h for one prototype per landmark."""
+    """`tune_prototypes` of core/src/map/sealed_store.h for one prototype per landmark."""
     rest = counts[own] - 1
     difference = queries - prototypes[own]
     usable = np.flatnonzero(rest > 0)

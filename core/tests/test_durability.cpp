@@ -50,37 +50,36 @@ void pieces(const fs::path& path) {
   whole.add("first", bytes.first(100));
   whole.add("second", bytes);
   whole.add("last", bytes);
-  pieced.add("none", 0, [](const ContainerWriter::Sink& sink) {
-    put_values<std::int32_t>(sink, 0, 3, [](std::size_t, std::int32_t*) {});
-  });
-  pieced.add("values", bytes.size(), [&](const ContainerWriter::Sink& sink) {
-    put_values<std::int32_t>(sink, values.size() / 3, 3, [&](std::size_t i, std::int32_t* to) {
-      std::copy_n(&values[3 * i], 3, to);
-    });
+  pieced.add({{"none", 0}, {"values", bytes.size()}}, [&](ContainerWriter::Sinks sinks) {
+    ValueWriter none(sinks[0]), writer(sinks[1]);
+    for (std::size_t i = 0; i < values.size(); i += 3) {
+      writer.add(std::array{values[i], values[i + 1], values[i + 2]});
+    }
+    none.finish();
+    writer.finish();
   });
   // Produced side by side, in any order.
-  pieced.add_together(
-      {{"first", 100}, {"second", bytes.size()}, {"last", ContainerWriter::kUnknownSize}},
-      [&](std::span<const ContainerWriter::Sink> sinks) {
-        sinks[2](bytes.first(7));
-        sinks[1](bytes.first(1000));
-        sinks[0](bytes.first(100));
-        sinks[2](bytes.subspan(7));
-        sinks[1](bytes.subspan(1000));
-      });
+  pieced.add({{"first", 100}, {"second", bytes.size()}, {"last", ContainerWriter::kUnknownSize}},
+             [&](ContainerWriter::Sinks sinks) {
+               sinks[2](bytes.first(7));
+               sinks[1](bytes.first(1000));
+               sinks[0](bytes.first(100));
+               sinks[2](bytes.subspan(7));
+               sinks[1](bytes.subspan(1000));
+             });
   CHECK(pieced.serialize() == whole.serialize());
   pieced.write(path);
   const auto old_bytes = read(path);
   CHECK(std::ranges::equal(std::as_bytes(std::span(old_bytes)), whole.serialize()));
 
   // If a producer throws, the old file stays.
-  pieced.add("broken", 1,
-             [](const ContainerWriter::Sink&) { throw std::invalid_argument("no such value"); });
+  pieced.add({{"broken", 1}},
+             [](ContainerWriter::Sinks) { throw std::invalid_argument("no such value"); });
   CHECK(check::throws<std::invalid_argument>([&] { pieced.write(path); }, "no such value"));
   CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
   for (const std::size_t size : {3u, 5u}) {
     ContainerWriter other(FileKind::encoder);
-    other.add("four", size, [](const auto& sink) { sink(std::vector<std::byte>(4)); });
+    other.add({{"four", size}}, [](auto sinks) { sinks[0](std::vector<std::byte>(4)); });
     CHECK(check::throws<std::logic_error>([&] { other.write(path); }, "has 4 bytes, not"));
     CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
   }

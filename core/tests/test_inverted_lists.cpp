@@ -154,9 +154,10 @@ void learning() {
   CHECK(CoarseQuantizer::learn({codes.data(), 1, kDim}, 1, 1).assign(view, 1) ==
         std::vector<std::uint32_t>(n, 0));
   // Equal centroids cost nothing: comparing each code with all of these would take minutes.
-  std::vector<std::int8_t> many(CoarseQuantizer::kMaxLists * kDim, 7);
-  std::ranges::copy(quantizer.centroids(), many.begin());
-  const auto lists = CoarseQuantizer(many, kDim).assign({many.data(), n * 20, kDim}, 1);
+  Matrix<std::int8_t> many(CoarseQuantizer::kMaxLists, kDim);
+  std::ranges::fill(many.data, std::int8_t{7});
+  std::ranges::copy(quantizer.centroids().data, many.data.begin());
+  const auto lists = CoarseQuantizer(many).assign({many.data.data(), n * 20, kDim}, 1);
   CHECK(lists[39] == 39 && lists[40] == 40 && lists.back() == 40);
 }
 

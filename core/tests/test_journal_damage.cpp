@@ -159,7 +159,7 @@ void containers_within_a_torn_record() {
     chain.value(number);
     chain.value(std::uint64_t{0});
     ContainerWriter file(FileKind::commit);
-    file.add("chain", chain.take());
+    file.add("chain", chain.bytes());
     file.add("metadata", std::as_bytes(std::span(text)));
     const auto bytes = file.serialize();
     const auto* data = reinterpret_cast<const char*>(bytes.data());
@@ -217,7 +217,7 @@ void commits_to_other_map_files() {
   chain.value(std::uint64_t{3});
   chain.value(checksum);
   chain.value(std::uint32_t{0});
-  fold.add("chain", chain.take());
+  fold.add("chain", chain.bytes());
   fold.add("base", std::vector<std::byte>(64, std::byte{'a'}));
   const auto bytes = fold.serialize();
   Content folded(all.begin(), all.begin() + static_cast<std::ptrdiff_t>(c.lengths[2]));

@@ -24,7 +24,7 @@ std::vector<std::byte> file_of(const Ids& ids) {
   if (!IdBlockWriter::needed(ids.size(), ids.empty() ? -1 : ids.back())) return file.serialize();
   std::vector<ContainerWriter::Part> parts;
   IdBlockWriter::add_to(parts, ids.size());
-  file.add_together(std::move(parts), [&](std::span<const ContainerWriter::Sink> sinks) {
+  file.add(std::move(parts), [&](ContainerWriter::Sinks sinks) {
     IdBlockWriter to(sinks[0], sinks[1]);
     for (const std::int64_t id : ids) to.add(id);
     to.finish();

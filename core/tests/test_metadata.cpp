@@ -155,7 +155,7 @@ void test_broken_files() {
       out.text(name);
       out.text(text);
     }
-    return out.take();
+    return out.bytes();
   };
   const auto broken = [](const std::vector<std::byte>& section, const std::string& message) {
     return check::throws<FileError>([&] { parsed(section); }, "input: " + message);
@@ -172,13 +172,13 @@ void test_broken_files() {
     many.text(std::to_string(1000 + i));
     many.text("");
   }
-  CHECK(broken(many.take(), "metadata: a map has at most 256 names"));
+  CHECK(broken(many.bytes(), "metadata: a map has at most 256 names"));
   auto cut = pairs({{"a", "1"}});
   cut.pop_back();
   CHECK(broken(cut, "its section 'metadata' is shorter than it should be"));
   SectionWriter huge;
   huge.value(std::uint32_t{0xffffffff});
-  CHECK(broken(huge.take(), "its section 'metadata' is shorter than it should be"));
+  CHECK(broken(huge.bytes(), "its section 'metadata' is shorter than it should be"));
 }
 
 void test_expectations() {

@@ -55,19 +55,17 @@ struct Map {
   std::vector<std::int8_t> codes;          // rows x dim
   std::vector<std::int64_t> landmark_ids;  // of each landmark
   std::vector<LandmarkIndex> of_row;
-  std::vector<std::uint8_t> row_counts;
   std::vector<std::int64_t> row_ids;
 };
 
 // Few values give many ties. Ids do not ascend; with appearances a landmark has 1 to 5 rows.
 Map random_map(test::Random& random, std::size_t rows, std::size_t dim, bool appearances,
                int span) {
-  Map map{rows, dim, random.integers<std::int8_t>(rows * dim, -span, span), {}, {}, {}, {}};
+  Map map{rows, dim, random.integers<std::int8_t>(rows * dim, -span, span), {}, {}, {}};
   while (map.of_row.size() < rows) {
-    const auto landmark = static_cast<std::uint32_t>(map.row_counts.size());
+    const auto landmark = static_cast<std::uint32_t>(map.landmark_ids.size());
     const auto left = static_cast<std::int64_t>(rows - map.of_row.size());
     const auto n = appearances ? random.integer(1, std::min<std::int64_t>(5, left)) : 1;
-    map.row_counts.push_back(static_cast<std::uint8_t>(n));
     map.of_row.insert(map.of_row.end(), static_cast<std::size_t>(n), LandmarkIndex{landmark});
     // The largest id of all is among them.
     map.landmark_ids.push_back(landmark == 7 ? INT64_MAX : landmark * 7919ll % 1000003ll);
@@ -105,9 +103,8 @@ void check_codes(test::Random& random, std::size_t rows, std::size_t dim, std::s
     for (int repeat = 0; repeat < 6; ++repeat) {
       prototypes.landmarks = {};
       prototypes.landmarks.ids = map.landmark_ids.data();
-      if (appearances && repeat % 3 == 0) prototypes.landmarks.of_row = map.of_row.data();
-      if (appearances && repeat % 3 == 1) prototypes.landmarks.row_counts = map.row_counts.data();
-      if (appearances && repeat % 3 == 2) {
+      if (appearances && repeat % 2 == 0) prototypes.landmarks.of_row = map.of_row.data();
+      if (appearances && repeat % 2 == 1) {
         prototypes.landmarks.look_up = [&](Row row) { return map.of_row[row.value]; };
       }
       SearchOptions options;
@@ -170,7 +167,7 @@ void check_words(test::Random& random, std::size_t rows, std::size_t width, std:
   const std::vector<std::int8_t> table = decode_table(codebook, dim);
   PackedPrototypes prototypes{packed.data(), rows, dim, width, table.data()};
   prototypes.landmarks.ids = map.landmark_ids.data();
-  prototypes.landmarks.row_counts = map.row_counts.data();
+  prototypes.landmarks.of_row = map.of_row.data();
   const auto queries = random.integers<std::int8_t>(n * dim, -127, 127);
   for (int threads = 1; threads <= 4; ++threads) {
     SearchOptions options;

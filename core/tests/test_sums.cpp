@@ -94,9 +94,9 @@ void test_changes(std::size_t appearance_bits) {
     CHECK(equals_plain(store));
     // Rows move into other lists.
     FairSharedMutex nobody_searches;
-    const auto centroids = random.integers<std::int8_t>(
-        static_cast<std::size_t>(random.integer(2, 9)) * kDim, -127, 127);
-    auto arrangement = store.arrange({centroids, kDim}, 1);
+    Matrix<std::int8_t> centroids(static_cast<std::size_t>(random.integer(2, 9)), kDim);
+    centroids.data = random.integers<std::int8_t>(centroids.data.size(), -127, 127);
+    auto arrangement = store.arrange(CoarseQuantizer(centroids), 1);
     store.make_room_for(arrangement, nobody_searches);
     store.rearrange(arrangement);
     CHECK(equals_plain(store));

@@ -23,13 +23,10 @@ struct IndexOptions {
 
 struct SealOptions {
   // Bytes that a landmark may take on average for its prototypes and their number (not for
-  // position, id and index). By default prototypes are int8 numbers and every appearance is kept,
-  // so that the sealed map gives the answers of the learning map. Otherwise they are, too, if all
-  // of them fit. Else they are words of one of the encoder's codebooks, and appearances are merged,
-  // those of least merge cost first (Ward's criterion: what merging adds to the squared distances
-  // of all observations to their prototypes), until they fit. It takes the best words that fit, or,
-  // if no observations tune it, the best that leave room for 1.25 prototypes per landmark, from 48
-  // numbers on. Words of fewer numbers are better from 1.1 times as many on.
+  // position, id and index). By default, and if all of them fit, prototypes are int8 numbers and
+  // every appearance is kept, so that the sealed map gives the answers of the learning map. Else
+  // they are words of one of the encoder's codebooks, and appearances are merged, those of least
+  // merge cost first (Ward's criterion), until they fit; docs/sealing.md says which words.
   std::optional<double> bytes_per_landmark = std::nullopt;
   // Bits per coordinate. 32: floats relative to the middle of the map. 16: steps of a grid over the
   // bounding box, 65534 from end to end along each axis. 0: no positions.
@@ -156,7 +153,9 @@ class PROTOMARK_API PrototypeMap {
   std::vector<int32_t> distances(std::span<const int64_t> ids, Codes codes) const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).
-  Matches search(Descriptors queries, size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search(Descriptors queries, size_t k = 2, const SearchOptions& options = {}) const {
+    return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
+  }
   Matches search_codes(Codes queries, size_t k = 2, const SearchOptions& options = {}) const;
 
   // Writes the map, whole or not at all; equal maps (with equal centroids) give equal files.

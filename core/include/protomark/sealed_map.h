@@ -63,7 +63,9 @@ class PROTOMARK_API SealedMap {
   MapSummary summary() const;
 
   // Finds the k nearest landmarks of each query (protomark/search.h).
-  Matches search(Descriptors queries, size_t k = 2, const SearchOptions& options = {}) const;
+  Matches search(Descriptors queries, size_t k = 2, const SearchOptions& options = {}) const {
+    return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
+  }
   Matches search_codes(Codes queries, size_t k = 2, const SearchOptions& options = {}) const;
 
  private:

@@ -1,9 +1,6 @@
 #include "base/checksums.h"
 
-#include <array>
 #include <bit>
-#include <cstring>
-#include <vector>
 
 namespace protomark {
 namespace {
@@ -68,15 +65,12 @@ void compress(State& state, const uint8_t* block) {
 
 }  // namespace
 
-uint32_t crc32(std::span<const std::byte> bytes, uint32_t crc) {
+uint32_t crc32(Bytes bytes, uint32_t crc) {
   crc = ~crc;
   const std::byte* p = bytes.data();
   size_t n = bytes.size();
   for (; n >= 8; n -= 8, p += 8) {
-    uint32_t low, high;
-    std::memcpy(&low, p, 4);
-    std::memcpy(&high, p + 4, 4);
-    low ^= crc;
+    const uint32_t low = load<uint32_t>(p) ^ crc, high = load<uint32_t>(p + 4);
     crc = kTables[7][low & 0xff] ^ kTables[6][low >> 8 & 0xff] ^ kTables[5][low >> 16 & 0xff] ^
           kTables[4][low >> 24] ^ kTables[3][high & 0xff] ^ kTables[2][high >> 8 & 0xff] ^
           kTables[1][high >> 16 & 0xff] ^ kTables[0][high >> 24];
@@ -87,13 +81,12 @@ uint32_t crc32(std::span<const std::byte> bytes, uint32_t crc) {
   return ~crc;
 }
 
-std::string sha256(std::span<const std::byte> bytes) {
-  std::vector<uint8_t> message;
-  message.reserve(bytes.size() + 72);
-  for (const std::byte b : bytes) message.push_back(static_cast<uint8_t>(b));
+std::string sha256(Bytes bytes) {
+  const auto* data = reinterpret_cast<const uint8_t*>(bytes.data());
+  std::vector<uint8_t> message(data, data + bytes.size());
   message.push_back(0x80);
-  while (message.size() % 64 != 56) message.push_back(0);
-  const uint64_t length = 8 * static_cast<uint64_t>(bytes.size());
+  message.resize((message.size() + 71) / 64 * 64 - 8);
+  const uint64_t length = 8 * uint64_t{bytes.size()};
   for (int shift = 56; shift >= 0; shift -= 8) {
     message.push_back(static_cast<uint8_t>(length >> shift));
   }

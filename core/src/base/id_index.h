@@ -9,26 +9,15 @@
 
 namespace protomark {
 
-// Each process draws its own seed, so that nobody can write a file whose ids all hash to one slot.
-inline uint64_t hash_seed() {
-  static const uint64_t seed = [] {
-    std::random_device random;
-    return uint64_t{random()} << 32 | random();
-  }();
-  return seed;
-}
-
 // Open addressing with linear probing, at most two thirds full, no tombstones. The order of slots
 // differs from process to process, so no result may depend on it.
 class IdIndex {
  public:
   using Ids = LargeVector<int64_t>;  // the array that indices point into
 
-  // Returns the index of `id`, or kNoLandmark.
   LandmarkIndex find(const Ids& ids, int64_t id) const {
     return slots_.empty() ? kNoLandmark : slots_[slot_of(ids, id)];
   }
-  // Returns how many slots `find` reads.
   size_t probe_length(const Ids& ids, int64_t id) const {
     return slots_.empty() ? 0 : ((slot_of(ids, id) - home(id)) & mask()) + 1;
   }
@@ -44,31 +33,28 @@ class IdIndex {
     }
   }
 
-  bool has_room(size_t more) const { return 3 * (used_ + more) <= 2 * slots_.size(); }
+  bool has_room(size_t more) const { return fits(more, slots_.size()); }
   // Returns a copy with room for `more` further ids.
   IdIndex with_room(const Ids& ids, size_t more) const {
     IdIndex result;
     result.used_ = used_;
     size_t size = std::max<size_t>(16, slots_.size());
-    while (3 * (used_ + more) > 2 * size) size *= 2;
+    while (!fits(more, size)) size *= 2;
     result.slots_.assign(size, kNoLandmark);
     for (const LandmarkIndex index : slots_) {
       if (index != kNoLandmark) result.put(ids, index);
     }
     return result;
   }
-
   void make_room(const Ids& ids, size_t more) {
     if (!has_room(more)) *this = with_room(ids, more);
   }
-
   // Inserts an index whose id is not in the table yet.
   void insert(const Ids& ids, LandmarkIndex index) {
     make_room(ids, 1);
     put(ids, index);
     ++used_;
   }
-  // Changes the index of an id that is in the table.
   void move(const Ids& ids, int64_t id, LandmarkIndex to) { slots_[slot_of(ids, id)] = to; }
   // Gives every index i the new value to[i].
   void renumber(std::span<const Row> to) {
@@ -93,6 +79,7 @@ class IdIndex {
   }
 
  private:
+  bool fits(size_t more, size_t slots) const { return 3 * (used_ + more) <= 2 * slots; }
   size_t mask() const { return slots_.size() - 1; }
   size_t next(size_t s) const { return (s + 1) & mask(); }
 
@@ -119,7 +106,11 @@ class IdIndex {
 
   LargeVector<LandmarkIndex> slots_;
   size_t used_ = 0;
-  uint64_t seed_ = hash_seed();
+  uint64_t seed_ = [] {
+    // Each process draws its own, so that nobody can write a file whose ids all hash to one slot.
+    static const uint64_t seed = uint64_t{std::random_device()()} << 32 | std::random_device()();
+    return seed;
+  }();
 };
 
 class IdSet {

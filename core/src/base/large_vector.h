@@ -1,10 +1,10 @@
-// A vector for random access: it begins at a cache line, and a large one lies in huge pages, which
-// spares most reads a page-table walk.
+// Arrays for random access.
 #pragma once
 
-#include <cstddef>
-#include <new>
-#include <vector>
+#include <bit>
+#include <utility>
+
+#include "base/bytes.h"
 
 #ifdef __linux__
 #include <sys/mman.h>
@@ -12,6 +12,8 @@
 
 namespace protomark {
 
+// Memory begins at a cache line, and much of it lies in huge pages, which spares most reads a
+// page-table walk.
 template <typename T>
 struct LargePageAllocator {
   using value_type = T;
@@ -48,5 +50,56 @@ struct LargePageAllocator {
 
 template <typename T>
 using LargeVector = std::vector<T, LargePageAllocator<T>>;
+
+// Arrays of `size` bytes each, at least 4, which stay where they are while others come and go.
+class Slots {
+ public:
+  explicit Slots(size_t size) : size_(size) {}
+
+  const int8_t* operator[](uint32_t slot) const {
+    const auto [chunk, at] = place(slot);
+    return chunks_[chunk].data() + at * size_;
+  }
+  int8_t* operator[](uint32_t slot) { return const_cast<int8_t*>(std::as_const(*this)[slot]); }
+
+  // Makes sure that the next `take` does not throw for want of memory.
+  void make_room() {
+    if (free_ != kNone) return;
+    const size_t chunk = place(used_).first;
+    if (chunk == chunks_.size()) chunks_.emplace_back();
+    chunks_[chunk].reserve((kFirst << chunk) * size_);
+  }
+  uint32_t take() {
+    make_room();
+    const uint32_t slot = free_ != kNone ? free_ : used_;
+    if (slot == used_) {
+      auto& chunk = chunks_[place(used_++).first];
+      chunk.resize(chunk.size() + size_);
+    } else {
+      free_ = load<uint32_t>((*this)[slot]);
+    }
+    return slot;
+  }
+  void give_back(uint32_t slot) {
+    store((*this)[slot], free_);
+    free_ = slot;
+  }
+
+ private:
+  static constexpr size_t kFirst = 256;
+  static constexpr uint32_t kNone = UINT32_MAX;
+
+  // The chunk that a slot is in, each of which has twice as many as the one before, and where.
+  static std::pair<size_t, size_t> place(size_t slot) {
+    const auto chunk = static_cast<size_t>(std::bit_width(slot / kFirst + 1) - 1);
+    return {chunk, slot + kFirst - (kFirst << chunk)};
+  }
+
+  size_t size_;
+  std::vector<LargeVector<int8_t>> chunks_;
+  // The first of the slots that were given back, each of which begins with the next one; and how
+  // many were ever taken.
+  uint32_t free_ = kNone, used_ = 0;
+};
 
 }  // namespace protomark

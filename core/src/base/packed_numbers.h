@@ -4,14 +4,12 @@
 
 #include <algorithm>
 #include <atomic>
-#include <cstring>
 #include <functional>
 #include <memory>
 #include <utility>
 
 #include "base/checksums.h"
 #include "base/text.h"
-#include "protomark/types.h"
 
 namespace protomark {
 
@@ -26,23 +24,45 @@ constexpr size_t packed_bytes(size_t n, int bits) {
 inline uint64_t packed_number(const void* words, int bits, size_t i) {
   if (bits == 0) return 0;
   const auto width = static_cast<size_t>(bits), first = i * width, shift = first % 64;
-  uint64_t word[2];
-  const char* from = static_cast<const char*>(words) + first / 64 * sizeof(word[0]);
-  std::memcpy(word, from, sizeof(word[0]));
-  uint64_t value = word[0] >> shift;
-  if (shift + width > 64) {
-    std::memcpy(word + 1, from + sizeof(word[0]), sizeof(word[1]));
-    value |= word[1] << (64 - shift);
-  }
+  const char* from = static_cast<const char*>(words) + first / 64 * 8;
+  uint64_t value = load<uint64_t>(from) >> shift;
+  if (shift + width > 64) value |= load<uint64_t>(from + 8) << (64 - shift);
   return value & ((uint64_t{1} << width) - 1);
 }
 
-// Hands packed numbers to a sink.
+// Takes the bytes of a section in order.
+using Sink = std::function<void(Bytes)>;
+
+// Hands values to a sink in pieces of kPiece bytes or a little more, the last one shorter.
+class ValueWriter {
+ public:
+  static constexpr size_t kPiece = 1 << 15;
+
+  explicit ValueWriter(Sink sink) : sink_(std::move(sink)) {}
+
+  template <typename T>
+  void add(const T& value) {
+    store(add_bytes(sizeof(T)), value);
+  }
+  // Returns room for n more bytes, to be written before the next call.
+  std::byte* add_bytes(size_t n) {
+    if (bytes_.size() >= kPiece) finish();
+    bytes_.resize(bytes_.size() + n);
+    return &bytes_[bytes_.size() - n];
+  }
+  void finish() {
+    if (!bytes_.empty()) sink_(bytes_);
+    bytes_.clear();
+  }
+
+ private:
+  Sink sink_;
+  std::vector<std::byte> bytes_;
+};
+
 class PackedWriter {
  public:
-  using Sink = std::function<void(std::span<const std::byte>)>;
-
-  explicit PackedWriter(Sink sink) : sink_(std::move(sink)) {}
+  explicit PackedWriter(Sink sink) : words_(std::move(sink)) {}
 
   // A number of 64 bits begins at a whole word.
   void add(uint64_t value, int bits) {
@@ -51,40 +71,27 @@ class PackedWriter {
     filled_ += width;
     if (filled_ < 64) return;
     filled_ -= 64;
-    put();
+    words_.add(std::exchange(word_, 0));
     if (filled_ > 0) word_ = value >> (width - filled_);
   }
-  // Pads the last word with zeros.
   void align() {
-    if (filled_ > 0) put();
+    if (filled_ > 0) words_.add(std::exchange(word_, 0));
     filled_ = 0;
   }
   void finish() {
     align();
-    flush();
+    words_.finish();
   }
 
  private:
-  static constexpr size_t kPiece = 1 << 12;  // words, a multiple of CheckedNumbers::kBlock
-
-  void put() {
-    words_.push_back(std::exchange(word_, 0));
-    if (words_.size() == kPiece) flush();
-  }
-  void flush() {
-    sink_(std::as_bytes(std::span(words_)));
-    words_.clear();
-  }
-
-  Sink sink_;
-  std::vector<uint64_t> words_;
+  ValueWriter words_;
   uint64_t word_ = 0;
   unsigned filled_ = 0;  // bits of word_
 };
 
 // Packed numbers in a mapped file. A block of them is checked against its checksum when the first
-// number of it is read, so that opening reads none and a broken block never answers. Any number of
-// threads may read.
+// number of it is read (or FileError thrown), so that opening reads none and a broken block never
+// answers. Any number of threads may read.
 class CheckedNumbers {
  public:
   static constexpr size_t kBlock = 512;  // words per CRC-32
@@ -100,7 +107,6 @@ class CheckedNumbers {
         name_(std::move(name)),
         checked_(std::make_unique<std::atomic<bool>[]>(checksums.size())) {}
 
-  // Throws FileError if the number's block is broken.
   uint64_t operator[](size_t i) const {
     const size_t first = i * static_cast<size_t>(bits_);
     check(first / 64 / kBlock);

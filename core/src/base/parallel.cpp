@@ -5,10 +5,11 @@
 #include <atomic>
 #include <condition_variable>
 #include <deque>
-#include <exception>
 #include <mutex>
 #include <system_error>
 #include <thread>
+
+#include "base/text.h"
 
 namespace protomark {
 namespace {
@@ -104,7 +105,7 @@ Pool& pool() {
 }  // namespace
 
 void run_tasks(int threads, size_t n, const std::function<void(size_t)>& task) {
-  if (threads < 1) throw std::invalid_argument("threads must be at least 1");
+  require(threads >= 1, "threads must be at least 1");
   const size_t workers = std::min({static_cast<size_t>(threads), n, kMaxThreads});
   if (workers <= 1 || inside_task) {
     for (size_t i = 0; i < n; ++i) task(i);

@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <cstddef>
 #include <functional>
-#include <stdexcept>
 
 namespace protomark {
 
@@ -29,15 +28,9 @@ inline Range range_of(size_t n, size_t ranges, size_t i, size_t grain) {
 // the last have a multiple of `grain` elements.
 template <typename Body>
 void parallel_for(int threads, size_t n, size_t grain, const Body& body) {
-  if (threads < 1) throw std::invalid_argument("threads must be at least 1");
-  if (n == 0) return;
-  const size_t grains = (n + grain - 1) / grain;
-  if (threads == 1 || grains == 1) {
-    body(size_t{0}, n);
-    return;
-  }
+  if (threads == 1 && n > 0) return body(size_t{0}, n);
   // With several ranges per thread, others take over from a thread that is held up.
-  const size_t ranges = std::min(grains, 4 * static_cast<size_t>(threads));
+  const size_t ranges = std::min((n + grain - 1) / grain, 4 * static_cast<size_t>(threads));
   run_tasks(threads, ranges, [&](size_t i) {
     const Range range = range_of(n, ranges, i, grain);
     body(range.begin, range.end);

@@ -1,11 +1,9 @@
 // Sums of codes, and their means rounded to int8.
 #pragma once
 
-#include <algorithm>
-#include <array>
-#include <cstddef>
-#include <cstdint>
 #include <cstdlib>
+
+#include "protomark/types.h"
 
 namespace protomark {
 

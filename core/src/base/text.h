@@ -1,12 +1,9 @@
 // Texts: composes errors, and checks for UTF-8.
 #pragma once
 
-#include <cstddef>
-#include <cstdint>
 #include <sstream>
-#include <stdexcept>
-#include <string>
-#include <string_view>
+
+#include "protomark/types.h"
 
 namespace protomark {
 
@@ -18,10 +15,14 @@ std::string text(const Parts&... parts) {
   return out.str();
 }
 
-// Throws std::invalid_argument with the text of these parts.
+// Throw std::invalid_argument with the text of these parts, `require` unless a condition holds.
 template <typename... Parts>
 [[noreturn]] void invalid(const Parts&... parts) {
   throw std::invalid_argument(text(parts...));
+}
+template <typename... Parts>
+void require(bool condition, const Parts&... parts) {
+  if (!condition) invalid(parts...);
 }
 
 // Whether a text is well-formed UTF-8 (Unicode 15, table 3-7).
@@ -31,8 +32,7 @@ inline bool is_utf8(std::string_view text) {
   };
   for (size_t i = 0; i < text.size();) {
     const uint8_t lead = byte(i);
-    const bool leads = lead < 0x80 || (lead >= 0xc2 && lead <= 0xf4);
-    if (!leads) return false;
+    if ((lead >= 0x80 && lead < 0xc2) || lead > 0xf4) return false;
     const size_t size = lead < 0x80 ? 1 : lead < 0xe0 ? 2 : lead < 0xf0 ? 3 : 4;
     // The range of the second byte excludes overlong forms, surrogates and what is beyond U+10FFFF.
     uint8_t low = lead == 0xe0 ? 0xa0 : lead == 0xf0 ? 0x90 : 0x80;

@@ -33,26 +33,21 @@ constexpr Field kFields[] = {{"name", &EncoderInfo::name},
 
 void check_layer(const Layer& layer, size_t inputs, size_t index) {
   const std::string where = text("encoder: layer ", index);
-  if (layer.inputs != inputs) {
-    invalid(where, " has ", layer.inputs, " inputs, ", inputs, " are needed");
-  }
-  if (layer.outputs == 0 || layer.outputs > kMaxWidth) {
-    invalid(where, " has ", layer.outputs, " outputs, 1 to ", kMaxWidth, " are allowed");
-  }
-  if (layer.weights.size() != layer.inputs * layer.outputs || layer.bias.size() != layer.outputs ||
-      layer.multipliers.size() != layer.outputs) {
-    invalid(where, ": weights, bias and multipliers do not match its size");
-  }
-  if (layer.shift < 1 || layer.shift > 62) invalid(where, ": shift must be 1 to 62");
-  if (std::ranges::any_of(layer.multipliers, [](int32_t m) { return m <= 0; })) {
-    invalid(where, ": multipliers must be positive");
-  }
+  require(layer.inputs == inputs, where, " has ", layer.inputs, " inputs, ", inputs, " are needed");
+  require(layer.outputs >= 1 && layer.outputs <= kMaxWidth, where, " has ", layer.outputs,
+          " outputs, 1 to ", kMaxWidth, " are allowed");
+  require(layer.weights.size() == layer.inputs * layer.outputs &&
+              layer.bias.size() == layer.outputs && layer.multipliers.size() == layer.outputs,
+          where, ": weights, bias and multipliers do not match its size");
+  require(layer.shift >= 1 && layer.shift <= 62, where, ": shift must be 1 to 62");
+  require(std::ranges::all_of(layer.multipliers, [](int32_t m) { return m > 0; }), where,
+          ": multipliers must be positive");
   const int64_t largest = index == 0 ? 1 : 255;
   for (size_t o = 0; o < layer.outputs; ++o) {
     const auto [low, high] = sum_range(layer, o);
-    if (layer.bias[o] + largest * low < INT32_MIN || layer.bias[o] + largest * high > INT32_MAX) {
-      invalid(where, ": sums of output ", o, " could leave 32 bits");
-    }
+    require(
+        layer.bias[o] + largest * low >= INT32_MIN && layer.bias[o] + largest * high <= INT32_MAX,
+        where, ": sums of output ", o, " could leave 32 bits");
   }
 }
 
@@ -60,19 +55,15 @@ void check_codebooks(const std::vector<Codebook>& codebooks, size_t dim) {
   std::vector<size_t> widths;
   for (const Codebook& codebook : codebooks) {
     const auto& [width, words] = codebook;
-    if (width < 1 || width > kMaxWordWidth) {
-      invalid("encoder: words of a codebook have 1 to ", kMaxWordWidth, " numbers, not ", width);
-    }
-    if (words.empty() || words.size() % (Codebook::kWords * width) != 0 ||
-        words.size() > Codebook::kWords * dim) {
-      invalid("encoder: a codebook has 256 words for each ", width, " numbers of a code");
-    }
-    if (std::ranges::find(words, -128) != words.end()) {
-      invalid("encoder: numbers of words must be -127 to 127");
-    }
-    if (std::ranges::find(widths, width) != widths.end()) {
-      invalid("encoder: two codebooks have words of ", width, " numbers");
-    }
+    require(width >= 1 && width <= kMaxWordWidth, "encoder: words of a codebook have 1 to ",
+            kMaxWordWidth, " numbers, not ", width);
+    require(!words.empty() && words.size() % (Codebook::kWords * width) == 0 &&
+                words.size() <= Codebook::kWords * dim,
+            "encoder: a codebook has 256 words for each ", width, " numbers of a code");
+    require(std::ranges::find(words, -128) == words.end(),
+            "encoder: numbers of words must be -127 to 127");
+    require(std::ranges::find(widths, width) == widths.end(),
+            "encoder: two codebooks have words of ", width, " numbers");
     widths.push_back(width);
   }
 }
@@ -80,7 +71,7 @@ void check_codebooks(const std::vector<Codebook>& codebooks, size_t dim) {
 // Returns the field of a key, or the end of kFields for a note.
 const Field* field_of(std::string_view key) { return std::ranges::find(kFields, key, &Field::key); }
 
-ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network,
+ContainerWriter file_of(const EncoderInfo& info, Bytes network,
                         const std::vector<Codebook>& codebooks) {
   SectionWriter texts;
   for (const Field& field : kFields) {
@@ -92,8 +83,8 @@ ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network,
     texts.text(note);
   }
   ContainerWriter file(FileKind::encoder);
-  texts.add_to(file, section::kInfo);
-  file.add(section::kNetwork, std::move(network));
+  file.add(section::kInfo, texts.bytes());
+  file.add(section::kNetwork, network);
   if (codebooks.empty()) return file;
   SectionWriter out;
   for (const auto& [width, words] : codebooks) {
@@ -101,7 +92,7 @@ ContainerWriter file_of(const EncoderInfo& info, std::vector<std::byte> network,
     out.value(static_cast<uint32_t>(words.size() / (Codebook::kWords * width)));
     out.values(words.data(), words.size());
   }
-  out.add_to(file, section::kCodebooks);
+  file.add(section::kCodebooks, out.bytes());
   return file;
 }
 
@@ -128,9 +119,7 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t
       dims_(std::move(dims)),
       scale_(scale),
       codebooks_(std::move(codebooks)) {
-  const auto check = [](bool ok, const auto&... what) {
-    if (!ok) invalid("encoder: ", what...);
-  };
+  const auto check = [](bool ok, const auto&... what) { require(ok, "encoder: ", what...); };
   check(!info_.name.empty() && !info_.descriptor.empty(), "name and descriptor must be given");
   for (const Field& field : kFields) {
     check(is_utf8(info_.*field.text), "its ", field.key, " is not UTF-8");
@@ -172,14 +161,11 @@ Matrix<int8_t> Encoder::encode(Descriptors descriptors, size_t dimensions, int t
 void Encoder::encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads) const {
   // OpenCV's descriptors of an image without keypoints have neither rows nor columns.
   const bool empty = descriptors.rows == 0 && descriptors.columns == 0;
-  if (descriptors.columns != bytes() && !empty) {
-    invalid("descriptors have ", descriptors.columns, " bytes, encoder '", info_.name, "' takes ",
-            bytes());
-  }
-  if (codes.rows != descriptors.rows) invalid("codes must have as many rows as descriptors");
-  if (codes.columns == 0 || codes.columns > dim()) {
-    invalid("encoder '", info_.name, "' gives 1 to ", dim(), " dimensions, not ", codes.columns);
-  }
+  require(descriptors.columns == bytes() || empty, "descriptors have ", descriptors.columns,
+          " bytes, encoder '", info_.name, "' takes ", bytes());
+  require(codes.rows == descriptors.rows, "codes must have as many rows as descriptors");
+  require(codes.columns >= 1 && codes.columns <= dim(), "encoder '", info_.name, "' gives 1 to ",
+          dim(), " dimensions, not ", codes.columns);
   const kernels::Kernels& kernel = kernels::active();
   const Packed& network = *packed_;
   const size_t depth = layers_.size(), width = network.widest;
@@ -224,7 +210,7 @@ std::vector<std::byte> Encoder::network_bytes() const {
     out.values(layer.table.data(), layer.table.size());
     out.values(layer.weights.data(), layer.weights.size());
   }
-  return out.take();
+  return out.bytes();
 }
 
 std::vector<std::byte> Encoder::serialize() const {
@@ -257,21 +243,20 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
   SectionReader in(file, section::kNetwork);
   const auto scale = in.value<float>();
   const auto count = in.value<uint32_t>();
-  if (count > kMaxDim) file.fail("it has too many dims");
+  file.require(count <= kMaxDim, "it has too many dims");
   std::vector<size_t> dims;
   for (const uint32_t d : in.values<uint32_t>(count)) dims.push_back(d);
   const auto depth = in.value<uint32_t>();
-  if (depth > kMaxLayers) file.fail("it has too many layers");
+  file.require(depth <= kMaxLayers, "it has too many layers");
   std::vector<Layer> layers(depth);
   for (Layer& layer : layers) {
     layer.inputs = in.value<uint32_t>();
     layer.outputs = in.value<uint32_t>();
     if (layer.inputs > kMaxWidth || layer.outputs > kMaxWidth) file.fail("a layer is too wide");
-    const auto shift = in.value<uint32_t>();
-    layer.shift = static_cast<int>(std::min<uint32_t>(shift, 63));
+    layer.shift = static_cast<int>(std::min<uint32_t>(in.value<uint32_t>(), 63));
     layer.bias = in.values<int32_t>(layer.outputs);
     layer.multipliers = in.values<int32_t>(layer.outputs);
-    in.copy(layer.table.data(), layer.table.size());
+    std::ranges::copy(in.values<uint8_t>(layer.table.size()), layer.table.begin());
     layer.weights = in.values<int8_t>(layer.inputs * layer.outputs);
   }
   in.finish();
@@ -279,7 +264,7 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
   if (file.has(section::kCodebooks)) {
     for (SectionReader words(file, section::kCodebooks); !words.empty();) {
       const size_t width = words.value<uint32_t>(), subspaces = words.value<uint32_t>();
-      if (width > kMaxWordWidth || subspaces > kMaxDim) file.fail("a codebook is too large");
+      file.require(width <= kMaxWordWidth && subspaces <= kMaxDim, "a codebook is too large");
       codebooks.push_back({width, words.values<int8_t>(subspaces * Codebook::kWords * width)});
     }
   }

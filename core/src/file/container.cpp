@@ -94,24 +94,20 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
 ContainerReader::ContainerReader(Bytes file, std::string name)
     : file_(file), name_(std::move(name)) {
   ContainerHeader header;
-  if (file_.size() < sizeof(header) || !has_magic(file_)) fail("not a Protomark file");
+  require(file_.size() >= sizeof(header) && has_magic(file_), "not a Protomark file");
   std::memcpy(&header, file_.data(), sizeof(header));
-  if (header.version != kVersion) {
-    fail("format version ", header.version, ", this Protomark reads version ", kVersion);
-  }
-  if (header.kind == static_cast<uint32_t>(FileKind::journal) && header.file_size < file_.size()) {
-    fail("it is the journal of a map: name the map file beside it");
-  }
-  if (header.file_size != file_.size()) {
-    fail("it should have ", header.file_size, " bytes and has ", file_.size(),
-         file_.size() < header.file_size ? ": it is cut off" : "");
-  }
+  require(header.version == kVersion, "format version ", header.version,
+          ", this Protomark reads version ", kVersion);
+  const bool more = file_.size() > header.file_size;
+  require(!more || header.kind != static_cast<uint32_t>(FileKind::journal),
+          "it is the journal of a map: name the map file beside it");
+  require(header.file_size == file_.size(), "it should have ", header.file_size, " bytes and has ",
+          file_.size(), more ? "" : ": it is cut off");
   const auto head = ContainerHead::parse(file_);
-  if (!head) fail("its header is broken");
-  if (!head->has_right_checksum()) fail("its header does not match its checksum");
-  if (header.kind < 1 || header.kind > static_cast<uint32_t>(FileKind::fold)) {
-    fail("it is of a kind that this Protomark does not know");
-  }
+  require(head.has_value(), "its header is broken");
+  require(head->has_right_checksum(), "its header does not match its checksum");
+  require(header.kind >= 1 && header.kind <= static_cast<uint32_t>(FileKind::fold),
+          "it is of a kind that this Protomark does not know");
   head_ = *head;
   kind_ = static_cast<FileKind>(header.kind);
 
@@ -119,25 +115,22 @@ ContainerReader::ContainerReader(Bytes file, std::string name)
   for (size_t at = sizeof(header); at < head_.bytes.size(); at += sizeof(SectionEntry)) {
     SectionEntry entry;
     std::memcpy(&entry, head_.bytes.data() + at, sizeof(entry));
-    if (entry.offset % kSectionAlignment != 0 || entry.offset < end ||
-        entry.offset > file_.size() || entry.size > file_.size() - entry.offset) {
-      fail("its section table is broken");
-    }
+    require(entry.offset % kSectionAlignment == 0 && entry.offset >= end &&
+                entry.offset <= file_.size() && entry.size <= file_.size() - entry.offset,
+            "its section table is broken");
     end = entry.offset + entry.size;
     // Errors print names, which must not send commands to a terminal.
-    if (!std::ranges::all_of(entry.name(), [](char c) { return c >= ' ' && c <= '~'; })) {
-      fail("its section table is broken: a name is not printable ASCII");
-    }
-    if (has(entry.name())) fail("it has two sections '", entry.name(), "'");
+    require(std::ranges::all_of(entry.name(), [](char c) { return c >= ' ' && c <= '~'; }),
+            "its section table is broken: a name is not printable ASCII");
+    require(!has(entry.name()), "it has two sections '", entry.name(), "'");
     sections_.push_back(entry);
   }
 }
 
 Bytes ContainerReader::read(std::string_view section) const {
   const Bytes bytes = map(section);
-  if (crc32(bytes) != find(section)->crc) {
-    fail("its section '", section, "' does not match its checksum");
-  }
+  require(crc32(bytes) == find(section)->crc, "its section '", section,
+          "' does not match its checksum");
   return bytes;
 }
 

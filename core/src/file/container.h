@@ -4,9 +4,8 @@
 
 #include <algorithm>
 #include <cstring>
-#include <functional>
 
-#include "base/checksums.h"
+#include "base/packed_numbers.h"
 #include "file/disk.h"
 
 namespace protomark {
@@ -80,35 +79,24 @@ struct ContainerHead {
 // while the file is written.
 class ContainerWriter {
  public:
-  using Sink = std::function<void(Bytes)>;
-  using Produce = std::function<void(const Sink&)>;
-
-  explicit ContainerWriter(FileKind kind) : kind_(kind) {}
-
-  // `bytes` must stay alive until the file is written.
-  void add(std::string name, Bytes bytes) {
-    add(std::move(name), bytes.size(), [bytes](const Sink& sink) { sink(bytes); });
-  }
-  void add(std::string name, std::vector<std::byte> bytes) {
-    const size_t size = bytes.size();
-    add(std::move(name), size, [owned = std::move(bytes)](const Sink& sink) { sink(owned); });
-  }
-  // `produce` hands `size` bytes to the sink in order, each time that the file is written.
-  void add(std::string name, size_t size, Produce produce) {
-    add_together(
-        {{std::move(name), size}},
-        [produce = std::move(produce)](std::span<const Sink> sinks) { produce(sinks[0]); });
-  }
-
+  using Sink = protomark::Sink;
+  using Sinks = std::span<const Sink>;
   struct Part {
     std::string name;
     size_t size;  // in bytes
   };
   static constexpr size_t kUnknownSize = SIZE_MAX;
-  using ProduceAll = std::function<void(std::span<const Sink>)>;
-  // Sections that are produced side by side: `produce` gets a sink for each. Only the size of the
-  // last one may be unknown.
-  void add_together(std::vector<Part> parts, ProduceAll produce) {
+  using Produce = std::function<void(Sinks)>;
+
+  explicit ContainerWriter(FileKind kind) : kind_(kind) {}
+
+  void add(std::string name, Bytes bytes) {
+    add({{std::move(name), bytes.size()}},
+        [owned = std::vector(bytes.begin(), bytes.end())](Sinks sinks) { sinks[0](owned); });
+  }
+  // Sections that are produced side by side, each time that the file is written: `produce` gets a
+  // sink for each. Only the size of the last one may be unknown.
+  void add(std::vector<Part> parts, Produce produce) {
     groups_.push_back({std::move(parts), std::move(produce)});
   }
 
@@ -139,7 +127,7 @@ class ContainerWriter {
  private:
   struct Group {
     std::vector<Part> parts;
-    ProduceAll produce;
+    Produce produce;
   };
   using Put = std::function<void(size_t offset, Bytes)>;
   size_t head_size() const;
@@ -148,6 +136,16 @@ class ContainerWriter {
 
   FileKind kind_;
   std::vector<Group> groups_;
+};
+
+// Gives the sinks of sections one after the other, and an empty one for a section that is left out.
+class SinkQueue {
+ public:
+  explicit SinkQueue(ContainerWriter::Sinks sinks) : next_(sinks.begin()) {}
+  Sink next(bool present = true) { return present ? *next_++ : Sink(); }
+
+ private:
+  ContainerWriter::Sinks::iterator next_;
 };
 
 // A checked view of the bytes of a file, which errors call `name`. All functions throw FileError.
@@ -162,9 +160,8 @@ class ContainerReader {
   uint32_t checksum() const { return head_.header.crc; }
   std::string identity() const { return head_.identity(); }
   size_t size() const { return file_.size(); }
-  // Throws if the file is of another kind.
   void expect(FileKind kind) const {
-    if (kind_ != kind) fail("it holds ", describe(kind_), ", not ", describe(kind));
+    require(kind_ == kind, "it holds ", describe(kind_), ", not ", describe(kind));
   }
 
   bool has(std::string_view section) const { return find(section) != nullptr; }
@@ -173,7 +170,7 @@ class ContainerReader {
   // Returns a section without reading it, for those that are large and mapped.
   Bytes map(std::string_view section) const {
     const SectionEntry* found = find(section);
-    if (found == nullptr) fail("it lacks the section '", section, "'");
+    require(found != nullptr, "it lacks the section '", section, "'");
     return file_.subspan(found->offset, found->size);
   }
   // The same as n values of a type, for which the file's bytes must be aligned.
@@ -185,7 +182,6 @@ class ContainerReader {
   std::span<const T> map(std::string_view section, size_t n) const {
     return as<T>(section, map(section), n);
   }
-  // In bytes, in file order.
   std::vector<std::pair<std::string, size_t>> sections() const {
     std::vector<std::pair<std::string, size_t>> result;
     for (const SectionEntry& entry : sections_) result.emplace_back(entry.name(), entry.size);
@@ -194,19 +190,23 @@ class ContainerReader {
   void verify() const {
     for (const SectionEntry& entry : sections_) read(entry.name());
   }
-  // Throw FileError about this file.
+  // Throw FileError about this file, two of them unless a condition holds.
   template <typename... Parts>
   [[noreturn]] void fail(const Parts&... what) const {
     throw FileError(text(name_, ": ", what...));
   }
-  [[noreturn]] void fail_size(std::string_view section) const {
-    fail("its section '", section, "' has the wrong size");
+  template <typename... Parts>
+  void require(bool condition, const Parts&... what) const {
+    if (!condition) fail(what...);
+  }
+  void require_size(bool condition, std::string_view section) const {
+    require(condition, "its section '", section, "' has the wrong size");
   }
 
  private:
   template <typename T>
   std::span<const T> as(std::string_view section, Bytes bytes, size_t n) const {
-    if (bytes.size() % sizeof(T) != 0 || bytes.size() / sizeof(T) != n) fail_size(section);
+    require_size(bytes.size() % sizeof(T) == 0 && bytes.size() / sizeof(T) == n, section);
     return {reinterpret_cast<const T*>(bytes.data()), n};
   }
   const SectionEntry* find(std::string_view name) const {

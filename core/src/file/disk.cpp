@@ -38,17 +38,17 @@ FileDescriptor::~FileDescriptor() {
   errno = error;
 }
 
-std::optional<std::span<std::byte>> FileDescriptor::read(std::span<std::byte> to) const {
-  size_t done = 0;
-  while (done < to.size()) {
-    const ssize_t n =
-        ::pread(descriptor_, to.data() + done, to.size() - done, static_cast<off_t>(done));
-    if (n < 0 && errno == EINTR) continue;
-    if (n < 0) return std::nullopt;
-    if (n == 0) break;
-    done += static_cast<size_t>(n);
+std::optional<std::vector<std::byte>> FileDescriptor::read(size_t n) const {
+  std::vector<std::byte> result(n);
+  for (size_t done = 0; done < result.size();) {
+    const ssize_t more =
+        ::pread(descriptor_, &result[done], result.size() - done, static_cast<off_t>(done));
+    if (more < 0 && errno == EINTR) continue;
+    if (more < 0) return std::nullopt;
+    if (more == 0) result.resize(done);
+    done += static_cast<size_t>(more);
   }
-  return to.first(done);
+  return result;
 }
 
 bool FileDescriptor::write(size_t offset, Bytes bytes) const {
@@ -122,7 +122,7 @@ TemporaryFile::TemporaryFile(const std::filesystem::path& target)
   } while (!file_ && errno == EEXIST);
   if (!file_) {
     path_.clear();
-    fail();
+    fail_write(name_);
   }
   // Restores what the umask removed; if that fails, fewer may read the file, never more.
   if (mode) ::fchmod(file_.get(), *mode);
@@ -133,38 +133,36 @@ TemporaryFile::~TemporaryFile() {
 }
 
 void TemporaryFile::write(size_t offset, Bytes bytes) {
-  if (!file_.write(offset, bytes)) fail();
+  if (!file_.write(offset, bytes)) fail_write(name_);
 }
 
 void TemporaryFile::sync() {
-  if (::fsync(file_.get()) != 0 || ::close(file_.release()) != 0) fail();
+  if (::fsync(file_.get()) != 0 || ::close(file_.release()) != 0) fail_write(name_);
 }
 
 void TemporaryFile::replace_target() {
-  if (::rename(path_.c_str(), target_.c_str()) != 0) fail();
+  if (::rename(path_.c_str(), target_.c_str()) != 0) fail_write(name_);
   path_.clear();
   if (!sync_folder(target_)) {
     fail_file(name_, "is written, but its folder cannot be synced: ", system_error());
   }
 }
 
-void TemporaryFile::fail() const { fail_file(name_, "cannot be written: ", system_error()); }
-
 MappedFile::MappedFile(const std::filesystem::path& path)
     : MappedFile(FileDescriptor::open_to_read(path), path) {}
 
 MappedFile::MappedFile(const FileDescriptor& file, const std::filesystem::path& path) {
   struct stat status;
-  if (!file) fail_file(path, "cannot be read: ", system_error());
+  if (!file) fail_read(path);
   if (::fstat(file.get(), &status) != 0 || !S_ISREG(status.st_mode)) fail_file(path, "not a file");
   const auto size = static_cast<size_t>(status.st_size);
   if (size == 0) return;
   // The mapping and this descriptor are of one file, whatever becomes of its name.
   file_ = FileDescriptor(::fcntl(file.get(), F_DUPFD_CLOEXEC, 0));
-  if (!file_) fail_file(path, "cannot be read: ", system_error());
+  if (!file_) fail_read(path);
   stamp_ = stamp_of(file_);
   void* data = ::mmap(nullptr, size, PROT_READ, MAP_SHARED, file.get(), 0);
-  if (data == MAP_FAILED) fail_file(path, "cannot be read: ", system_error());
+  if (data == MAP_FAILED) fail_read(path);
   bytes_ = {static_cast<const std::byte*>(data), size};
 }
 

@@ -6,12 +6,10 @@
 #include <filesystem>
 #include <utility>
 
+#include "base/bytes.h"
 #include "base/text.h"
-#include "protomark/types.h"
 
 namespace protomark {
-
-using Bytes = std::span<const std::byte>;
 
 std::string system_error();
 
@@ -20,7 +18,13 @@ template <typename... Parts>
   throw FileError(text(path.string(), ": ", what...));
 }
 
-// Owns an open file.
+[[noreturn]] inline void fail_read(const std::filesystem::path& path) {
+  fail_file(path, "cannot be read: ", system_error());
+}
+[[noreturn]] inline void fail_write(const std::filesystem::path& path) {
+  fail_file(path, "cannot be written: ", system_error());
+}
+
 class FileDescriptor {
  public:
   FileDescriptor() = default;
@@ -38,8 +42,8 @@ class FileDescriptor {
   int get() const { return descriptor_; }
   int release() { return std::exchange(descriptor_, -1); }
 
-  // Reads from the beginning up to to.size() bytes. Returns nullopt, with errno set, on failure.
-  std::optional<std::span<std::byte>> read(std::span<std::byte> to) const;
+  // Reads up to n bytes from the beginning. Returns nullopt, with errno set, on failure.
+  std::optional<std::vector<std::byte>> read(size_t n) const;
   // Writes all bytes from an offset on. Returns false, with errno set, on failure, also at a limit
   // on file sizes, which raises no signal.
   bool write(size_t offset, Bytes bytes) const;
@@ -57,15 +61,13 @@ std::filesystem::path link_target(std::filesystem::path path);
 // with errno set, on failure, but true if the file system or the folder's permissions rule it out.
 bool sync_folder(const std::filesystem::path& path);
 
-// Returns the permission bits of a file; nullopt if it does not exist.
 std::optional<mode_t> permissions(const std::filesystem::path& path);
 
 // A file that is written beside its target (if that is a link, beside the file that it leads to),
-// with the permissions of an existing target, and removed unless it replaces the target. All
-// functions throw FileError.
+// with the permissions of an existing target, which must be a regular file, and removed unless it
+// replaces the target. All functions throw FileError.
 class TemporaryFile {
  public:
-  // The target must be a regular file if it exists.
   explicit TemporaryFile(const std::filesystem::path& target);
   ~TemporaryFile();
   TemporaryFile(const TemporaryFile&) = delete;
@@ -73,18 +75,14 @@ class TemporaryFile {
 
   void write(size_t offset, Bytes bytes);
   void sync();
-  // Renames the synced file to its target, and syncs the folder.
   void replace_target();
 
  private:
-  [[noreturn]] void fail() const;
-
   std::filesystem::path name_, target_;  // as errors call the target, and where it leads
   std::filesystem::path path_;
   FileDescriptor file_;
 };
 
-// A file mapped read-only.
 class MappedFile {
  public:
   // Throw FileError if the file cannot be read; errors call an open one `path`.
@@ -100,11 +98,7 @@ class MappedFile {
   bool unchanged() const;
 
  private:
-  struct Stamp {
-    off_t size = 0;
-    int64_t seconds = 0, nanoseconds = 0;
-    bool operator==(const Stamp&) const = default;
-  };
+  using Stamp = std::array<int64_t, 3>;  // size, seconds and nanoseconds of the last change
   static std::optional<Stamp> stamp_of(const FileDescriptor& file);
 
   FileDescriptor file_;

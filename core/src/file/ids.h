@@ -22,8 +22,7 @@ inline constexpr size_t kIdBlock = 128;  // landmarks; the last block may have f
 // Writes the sections `idblocks` and `idgaps` from ascending ids.
 class IdBlockWriter {
  public:
-  IdBlockWriter(ContainerWriter::Sink blocks, ContainerWriter::Sink gaps)
-      : blocks_(std::move(blocks)), gaps_(std::move(gaps)) {}
+  IdBlockWriter(Sink blocks, Sink gaps) : blocks_(std::move(blocks)), gaps_(std::move(gaps)) {}
 
   void add(int64_t id) {
     ids_.push_back(id);
@@ -68,15 +67,13 @@ class LandmarkIds {
   LandmarkIds(const ContainerReader& file, size_t n) : file_(&file), n_(n) {
     if (!file.has(section::kIdBlocks)) return;
     const size_t blocks = (n + kIdBlock - 1) / kIdBlock;
-    if (file.map(section::kIdBlocks).size() != blocks * sizeof(IdBlock)) {
-      file.fail_size(section::kIdBlocks);
-    }
+    file.require_size(file.map(section::kIdBlocks).size() == blocks * sizeof(IdBlock),
+                      section::kIdBlocks);
     blocks_ = read_section<IdBlock>(file, section::kIdBlocks, blocks);
     gaps_ = file.map(section::kIdGaps);
     check_blocks();
   }
 
-  // Whether each landmark's id is its index.
   bool are_indices() const { return blocks_.empty(); }
   // Throws FileError if the id is not below those of the next block.
   int64_t operator[](LandmarkIndex landmark) const {
@@ -85,7 +82,7 @@ class LandmarkIds {
     const IdBlock& block = blocks_[b];
     const uint64_t id = static_cast<uint64_t>(block.first_id) + j +
                         packed_number(gaps_.data() + 8 * block.first_word(), block.bits(), j);
-    if (id >= end_of(b)) file_->fail(kNoOrder);
+    file_->require(id < end_of(b), kNoOrder);
     return static_cast<int64_t>(id);
   }
   // Throws UnknownLandmark.
@@ -109,7 +106,7 @@ class LandmarkIds {
     std::vector<int64_t> result(n_);
     for (size_t i = 0; i < n_; ++i) {
       result[i] = (*this)[landmark_at(i)];
-      if (i > 0 && result[i] <= result[i - 1]) file_->fail(kNoOrder);
+      file_->require(i == 0 || result[i] > result[i - 1], kNoOrder);
     }
     return result;
   }
@@ -118,7 +115,6 @@ class LandmarkIds {
   static constexpr char kNoOrder[] = "its landmark ids do not ascend";
 
   size_t block_size(size_t b) const { return std::min(kIdBlock, n_ - b * kIdBlock); }
-  // Returns a number that all ids of a block are below.
   uint64_t end_of(size_t b) const {
     return b + 1 < blocks_.size() ? static_cast<uint64_t>(blocks_[b + 1].first_id)
                                   : uint64_t{1} << 63;
@@ -127,16 +123,14 @@ class LandmarkIds {
   void check_blocks() const {
     size_t words = 0;
     for (size_t b = 0; b < blocks_.size(); ++b) {
-      if (blocks_[b].first_word() != words)
-        file_->fail("its blocks of ids do not follow each other");
-      words += packed_words(block_size(b), blocks_[b].bits());
-      if (blocks_[b].first_id < 0) file_->fail("it has a negative landmark id");
+      const IdBlock& block = blocks_[b];
+      file_->require(block.first_word() == words, "its blocks of ids do not follow each other");
+      words += packed_words(block_size(b), block.bits());
+      file_->require(block.first_id >= 0, "it has a negative landmark id");
       // The last id of a block is at least this.
-      if (static_cast<uint64_t>(blocks_[b].first_id) + block_size(b) > end_of(b)) {
-        file_->fail(kNoOrder);
-      }
+      file_->require(static_cast<uint64_t>(block.first_id) + block_size(b) <= end_of(b), kNoOrder);
     }
-    if (packed_bytes(words, 64) != gaps_.size()) file_->fail_size(section::kIdGaps);
+    file_->require_size(packed_bytes(words, 64) == gaps_.size(), section::kIdGaps);
   }
 
   const ContainerReader* file_ = nullptr;

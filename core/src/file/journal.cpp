@@ -17,7 +17,6 @@ constexpr size_t kIdentitySize = 64;  // hexadecimal digits
 // Size of a journal's first container: header, table and the section `base`.
 constexpr size_t kFirstSize = 128 + kIdentitySize;
 
-// Returns the header and table that bytes begin with, if their checksum is right.
 std::optional<ContainerHead> intact_head(Bytes bytes) {
   const auto head = ContainerHead::parse(bytes);
   return head && head->has_right_checksum() ? head : std::nullopt;
@@ -85,9 +84,8 @@ bool is_unfinished(Bytes bytes) {
 }
 
 std::string read_base(const ContainerReader& file) {
-  const Bytes bytes = file.read(section::kBase);
-  if (bytes.size() != kIdentitySize) file.fail_size(section::kBase);
-  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+  const auto digits = file.read<char>(section::kBase, kIdentitySize);
+  return {digits.begin(), digits.end()};
 }
 
 constexpr char kSaveElsewhere[] = "; save to another path to keep what is in memory";
@@ -96,28 +94,21 @@ constexpr int kTries = 100;
 
 // Names who has locked a file, as far as Linux tells.
 std::string holder(const FileDescriptor& file) {
-  struct stat status;
-  if (::fstat(file.get(), &status) == 0) {
-    std::ifstream locks("/proc/locks");
-    for (std::string line; std::getline(locks, line);) {
-      // 1: FLOCK  ADVISORY  WRITE 4711 fe:00:12345 0 EOF
-      std::istringstream words(line);
-      std::string number, kind, mode, access, inode;
-      long process = 0;
-      if (!(words >> number >> kind >> mode >> access >> process >> inode) || kind != "FLOCK" ||
-          process <= 0 || !inode.ends_with(":" + std::to_string(status.st_ino))) {
-        continue;
-      }
-      if (process == ::getpid()) return "another map of this process";
-      return "process " + std::to_string(process);
-    }
+  struct stat status{};
+  ::fstat(file.get(), &status);
+  const std::string inode = ":" + std::to_string(status.st_ino);
+  std::ifstream locks("/proc/locks");
+  for (std::string line; std::getline(locks, line);) {
+    // 1: FLOCK  ADVISORY  WRITE 4711 fe:00:12345 0 EOF
+    std::istringstream words(line);
+    std::string number, kind, mode, access, place;
+    long process = 0;
+    words >> number >> kind >> mode >> access >> process >> place;
+    if (kind != "FLOCK" || process <= 0 || !place.ends_with(inode)) continue;
+    if (process == ::getpid()) return "another map of this process";
+    return text("process ", process);
   }
   return "another map or process";
-}
-
-void add_base(ContainerWriter& file, const std::string& identity) {
-  const Bytes bytes = std::as_bytes(std::span(identity));
-  file.add(section::kBase, std::vector(bytes.begin(), bytes.end()));
 }
 
 uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
@@ -125,35 +116,24 @@ uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->
 // Returns the bytes of an open journal, which its writer may cut off meanwhile. Throws FileError if
 // it is not a journal.
 std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path) {
-  const auto fail = [&](const auto&... why) { fail_file(path, "cannot be read: ", why...); };
   struct stat status;
-  if (::fstat(file.get(), &status) != 0) fail(system_error());
+  if (::fstat(file.get(), &status) != 0) fail_read(path);
   if (!S_ISREG(status.st_mode)) fail_file(path, "not a file");
-  const auto size = static_cast<size_t>(status.st_size);
-  const auto read = [&](std::span<std::byte> to) {
-    const auto bytes = file.read(to);
-    if (!bytes) fail(system_error());
-    return *bytes;
-  };
   // A file that does not begin as a journal is not read, however large.
-  std::array<std::byte, kMaxHead> space;
-  const Bytes head = read(std::span(space).first(std::min(size, space.size())));
-  if (head.size() > kFirstSize && !intact_head(head)) refuse(head, path.string());
-  std::vector<std::byte> result;
+  const auto head = file.read(kMaxHead);
+  if (head && head->size() > kFirstSize && !intact_head(*head)) refuse(*head, path.string());
   try {
-    result.resize(size);
+    if (auto bytes = file.read(static_cast<size_t>(status.st_size))) return *std::move(bytes);
   } catch (const std::bad_alloc&) {
-    fail("its ", size, " bytes do not fit into memory");
+    fail_file(path, "cannot be read: its ", status.st_size, " bytes do not fit into memory");
   }
-  result.resize(read(result).size());
-  return result;
+  fail_read(path);
 }
 
 // Returns the identity of the map file at `path`; empty if that cannot be read.
 std::string identity_of(const std::filesystem::path& path) {
   const auto file = FileDescriptor::open_to_read(path);
-  std::array<std::byte, kMaxHead> space;
-  const auto bytes = file ? file.read(space) : std::nullopt;
+  const auto bytes = file ? file.read(kMaxHead) : std::nullopt;
   const auto head = bytes ? ContainerHead::parse(*bytes) : std::nullopt;
   return head ? head->identity() : "";
 }
@@ -165,7 +145,7 @@ FileDescriptor guard(const std::filesystem::path& map) {
   for (int tries = 0; tries < kTries; ++tries) {
     file = FileDescriptor::open_to_read(path);
     if (!file && (errno == ENOENT || errno == ENAMETOOLONG || errno == ENOTDIR)) return file;
-    if (!file) fail_file(path, "cannot be read: ", system_error());
+    if (!file) fail_read(path);
     if (::flock(file.get(), LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK) {
       fail_file(map, "cannot be written: its journal is held by ", holder(file),
                 "; close it there, or save to another path");
@@ -197,9 +177,7 @@ JournaledFile::JournaledFile(const std::filesystem::path& map) {
     mapped_ = std::make_unique<MappedFile>(open, map);
     file_.emplace(mapped_->bytes(), map.string());
     const auto journal = FileDescriptor::open_to_read(path);
-    if (!journal && errno != ENOENT && errno != ENAMETOOLONG) {
-      fail_file(path, "cannot be read: ", system_error());
-    }
+    if (!journal && errno != ENOENT && errno != ENAMETOOLONG) fail_read(path);
     bytes_ = journal ? read_journal(journal, path) : std::vector<std::byte>();
     if (identity_of(map) == file_->identity() && (open.is_at(map) || tries >= kTries)) break;
   }
@@ -231,11 +209,10 @@ JournalContent::JournalContent(Bytes bytes, std::string name)
                            "journal off (truncate --size=",
                            end_, ")"));
     }
-    if (!is_record(record->kind())) record->fail("it is ", describe(record->kind()));
+    record->require(is_record(record->kind()), "it is ", describe(record->kind()));
     const auto link = read_value<ChainLink>(*record, section::kChain);
-    if (link.record != last_.record + 1 || link.previous != last_.previous) {
-      record->fail("it does not follow the one before it");
-    }
+    record->require(link.record == last_.record + 1 && link.previous == last_.previous,
+                    "it does not follow the one before it");
     if (record->kind() == FileKind::commit) {
       commits_.push_back({bytes.subspan(end_, record->size()), end_});
     } else {
@@ -272,7 +249,7 @@ Journal::Journal(const std::filesystem::path& map) : process_(::getpid()) {
     made_ = bool(file_);
     if (made_) ::fchmod(file_.get(), mode);  // the umask may have removed some
     if (!made_) file_ = FileDescriptor(::open(path_.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, mode));
-    if (!file_) fail_write();
+    if (!file_) fail_write(path_);
     if (::flock(file_.get(), LOCK_EX | LOCK_NB) != 0) {
       if (errno != EWOULDBLOCK) fail_file(path_, "cannot be locked: ", system_error());
       fail_file(path_, "is held by ", holder(file_),
@@ -297,7 +274,7 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   if (end_ == 0) {
     begin();
   } else if (!cut(end_) || ::fsync(file_.get()) != 0) {
-    fail_write();
+    fail_write(path_);
   }
 }
 
@@ -310,14 +287,14 @@ bool Journal::cut(size_t size) {
 // Empties the file and syncs it before writing a header, so that no older record follows that.
 void Journal::begin() {
   tail_ = true;
-  if (!cut(0)) fail_write();
+  if (!cut(0)) fail_write(path_);
   end_ = 0;
   tail_ = true;
   ContainerWriter file(FileKind::journal);
-  add_base(file, base_);
+  file.add(section::kBase, std::as_bytes(std::span(base_)));
   const auto first = file.serialize();
   if (::fsync(file_.get()) != 0 || !file_.write(0, first) || ::fsync(file_.get()) != 0) {
-    fail_write();
+    fail_write(path_);
   }
   end_ = first.size();
   last_ = {0, checksum_of(first), 0};
@@ -329,8 +306,8 @@ void Journal::check_owner() const {
     fail_file(path_, "was opened by process ", process_,
               ", of which this one is a copy (fork); only that one may commit");
   }
-  if (!file_.is_at(path_))
-    fail_file(path_, "was moved or deleted since it was opened", kSaveElsewhere);
+  if (file_.is_at(path_)) return;
+  fail_file(path_, "was moved or deleted since it was opened", kSaveElsewhere);
 }
 
 ContainerWriter Journal::record(FileKind kind) {
@@ -349,13 +326,13 @@ void Journal::append(Bytes record) {
               kSaveElsewhere);
   }
   base_ = now;
-  if (!cut(end_)) fail_write();
+  if (!cut(end_)) fail_write(path_);
   tail_ = true;
   if (!file_.write(end_, record) || ::fsync(file_.get()) != 0) {
     const int error = errno;
     cut(end_);  // or before the next one
     errno = error;
-    fail_write();
+    fail_write(path_);
   }
   tail_ = false;
   end_ += record.size();
@@ -364,7 +341,7 @@ void Journal::append(Bytes record) {
 
 void Journal::fold(const std::string& identity) {
   ContainerWriter file = record(FileKind::fold);
-  add_base(file, identity);
+  file.add(section::kBase, std::as_bytes(std::span(identity)));
   append(file.serialize());
   folded_ = identity;
 }

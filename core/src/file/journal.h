@@ -19,7 +19,6 @@ struct ChainLink {
 // Returns the path of the journal beside a map file, or beside the file that it links to.
 std::filesystem::path journal_path(const std::filesystem::path& map);
 
-// The records of a journal.
 class JournalContent {
  public:
   struct Commit {
@@ -67,7 +66,6 @@ class JournalContent {
 // compacts meanwhile.
 class JournaledFile {
  public:
-  // Throws FileError.
   explicit JournaledFile(const std::filesystem::path& map);
 
   const ContainerReader& file() const { return *file_; }
@@ -95,7 +93,6 @@ class Journal {
   // and begins anew if no commit is to be applied to the map file.
   void resume(const JournalContent& content, const std::string& identity);
 
-  // Begins the next record, with its chain link.
   ContainerWriter record(FileKind kind);
   // Returns once the record is durable. If that fails the journal is as before.
   void append(Bytes record);
@@ -111,7 +108,6 @@ class Journal {
   void check_owner() const;
   void begin();
   bool cut(size_t size);
-  [[noreturn]] void fail_write() const { fail_file(path_, "cannot be written: ", system_error()); }
 
   std::filesystem::path map_, path_;
   FileDescriptor file_;  // locked while it is open, also in a forked child

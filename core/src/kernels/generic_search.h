@@ -38,39 +38,6 @@ size_t append_hits(unsigned near, const int32_t* halves, const int32_t* biases, 
   return found;
 }
 
-// Decides whether to compare the prefix of the dimensions first, which pays if it leaves few
-// queries. If not, some steps are compared in full before it is tried again.
-class Prefix {
- public:
-  Prefix(const CodeQueries& queries, const PackedCodes& rows)
-      : queries_(queries.n),
-        never_(rows.biases == nullptr || rows.prefix >= rows.dim || queries.n < kTileQueries),
-        steps_in_full_(queries.steps_in_full) {
-    // |p|^2 - 2 p . q over the other dimensions is at least minus the query's squared norm there.
-    for (size_t q = 0; q < queries_; ++q) {
-      const int32_t limit = queries.limits[q], rest = queries.rest_norms[q];
-      thresholds_[q] = threshold(limit > INT32_MAX - rest ? INT32_MAX : limit + rest);
-    }
-  }
-
-  const int32_t* thresholds() const { return thresholds_; }
-  bool pays() {
-    if (never_) return false;
-    if (*steps_in_full_ == 0) return true;
-    --*steps_in_full_;
-    return false;
-  }
-  void left(size_t queries) {
-    if (4 * queries > queries_) *steps_in_full_ = 15;
-  }
-
- private:
-  size_t queries_;
-  bool never_;
-  size_t* steps_in_full_;
-  int32_t thresholds_[kScanQueries];
-};
-
 // Queries and rows to compare.
 //   S::Step               4 dimensions of a query, as S reads them best
 template <typename S>
@@ -79,11 +46,7 @@ struct CodeTile {
   const int32_t* limits;
   const int32_t* thresholds;
   const int32_t* prefix_thresholds;
-  const int8_t* codes;
-  const int32_t* biases;
-  const int32_t* prefix_biases;
-  size_t dim;
-  size_t prefix;
+  PackedCodes rows;  // from first_row on
   size_t first_row;
 };
 
@@ -101,13 +64,13 @@ PROTOMARK_INLINE void sum_up(const CodeTile<S>& t, size_t query, const int32_t* 
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) acc[q][b] = half;
   }
-  const int8_t* p = t.codes;
-  const size_t steps = t.dim / 4;
+  const int8_t* p = t.rows.codes;
+  const size_t steps = t.rows.dim / 4;
   const typename S::Step* step = t.queries + query * steps;
   for (size_t s = 0; s < dims / 4; ++s, p += 4 * kCodeRows) {
     typename S::Codes codes[Blocks];
 #pragma GCC unroll 8
-    for (int b = 0; b < Blocks; ++b) codes[b] = S::load_codes(p + b * kCodeRows * t.dim);
+    for (int b = 0; b < Blocks; ++b) codes[b] = S::load_codes(p + b * kCodeRows * t.rows.dim);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) {
       const auto four = S::query(step[q * steps + s]);
@@ -124,8 +87,8 @@ template <typename S, int Queries, int Blocks>
 PROTOMARK_INLINE void sum_up_with_biases(const CodeTile<S>& t, size_t query,
                                          typename S::Sums (&biases)[Blocks],
                                          typename S::Sums (&acc)[Queries][Blocks]) {
-  const int8_t* p = t.codes;
-  const size_t steps = t.dim / 4;
+  const int8_t* p = t.rows.codes;
+  const size_t steps = t.rows.dim / 4;
   const typename S::Step* step = t.queries + query * steps;
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
@@ -166,7 +129,7 @@ template <typename S, int Queries, int Blocks, bool HasBiases>
 PROTOMARK_TILE size_t scan_tile(const CodeTile<S>& t, size_t query, Hit* hits) {
   typename S::Sums acc[Queries][Blocks], own_biases[Blocks];
   if constexpr (HasBiases) {
-    sum_up(t, query, t.biases, t.dim, acc);
+    sum_up(t, query, t.rows.biases, t.rows.dim, acc);
   } else {
     sum_up_with_biases(t, query, own_biases, acc);
   }
@@ -180,7 +143,9 @@ PROTOMARK_TILE size_t scan_tile(const CodeTile<S>& t, size_t query, Hit* hits) {
   alignas(64) int32_t halves[Queries][Blocks][kCodeRows], biases[Blocks][kCodeRows];
 #pragma GCC unroll 8
   for (int b = 0; b < Blocks; ++b) {
-    if constexpr (HasBiases) own_biases[b] = load_pack<typename S::Sums>(t.biases + b * kCodeRows);
+    if constexpr (HasBiases) {
+      own_biases[b] = load_pack<typename S::Sums>(t.rows.biases + b * kCodeRows);
+    }
     store_pack(biases[b], own_biases[b]);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) store_pack(halves[q][b], acc[q][b]);
@@ -211,8 +176,9 @@ template <typename S, int Blocks>
 size_t scan_blocks(const CodeTile<S>& t, size_t n, Hit* hits) {
   size_t found = 0;
   each_tile(n, [&]<int Queries>(size_t query) {
-    found += t.biases != nullptr ? scan_tile<S, Queries, Blocks, true>(t, query, hits + found)
-                                 : scan_tile<S, Queries, Blocks, false>(t, query, hits + found);
+    found += t.rows.biases != nullptr
+                 ? scan_tile<S, Queries, Blocks, true>(t, query, hits + found)
+                 : scan_tile<S, Queries, Blocks, false>(t, query, hits + found);
   });
   return found;
 }
@@ -223,7 +189,7 @@ size_t near_by_prefix(const CodeTile<S>& t, size_t n, uint8_t* queries) {
   size_t size = 0;
   each_tile(n, [&]<int Queries>(size_t query) {
     typename S::Sums acc[Queries][S::kBlocks];
-    sum_up(t, query, t.prefix_biases, t.prefix, acc);
+    sum_up(t, query, t.rows.prefix_biases, t.rows.prefix, acc);
 #pragma GCC unroll 8
     for (int q = 0; q < Queries; ++q) {
       // Without a branch, as none could be predicted.
@@ -237,49 +203,48 @@ size_t near_by_prefix(const CodeTile<S>& t, size_t n, uint8_t* queries) {
 //   S::convert(codes, n, steps)  where S::Step is not 4 bytes of the codes
 template <typename S>
 size_t code_scan(const CodeQueries& queries, const PackedCodes& rows, size_t* block, Hit* hits) {
+  // Comparing the prefix of the dimensions first pays if it leaves few queries. If not, some steps
+  // are compared in full before it is tried again.
+  const bool has_prefix =
+      rows.biases != nullptr && rows.prefix < rows.dim && queries.n >= kTileQueries;
+  int32_t thresholds[kScanQueries], prefix_thresholds[kScanQueries];
+  for (size_t q = 0; q < queries.n; ++q) {
+    // |p|^2 - 2 p . q over the other dimensions is at least minus the query's squared norm there.
+    const int32_t limit = queries.limits[q], rest = queries.rest_norms[q];
+    thresholds[q] = threshold(limit);
+    prefix_thresholds[q] = threshold(limit > INT32_MAX - rest ? INT32_MAX : limit + rest);
+  }
   [[maybe_unused]] typename S::Step room[kScanQueries * 64];
-  int32_t thresholds[kScanQueries];
-  for (size_t q = 0; q < queries.n; ++q) thresholds[q] = threshold(queries.limits[q]);
-  Prefix prefix(queries, rows);
-  CodeTile<S> tile{};
+  CodeTile<S> tile{nullptr, queries.limits, thresholds, prefix_thresholds, rows, 0};
   if constexpr (requires { S::convert(queries.codes, 0, room); }) {
     S::convert(queries.codes, queries.n * rows.dim / 4, room);
     tile.queries = room;
   } else {
     tile.queries = reinterpret_cast<const typename S::Step*>(queries.codes);
   }
-  tile.limits = queries.limits;
-  tile.thresholds = thresholds;
-  tile.prefix_thresholds = prefix.thresholds();
-  tile.dim = rows.dim;
-  tile.prefix = rows.prefix;
   size_t found = 0;
-  size_t b = *block;
-  while (b < rows.blocks && found < kHitsEnough) {
-    tile.first_row = b * kCodeRows;
-    tile.codes = rows.codes + tile.first_row * rows.dim;
+  for (size_t n = 0; *block < rows.blocks && found < kHitsEnough; *block += n) {
+    n = *block + S::kBlocks <= rows.blocks ? S::kBlocks : 1;
+    tile.first_row = *block * kCodeRows;
+    tile.rows.codes = rows.codes + tile.first_row * rows.dim;
     if (rows.biases != nullptr) {
-      tile.biases = rows.biases + tile.first_row;
-      tile.prefix_biases = rows.prefix_biases + tile.first_row;
+      tile.rows.biases = rows.biases + tile.first_row;
+      tile.rows.prefix_biases = rows.prefix_biases + tile.first_row;
     }
-    if (b + S::kBlocks > rows.blocks) {
+    if (n < S::kBlocks) {
       found += scan_blocks<S, 1>(tile, queries.n, hits + found);
-      b += 1;
-      continue;
-    }
-    if (prefix.pays()) {
+    } else if (has_prefix && *queries.steps_in_full == 0) {
       uint8_t near[kScanQueries];
-      const size_t n = near_by_prefix(tile, queries.n, near);
-      for (size_t i = 0; i < n; ++i) {
+      const size_t left = near_by_prefix(tile, queries.n, near);
+      for (size_t i = 0; i < left; ++i) {
         found += scan_tile<S, 1, S::kBlocks, true>(tile, near[i], hits + found);
       }
-      prefix.left(n);
+      if (4 * left > queries.n) *queries.steps_in_full = 15;
     } else {
+      if (has_prefix) --*queries.steps_in_full;
       found += scan_blocks<S, S::kBlocks>(tile, queries.n, hits + found);
     }
-    b += S::kBlocks;
   }
-  *block = b;
   return found;
 }
 

@@ -33,30 +33,26 @@ bool is_utc_time(std::string_view text) {
 }
 
 MapKind kind_of(const ContainerReader& file) {
-  if (file.kind() == FileKind::learning_map) return MapKind::learning;
-  if (file.kind() == FileKind::sealed_map) return MapKind::sealed;
-  file.fail("it holds ", describe(file.kind()), ", not a map");
+  const bool learning = file.kind() == FileKind::learning_map;
+  file.require(learning || file.kind() == FileKind::sealed_map, "it holds ", describe(file.kind()),
+               ", not a map");
+  return learning ? MapKind::learning : MapKind::sealed;
 }
 
 }  // namespace
 
 void check_metadata(const Metadata& metadata) {
-  if (metadata.size() > kMaxMetadata) {
-    invalid("metadata: a map has at most ", kMaxMetadata, " names, not ", metadata.size());
-  }
+  require(metadata.size() <= kMaxMetadata, "metadata: a map has at most ", kMaxMetadata,
+          " names, not ", metadata.size());
   for (const auto& [name, text] : metadata) {
-    if (!is_utf8(name) || !is_utf8(text)) invalid("metadata: names and texts must be UTF-8");
-    if (name.empty() || name.size() > kMaxMetadataName) {
-      invalid("metadata: a name has 1 to ", kMaxMetadataName, " bytes, not ", name.size());
-    }
-    if (text.size() > kMaxMetadataText) {
-      invalid("metadata: '", name, "' has ", text.size(), " bytes, at most ", kMaxMetadataText,
-              " are allowed");
-    }
-    if (name == kCreated && !is_utc_time(text)) {
-      invalid("metadata: 'created' must be a time in UTC such as 2026-11-23T03:39:41Z, not '", text,
-              "'");
-    }
+    require(is_utf8(name) && is_utf8(text), "metadata: names and texts must be UTF-8");
+    require(!name.empty() && name.size() <= kMaxMetadataName, "metadata: a name has 1 to ",
+            kMaxMetadataName, " bytes, not ", name.size());
+    require(text.size() <= kMaxMetadataText, "metadata: '", name, "' has ", text.size(),
+            " bytes, at most ", kMaxMetadataText, " are allowed");
+    require(name != kCreated || is_utc_time(text),
+            "metadata: 'created' must be a time in UTC such as 2026-11-23T03:39:41Z, not '", text,
+            "'");
   }
 }
 
@@ -77,7 +73,7 @@ void add_metadata(ContainerWriter& file, const Metadata& metadata) {
     out.text(name);
     out.text(text);
   }
-  out.add_to(file, section::kMetadata);
+  file.add(section::kMetadata, out.bytes());
 }
 
 Metadata read_metadata(const ContainerReader& file) {
@@ -85,9 +81,8 @@ Metadata read_metadata(const ContainerReader& file) {
   if (!file.has(section::kMetadata)) return result;
   for (SectionReader in(file, section::kMetadata); !in.empty();) {
     std::string name = in.text();
-    if (!result.empty() && name <= result.rbegin()->first) {
-      file.fail("the names of its metadata do not ascend");
-    }
+    file.require(result.empty() || name > result.rbegin()->first,
+                 "the names of its metadata do not ascend");
     result.emplace_hint(result.end(), std::move(name), in.text());
     if (result.size() > kMaxMetadata) break;
   }
@@ -101,13 +96,11 @@ Metadata read_metadata(const ContainerReader& file) {
 
 MapShape read_shape(const ContainerReader& file, const Encoder& encoder) {
   const auto shape = read_value<MapShape>(file, section::kShape);
-  if (shape.landmarks > UINT32_MAX) file.fail("it claims more landmarks than a map can hold");
-  if (shape.dim == 0 || shape.dim > encoder.dim()) {
-    file.fail("its dimension does not fit its encoder");
-  }
-  if (!std::ranges::all_of(shape.origin, [](double x) { return std::isfinite(x); })) {
-    file.fail("its origin is not finite");
-  }
+  file.require(shape.landmarks <= UINT32_MAX, "it claims more landmarks than a map can hold");
+  file.require(shape.dim >= 1 && shape.dim <= encoder.dim(),
+               "its dimension does not fit its encoder");
+  file.require(std::ranges::all_of(shape.origin, [](double x) { return std::isfinite(x); }),
+               "its origin is not finite");
   return shape;
 }
 
@@ -116,24 +109,22 @@ std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file) {
       Encoder::parse(file.read(section::kEncoder), file.name() + ": encoder"));
 }
 
-std::vector<int8_t> read_centroids(const ContainerReader& file, size_t dim) {
+Matrix<int8_t> read_centroids(const ContainerReader& file, size_t dim) {
   if (!file.has(section::kCentroids)) return {};
   const size_t size = file.map(section::kCentroids).size(), lists = size / dim;
-  if (lists == 0 || lists > CoarseQuantizer::kMaxLists || size % dim != 0) {
-    file.fail_size(section::kCentroids);
-  }
-  auto centroids = read_section<int8_t>(file, section::kCentroids, size);
-  if (std::ranges::find(centroids, -128) != centroids.end()) {
-    file.fail("its centroids are impossible");
-  }
+  file.require_size(lists >= 1 && lists <= CoarseQuantizer::kMaxLists && size % dim == 0,
+                    section::kCentroids);
+  Matrix<int8_t> centroids(lists, dim);
+  centroids.data = read_section<int8_t>(file, section::kCentroids);
+  file.require(std::ranges::find(centroids.data, -128) == centroids.data.end(),
+               "its centroids are impossible");
   return centroids;
 }
 
 void check_ids(const ContainerReader& file, std::span<const int64_t> ids) {
-  if (!ids.empty() && ids.front() < 0) file.fail("it has a negative landmark id");
-  for (size_t i = 1; i < ids.size(); ++i) {
-    if (ids[i] <= ids[i - 1]) file.fail("its landmark ids do not ascend");
-  }
+  file.require(ids.empty() || ids.front() >= 0, "it has a negative landmark id");
+  file.require(std::ranges::adjacent_find(ids, std::greater_equal<>()) == ids.end(),
+               "its landmark ids do not ascend");
 }
 
 MapKind map_kind(const std::filesystem::path& path) {

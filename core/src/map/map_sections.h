@@ -21,8 +21,7 @@ Metadata read_metadata(const ContainerReader& file);
 // std::invalid_argument if there are too many.
 Metadata merged(const Metadata& into, const Metadata& other);
 // Returns the centroids of inverted lists (nlist x dim); none without an index.
-std::vector<int8_t> read_centroids(const ContainerReader& file, size_t dim);
-// Fails unless ids ascend and are not negative.
+Matrix<int8_t> read_centroids(const ContainerReader& file, size_t dim);
 void check_ids(const ContainerReader& file, std::span<const int64_t> ids);
 
 }  // namespace protomark

@@ -6,9 +6,17 @@
 #include "file/journal.h"
 #include "map/prototype_store.h"
 #include "protomark/prototype_map.h"
-#include "search/recall.h"
+#include "search/inverted_lists.h"
 
 namespace protomark {
+
+inline constexpr char kBuildIndex[] = "call build_index first";
+
+struct MeasuredRecall {
+  RecallTable table;
+  size_t lists_version;
+  size_t changes;
+};
 
 // Locks, in the order in which a thread takes them, and who holds them:
 //   journal_mutex  commit, compact, close, and a save onto the map's own file
@@ -39,7 +47,6 @@ struct MapState {
   // released while the recall table is measured.
   size_t nprobe(std::shared_lock<FairSharedMutex>& lock, double recall, int threads);
 
-  // Returns a map of these landmarks.
   PrototypeMap part(std::span<const LandmarkIndex> landmarks) const;
 
   // Throws std::invalid_argument without a journal.
@@ -56,27 +63,27 @@ struct MapState {
 };
 
 inline void check_pairs(size_t ids, size_t others, const char* what) {
-  if (ids != others) invalid(ids, " landmark ids for ", others, " ", what);
+  require(ids == others, ids, " landmark ids for ", others, " ", what);
 }
 
 inline void check_codes(Codes codes, size_t dim) {
-  if (codes.columns != dim) {
-    invalid("codes have ", codes.columns, " dimensions, the map has ", dim);
-  }
+  require(codes.columns == dim, "codes have ", codes.columns, " dimensions, the map has ", dim);
   const size_t n = codes.rows * codes.columns;
-  if (n > 0 && std::memchr(codes.data, -128, n) != nullptr) {
-    invalid("codes must be -127 to 127, one is -128");
-  }
+  require(n == 0 || std::memchr(codes.data, -128, n) == nullptr,
+          "codes must be -127 to 127, one is -128");
 }
 
-// Reads a map file and the commits to it. Throws FileError.
+// Throws FileError.
 std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal);
 
-// Measures the recall table of a store whose rounded prototypes are searched as stored(prototype)
-// leaves them, where `search` finds the nearest landmarks of queries.
-RecallTable measure_recall_of(const PrototypeStore& store,
-                              const std::function<void(int8_t*)>& stored,
-                              const ExactSearch& search);
+// Finds the two nearest landmarks of each query exactly.
+using ExactSearch = std::function<Matches(Codes)>;
+// Measures a recall table with two kinds of test queries: prototypes search for another landmark,
+// as keypoints do whose landmark is not in the map; and codes as far from these as observations are
+// search for any landmark, which is harder in a dense map. For each share of the queries the larger
+// number counts. Prototypes are searched as stored(prototype) leaves them.
+RecallTable measure_recall(const PrototypeStore& store, const std::function<void(int8_t*)>& stored,
+                           const ExactSearch& search);
 
 // A change of a map: while it exists no other one begins, and all that read the map for long wait.
 // Searches go on between its pieces.

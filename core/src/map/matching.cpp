@@ -27,9 +27,8 @@ std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
     in >> length;
     for (double& weight : calibration.weights) in >> weight;
     std::string rest;
-    if (in.fail() || in >> rest) {
-      invalid("the model's note on ", kNote, " is broken: '", line.substr(0, 80), "'");
-    }
+    require(!in.fail() && !(in >> rest), "the model's note on ", kNote, " is broken: '",
+            line.substr(0, 80), "'");
     fitted.emplace(length, calibration);
   }
   const auto next = fitted.lower_bound(dim);
@@ -48,15 +47,12 @@ std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
 template <typename Map>
 MatchList match_with(const Map& map, bool tuned, Descriptors descriptors,
                      const MatchOptions& options) {
-  if (!(options.min_probability >= 0 && options.min_probability <= 1)) {
-    invalid("min_probability must be 0 to 1, not ", options.min_probability);
-  }
+  require(options.min_probability >= 0 && options.min_probability <= 1,
+          "min_probability must be 0 to 1, not ", options.min_probability);
   const auto calibration = MatchCalibration::of(*map.encoder(), map.dim(), tuned);
-  SearchOptions search;
-  search.recall = options.recall;
-  search.among = options.among;
-  search.threads = options.threads;
-  const auto [ids, distances] = map.search(descriptors, 2, search);
+  const auto [ids, distances] =
+      map.search(descriptors, 2,
+                 {.recall = options.recall, .among = options.among, .threads = options.threads});
   std::vector<int64_t> nearest(ids.rows);
   std::vector<double> probabilities(ids.rows);
   for (size_t i = 0; i < ids.rows; ++i) {
@@ -89,9 +85,8 @@ double MatchCalibration::probability(double nearest, double second) const {
 
 MatchList accept(std::span<const int64_t> nearest, std::span<const double> probabilities,
                  double min_probability) {
-  if (nearest.size() != probabilities.size()) {
-    invalid(probabilities.size(), " probabilities do not fit ", nearest.size(), " landmarks");
-  }
+  require(nearest.size() == probabilities.size(), probabilities.size(),
+          " probabilities do not fit ", nearest.size(), " landmarks");
   std::vector<size_t> order;
   for (size_t i = 0; i < nearest.size(); ++i) {
     if (nearest[i] >= 0 && probabilities[i] >= min_probability) order.push_back(i);

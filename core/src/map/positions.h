@@ -28,9 +28,8 @@ class PositionCodec {
   PositionCodec(const std::array<Position, 2>& extent, int bits) : bits_(bits) {
     for (size_t i = 0; i < 3; ++i) {
       const double low = extent[0][i], high = extent[1][i], middle = low / 2 + high / 2;
-      if (std::max(high - middle, middle - low) > std::numeric_limits<float>::max()) {
-        invalid("positions are too far apart for a sealed map");
-      }
+      require(std::max(high - middle, middle - low) <= std::numeric_limits<float>::max(),
+              "positions are too far apart for a sealed map");
       origin_[i] = bits == 16 ? low : middle;
       if (bits == 16) step_[i] = (high - low) / kLast;
     }
@@ -41,9 +40,8 @@ class PositionCodec {
     bits_ = 16;
     step_ = read_value<Position>(file, section::kSteps);
     for (size_t i = 0; i < 3; ++i) {
-      if (!(step_[i] >= 0) || !std::isfinite(origin_[i] + step_[i] * kLast)) {
-        file.fail("the steps of its positions are impossible");
-      }
+      file.require(step_[i] >= 0 && std::isfinite(origin_[i] + step_[i] * kLast),
+                   "the steps of its positions are impossible");
     }
   }
 
@@ -58,14 +56,12 @@ class PositionCodec {
     for (size_t i = 0; i < 3; ++i) {
       const double distance = p[i] - origin_[i];
       if (bits_ == 32) {
-        const auto number = static_cast<float>(distance);
-        std::memcpy(to + i * sizeof(number), &number, sizeof(number));
-      } else {
-        const double steps = step_[i] > 0 ? std::round(distance / step_[i]) : 0;
-        const auto number =
-            std::isnan(p[0]) ? kNone : static_cast<uint16_t>(std::clamp(steps, 0.0, double{kLast}));
-        std::memcpy(to + i * sizeof(number), &number, sizeof(number));
+        store(to + 4 * i, static_cast<float>(distance));
+        continue;
       }
+      const double steps = step_[i] > 0 ? std::round(distance / step_[i]) : 0;
+      const double number = std::isnan(p[0]) ? kNone : std::clamp(steps, 0.0, double{kLast});
+      store(to + 2 * i, static_cast<uint16_t>(number));
     }
   }
   // Returns NaN if there is no position, or no number in a broken file.
@@ -73,12 +69,9 @@ class PositionCodec {
     Position p = origin_;
     for (size_t i = 0; i < 3; ++i) {
       if (bits_ == 32) {
-        float number;
-        std::memcpy(&number, from + i * sizeof(number), sizeof(number));
-        p[i] += number;
+        p[i] += load<float>(from + 4 * i);
       } else {
-        uint16_t number;
-        std::memcpy(&number, from + i * sizeof(number), sizeof(number));
+        const auto number = load<uint16_t>(from + 2 * i);
         p[i] = number == kNone ? kNaN : p[i] + step_[i] * number;
       }
     }

@@ -1,7 +1,10 @@
-// Changes observations, landmarks, positions and metadata of a learning map.
+// Changes observations, landmarks, positions and metadata of a learning map, merges maps into one
+// and splits one into parts.
+#include <map>
 #include <unordered_map>
 
 #include "base/parallel.h"
+#include "map/map_sections.h"
 #include "map/map_state.h"
 
 namespace protomark {
@@ -12,8 +15,34 @@ constexpr size_t kEncodeChunk = 1 << 13;
 // Descriptors that a thread encodes at a time while another one adds.
 constexpr size_t kMinShare = 64, kMaxShare = 512;
 
-void check_new_id(int64_t id) {
-  if (id < 0) invalid("landmark id ", id, " is negative");
+void check_new_id(int64_t id) { require(id >= 0, "landmark id ", id, " is negative"); }
+
+using Cell = std::array<int64_t, 3>;
+
+// Beyond this, neighbouring cells are the same in double precision.
+constexpr double kMaxCell = 9007199254740992;  // 2^53
+
+Cell cell_of(const Position& position, double size) {
+  Cell cell;
+  for (size_t i = 0; i < cell.size(); ++i) {
+    // A quotient alone may be rounded up to the next cell; a remainder is exact.
+    const double remainder = std::fmod(position[i], size);
+    const double index = std::round((position[i] - remainder) / size) - (remainder < 0 ? 1 : 0);
+    require(std::abs(index) <= kMaxCell, "cells of ", size,
+            " are too small for the extent of this map");
+    cell[i] = static_cast<int64_t>(index);
+  }
+  return cell;
+}
+
+void check_alike(const PrototypeMap& map, const PrototypeMap& other) {
+  require(other.encoder()->identity() == map.encoder()->identity() && other.dim() == map.dim(),
+          "maps of different encoders or dimensions cannot be merged: '",
+          map.encoder()->info().name, "' with ", map.dim(), ", '", other.encoder()->info().name,
+          "' with ", other.dim());
+  require(other.appearance_bits() == map.appearance_bits(), "maps of ", map.appearance_bits(),
+          " and ", other.appearance_bits(),
+          " appearance bits cannot be merged: build both with the same");
 }
 
 }  // namespace
@@ -117,48 +146,37 @@ void PrototypeMap::subtract_codes(std::span<const int64_t> ids, Codes codes) {
 
   // Sums up what to subtract from each row, to check everything before anything changes.
   struct Difference {
-    int64_t id;
-    uint16_t appearance;
-    int count;
     std::vector<int> sum;
+    int count = 0;
   };
-  std::vector<Difference> differences;
-  std::unordered_map<uint32_t, size_t> of_row;
-  const auto never_added = [](int64_t id) {
-    invalid("descriptors to subtract from landmark ", id, " were never added to it");
-  };
+  std::map<PrototypeStore::Key, Difference> differences;
   for (size_t i = 0; i < ids.size(); ++i) {
-    const int64_t id = ids[i];
-    const Row row = store.find_row(store.at(id), store.appearance_of(codes.row(i)));
-    if (row == kNoRow) never_added(id);
-    const auto [found, is_new] = of_row.emplace(row.value, differences.size());
-    if (is_new) differences.push_back({id, store.appearance(row), 0, std::vector<int>(dim)});
-    Difference& difference = differences[found->second];
+    const PrototypeStore::Key key{ids[i], store.appearance_of(codes.row(i))};
+    Difference& difference = differences[key];
+    difference.sum.resize(dim);
     for (size_t d = 0; d < dim; ++d) difference.sum[d] += codes.row(i)[d];
     ++difference.count;
   }
-  for (const auto& [row_value, index] : of_row) {
-    const Row row{row_value};
-    const Difference& difference = differences[index];
-    const int left = store.count(row) - difference.count;
-    if (left < 0) {
-      invalid("landmark ", difference.id, " has ", store.count(row), " observations",
-              store.several() ? " of one appearance" : "", ", ", difference.count,
-              " cannot be subtracted");
-    }
-    const Sum sum = store.sum(row);
+  for (const auto& [key, difference] : differences) {
+    const Row row = store.find_row(store.at(key.id), key.appearance);
+    const int left = row == kNoRow ? 0 : store.count(row) - difference.count;
+    require(left >= 0, "landmark ", key.id, " has ", left + difference.count, " observations",
+            store.several() ? " of one appearance" : "", ", ", difference.count,
+            " cannot be subtracted");
+    bool possible = row != kNoRow;
+    const Sum sum = possible ? store.sum(row) : Sum{};
     for (size_t d = 0; d < dim; ++d) {
-      if (std::abs(sum[d] - difference.sum[d]) > 127 * left) never_added(difference.id);
+      possible = possible && std::abs(sum[d] - difference.sum[d]) <= 127 * left;
     }
+    require(possible, "descriptors to subtract from landmark ", key.id, " were never added to it");
   }
-  change.in_pieces(differences.size(), [&](size_t i) {
-    const Difference& difference = differences[i];
-    const Row row = store.find_row(difference.id, difference.appearance);
+  auto next = differences.begin();
+  change.in_pieces(differences.size(), [&](size_t) {
+    const auto& [key, difference] = *next++;
+    const Row row = store.find_row(key.id, key.appearance);
     if (store.count(row) == difference.count) return store.erase_row(row);
     Sum sum = store.sum(row);
-    for (size_t d = 0; d < dim; ++d) {
-      sum[d] = static_cast<int16_t>(sum[d] - difference.sum[d]);
-    }
+    for (size_t d = 0; d < dim; ++d) sum[d] = static_cast<int16_t>(sum[d] - difference.sum[d]);
     store.set(row, sum, store.count(row) - difference.count);
   });
 }
@@ -182,11 +200,10 @@ void PrototypeMap::merge_landmarks(std::span<const int64_t> into, std::span<cons
     const auto [to, from] = pairs.emplace_back(std::array{into[i], source[i]});
     for (const int64_t id : {to, from}) {
       store.at(id);
-      if (removed.contains(id)) {
-        invalid("landmark ", id, " was merged into another earlier in the same call");
-      }
+      require(!removed.contains(id), "landmark ", id,
+              " was merged into another earlier in the same call");
     }
-    if (to == from) invalid("landmark ", to, " cannot be merged into itself");
+    require(to != from, "landmark ", to, " cannot be merged into itself");
     removed.insert(from);
   }
   change.in_pieces(pairs.size(), [&](size_t i) {
@@ -209,14 +226,123 @@ void PrototypeMap::set_positions(std::span<const int64_t> ids,
   for (size_t i = 0; i < ids.size(); ++i) {
     store.at(ids[i]);
     const Position& p = positions[i];
-    if (!is_finite(p) && has_position(p))
-      invalid("position of landmark ", ids[i], " is not finite");
+    require(is_finite(p) || !has_position(p), "position of landmark ", ids[i], " is not finite");
   }
   if (std::ranges::any_of(positions, has_position)) {
     store.make_room_for_positions(state_->searching);
   }
   change.in_pieces(ids.size(),
                    [&](size_t i) { store.set_position(store.at(ids[i]), positions[i]); });
+}
+
+void PrototypeMap::merge_map(const PrototypeMap& other, std::span<const int64_t> into,
+                             std::span<const int64_t> source) {
+  require(&other != this, "a map cannot be merged into itself");
+  check_alike(*this, other);
+  check_pairs(into.size(), source.size(), "sources");
+  // In one order for all pairs of maps, so that no two merges wait for each other.
+  std::unique_lock changing(state_->changing, std::defer_lock);
+  std::shared_lock reading(other.state_->changing, std::defer_lock);
+  const bool first_this = std::less<>{}(state_.get(), other.state_.get());
+  if (first_this) changing.lock();
+  reading.lock();
+  if (!first_this) changing.lock();
+  MapChange change(*state_, std::move(changing));
+  PrototypeStore& to = state_->store;
+  const PrototypeStore& from = other.state_->store;
+  std::unordered_map<uint32_t, int64_t> renamed;
+  renamed.reserve(source.size());
+  for (size_t i = 0; i < source.size(); ++i) {
+    const int64_t id = into[i], other_id = source[i];
+    check_new_id(id);
+    const bool is_new = renamed.emplace(from.at(other_id).value, id).second;
+    require(is_new, "landmark ", other_id, " of the other map is named twice");
+  }
+  Metadata metadata = merged(state_->metadata, other.state_->metadata);
+  if (!from.positions().empty()) to.make_room_for_positions(state_->searching);
+  // By id, so that the result does not depend on the history of the other map.
+  const std::vector<LandmarkIndex> landmarks = from.sorted_landmarks();
+  std::vector<int64_t> ids;
+  for (size_t first = 0, end = 0; first < landmarks.size(); first = end) {
+    ids.clear();
+    size_t rows = 0, new_landmarks = 0;
+    for (; end < landmarks.size() && rows < MapChange::kPiece; ++end) {
+      const auto found = renamed.find(landmarks[end].value);
+      ids.push_back(found == renamed.end() ? from.id(landmarks[end]) : found->second);
+      rows += from.row_count(landmarks[end]);
+      if (to.find(ids.back()) == kNoLandmark) ++new_landmarks;
+    }
+    to.make_room(new_landmarks, to.several() ? rows : new_landmarks, rows, state_->searching);
+    const auto lock = change.write();
+    for (size_t i = 0; i < ids.size(); ++i) to.merge(ids[i], from, landmarks[first + i]);
+    to.reassign(1);
+  }
+  change.set_metadata(std::move(metadata));
+}
+
+PrototypeMap MapState::part(std::span<const LandmarkIndex> landmarks) const {
+  auto result = std::make_unique<MapState>(encoder, store.dim(), store.appearance_bits());
+  PrototypeStore& to = result->store;
+  result->metadata = metadata;
+  size_t rows = 0;
+  for (const LandmarkIndex landmark : landmarks) rows += store.row_count(landmark);
+  to.reserve(landmarks.size(), rows);
+  for (const LandmarkIndex landmark : landmarks) to.merge(store.id(landmark), store, landmark);
+  return PrototypeMap(std::move(result));
+}
+
+PrototypeMap PrototypeMap::part(std::span<const int64_t> ids) const {
+  const std::shared_lock lock(state_->changing);
+  std::vector<LandmarkIndex> landmarks;
+  landmarks.reserve(ids.size());
+  for (const int64_t id : ids) landmarks.push_back(state_->store.at(id));
+  sort_unique(landmarks);
+  return state_->part(landmarks);
+}
+
+std::vector<PrototypeMap> PrototypeMap::split_by_id(std::span<const int64_t> boundaries) const {
+  require(std::ranges::is_sorted(boundaries), "boundaries of parts must ascend");
+  const std::shared_lock lock(state_->changing);
+  const std::vector<LandmarkIndex> landmarks = state_->store.sorted_landmarks();
+  std::vector<PrototypeMap> parts;
+  parts.reserve(boundaries.size() + 1);
+  auto first = landmarks.begin();
+  for (size_t i = 0; i <= boundaries.size(); ++i) {
+    const auto end =
+        i == boundaries.size()
+            ? landmarks.end()
+            : std::ranges::lower_bound(first, landmarks.end(), boundaries[i], {},
+                                       [&](LandmarkIndex l) { return state_->store.id(l); });
+    parts.push_back(state_->part({first, end}));
+    first = end;
+  }
+  return parts;
+}
+
+std::vector<MapPart> PrototypeMap::split_by_space(double cell_size) const {
+  require(cell_size > 0 && !std::isinf(cell_size), "the edge of a cell must be above 0 and finite");
+  const std::shared_lock lock(state_->changing);
+  const PrototypeStore& store = state_->store;
+  std::vector<std::pair<std::optional<Cell>, LandmarkIndex>> all;
+  all.reserve(store.landmark_count());
+  for (const LandmarkIndex landmark : store.sorted_landmarks()) {
+    const Position position = store.position(landmark);
+    all.emplace_back(std::nullopt, landmark);
+    if (has_position(position)) all.back().first = cell_of(position, cell_size);
+  }
+  // By cell, then those without a position.
+  std::ranges::stable_sort(all, [](const auto& a, const auto& b) {
+    return a.first && (!b.first || *a.first < *b.first);
+  });
+  std::vector<MapPart> parts;
+  std::vector<LandmarkIndex> landmarks;
+  for (size_t i = 0; i < all.size(); ++i) {
+    landmarks.push_back(all[i].second);
+    if (i + 1 < all.size() && all[i + 1].first == all[i].first) continue;
+    parts.push_back({all[i].first, state_->part(landmarks)});
+    landmarks.clear();
+  }
+  return parts;
 }
 
 }  // namespace protomark

@@ -29,28 +29,24 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   int64_t largest = -1;
   // A map whose positions were all removed equals one that never had any.
   bool positions = false;
-  const auto count_landmark = [&](LandmarkIndex landmark) {
+  const auto count = [&](LandmarkIndex landmark) {
     ++n;
     largest = std::max(largest, store.id(landmark));
     positions = positions || has_position(store.position(landmark));
-  };
-  const auto count_row = [&](Row row) {
-    ++m;
-    const Sum sum = store.sum(row);
-    const int width = sum_bits(store.count(row));
-    for (size_t d = 0; d < dim; d += 8) {
-      spares_size += kSpareBits;
-      sums_size += 8 * static_cast<size_t>(width - spare_bits(&sum[d], width));
-    }
+    store.each_row_of(landmark, [&](Row row) {
+      ++m;
+      const Sum sum = store.sum(row);
+      const int width = sum_bits(store.count(row));
+      for (size_t d = 0; d < dim; d += 8) {
+        spares_size += kSpareBits;
+        sums_size += 8 * static_cast<size_t>(width - spare_bits(&sum[d], width));
+      }
+    });
   };
   if (changed) {
-    for (const LandmarkIndex landmark : *changed) {
-      count_landmark(landmark);
-      store.each_row_of(landmark, count_row);
-    }
+    std::ranges::for_each(*changed, count);
   } else {
-    store.each_landmark(count_landmark);
-    store.each_row(count_row);
+    store.each_landmark(count);
   }
   const bool ids = IdBlockWriter::needed(n, largest), several = store.several();
   const auto appearance_bits = static_cast<int>(store.appearance_bits());
@@ -65,23 +61,18 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
   if (ids) IdBlockWriter::add_to(parts, n);
 
-  file.add_together(std::move(parts), [=, &store](auto sinks) {
-    auto sink = sinks.begin();
-    const auto& count_sink = *sink++;
-    PackedWriter spares(*sink++), sums(*sink++);
-    std::optional<PackedWriter> appearances;
-    if (several) appearances.emplace(*sink++);
-    const auto* position_sink = positions ? &*sink++ : nullptr;
-    std::optional<IdBlockWriter> id_writer;
-    if (ids) id_writer.emplace(sink[0], sink[1]);
+  file.add(std::move(parts), [=, &store](ContainerWriter::Sinks sinks) {
+    SinkQueue queue(sinks);
+    ValueWriter counts(queue.next());
+    PackedWriter spares(queue.next()), sums(queue.next()), appearances(queue.next(several));
+    ValueWriter positions_of(queue.next(positions));
+    IdBlockWriter ids_of{queue.next(ids), queue.next(ids)};
     const auto put_piece = [&](std::span<const LandmarkIndex> landmarks) {
       constexpr size_t kAhead = 16;
-      const std::vector<Row> sorted = store.sorted_rows(landmarks);
-      const std::span<const Row> rows(sorted);
-      put_each<uint8_t>(count_sink, rows,
-                        [&](Row row) { return static_cast<uint8_t>(store.count(row)); });
+      const std::vector<Row> rows = store.sorted_rows(landmarks);
       for (size_t i = 0; i < rows.size(); ++i) {
         if (i + kAhead < rows.size()) store.prefetch(rows[i + kAhead]);
+        counts.add(static_cast<uint8_t>(store.count(rows[i])));
         const Sum sum = store.sum(rows[i]);
         const int width = sum_bits(store.count(rows[i]));
         for (size_t d = 0; d < dim; d += 8) {
@@ -97,15 +88,13 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
         }
         if (!several) continue;
         const bool last = i + 1 == rows.size() || store.owner(rows[i + 1]) != store.owner(rows[i]);
-        appearances->add(store.appearance(rows[i]) | uint64_t{last} << appearance_bits,
-                         appearance_bits + 1);
+        appearances.add(store.appearance(rows[i]) | uint64_t{last} << appearance_bits,
+                        appearance_bits + 1);
       }
       for (const LandmarkIndex l : landmarks) {
-        if (ids) id_writer->add(store.id(l));
+        if (ids) ids_of.add(store.id(l));
+        if (positions) positions_of.add(store.position(l));
       }
-      if (!positions) return;
-      put_each<Position>(*position_sink, landmarks,
-                         [&](LandmarkIndex l) { return store.position(l); });
     };
     const auto put = [&](std::span<const LandmarkIndex> landmarks) {
       constexpr size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
@@ -117,10 +106,12 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
       }
     };
     changed ? put(*changed) : store.visit_sorted_landmarks(put);
+    counts.finish();
     spares.finish();
     sums.finish();
-    if (appearances) appearances->finish();
-    if (id_writer) id_writer->finish();
+    appearances.finish();
+    positions_of.finish();
+    ids_of.finish();
   });
 }
 
@@ -129,9 +120,8 @@ size_t read_appearance_bits(const ContainerReader& file, size_t dim) {
   if (!file.has(section::kAppearanceBits)) return 0;
   const auto bits = read_value<uint32_t>(file, section::kAppearanceBits);
   const size_t limit = std::min(PrototypeMap::kMaxAppearanceBits, dim);
-  if (bits == 0 || bits > limit) {
-    file.fail("its appearances have ", bits, " bits, not 1 to ", limit);
-  }
+  file.require(bits >= 1 && bits <= limit, "its appearances have ", bits, " bits, not 1 to ",
+               limit);
   return bits;
 }
 
@@ -140,27 +130,23 @@ size_t read_appearance_bits(const ContainerReader& file, size_t dim) {
 // is proportional to the bytes read.
 class Reading {
  public:
-  explicit Reading(MapState& state)
-      : encoder_(*state.encoder), store_(state.store), state_(state) {}
+  explicit Reading(MapState& state) : state_(state), store_(state.store) {}
 
   void read_commit(const ContainerReader& commit) {
-    const MapShape shape = read_shape(commit, encoder_);
-    if (shape.dim != store_.dim() ||
-        read_appearance_bits(commit, shape.dim) != store_.appearance_bits()) {
-      commit.fail("its dimension or appearance bits are not the map's");
-    }
+    const MapShape shape = read_shape(commit, *state_.encoder);
+    commit.require(shape.dim == store_.dim() &&
+                       read_appearance_bits(commit, shape.dim) == store_.appearance_bits(),
+                   "its dimension or appearance bits are not the map's");
     auto ids = read_landmarks(commit, shape.landmarks);
     if (commit.has(section::kRemoved)) {
-      const Bytes bytes = commit.map(section::kRemoved);
-      const auto removed =
-          read_section<int64_t>(commit, section::kRemoved, bytes.size() / sizeof(int64_t));
+      const auto removed = read_section<int64_t>(commit, section::kRemoved);
       check_ids(commit, removed);
       ids.insert(ids.end(), removed.begin(), removed.end());
     }
     for (const int64_t id : ids) read_.insert(id);
     if (commit.has(section::kCentroids)) {
       // Empty if the index was dropped.
-      auto centroids = commit.map(section::kCentroids).empty() ? std::vector<int8_t>()
+      auto centroids = commit.map(section::kCentroids).empty() ? Matrix<int8_t>()
                                                                : read_centroids(commit, shape.dim);
       if (!centroids_) centroids_ = std::move(centroids);
     }
@@ -173,11 +159,11 @@ class Reading {
   void read_map(const ContainerReader& file) {
     auto metadata = read_metadata(file);
     auto centroids = read_centroids(file, store_.dim());
-    read_landmarks(file, read_shape(file, encoder_).landmarks);
+    read_landmarks(file, read_shape(file, *state_.encoder).landmarks);
     state_.metadata = std::move(metadata_ ? *metadata_ : metadata);
     if (centroids_) centroids = std::move(*centroids_);
-    if (centroids.empty()) return;
-    MapChange(state_).set_quantizer({std::move(centroids), store_.dim()}, 1, true);
+    if (centroids.rows == 0) return;
+    MapChange(state_).set_quantizer(CoarseQuantizer(std::move(centroids)), 1, true);
   }
 
  private:
@@ -187,10 +173,10 @@ class Reading {
     const auto bits = static_cast<int>(store_.appearance_bits());
     const bool several = store_.several();
     const size_t m = several ? file.map(section::kCounts).size() : n;
-    if (m > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
-    if (m < n) file.fail_size(section::kCounts);
+    file.require(m <= UINT32_MAX, "it claims more prototypes than a map can hold");
+    file.require_size(m >= n, section::kCounts);
     const auto counts = read_section<uint8_t>(file, section::kCounts, m);
-    if (std::ranges::find(counts, 0) != counts.end()) file.fail("it has an impossible prototype");
+    file.require(std::ranges::find(counts, 0) == counts.end(), "it has an impossible prototype");
     const size_t spares_size = m * ((dim + 7) / 8) * kSpareBits;
     PackedReader spares(file, section::kSpareBits, spares_size);
     size_t sums_size = 0;
@@ -223,7 +209,7 @@ class Reading {
       LandmarkIndex landmark = kNoLandmark;
       int32_t before = -1;  // the appearance of the row before
       for (bool last = false; !last; ++row) {
-        if (row == m) file.fail("it has a landmark without prototypes");
+        file.require(row != m, "it has a landmark without prototypes");
         const int count = counts[row];
         Sum sum{};
         bool possible = true;
@@ -236,13 +222,11 @@ class Reading {
             sum[j] = static_cast<int16_t>(number);
           }
         }
-        if (!possible) file.fail("landmark ", ids[i], " has an impossible prototype");
+        file.require(possible, "landmark ", ids[i], " has an impossible prototype");
         const auto marked = several ? static_cast<int32_t>(appearances->next(bits + 1)) : 1;
         const int32_t appearance = marked & ((1 << bits) - 1);
         last = marked >> bits != 0;
-        if (appearance <= before) {
-          file.fail("the appearances of landmark ", ids[i], " do not ascend");
-        }
+        file.require(appearance > before, "the appearances of landmark ", ids[i], " do not ascend");
         before = appearance;
         if (!is_newest) continue;
         const Row to = store_.create_row(ids[i], landmark, static_cast<uint16_t>(appearance));
@@ -250,11 +234,10 @@ class Reading {
       }
       if (positions.empty()) continue;
       landmarks.push_back(landmark);
-      if (!is_finite(positions[i]) && has_position(positions[i])) {
-        file.fail("landmark ", ids[i], " has no finite position");
-      }
+      file.require(is_finite(positions[i]) || !has_position(positions[i]), "landmark ", ids[i],
+                   " has no finite position");
     }
-    if (row != m) file.fail("it has prototypes of no landmark");
+    file.require(row == m, "it has prototypes of no landmark");
     // After the landmarks, so that room for positions is made once.
     for (size_t i = 0; i < positions.size(); ++i) {
       if (landmarks[i] != kNoLandmark) store_.set_position(landmarks[i], positions[i]);
@@ -262,12 +245,11 @@ class Reading {
     return ids;
   }
 
-  const Encoder& encoder_;
-  PrototypeStore& store_;
   MapState& state_;
+  PrototypeStore& store_;
   IdSet read_;  // landmarks that later commits name
   std::optional<Metadata> metadata_;
-  std::optional<std::vector<int8_t>> centroids_;
+  std::optional<Matrix<int8_t>> centroids_;
 };
 
 std::unique_ptr<MapState> read_with_journal(const std::filesystem::path& path) {
@@ -296,16 +278,16 @@ ContainerWriter file_of(const MapState& state) {
   ContainerWriter file(FileKind::learning_map);
   file.add(section::kEncoder, state.encoder->serialize());
   add_metadata(file, state.metadata);
-  const std::vector<int8_t>& centroids = state.store.quantizer().centroids();
+  const std::vector<int8_t>& centroids = state.store.quantizer().centroids().data;
   if (!centroids.empty()) file.add(section::kCentroids, std::as_bytes(std::span(centroids)));
   add_landmarks(file, state.store);
   return file;
 }
 
-// Adds the changes to the record of a commit, and returns its bytes.
 std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
                                  const Uncommitted& changes) {
-  std::vector<int64_t> ids(changes.ids().begin(), changes.ids().end()), removed;
+  const auto& changed = changes.landmarks.ids();
+  std::vector<int64_t> ids(changed.begin(), changed.end()), removed;
   std::ranges::sort(ids);
   std::vector<LandmarkIndex> existing;
   for (const int64_t id : ids) {
@@ -320,7 +302,8 @@ std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
                            : add_metadata(record, state.metadata);
   }
   if (changes.centroids) {
-    record.add(section::kCentroids, std::as_bytes(std::span(state.store.quantizer().centroids())));
+    const std::vector<int8_t>& centroids = state.store.quantizer().centroids().data;
+    record.add(section::kCentroids, std::as_bytes(std::span(centroids)));
   }
   return record.serialize();
 }
@@ -371,8 +354,8 @@ bool PrototypeMap::has_journal() const {
 }
 
 Journal& MapState::need_journal() const {
-  if (journal) return *journal;
-  invalid("this map has no journal: open it with a journal to commit");
+  require(journal != nullptr, "this map has no journal: open it with a journal to commit");
+  return *journal;
 }
 
 size_t PrototypeMap::commit() {
@@ -386,7 +369,7 @@ size_t PrototypeMap::commit() {
     const std::shared_lock lock(state_->changing);
     Uncommitted& uncommitted = *state_->store.uncommitted;
     if (uncommitted.empty()) return 0;
-    if (!uncommitted.incomplete()) {
+    if (!uncommitted.incomplete) {
       record = serialize(file, *state_, uncommitted);
       changes = std::exchange(uncommitted, {});
     }

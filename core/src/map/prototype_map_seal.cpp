@@ -4,14 +4,12 @@
 #include "map/map_sections.h"
 #include "map/map_state.h"
 #include "map/sealed_store.h"
-#include "map/tuning.h"
 #include "search/scan.h"
 
 namespace protomark {
 namespace {
 
-using Sink = ContainerWriter::Sink;
-using Sinks = std::span<const Sink>;
+using Sinks = ContainerWriter::Sinks;
 
 // Packs blocks of kPackedRows rows as search reads them.
 class BlockPacker {
@@ -47,22 +45,15 @@ class BlockPacker {
   void pack(const Row* rows, uint8_t* to) const {
     const size_t dim = store_->dim();
     std::array<int8_t, 256 * kPackedRows> codes{};
-    for (size_t i = 0; i < kPackedRows; ++i) {
-      if (rows[i] != kNoRow) store_->rounded(rows[i], &codes[i * dim]);
-    }
-    if (nearest_) {
-      nearest_->find(codes.data(), dim, kPackedRows, to);
-      for (size_t i = 0; i < size(); ++i) {
-        if (rows[i % kPackedRows] == kNoRow) to[i] = 0;
-      }
-      return;
-    }
     std::fill_n(to, size(), uint8_t{0});
     for (size_t i = 0; i < kPackedRows; ++i) {
-      for (size_t d = 0; d < dim; d += 4) {
-        std::memcpy(to + packed_index(i, d, dim), &codes[i * dim + d],
-                    std::min<size_t>(4, dim - d));
-      }
+      if (rows[i] == kNoRow) continue;
+      nearest_ ? store_->rounded(rows[i], &codes[i * dim]) : store_->copy_packed(rows[i], to, i);
+    }
+    if (!nearest_) return;
+    nearest_->find(codes.data(), dim, kPackedRows, to);
+    for (size_t i = 0; i < size(); ++i) {
+      if (rows[i % kPackedRows] == kNoRow) to[i] = 0;
     }
   }
 
@@ -104,49 +95,46 @@ class SealedLandmarks {
 // Writes rows, each list beginning a new block, and their owners if there is a writer for these.
 class RowWriter {
  public:
-  RowWriter(const BlockPacker& packer, size_t landmarks, const Sink& prototypes,
+  RowWriter(const BlockPacker& packer, size_t landmarks, Sink prototypes,
             PackedWriter* owners = nullptr)
-      : packer_(packer), landmarks_(landmarks), prototypes_(prototypes), owners_(owners) {}
+      : packer_(packer),
+        landmarks_(landmarks),
+        prototypes_(std::move(prototypes)),
+        owners_(owners) {}
 
   void add(Row row, size_t owner = 0) {
     block_[filled_++] = row;
     if (owners_ != nullptr) owners_->add(owner, owner_bits(landmarks_));
     if (filled_ < kPackedRows) return;
-    packed_.resize(packed_.size() + packer_.size());
-    packer_.pack(block_.data(), packed_.data() + packed_.size() - packer_.size());
+    packer_.pack(block_.data(), reinterpret_cast<uint8_t*>(prototypes_.add_bytes(packer_.size())));
     filled_ = 0;
-    if (packed_.size() >= kPiece) flush();
   }
   void end_list() {
     while (filled_ != 0) add(kNoRow, landmarks_);
   }
-  void flush() {
-    prototypes_(std::as_bytes(std::span(packed_)));
-    packed_.clear();
+  void finish() {
+    end_list();
+    prototypes_.finish();
   }
 
  private:
-  static constexpr size_t kPiece = 1 << 16;  // bytes
-
   const BlockPacker& packer_;
   size_t landmarks_;
-  const Sink& prototypes_;
+  ValueWriter prototypes_;
   PackedWriter* owners_;
   std::array<Row, kPackedRows> block_{};
   size_t filled_ = 0;
-  std::vector<uint8_t> packed_;
 };
 
 // Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
 // piece.
-Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries,
-                      size_t k) {
+Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
   // A piece is small compared with the map.
   const size_t size = std::max<size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector) + 1);
   std::array<Row, kPackedRows> block;
   const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(k, {});
+  Neighbours nearest = prepared.neighbours(2, {});
   PackedPrototypes piece = packer.view();
   piece.data = packed.data();
   for (size_t first = 0; first < store.row_end(); first += piece.rows) {
@@ -163,7 +151,7 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
       piece.landmarks.ids += piece.rows;
     }
   }
-  Matches matches{{queries.rows, k}, {queries.rows, k}};
+  Matches matches{{queries.rows, 2}, {queries.rows, 2}};
   write_answer(nearest, prepared.norms(), {}, 0, matches);
   return matches;
 }
@@ -181,7 +169,7 @@ class SealedContent {
     ids_are_stored_ = IdBlockWriter::needed(store.landmark_count(), largest);
   }
 
-  // Adds the sections to a file that is written while this exists.
+  // The file must be written while this exists.
   void add_to(ContainerWriter& file) {
     const size_t n = store_.landmark_count(), nlist = store_.quantizer().nlist();
     const ContainerWriter::Part prototypes{section::kPrototypes,
@@ -191,26 +179,24 @@ class SealedContent {
     if (codec_) parts.push_back({section::kPositions, n * codec_->size()});
     if (nlist == 0) parts.push_back(prototypes);
     if (ids_are_stored_) IdBlockWriter::add_to(parts, n);
-    if (!parts.empty()) {
-      file.add_together(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
-    }
+    file.add(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
     if (nlist == 0) return;
     const size_t words = packed_words(store_.row_end(), owner_bits(n));
-    file.add_together({prototypes, {section::kOwners, packed_bytes(words, 64)}},
-                      [this](Sinks sinks) { put_lists(sinks); });
-    file.add(section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(uint32_t),
-             [this](const Sink& sink) { sink(std::as_bytes(std::span(owner_checksums_))); });
-    file.add(section::kCentroids, std::as_bytes(std::span(store_.quantizer().centroids())));
-    file.add(section::kListRows, nlist * sizeof(uint32_t), [this, nlist](const Sink& sink) {
-      put_values<uint32_t>(sink, nlist, 1, [&](size_t list, uint32_t* to) {
-        *to = static_cast<uint32_t>(store_.lists().rows(static_cast<uint32_t>(list)));
-      });
-    });
-    file.add(section::kRecall, ContainerWriter::kUnknownSize, [this](const Sink& sink) {
-      const RecallTable table = measure_recall_of(
+    file.add({prototypes, {section::kOwners, packed_bytes(words, 64)}},
+             [this](Sinks sinks) { put_lists(sinks); });
+    file.add({{section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(uint32_t)}},
+             [this](Sinks sinks) { sinks[0](std::as_bytes(std::span(owner_checksums_))); });
+    file.add(section::kCentroids, std::as_bytes(std::span(store_.quantizer().centroids().data)));
+    std::vector<uint32_t> list_rows;
+    for (uint32_t list = 0; list < nlist; ++list) {
+      list_rows.push_back(static_cast<uint32_t>(store_.lists().rows(list)));
+    }
+    file.add(section::kListRows, std::as_bytes(std::span(list_rows)));
+    file.add({{section::kRecall, ContainerWriter::kUnknownSize}}, [this](Sinks sinks) {
+      const RecallTable table = measure_recall(
           store_, [this](int8_t* code) { packer_.quantize(code); },
-          [this](Codes queries, size_t k) { return search_packed(store_, packer_, queries, k); });
-      sink(std::as_bytes(std::span(table)));
+          [this](Codes queries) { return search_packed(store_, packer_, queries); });
+      sinks[0](std::as_bytes(std::span(table)));
     });
   }
 
@@ -218,39 +204,30 @@ class SealedContent {
   bool has_row_counts() const { return store_.prototype_count() != store_.landmark_count(); }
 
   void put_landmarks(Sinks sinks) {
-    auto sink = sinks.begin();
-    const Sink* row_counts = has_row_counts() ? &*sink++ : nullptr;
-    const Sink* positions = codec_ ? &*sink++ : nullptr;
-    std::optional<RowWriter> prototypes;
-    if (store_.quantizer().nlist() == 0) {
-      prototypes.emplace(packer_, store_.landmark_count(), *sink++);
-    }
-    std::optional<IdBlockWriter> ids;
-    if (ids_are_stored_) ids.emplace(sink[0], sink[1]);
-    if (!prototypes && ids_are_stored_) landmarks_.emplace(store_);
+    const bool indexed = store_.quantizer().nlist() != 0;
+    SinkQueue queue(sinks);
+    ValueWriter row_counts(queue.next(has_row_counts()));
+    ValueWriter positions(queue.next(codec_.has_value()));
+    RowWriter prototypes(packer_, store_.landmark_count(), queue.next(!indexed));
+    IdBlockWriter ids{queue.next(ids_are_stored_), queue.next(ids_are_stored_)};
+    if (indexed && ids_are_stored_) landmarks_.emplace(store_);
     store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
-      if (row_counts != nullptr) {
-        put_each<uint8_t>(*row_counts, landmarks, [&](LandmarkIndex l) {
-          return static_cast<uint8_t>(store_.row_count(l));
-        });
+      for (const LandmarkIndex l : landmarks) {
+        if (has_row_counts()) row_counts.add(static_cast<uint8_t>(store_.row_count(l)));
+        if (codec_) {
+          codec_->encode(map_.position(&store_ == &map_ ? l : map_.at(store_.id(l))),
+                         positions.add_bytes(codec_->size()));
+        }
+        if (ids_are_stored_) ids.add(store_.id(l));
+        if (landmarks_) landmarks_->add(l);
       }
-      if (positions != nullptr) {
-        put_values<std::byte>(*positions, landmarks.size(), codec_->size(), [&](auto i, auto* to) {
-          const LandmarkIndex l = landmarks[i];
-          codec_->encode(map_.position(&store_ == &map_ ? l : map_.at(store_.id(l))), to);
-        });
-      }
-      for (const LandmarkIndex landmark : landmarks) {
-        if (ids) ids->add(store_.id(landmark));
-        if (landmarks_) landmarks_->add(landmark);
-      }
-      if (!prototypes) return;
-      for (const Row row : store_.sorted_rows(landmarks)) prototypes->add(row);
+      if (indexed) return;
+      for (const Row row : store_.sorted_rows(landmarks)) prototypes.add(row);
     });
-    if (ids) ids->finish();
-    if (!prototypes) return;
-    prototypes->end_list();
-    prototypes->flush();
+    row_counts.finish();
+    positions.finish();
+    prototypes.finish();
+    ids.finish();
   }
 
   void put_lists(Sinks sinks) {
@@ -274,7 +251,7 @@ class SealedContent {
       });
       writer.end_list();
     }
-    writer.flush();
+    writer.finish();
     owners.finish();
     landmarks_.reset();  // makes room for the test queries
   }
@@ -298,9 +275,8 @@ void PrototypeMap::seal(const std::filesystem::path& path, const SealOptions& op
 
 void PrototypeMap::seal_codes(const std::filesystem::path& path, const SealOptions& options,
                               std::span<const int64_t> ids, Codes codes) const {
-  if (options.position_bits != 32 && options.position_bits != 16 && options.position_bits != 0) {
-    invalid("position_bits must be 32, 16 or 0, not ", options.position_bits);
-  }
+  const int bits = options.position_bits;
+  require(bits == 32 || bits == 16 || bits == 0, "position_bits must be 32, 16 or 0, not ", bits);
   check_pairs(ids.size(), codes.rows, "codes");
   if (codes.rows != 0) check_codes(codes, dim());
   const std::shared_lock lock(state_->changing);
@@ -319,8 +295,8 @@ void PrototypeMap::seal_codes(const std::filesystem::path& path, const SealOptio
   }
   const PrototypeStore& store = changed ? *changed : map;
   std::optional<PositionCodec> codec;
-  if (options.position_bits != 0) {
-    if (const auto extent = map.summary().extent) codec.emplace(*extent, options.position_bits);
+  if (const auto extent = bits == 0 ? std::nullopt : map.summary().extent) {
+    codec.emplace(*extent, bits);
   }
 
   ContainerWriter file(FileKind::sealed_map);

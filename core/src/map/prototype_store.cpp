@@ -20,17 +20,6 @@ Eight eight(uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
 }
 
-template <typename T>
-T load(const void* from) {
-  T value;
-  std::memcpy(&value, from, sizeof(value));
-  return value;
-}
-template <typename T>
-void store(void* to, const T& value) {
-  std::memcpy(to, &value, sizeof(value));
-}
-
 // Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
 // odd count is rounded down.
 int16_t half(int sum, int count) {
@@ -45,7 +34,7 @@ void PrototypeStore::make_room(size_t landmarks, size_t rows, size_t changed,
   const size_t moving = quantizer_.nlist() == 0 ? 0 : std::min(changed, quantizer_.nlist());
   const size_t blocks = 2 * packed_blocks(rows) + moving;
   for_each_array(landmarks, blocks * kPackedRows, [&](auto& v, size_t more, const auto&) {
-    if (!has_room(v, more)) enlarge(v, larger_capacity(v, more), searching);
+    enlarge(v, capacity_for(v, more), searching);
   });
   if (!index_.has_room(landmarks)) {
     IdIndex larger = index_.with_room(ids_, landmarks);
@@ -54,14 +43,14 @@ void PrototypeStore::make_room(size_t landmarks, size_t rows, size_t changed,
   }
 }
 
-// Makes room for a row at the end of a list.
 Row PrototypeStore::take_row(uint32_t list) {
   if (row_end() + kPackedRows > UINT32_MAX) {
     throw std::length_error("a map holds under 2^32 prototypes");
   }
   lists_.make_room();
   slots_.make_room();
-  for_each_array(0, kPackedRows, [](auto& v, size_t more, const auto&) { make_room_in(v, more); });
+  for_each_array(0, kPackedRows,
+                 [](auto& v, size_t more, const auto&) { v.reserve(capacity_for(v, more)); });
   const Row row = lists_.append(list);
   if (row_end() != counts_.size()) resize(row_end());
   ++prototype_count_;
@@ -74,10 +63,7 @@ void PrototypeStore::copy_row(Row from, Row to) {
   for_each_plain_array(0, 1, [&](auto& v, size_t width, const auto&) {
     std::copy_n(v.data() + from.value * width, width, v.data() + to.value * width);
   });
-  for (size_t d = 0; d < dim_; d += 4) {
-    std::memcpy(packed() + packed_index(to.value, d, dim_),
-                packed() + packed_index(from.value, d, dim_), 4);
-  }
+  copy_packed(from, packed(), to.value);
 }
 
 // Moves the last row of a list to where one was removed, and the last of all blocks to a block that
@@ -131,15 +117,14 @@ void PrototypeStore::find_rows(std::span<const Key> keys, std::span<Row> rows) c
     left.push_back(at);
   }
   // All rows of a landmark once, not once per key.
-  const auto key = [&](size_t i) { return keys[i]; };
-  std::ranges::sort(left, {}, key);
+  const auto key_of = [&](size_t i) { return keys[i]; };
+  std::ranges::sort(left, {}, key_of);
   for (size_t i = 0; i < left.size(); ++i) {
     const int64_t id = keys[left[i]].id;
     if (i > 0 && keys[left[i - 1]].id == id) continue;
     each_row_of(find(id), [&](Row row) {
-      const Key wanted{id, appearance(row)};
-      auto at = std::ranges::lower_bound(left, wanted, {}, key);
-      for (; at != left.end() && keys[*at] == wanted; ++at) rows[*at] = row;
+      auto at = std::ranges::lower_bound(left, key(row), {}, key_of);
+      for (; at != left.end() && keys[*at] == key(row); ++at) rows[*at] = row;
     });
   }
 }
@@ -176,7 +161,6 @@ void PrototypeStore::add(std::span<const Key> keys, Codes codes, std::span<const
   }
 }
 
-// Adds n codes.
 void PrototypeStore::add(Row row, const int8_t* codes, size_t n) {
   Sum s = sum(row);
   int count = counts_[row.value];
@@ -256,45 +240,30 @@ void PrototypeStore::set(Row row, const Sum& sum, int count) {
   uint32_t differences = 0;
   int8_t* at = packed() + packed_index(row.value, 0, dim);
   for (size_t d = 0; d < dim; d += 4, at += 4 * kPackedRows) {
-    uint32_t before, after;
-    std::memcpy(&before, at, 4);
-    std::memcpy(&after, &means[d], 4);
-    std::memcpy(at, &after, 4);
-    differences |= before ^ after;
+    const auto after = load<uint32_t>(&means[d]);
+    differences |= load<uint32_t>(at) ^ after;
+    store(at, after);
   }
   if (uncommitted) uncommitted->insert(id(owner(row)));
-  if (differences != 0 && quantizer_.nlist() != 0) {
-    to_reassign_.push_back({id(owner(row)), appearance(row)});
-  }
+  if (differences != 0 && quantizer_.nlist() != 0) to_reassign_.push_back(key(row));
 }
 
-// Finds a row by its key again before moving it, as another move may have changed its index.
 void PrototypeStore::reassign(int threads) {
-  std::vector<Key> keys;
-  std::vector<Row> rows;
   for (size_t first = 0; first < to_reassign_.size(); first += kReassignChunk) {
     const size_t n = std::min(kReassignChunk, to_reassign_.size() - first);
-    rows.resize(n);
+    std::vector<Row> rows(n);
     find_rows({&to_reassign_[first], n}, rows);
-    keys.clear();
-    for (size_t i = 0; i < n; ++i) {
-      if (rows[i] == kNoRow) continue;
-      rows[keys.size()] = rows[i];
-      keys.push_back(to_reassign_[first + i]);
-    }
-    rows.resize(keys.size());
-    const std::vector<int8_t> codes = rounded(rows);
-    auto lists = quantizer_.assign({codes.data(), rows.size(), dim_}, threads);
-    size_t moving = 0;
+    std::erase(rows, kNoRow);
+    const auto lists = quantizer_.assign(rounded(rows), threads);
+    std::vector<std::pair<Key, uint32_t>> moving;
     for (size_t i = 0; i < rows.size(); ++i) {
-      if (lists_.list_of(rows[i]) == lists[i]) continue;
-      keys[moving] = keys[i];
-      lists[moving++] = lists[i];
+      if (lists_.list_of(rows[i]) != lists[i]) moving.emplace_back(key(rows[i]), lists[i]);
     }
-    for (size_t i = 0; i < moving; ++i) {
-      const Row row = find_row(keys[i].id, keys[i].appearance);
-      if (lists_.list_of(row) == lists[i]) continue;  // its key came twice
-      relocate(row, take_row(lists[i]));
+    // By key, as the move of one row may change the index of another.
+    for (const auto& [of_row, list] : moving) {
+      const Row row = find_row(of_row.id, of_row.appearance);
+      if (lists_.list_of(row) == list) continue;  // its key came twice
+      relocate(row, take_row(list));
       close_gap(row);
     }
   }
@@ -303,10 +272,9 @@ void PrototypeStore::reassign(int threads) {
 }
 
 CoarseQuantizer PrototypeStore::learn_quantizer(size_t nlist, int threads) const {
-  std::vector<size_t> sample(std::min(prototype_count_, CoarseQuantizer::sample_size(nlist)));
+  std::vector<size_t> sample(std::min(prototype_count_, CoarseQuantizer::kSampleSize * nlist));
   for (size_t i = 0; i < sample.size(); ++i) sample[i] = i * prototype_count_ / sample.size();
-  const std::vector<int8_t> codes = rounded(sorted_rows_at(sample));
-  return CoarseQuantizer::learn({codes.data(), sample.size(), dim_}, nlist, threads);
+  return CoarseQuantizer::learn(rounded(sorted_rows_at(sample)), nlist, threads);
 }
 
 PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, int threads) const {
@@ -316,10 +284,7 @@ PrototypeStore::Arrangement PrototypeStore::arrange(CoarseQuantizer quantizer, i
   rows.reserve(std::min(prototype_count_, kAssignChunk));
   const auto assign = [&] {
     std::vector<uint32_t> lists(rows.size(), 0);
-    if (quantizer.nlist() != 0) {
-      const std::vector<int8_t> codes = rounded(rows);
-      lists = quantizer.assign({codes.data(), rows.size(), dim_}, threads);
-    }
+    if (quantizer.nlist() != 0) lists = quantizer.assign(rounded(rows), threads);
     for (size_t i = 0; i < rows.size(); ++i) list_of_row[rows[i].value].value = lists[i];
     rows.clear();
   };

@@ -1,9 +1,10 @@
 // The landmarks of a learning map, with a row for each prototype.
 #pragma once
 
+#include "base/bytes.h"
+#include "base/large_vector.h"
 #include "base/quantize.h"
-#include "base/slots.h"
-#include "base/sorted_pieces.h"
+#include "base/rows.h"
 #include "map/positions.h"
 #include "search/coarse_quantizer.h"
 #include "search/list_blocks.h"
@@ -11,31 +12,22 @@
 namespace protomark {
 
 // The changes of a map since its last commit.
-class Uncommitted {
- public:
-  bool empty() const { return !centroids && !metadata && ids_.empty() && !incomplete_; }
-  // Landmarks that were added, changed or removed, each once.
-  const LargeVector<int64_t>& ids() const { return ids_.ids(); }
-  // Whether memory ran out, so that some ids are missing.
-  bool incomplete() const { return incomplete_; }
-
+struct Uncommitted {
+  bool empty() const { return !centroids && !metadata && landmarks.empty() && !incomplete; }
   // Never throws, so that every change is noted.
-  void insert(int64_t id) noexcept try { ids_.insert(id); } catch (const std::bad_alloc&) {
-    incomplete_ = true;
+  void insert(int64_t id) noexcept try { landmarks.insert(id); } catch (const std::bad_alloc&) {
+    incomplete = true;
   }
   void insert(const Uncommitted& other) noexcept {
-    for (const int64_t id : other.ids()) insert(id);
+    for (const int64_t id : other.landmarks.ids()) insert(id);
     centroids |= other.centroids;
     metadata |= other.metadata;
-    incomplete_ |= other.incomplete_;
+    incomplete |= other.incomplete;
   }
 
-  bool centroids = false;
-  bool metadata = false;
-
- private:
-  IdSet ids_;
-  bool incomplete_ = false;
+  IdSet landmarks;  // that were added, changed or removed
+  bool centroids = false, metadata = false;
+  bool incomplete = false;  // memory ran out, so that some ids are missing
 };
 
 // Rows are in blocks by inverted list: all in one without an index, otherwise each in the list of
@@ -66,8 +58,7 @@ class PrototypeStore : public RowTable {
   bool several() const { return several_; }
   size_t landmark_count() const { return several_ ? ids_.size() : prototype_count_; }
   size_t prototype_count() const { return prototype_count_; }
-  // The number of rows, padding included.
-  size_t row_end() const { return lists_.blocks() * kPackedRows; }
+  size_t row_end() const { return lists_.blocks() * kPackedRows; }  // with padding
   // Bytes per row of few observations, without what arrays have room for, so that equal maps have
   // the same.
   size_t row_bytes() const {
@@ -111,7 +102,6 @@ class PrototypeStore : public RowTable {
     }
     return row;
   }
-  // Removes a row, and with its last row a landmark.
   void erase_row(Row row) {
     if (uncommitted) uncommitted->insert(id(owner(row)));
     if (has_slot(row)) slots_.give_back(slot(row));
@@ -126,7 +116,7 @@ class PrototypeStore : public RowTable {
 
   uint32_t observations(LandmarkIndex landmark) const {
     uint32_t n = 0;
-    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) n += counts_[row.value];
+    each_row_of(landmark, [&](Row row) { n += counts_[row.value]; });
     return n;
   }
   MapSummary summary() const {
@@ -138,6 +128,7 @@ class PrototypeStore : public RowTable {
     });
     return result;
   }
+  Key key(Row row) const { return {id(owner(row)), appearance(row)}; }
   int count(Row row) const { return counts_[row.value]; }
   Sum sum(Row row) const;
   // Asks for what `sum` reads and `set` writes ahead. Inlined, as GCC drops calls of a function
@@ -153,20 +144,26 @@ class PrototypeStore : public RowTable {
   // Replaces the sum and count of a row; its rounded prototype follows. If memory runs out nothing
   // has changed, and for a new row it does not.
   void set(Row row, const Sum& sum, int count);
-  // Return the rounded prototypes of one row or several (rows x dim).
   void rounded(Row row, int8_t* to) const {
     for (size_t d = 0; d < dim_; d += 4) {
       std::copy_n(packed() + packed_index(row.value, d, dim_), std::min<size_t>(4, dim_ - d),
                   to + d);
     }
   }
-  std::vector<int8_t> rounded(std::span<const Row> rows) const {
-    std::vector<int8_t> result(rows.size() * dim_);
-    for (size_t i = 0; i < rows.size(); ++i) rounded(rows[i], &result[i * dim_]);
+  // Copies it to row i of other packed prototypes.
+  void copy_packed(Row row, void* to, size_t i) const {
+    for (size_t d = 0; d < dim_; d += 4) {
+      std::memcpy(static_cast<int8_t*>(to) + packed_index(i, d, dim_),
+                  packed() + packed_index(row.value, d, dim_), 4);
+    }
+  }
+  Matrix<int8_t> rounded(std::span<const Row> rows) const {
+    Matrix<int8_t> result(rows.size(), dim_);
+    for (size_t i = 0; i < rows.size(); ++i) rounded(rows[i], result.row(i));
     return result;
   }
 
-  // Call take(landmark) for all landmarks, or take(row) for all rows, in no order.
+  // These come in no order.
   template <typename Take>
   void each_landmark(const Take& take) const {
     for (LandmarkIndex l{0}; l.value < ids_.size(); ++l.value) {
@@ -179,20 +176,15 @@ class PrototypeStore : public RowTable {
       if (is_row(row)) take(row);
     }
   }
-  // Visit all landmarks by ascending id, or the rows of a list by id and then appearance, piece by
-  // piece (sorted_pieces.h).
-  using VisitLandmarks = std::function<void(std::span<const LandmarkIndex>)>;
-  using VisitRows = std::function<void(std::span<const Row>)>;
-  void visit_sorted_landmarks(const VisitLandmarks& visit) const {
+  // Visit all landmarks by ascending id, or the rows of a list by key, piece by piece (rows.h).
+  void visit_sorted_landmarks(const VisitPiece<LandmarkIndex>& visit) const {
     const auto each = [&](const auto& take) { each_landmark(take); };
     visit_sorted<LandmarkIndex>(
         landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
   }
-  void visit_sorted_rows(uint32_t list, const VisitRows& visit) const {
+  void visit_sorted_rows(uint32_t list, const VisitPiece<Row>& visit) const {
     const auto each = [&](const auto& take) { lists_.each_row(list, take); };
-    visit_sorted<Row>(
-        lists_.rows(list), each,
-        [&](Row row) { return std::pair(id(owner(row)), appearance(row)); }, visit);
+    visit_sorted<Row>(lists_.rows(list), each, [&](Row row) { return key(row); }, visit);
   }
   std::vector<LandmarkIndex> sorted_landmarks() const {
     std::vector<LandmarkIndex> result;
@@ -201,13 +193,12 @@ class PrototypeStore : public RowTable {
         [&](auto piece) { result.insert(result.end(), piece.begin(), piece.end()); });
     return result;
   }
-  // Returns the rows that are n-th among all by id and then appearance.
+  // Returns the rows that are n-th among all by key.
   std::vector<Row> sorted_rows_at(std::span<const size_t> n) const;
 
-  // Finds the rows of keys, kNoRow for those that do not exist.
   void find_rows(std::span<const Key> keys, std::span<Row> rows) const;
-  // Applies Eq. 2 for one code after the other, with new landmarks and rows where needed. `rows`
-  // are those that find_rows found.
+  // Applies Eq. 2 for one code after the other. `rows` are those that find_rows found; where it
+  // found none, new ones are made.
   void add(std::span<const Key> keys, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const Sum& sum, int count);
@@ -252,9 +243,8 @@ class PrototypeStore : public RowTable {
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
     // One more block is for rows while they move.
     const size_t blocks = std::max(lists_.blocks(), arrangement.lists.blocks()) + 1;
-    for_each_array(0, blocks * kPackedRows, [&](auto& v, size_t n, const auto&) {
-      if (v.capacity() < n) enlarge(v, n, searching);
-    });
+    for_each_array(0, blocks * kPackedRows,
+                   [&](auto& v, size_t n, const auto&) { enlarge(v, n, searching); });
   }
 
   // Grows with each new set of centroids.
@@ -279,11 +269,7 @@ class PrototypeStore : public RowTable {
   const uint8_t* rest(Row row) const { return &rests_[row.value * rest_bytes_]; }
   uint8_t* rest(Row row) { return &rests_[row.value * rest_bytes_]; }
   bool has_slot(Row row) const { return counts_[row.value] > kMaxSmallCount; }
-  uint32_t slot(Row row) const {
-    uint32_t slot;
-    std::memcpy(&slot, rest(row), sizeof(slot));
-    return slot;
-  }
+  uint32_t slot(Row row) const { return load<uint32_t>(rest(row)); }
   [[gnu::always_inline]] void prefetch_slot(Row row) const {
     if (!has_slot(row)) return;
     __builtin_prefetch(slots_[slot(row)], 1);
@@ -295,14 +281,12 @@ class PrototypeStore : public RowTable {
     for_each_array(ids_.size(), rows,
                    [](auto& v, size_t n, const auto& padding) { v.resize(n, padding); });
   }
-  // Copies all of a row, but not what leads to it.
-  void copy_row(Row from, Row to);
+  void copy_row(Row from, Row to);  // but not what leads to it
   void vacate(Row row) {
     for_each_plain_array(0, 1, [&](auto& v, size_t width, const auto& padding) {
       std::fill_n(v.data() + row.value * width, width, padding);
     });
   }
-  // Moves a row to a padding row, and leaves padding.
   void relocate(Row from, Row to) {
     relink(from, to);
     copy_row(from, to);

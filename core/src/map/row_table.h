@@ -21,22 +21,17 @@ inline bool is_finite(const Position& p) {
   return std::ranges::all_of(p, [](double x) { return std::isfinite(x); });
 }
 
-// Arrays grow as with push_back, but before a change, which therefore cannot fail half-way.
+// Returns the capacity for more elements. Arrays grow as with push_back, but before a change, which
+// therefore cannot fail half-way.
 template <typename Vector>
-size_t larger_capacity(const Vector& v, size_t more) {
-  return std::max(2 * v.capacity(), v.size() + more);
-}
-template <typename Vector>
-bool has_room(const Vector& v, size_t more) {
-  return v.capacity() - v.size() >= more;
-}
-template <typename Vector>
-void make_room_in(Vector& v, size_t more) {
-  if (!has_room(v, more)) v.reserve(larger_capacity(v, more));
+size_t capacity_for(const Vector& v, size_t more) {
+  const size_t size = v.size() + more;
+  return size <= v.capacity() ? v.capacity() : std::max(2 * v.capacity(), size);
 }
 // Replaces an array by one of more capacity; only the swap excludes searches.
 template <typename Vector>
 void enlarge(Vector& v, size_t capacity, FairSharedMutex& searching) {
+  if (v.capacity() >= capacity) return;
   Vector larger;
   larger.reserve(capacity);
   larger.assign(v.begin(), v.end());
@@ -58,14 +53,13 @@ class RowTable {
   // By landmark index; -1 for padding.
   const LargeVector<int64_t>& ids() const { return ids_; }
   int64_t id(LandmarkIndex landmark) const { return ids_[landmark.value]; }
-  // Return the landmark with an id; if there is none, kNoLandmark, or `at` throws UnknownLandmark.
   LandmarkIndex find(int64_t id) const { return index_.find(ids_, id); }
+  // Throws UnknownLandmark.
   LandmarkIndex at(int64_t id) const {
     const LandmarkIndex landmark = find(id);
     if (landmark == kNoLandmark) throw UnknownLandmark(id);
     return landmark;
   }
-
   LandmarkIndex owner(Row row) const {
     return several_ ? owners_[row.value] : LandmarkIndex{row.value};
   }
@@ -82,8 +76,7 @@ class RowTable {
   void each_row_of(LandmarkIndex landmark, const Take& take) const {
     for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) take(row);
   }
-  // Steps from a row of a landmark to that of an appearance, which may be kNoRow, but over at most
-  // `limit` others.
+  // Steps from a row to that of an appearance, or to kNoRow, but over at most `limit` others.
   Row walk(Row row, uint16_t appearance, size_t limit) const {
     if (!several_) return row;
     size_t steps = 0;
@@ -93,7 +86,7 @@ class RowTable {
     steps_ += steps;
     return row;
   }
-  // Returns the row of a landmark's appearance, or kNoRow. Only changes may call this.
+  // Only changes may call this.
   Row find_row(LandmarkIndex landmark, uint16_t appearance) const {
     return walk(first_row(landmark), appearance, SIZE_MAX);
   }
@@ -104,23 +97,21 @@ class RowTable {
 
   size_t row_count(LandmarkIndex landmark) const {
     size_t n = 0;
-    for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) ++n;
+    each_row_of(landmark, [&](Row) { ++n; });
     return n;
   }
-  // Return the rows of a landmark by ascending appearance, or of several landmarks in their order.
   std::vector<Row> sorted_rows(LandmarkIndex landmark) const {
     return sorted_rows(std::span(&landmark, 1));
   }
+  // Returns the rows of one landmark after the other, by ascending appearance.
   std::vector<Row> sorted_rows(std::span<const LandmarkIndex> landmarks) const {
     std::vector<Row> result;
     result.reserve(landmarks.size());
     for (const LandmarkIndex landmark : landmarks) {
       const auto first = static_cast<std::ptrdiff_t>(result.size());
-      for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) result.push_back(row);
-      if (several_) {
-        std::sort(result.begin() + first, result.end(),
-                  [&](Row a, Row b) { return appearance(a) < appearance(b); });
-      }
+      each_row_of(landmark, [&](Row row) { result.push_back(row); });
+      std::ranges::sort(result.begin() + first, result.end(), {},
+                        [&](Row row) { return appearance(row); });
     }
     return result;
   }
@@ -130,17 +121,16 @@ class RowTable {
   }
   // By landmark index; empty if no landmark ever had a position.
   const std::vector<Position>& positions() const { return positions_; }
-  bool any_position() const { return std::ranges::any_of(positions_, has_position); }
 
   // Counts rows that changes stepped over to find, remove or move others.
   size_t steps() const { return steps_; }
 
  protected:
-  // Makes room for a landmark, without which add_landmark could run out of memory.
+  // Without this, add_landmark could run out of memory.
   void make_room_for_landmark() {
     index_.make_room(ids_, 1);
     if (!several_) return;
-    for_each_array(1, 0, [](auto& v, size_t more, const auto&) { make_room_in(v, more); });
+    for_each_array(1, 0, [](auto& v, size_t n, const auto&) { v.reserve(capacity_for(v, n)); });
   }
   // Makes a padding row the only one of a new landmark.
   void add_landmark(int64_t id, Row row, uint16_t appearance) {
@@ -156,13 +146,11 @@ class RowTable {
     if (!positions_.empty()) positions_.push_back(kNoPosition);
     add_row(landmark, row, appearance);
   }
-  // Makes a padding row one more of a landmark.
   void add_row(LandmarkIndex landmark, Row row, uint16_t appearance) {
     appearances_[row.value] = appearance;
     owners_[row.value] = landmark;
     next_rows_[row.value] = std::exchange(first_rows_[landmark.value], row);
   }
-  // Removes a row from its landmark, and a landmark with its last row.
   void remove_row(Row row) {
     if (!several_) return index_.erase(ids_, ids_[row.value]);
     const LandmarkIndex landmark = owner(row);
@@ -198,7 +186,8 @@ class RowTable {
   // Bytes per row as in a file, so that equal maps have the same.
   size_t row_bytes() const {
     if (several_) return sizeof(appearances_[0]) + sizeof(owners_[0]) + sizeof(next_rows_[0]);
-    return sizeof(ids_[0]) + (any_position() ? sizeof(Position) : 0);
+    const bool placed = std::ranges::any_of(positions_, has_position);
+    return sizeof(ids_[0]) + (placed ? sizeof(Position) : 0);
   }
   // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
   // and rows.

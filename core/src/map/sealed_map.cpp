@@ -5,8 +5,7 @@
 #include "file/journal.h"
 #include "map/map_sections.h"
 #include "map/sealed_store.h"
-#include "search/among.h"
-#include "search/recall.h"
+#include "search/inverted_lists.h"
 
 namespace protomark {
 
@@ -24,12 +23,10 @@ struct SealedMap::Content {
     if (file.has(section::kRows)) read_row_counts();
     prototypes.rows = prototype_count;
     prototypes.dim = shape.dim;
-    if (file.has(section::kCentroids)) {
-      read_index();
+    if (file.has(section::kCentroids)) read_index();
+    if (owners != nullptr || !row_counts.empty()) {
       prototypes.landmarks.look_up = [this](Row row) { return owner(row); };
       prototypes.landmarks.end = landmark_at(n);
-    } else {
-      prototypes.landmarks.row_counts = row_counts.empty() ? nullptr : row_counts.data();
     }
     if (file.has(section::kWidth)) read_codebook();
     const size_t size = packed_size(prototypes.rows, shape.dim, prototypes.width);
@@ -44,9 +41,8 @@ struct SealedMap::Content {
     const size_t width = read_value<uint32_t>(file, section::kWidth);
     const auto& codebooks = encoder->codebooks();
     const auto codebook = std::ranges::find(codebooks, width, &Codebook::width);
-    if (codebook == codebooks.end() || !codebook->covers(shape.dim)) {
-      file.fail("its encoder has no codebook for words of ", width, " numbers of ", shape.dim);
-    }
+    file.require(codebook != codebooks.end() && codebook->covers(shape.dim),
+                 "its encoder has no codebook for words of ", width, " numbers of ", shape.dim);
     table = decode_table(*codebook, shape.dim);
     prototypes.width = width;
     prototypes.table = table.data();
@@ -56,18 +52,18 @@ struct SealedMap::Content {
     row_counts = file.read<uint8_t>(section::kRows, shape.landmarks);
     prototype_count = 0;
     for (size_t i = 0; i < row_counts.size(); ++i) {
-      if (row_counts[i] == 0) file.fail("it has a landmark without prototypes");
+      file.require(row_counts[i] != 0, "it has a landmark without prototypes");
       if (i % kFirstRowStep == 0) first_rows.push_back(static_cast<uint32_t>(prototype_count));
       prototype_count += row_counts[i];
     }
-    if (prototype_count > UINT32_MAX) file.fail("it claims more prototypes than a map can hold");
+    file.require(prototype_count <= UINT32_MAX, "it claims more prototypes than a map can hold");
   }
 
   // Reads the inverted lists, which tell how many rows there are, padding included.
   void read_index() {
-    centroids = read_centroids(file, shape.dim);
-    const size_t lists = centroids.size() / shape.dim;
-    packed_centroids = pack_codes({centroids.data(), lists, shape.dim});
+    const Matrix<int8_t> centroids = read_centroids(file, shape.dim);
+    const size_t lists = centroids.rows;
+    packed_centroids = pack_codes(centroids);
     list_rows = file.read<uint32_t>(section::kListRows, lists);
     first_blocks.push_back(0);
     uint64_t total = 0;
@@ -76,7 +72,7 @@ struct SealedMap::Content {
       if (total > prototype_count) break;
       first_blocks.push_back(first_blocks.back() + static_cast<uint32_t>(packed_blocks(n)));
     }
-    if (total != prototype_count) file.fail("its lists do not have as many prototypes as the map");
+    file.require(total == prototype_count, "its lists do not have as many prototypes as the map");
     prototypes.rows = size_t{first_blocks.back()} * kPackedRows;
     const int bits = owner_bits(shape.landmarks);
     const auto words = file.map<uint64_t>(section::kOwners, packed_words(prototypes.rows, bits));
@@ -84,17 +80,25 @@ struct SealedMap::Content {
         words, bits,
         file.read<uint32_t>(section::kOwnerChecksums, CheckedNumbers::blocks(words.size())),
         file.name() + ": its section '" + section::kOwners + "'");
-    const size_t size = file.map(section::kRecall).size() / sizeof(uint32_t);
-    recall_table = read_section<uint32_t>(file, section::kRecall, size);
-    if (size > kTestQueries || !std::ranges::is_sorted(recall_table) ||
-        (size > 0 && (recall_table.front() < 1 || recall_table.back() > lists))) {
-      file.fail("its recall table is impossible");
-    }
+    recall_table = read_section<uint32_t>(file, section::kRecall);
+    file.require(
+        recall_table.size() <= kTestQueries && std::ranges::is_sorted(recall_table) &&
+            (recall_table.empty() || (recall_table.front() >= 1 && recall_table.back() <= lists)),
+        "its recall table is impossible");
   }
 
   size_t words() const { return prototypes.width == 0 ? 0 : shape.dim / prototypes.width; }
-  // Only with an index. Throws FileError if the owners are broken.
-  LandmarkIndex owner(Row row) const { return landmark_at((*owners)[row.value]); }
+  // Returns the landmark of a row if that is not the row's own index. Throws FileError if the
+  // owners are broken.
+  LandmarkIndex owner(Row row) const {
+    if (owners != nullptr) return landmark_at((*owners)[row.value]);
+    const auto next = std::ranges::upper_bound(first_rows, row.value);
+    auto landmark = static_cast<size_t>(next - first_rows.begin() - 1) * kFirstRowStep;
+    for (size_t end = *std::prev(next) + row_counts[landmark]; end <= row.value;) {
+      end += row_counts[++landmark];
+    }
+    return landmark_at(landmark);
+  }
 
   size_t nlist() const { return list_rows.size(); }
 
@@ -127,15 +131,27 @@ struct SealedMap::Content {
         if (landmark.value >= shape.landmarks) continue;
         const auto [first, last] = prototypes_of(landmark);
         const size_t at = first + taken[landmark.value]++;
-        if (at == last) file.fail("it has more prototypes of a landmark than it counts");
+        file.require(at != last, "it has more prototypes of a landmark than it counts");
         found[at] = row;
         ++total;
       }
-      if (total != prototype_count) file.fail("it lacks prototypes of a landmark");
+      file.require(total == prototype_count, "it lacks prototypes of a landmark");
       rows = std::move(found);
     });
   }
 
+  std::vector<Row> rows_of(int64_t id) const {
+    std::vector<Row> result;
+    append_rows(ids.find(id), result);
+    return result;
+  }
+  void write_mean(std::span<const Row> of, float* mean) const {
+    for (size_t d = 0; d < shape.dim; ++d) {
+      int sum = 0;
+      for (const Row row : of) sum += value(row, d);
+      mean[d] = static_cast<float>(sum) / static_cast<float>(of.size());
+    }
+  }
   int value(Row row, size_t d) const {
     const auto* data = static_cast<const int8_t*>(prototypes.data);
     if (words() == 0) return data[packed_index(row.value, d, shape.dim)];
@@ -143,7 +159,7 @@ struct SealedMap::Content {
     return table[d * Codebook::kWords + static_cast<uint8_t>(word)];
   }
 
-  static constexpr size_t kFirstRowStep = 64;  // landmarks
+  static constexpr size_t kFirstRowStep = 16;  // landmarks
 
   std::unique_ptr<MappedFile> mapped;  // nullptr if the caller keeps the bytes
   ContainerReader file;
@@ -156,7 +172,6 @@ struct SealedMap::Content {
   PackedPrototypes prototypes;
   std::vector<int8_t> table;  // of a codebook, if there are words
   // With an index.
-  std::vector<int8_t> centroids;
   std::vector<CodeVector> packed_centroids;
   std::span<const uint32_t> list_rows;
   std::vector<uint32_t> first_blocks;            // of each list, and the end
@@ -179,9 +194,8 @@ SealedMap::SealedMap(const std::filesystem::path& path) {
   both.journal().commits(both.file().identity());
 }
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
-  if (reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment != 0) {
-    invalid("the bytes of a map must begin at a multiple of ", kSectionAlignment, " in memory");
-  }
+  require(reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment == 0,
+          "the bytes of a map must begin at a multiple of ", kSectionAlignment, " in memory");
   content_ = std::make_unique<const Content>(bytes, name);
 }
 SealedMap::SealedMap(SealedMap&&) noexcept = default;
@@ -189,11 +203,10 @@ SealedMap::~SealedMap() = default;
 
 // What was checked when the map was opened need not hold for other bytes.
 const SealedMap::Content& SealedMap::unchanged() const {
-  if (content_->mapped && !content_->mapped->unchanged()) {
-    content_->file.fail(
-        "it was written to while it was open: open it again, and replace map files "
-        "by renaming, not by cp, scp or rsync --inplace");
-  }
+  content_->file.require(
+      !content_->mapped || content_->mapped->unchanged(),
+      "it was written to while it was open: open it again, and replace map files by renaming, not "
+      "by cp, scp or rsync --inplace");
   return *content_;
 }
 
@@ -230,52 +243,32 @@ std::optional<Position> SealedMap::position_error() const {
 Matrix<float> SealedMap::prototypes(std::span<const int64_t> landmark_ids) const {
   const Content& c = unchanged();
   Matrix<float> means(landmark_ids.size(), dim());
-  std::vector<Row> rows;
   for (size_t i = 0; i < landmark_ids.size(); ++i) {
-    rows.clear();
-    c.append_rows(c.ids.find(landmark_ids[i]), rows);
-    for (size_t d = 0; d < dim(); ++d) {
-      int sum = 0;
-      for (const Row row : rows) sum += c.value(row, d);
-      means.row(i)[d] = static_cast<float>(sum) / static_cast<float>(rows.size());
-    }
+    c.write_mean(c.rows_of(landmark_ids[i]), means.row(i));
   }
   return means;
 }
 
 Matrix<float> SealedMap::appearances(int64_t id) const {
   const Content& c = unchanged();
-  std::vector<Row> rows;
-  c.append_rows(c.ids.find(id), rows);
+  const std::vector<Row> rows = c.rows_of(id);
   Matrix<float> result(rows.size(), dim());
-  for (size_t i = 0; i < rows.size(); ++i) {
-    for (size_t d = 0; d < dim(); ++d) {
-      result.row(i)[d] = static_cast<float>(c.value(rows[i], d));
-    }
-  }
+  for (size_t i = 0; i < rows.size(); ++i) c.write_mean({&rows[i], 1}, result.row(i));
   return result;
 }
 
 std::vector<Position> SealedMap::positions(std::span<const int64_t> landmark_ids) const {
   const Content& c = unchanged();
   std::vector<Position> result;
-  for (const int64_t id : landmark_ids) {
-    result.push_back(c.position(c.ids.find(id)));
-  }
+  for (const int64_t id : landmark_ids) result.push_back(c.position(c.ids.find(id)));
   return result;
 }
 
 MapSummary SealedMap::summary() const {
   const Content& c = unchanged();
   MapSummary result;
-  for (size_t i = 0; i < size(); ++i) {
-    add_to_summary(result, c.position(landmark_at(i)));
-  }
+  for (size_t i = 0; i < size(); ++i) add_to_summary(result, c.position(landmark_at(i)));
   return result;
-}
-
-Matches SealedMap::search(Descriptors queries, size_t k, const SearchOptions& options) const {
-  return search_codes(encoder()->encode(queries, dim(), options.threads), k, options);
 }
 
 Matches SealedMap::search_codes(Codes queries, size_t k, const SearchOptions& options) const {

@@ -80,9 +80,7 @@ constexpr size_t kMaxCompared = 2048;
 // algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering algorithms".
 class Clusters {
  public:
-  // Adds to `merges` those that bring the number of rows down to kMaxCompared.
-  Clusters(std::span<const int16_t> sums, std::span<const uint8_t> counts, size_t dim,
-           std::vector<AppearanceMerge>& merges)
+  Clusters(std::span<const int16_t> sums, std::span<const uint8_t> counts, size_t dim)
       : dim_(dim),
         sums_(sums.begin(), sums.end()),
         counts_(counts.begin(), counts.end()),
@@ -90,22 +88,23 @@ class Clusters {
         partner_(counts.size(), 0),
         cost_(counts.size(), 0) {
     std::iota(remaining_.begin(), remaining_.end(), size_t{0});
-    while (remaining_.size() > kMaxCompared) halve(merges);
+    while (remaining_.size() > kMaxCompared) halve();
     for (size_t at = 0; at + 1 < remaining_.size(); ++at) find_partner(at);
   }
 
-  size_t size() const { return remaining_.size(); }
+  std::vector<AppearanceMerge> merge_all() {
+    while (remaining_.size() > 1) merge_best();
+    return std::move(merges_);
+  }
 
-  // Merges the pair of least cost.
-  AppearanceMerge merge_best() {
+ private:
+  void merge_best() {
     size_t best = 0;
     for (size_t at = 1; at + 1 < remaining_.size(); ++at) {
       if (cost_[remaining_[at]] < cost_[remaining_[best]]) best = at;
     }
     const size_t into = remaining_[best], source = partner_[into];
-    const AppearanceMerge result{cost_[into], static_cast<uint16_t>(into),
-                                 static_cast<uint16_t>(source)};
-    merge(into, source);
+    merge(into, source, cost_[into]);
     std::erase(remaining_, source);
     for (size_t at = 0; at + 1 < remaining_.size() && remaining_[at] < source; ++at) {
       const size_t row = remaining_[at];
@@ -115,24 +114,20 @@ class Clusters {
         offer(row, into);
       }
     }
-    return result;
   }
 
- private:
-  void merge(size_t into, size_t source) {
+  void merge(size_t into, size_t source, double cost) {
+    merges_.push_back({cost, static_cast<uint16_t>(into), static_cast<uint16_t>(source)});
     for (size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[source * dim_ + d];
     counts_[into] += counts_[source];
   }
 
   // Merges each second row into the one before it.
-  void halve(std::vector<AppearanceMerge>& merges) {
+  void halve() {
     std::vector<size_t> halved;
     for (size_t at = 0; at < remaining_.size(); at += 2) {
       halved.push_back(remaining_[at]);
-      if (at + 1 == remaining_.size()) break;
-      merge(remaining_[at], remaining_[at + 1]);
-      merges.push_back(
-          {0.0, static_cast<uint16_t>(remaining_[at]), static_cast<uint16_t>(remaining_[at + 1])});
+      if (at + 1 < remaining_.size()) merge(remaining_[at], remaining_[at + 1], 0.0);
     }
     remaining_ = std::move(halved);
   }
@@ -141,9 +136,7 @@ class Clusters {
     const size_t row = remaining_[at];
     partner_[row] = remaining_[at + 1];
     cost_[row] = cost(row, partner_[row]);
-    for (size_t other = at + 2; other < remaining_.size(); ++other) {
-      offer(row, remaining_[other]);
-    }
+    for (size_t other = at + 2; other < remaining_.size(); ++other) offer(row, remaining_[other]);
   }
 
   void offer(size_t row, size_t other) {
@@ -176,6 +169,7 @@ class Clusters {
   }
 
   size_t dim_;
+  std::vector<AppearanceMerge> merges_;
   std::vector<double> sums_;  // whole numbers
   std::vector<double> counts_;
   std::vector<size_t> remaining_;  // ascending
@@ -209,10 +203,7 @@ Words best_words(const Encoder& encoder, size_t dim, double bytes) {
 
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
                                                std::span<const uint8_t> counts, size_t dim) {
-  std::vector<AppearanceMerge> result;
-  Clusters clusters(sums, counts, dim, result);
-  while (clusters.size() > 1) result.push_back(clusters.merge_best());
-  return result;
+  return Clusters(sums, counts, dim).merge_all();
 }
 
 size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes) {
@@ -249,15 +240,12 @@ SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
   if (enough && static_cast<double>(sealed_bytes(n, rows, packed_dim(dim))) <= limit * landmarks) {
     return lossless;
   }
-  if (best_words(encoder, dim, static_cast<double>(dim)).count == 0) {
-    invalid("bytes_per_landmark needs codebooks, which encoder '", encoder.info().name,
-            "' does not have for this map: give it some, or seal the map as it is, without "
-            "bytes_per_landmark");
-  }
-  if (!enough) {
-    invalid("bytes_per_landmark must be at least ", smallest,
-            " for this map, which one prototype of ", smallest, " words takes");
-  }
+  require(best_words(encoder, dim, static_cast<double>(dim)).count != 0,
+          "bytes_per_landmark needs codebooks, which encoder '", encoder.info().name,
+          "' does not have for this map: give it some, or seal the map as it is, without "
+          "bytes_per_landmark");
+  require(enough, "bytes_per_landmark must be at least ", smallest,
+          " for this map, which one prototype of ", smallest, " words takes");
   if (!observed && static_cast<double>(rows) >= kWorthwhile * landmarks) {
     const Words several = best_words(encoder, dim, (limit - 1) / kWorthwhile);
     if (several.numbers() >= kEnoughNumbers) {
@@ -297,8 +285,9 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, siz
       result.set(row, own_sum, fits_row ? static_cast<int>(counts[from]) : 1);
     }
   }
-  if (store.quantizer().nlist() != 0)
+  if (store.quantizer().nlist() != 0) {
     result.rearrange(result.arrange(store.quantizer().cut(dim), 1));
+  }
   return result;
 }
 

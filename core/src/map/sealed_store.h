@@ -1,4 +1,4 @@
-// Chooses how a map is sealed: numbers of a prototype, their words, and which prototypes.
+// Chooses how a map is sealed: numbers of a prototype, their words, and which prototypes, tuned.
 #pragma once
 
 #include "map/prototype_store.h"
@@ -31,13 +31,9 @@ struct AppearanceMerge {
   uint16_t source;
 };
 
-// Returns all merges that make one prototype of several, at each step the one of least cost, ties
-// to the first rows. `sums` is (rows x dim), `counts` (rows), at most 65536 rows. Of more than 2048
-// rows, neighbours are merged first, at no cost.
-//
-// The cost of merging the means a and b of n and m observations is what that adds to the sum of
-// squared distances of all observations to their means (Ward 1963), |a - b|^2 n m / (n + m). It is
-// the same double on every machine, as the order of operations on the integer sums is fixed.
+// Returns all merges that make one prototype of several, at each step the one of least cost (Ward
+// 1963), ties to the first rows. `sums` is (rows x dim), `counts` (rows), at most 65536 rows. Of
+// more than 2048 rows, neighbours are merged first, at no cost.
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
                                                std::span<const uint8_t> counts, size_t dim);
 
@@ -47,5 +43,25 @@ std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
 // observations has its rounded mean as sum, and a count of one.
 std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, size_t dim,
                                                 size_t limit);
+
+// What prototypes are tuned by: codes, each of a landmark and standing for `weight` observations.
+struct TuningQueries {
+  // Takes the appearances of a learning map, cut to `dim` numbers.
+  TuningQueries(const PrototypeStore& map, size_t dim);
+  // Takes observations, cut to `dim` numbers.
+  TuningQueries(std::span<const int64_t> ids, Codes observed, size_t dim)
+      : landmarks(ids.begin(), ids.end()), codes(ids.size(), dim), weights(ids.size(), uint8_t{1}) {
+    for (size_t i = 0; i < ids.size(); ++i) std::copy_n(observed.row(i), dim, codes.row(i));
+  }
+
+  std::vector<int64_t> landmarks;  // ids; queries of others than the map's are ignored
+  Matrix<int8_t> codes;
+  std::vector<uint8_t> weights;
+};
+
+// Returns the store with prototypes tuned as docs/design.md says, each as the sum of one
+// observation. Equal stores and queries, in any order, give equal prototypes on every machine.
+PrototypeStore tune_prototypes(const PrototypeStore& store, const TuningQueries& queries,
+                               int threads);
 
 }  // namespace protomark

@@ -1,5 +1,5 @@
 // Compiled without contraction of products and sums (core/CMakeLists.txt).
-#include "map/tuning.h"
+#include "map/sealed_store.h"
 
 #include "base/parallel.h"
 #include "search/inverted_lists.h"
@@ -60,17 +60,13 @@ class Tuner {
   }
 
   PrototypeStore run() {
-    for (size_t q = 0; q < own_.size(); ++q) {
-      if (own_[q] != UINT32_MAX && rest(q) != 0) contested_.push_back(static_cast<uint32_t>(q));
-    }
     for (int round = 0; round < kRounds; ++round) {
       find_rivals();
       for (int pass = 0; pass < kPasses; ++pass) move();
-      round_numbers();
     }
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
       Sum sum{};
-      std::ranges::copy(rounded(rank), sum.begin());
+      for (size_t d = 0; d < dim_; ++d) sum[d] = rounded(rank, d);
       tuned_.set(rows_[rank], sum, 1);
     }
     if (indexed_) {
@@ -84,15 +80,11 @@ class Tuner {
  private:
   // Ranks rows by id and appearance, as their places in memory depend on the map's history.
   void rank_rows() {
+    rows_ = tuned_.sorted_rows(tuned_.sorted_landmarks());
     rank_of_row_.assign(tuned_.row_end(), -1);
-    tuned_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
-      for (const Row row : tuned_.sorted_rows(landmarks)) {
-        rank_of_row_[row.value] = static_cast<int64_t>(rows_.size());
-        rows_.push_back(row);
-      }
-    });
     means_ = Matrix<int8_t>(rows_.size(), dim_);
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      rank_of_row_[rows_[rank].value] = static_cast<int64_t>(rank);
       tuned_.rounded(rows_[rank], means_.row(rank));
       counts_.push_back(static_cast<uint32_t>(tuned_.count(rows_[rank])));
     }
@@ -100,25 +92,10 @@ class Tuner {
       numbers_.push_back(static_cast<int16_t>(x * (1 << kFraction)));
     }
     packed_.resize(packed_size(tuned_.row_end(), dim_) / sizeof(CodeVector));
-    round_numbers();
   }
 
-  // Rounds prototypes to what search reads.
-  void round_numbers() {
-    auto* packed = reinterpret_cast<int8_t*>(packed_.data());
-    for (size_t rank = 0; rank < rows_.size(); ++rank) {
-      const std::vector<int8_t> code = rounded(rank);
-      for (size_t d = 0; d < dim_; ++d) {
-        packed[packed_index(rows_[rank].value, d, dim_)] = code[d];
-      }
-    }
-  }
-  std::vector<int8_t> rounded(size_t rank) const {
-    std::vector<int8_t> code(dim_);
-    for (size_t d = 0; d < dim_; ++d) {
-      code[d] = rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
-    }
-    return code;
+  int8_t rounded(size_t rank, size_t d) const {
+    return rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
   }
 
   // Finds the own prototype of each query, the nearest one of its landmark, and the temperature.
@@ -134,10 +111,8 @@ class Tuner {
         tuned_.each_row_of(landmark, [&](Row row) {
           const auto rank = static_cast<uint32_t>(rank_of_row_[row.value]);
           const int32_t d = squared_distance(queries_.codes.row(q), means_.row(rank), dim_);
-          if (std::pair(d, rank) < std::pair(distances[q], own_[q])) {
-            distances[q] = d;
-            own_[q] = rank;
-          }
+          std::tie(distances[q], own_[q]) =
+              std::min(std::pair(distances[q], own_[q]), std::pair(d, rank));
         });
       }
     });
@@ -146,18 +121,19 @@ class Tuner {
       if (own_[q] != UINT32_MAX) observed[own_[q]] += queries_.weights[q];
     }
     for (size_t i = 0; i < observed.size(); ++i) counts_[i] = std::max(counts_[i], observed[i]);
-    // Means of several observations are nearer to their prototypes than what they stand for.
-    uint64_t sum = 0, weight = 0;
-    for (const bool single : {true, false}) {
-      for (size_t q = 0; q < n && (single || weight == 0); ++q) {
-        if (own_[q] == UINT32_MAX || rest(q) == 0) continue;
-        if (single && queries_.weights[q] != 1) continue;
-        sum += uint64_t{queries_.weights[q]} * static_cast<uint64_t>(distances[q]);
-        weight += queries_.weights[q];
-      }
+    // Means of several observations are nearer to their prototypes than what they stand for, and
+    // count only where there is nothing else.
+    std::array<uint64_t, 2> sums{}, weights{};
+    for (uint32_t q = 0; q < n; ++q) {
+      if (own_[q] == UINT32_MAX || rest(q) == 0) continue;
+      contested_.push_back(q);
+      const size_t kind = queries_.weights[q] == 1 ? 0 : 1;
+      sums[kind] += uint64_t{queries_.weights[q]} * static_cast<uint64_t>(distances[q]);
+      weights[kind] += queries_.weights[q];
     }
-    temperature_ =
-        std::max<int64_t>(1, static_cast<int64_t>(sum / std::max<uint64_t>(4 * weight, 1)));
+    const size_t kind = weights[0] != 0 ? 0 : 1;
+    temperature_ = std::max<int64_t>(
+        1, static_cast<int64_t>(sums[kind] / std::max<uint64_t>(4 * weights[kind], 1)));
   }
 
   // Returns how many other observations the own prototype of a query has.
@@ -166,12 +142,17 @@ class Tuner {
   // Finds the prototypes that each contested query could be mistaken for. Queries without any, most
   // of them, are contested no longer.
   void find_rivals() {
+    auto* packed = reinterpret_cast<int8_t*>(packed_.data());
+    for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      for (size_t d = 0; d < dim_; ++d) {
+        packed[packed_index(rows_[rank].value, d, dim_)] = rounded(rank, d);
+      }
+    }
     PackedPrototypes view = tuned_.view();
     view.data = packed_.data();
     view.landmarks = {};
     view.landmarks.ids = rank_of_row_.data();
-    SearchOptions options;
-    options.threads = threads_;
+    const SearchOptions options{.threads = threads_};
     const std::vector<uint32_t> before = std::exchange(contested_, {});
     firsts_.clear();
     forces_.clear();
@@ -206,7 +187,8 @@ class Tuner {
     const int64_t limit = own_distance(q) + kReach * temperature_;
     for (size_t j = 0; j < kNearest && ranks[j] >= 0; ++j) {
       const auto rank = static_cast<uint32_t>(ranks[j]);
-      if (distances[j] > limit || owner_id(rank) == queries_.landmarks[q]) continue;
+      const int64_t owner = tuned_.id(tuned_.owner(rows_[rank]));
+      if (distances[j] > limit || owner == queries_.landmarks[q]) continue;
       if (contested_.size() == query) {
         contested_.push_back(q);
         firsts_.push_back(forces_.size());
@@ -215,8 +197,6 @@ class Tuner {
       forces_.push_back({query, rank});
     }
   }
-
-  int64_t owner_id(uint32_t rank) const { return tuned_.id(tuned_.owner(rows_[rank])); }
 
   // Returns the squared distance of a query to a prototype, in units of 4^-kFraction.
   uint32_t distance(const int8_t* code, const int16_t* prototype) const {

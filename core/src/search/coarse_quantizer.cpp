@@ -8,7 +8,6 @@
 
 #include "base/quantize.h"
 #include "search/inverted_lists.h"
-#include "search/recall.h"
 
 namespace protomark {
 namespace {
@@ -17,26 +16,14 @@ constexpr int kIterations = 8;
 constexpr size_t kGroupProbes = 4;
 // Centroids of a group at most, in terms of the mean.
 constexpr size_t kLargestGroup = 4;
-// Codes that are assigned at a time.
-constexpr size_t kAssignChunk = 1 << 14;
-
-// Returns the id that search(codes) finds for each code.
-template <typename Search>
-std::vector<uint32_t> nearest_ids(Codes codes, const Search& search) {
-  std::vector<uint32_t> result;
-  result.reserve(codes.rows);
-  for (size_t first = 0; first < codes.rows; first += kAssignChunk) {
-    const size_t n = std::min(kAssignChunk, codes.rows - first);
-    const Matches nearest = search(Codes{codes.row(first), n, codes.columns});
-    for (const int64_t id : nearest.ids.data) result.push_back(static_cast<uint32_t>(id));
-  }
-  return result;
+std::vector<uint32_t> ids_of(const Matches& nearest) {
+  return {nearest.ids.data.begin(), nearest.ids.data.end()};
 }
 
 // Replaces each centroid without codes by a code of the largest lists.
 void refill(Codes codes, const std::vector<uint32_t>& list_of, const std::vector<uint32_t>& counts,
-            std::vector<int8_t>& centroids) {
-  const size_t nlist = counts.size(), dim = codes.columns;
+            Matrix<int8_t>& centroids) {
+  const size_t nlist = counts.size();
   std::vector<uint32_t> first(nlist + 1, 0), members(codes.rows);
   for (size_t c = 0; c < nlist; ++c) first[c + 1] = first[c] + counts[c];
   std::vector<uint32_t> next(first.begin(), first.end() - 1);
@@ -57,7 +44,7 @@ void refill(Codes codes, const std::vector<uint32_t>& list_of, const std::vector
     largest.pop();
     // Another code each time, spread over the list.
     const size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
-    std::copy_n(codes.row(members[at]), dim, &centroids[c * dim]);
+    std::copy_n(codes.row(members[at]), codes.columns, centroids.row(c));
     ++from.parts;
     from.share = counts[from.list] / from.parts;
     largest.push(from);
@@ -66,25 +53,25 @@ void refill(Codes codes, const std::vector<uint32_t>& list_of, const std::vector
 
 // `assign(centroids)` returns the list of each code.
 template <typename Assign>
-std::vector<int8_t> k_means(Codes codes, size_t nlist, const Assign& assign) {
+Matrix<int8_t> k_means(Codes codes, size_t nlist, const Assign& assign) {
   const size_t dim = codes.columns;
-  std::vector<int8_t> centroids(nlist * dim);
+  Matrix<int8_t> centroids(nlist, dim);
   for (size_t c = 0; c < nlist; ++c) {
-    std::copy_n(codes.row(c * codes.rows / nlist), dim, &centroids[c * dim]);
+    std::copy_n(codes.row(c * codes.rows / nlist), dim, centroids.row(c));
   }
   for (int i = 0; i < kIterations; ++i) {
     const std::vector<uint32_t> list_of = assign(centroids);
-    std::vector<int64_t> sums(centroids.size(), 0);
+    Matrix<int64_t> sums(nlist, dim);
     std::vector<uint32_t> counts(nlist, 0);
     for (size_t row = 0; row < codes.rows; ++row) {
       const size_t c = list_of[row];
-      for (size_t d = 0; d < dim; ++d) sums[c * dim + d] += codes.row(row)[d];
+      for (size_t d = 0; d < dim; ++d) sums.row(c)[d] += codes.row(row)[d];
       ++counts[c];
     }
     for (size_t c = 0; c < nlist; ++c) {
       if (counts[c] == 0) continue;
       for (size_t d = 0; d < dim; ++d) {
-        centroids[c * dim + d] = rounded_mean<int64_t>(sums[c * dim + d], counts[c]);
+        centroids.row(c)[d] = rounded_mean<int64_t>(sums.row(c)[d], counts[c]);
       }
     }
     refill(codes, list_of, counts, centroids);
@@ -109,30 +96,29 @@ ListOrder::ListOrder(std::vector<Row> lists, size_t nlist)
   }
 }
 
-CoarseQuantizer::CoarseQuantizer(std::vector<int8_t> centroids, size_t dim)
-    : dim_(dim), centroids_(std::move(centroids)) {
-  packed_ = pack_codes({centroids_.data(), nlist(), dim_});
+CoarseQuantizer::CoarseQuantizer(Matrix<int8_t> centroids)
+    : centroids_(std::move(centroids)), packed_(pack_codes(centroids_)) {
+  const size_t dim = centroids_.columns;
   // Of equal centroids only the first one gets codes.
   std::vector<int8_t> distinct;
   std::vector<LandmarkIndex> lists;
   std::set<std::span<const int8_t>, decltype(std::ranges::lexicographical_compare)> seen;
   for (LandmarkIndex list{0}; list.value < nlist(); ++list.value) {
-    const std::span<const int8_t> centroid(&centroids_[list.value * dim_], dim_);
+    const std::span<const int8_t> centroid(centroids_.row(list.value), dim);
     if (!seen.insert(centroid).second) continue;
     distinct.insert(distinct.end(), centroid.begin(), centroid.end());
     lists.push_back(list);
   }
   const size_t n = lists.size();
-  const Codes all{distinct.data(), n, dim_};
+  const Codes all{distinct.data(), n, dim};
 
   const auto groups =
       std::min(n, static_cast<size_t>(std::ceil(2 * std::sqrt(static_cast<double>(n)))));
-  const auto assign = [&](const std::vector<int8_t>& to) {
-    const std::vector<CodeVector> packed = pack_codes({to.data(), groups, dim_});
-    return nearest_ids(
-        all, [&](Codes codes) { return search_exact(packed_view(packed, groups), codes, 1, {}); });
+  const auto assign = [&](const Matrix<int8_t>& to) {
+    const std::vector<CodeVector> packed = pack_codes(to);
+    return ids_of(search_exact(packed_view(packed, groups), all, 1, {}));
   };
-  const std::vector<int8_t> group_centroids = k_means(all, groups, assign);
+  const Matrix<int8_t> group_centroids = k_means(all, groups, assign);
   // Cuts large groups into parts, as k-means may leave nearly all centroids in one, with all of
   // which each code would be compared. Groups without centroids are left out.
   const size_t limit = kLargestGroup * ((n + groups - 1) / groups);
@@ -141,31 +127,29 @@ CoarseQuantizer::CoarseQuantizer(std::vector<int8_t> centroids, size_t dim)
   std::vector<Row> group_of;
   for (const uint32_t g : assign(group_centroids)) {
     if (sizes[g]++ % limit == 0) {
-      parts[g] = static_cast<uint32_t>(used.size() / dim_);
-      used.insert(used.end(), &group_centroids[g * dim_], &group_centroids[g * dim_] + dim_);
+      parts[g] = static_cast<uint32_t>(used.size() / dim);
+      used.insert(used.end(), group_centroids.row(g), group_centroids.row(g) + dim);
     }
     group_of.push_back({parts[g]});
   }
-  ListOrder order(std::move(group_of), used.size() / dim_);
-  group_centroids_ = pack_codes({used.data(), order.sizes.size(), dim_});
-  const size_t rows = order.first_blocks.back() * kPackedRows;
-  std::vector<int8_t> grouped(rows * dim_, 0);
-  list_of_.assign(rows, kNoLandmark);
+  ListOrder order(std::move(group_of), used.size() / dim);
+  group_centroids_ = pack_codes({used.data(), order.sizes.size(), dim});
+  Matrix<int8_t> grouped(order.first_blocks.back() * kPackedRows, dim);
+  list_of_.assign(grouped.rows, kNoLandmark);
   for (size_t i = 0; i < n; ++i) {
     const Row row = order.new_rows[i];
-    std::copy_n(all.row(i), dim_, &grouped[row.value * dim_]);
+    std::copy_n(all.row(i), dim, grouped.row(row.value));
     list_of_[row.value] = lists[i];
   }
-  grouped_ = pack_codes({grouped.data(), rows, dim_});
+  grouped_ = pack_codes(grouped);
   group_sizes_ = std::move(order.sizes);
   group_blocks_ = std::move(order.first_blocks);
 }
 
 CoarseQuantizer CoarseQuantizer::learn(Codes codes, size_t nlist, int threads) {
-  const auto assign = [&](const std::vector<int8_t>& centroids) {
-    return CoarseQuantizer(centroids, codes.columns).assign(codes, threads);
-  };
-  return {k_means(codes, nlist, assign), codes.columns};
+  return CoarseQuantizer(k_means(codes, nlist, [&](const Matrix<int8_t>& centroids) {
+    return CoarseQuantizer(centroids).assign(codes, threads);
+  }));
 }
 
 size_t CoarseQuantizer::default_nlist(size_t prototypes, size_t dim, size_t row_bytes) {
@@ -185,25 +169,19 @@ size_t CoarseQuantizer::default_nlist(size_t prototypes, size_t dim, size_t row_
 }
 
 CoarseQuantizer CoarseQuantizer::cut(size_t dim) const {
-  if (dim == dim_ || nlist() == 0) return *this;
-  std::vector<int8_t> centroids;
-  for (auto from = centroids_.begin(); from != centroids_.end();
-       from += static_cast<std::ptrdiff_t>(dim_)) {
-    centroids.insert(centroids.end(), from, from + static_cast<std::ptrdiff_t>(dim));
-  }
-  return {std::move(centroids), dim};
+  if (dim == centroids_.columns || nlist() == 0) return *this;
+  Matrix<int8_t> centroids(nlist(), dim);
+  for (size_t c = 0; c < nlist(); ++c) std::copy_n(centroids_.row(c), dim, centroids.row(c));
+  return CoarseQuantizer(std::move(centroids));
 }
 
 std::vector<uint32_t> CoarseQuantizer::assign(Codes codes, int threads) const {
   PackedPrototypes grouped = packed_view(grouped_, list_of_.size());
   grouped.landmarks.of_row = list_of_.data();
   const InvertedLists groups(group_sizes_, group_blocks_);
-  SearchOptions options;
-  options.threads = threads;
   const PackedPrototypes centroids = packed_view(group_centroids_, group_sizes_.size());
-  return nearest_ids(codes, [&](Codes chunk) {
-    return search_lists(grouped, groups, centroids, kGroupProbes, chunk, 1, options);
-  });
+  return ids_of(
+      search_lists(grouped, groups, centroids, kGroupProbes, codes, 1, {.threads = threads}));
 }
 
 }  // namespace protomark

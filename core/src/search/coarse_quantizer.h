@@ -15,32 +15,29 @@ class CoarseQuantizer {
 
   CoarseQuantizer() = default;  // without lists
   // `centroids` are (nlist x dim), at least one.
-  CoarseQuantizer(std::vector<int8_t> centroids, size_t dim);
+  explicit CoarseQuantizer(Matrix<int8_t> centroids);
   // Learns by Lloyd's k-means, in integers; `nlist` is at most the number of codes.
   static CoarseQuantizer learn(Codes codes, size_t nlist, int threads);
   // Returns a number of lists with which the index takes at most 4 bytes per prototype, both in a
   // learning map, where a row takes `row_bytes`, and in a sealed one.
   static size_t default_nlist(size_t prototypes, size_t dim, size_t row_bytes);
-  // Returns how many prototypes suffice to learn this many lists.
-  static size_t sample_size(size_t nlist) { return 48 * nlist; }
+  static constexpr size_t kSampleSize = 48;  // prototypes per list suffice to learn it
 
-  size_t nlist() const { return dim_ == 0 ? 0 : centroids_.size() / dim_; }
-  const std::vector<int8_t>& centroids() const { return centroids_; }
+  size_t nlist() const { return centroids_.rows; }
+  const Matrix<int8_t>& centroids() const { return centroids_; }
   PackedPrototypes packed() const { return packed_view(packed_, nlist()); }
 
   // Returns the quantizer of the first `dim` numbers of codes, with as many lists.
   CoarseQuantizer cut(size_t dim) const;
 
-  // Returns the list of each code.
   std::vector<uint32_t> assign(Codes codes, int threads) const;
 
  private:
   PackedPrototypes packed_view(const std::vector<CodeVector>& codes, size_t rows) const {
-    return {codes.data(), rows, dim_};
+    return {codes.data(), rows, centroids_.columns};
   }
 
-  size_t dim_ = 0;
-  std::vector<int8_t> centroids_;
+  Matrix<int8_t> centroids_;
   std::vector<CodeVector> packed_;
 
   std::vector<CodeVector> group_centroids_;

@@ -8,67 +8,11 @@
 #include "base/text.h"
 #include "kernels/kernels.h"
 #include "protomark/search.h"
-#include "protomark/types.h"
 
 namespace protomark {
 
-// The k nearest that one query has met so far, sorted, ties to the smaller id, in the caller's
-// arrays. Free entries have id -1, which counts as larger than all others, and the limit as their
-// distance.
-class TopK {
- public:
-  TopK(int64_t* ids, int32_t* distances, size_t k) : ids_(ids), distances_(distances), k_(k) {}
-
-  // Returns the distance that a candidate must not exceed.
-  int32_t limit() const { return distances_[k_ - 1]; }
-
-  // Takes a candidate whose id was not offered before. One or two neighbours, as most searches ask
-  // for, need no loop.
-  void offer(int32_t distance, int64_t id) {
-    if (k_ > 2) {
-      if (before(distance, id, k_ - 1)) insert(distance, id, k_ - 1);
-    } else if (before(distance, id, 0)) {
-      if (k_ == 2) set(1, distances_[0], ids_[0]);
-      set(0, distance, id);
-    } else if (k_ == 2 && before(distance, id, 1)) {
-      set(1, distance, id);
-    }
-  }
-
-  // Takes a candidate whose id may be among the nearest already, at another distance.
-  void offer_distinct(int32_t distance, int64_t id) {
-    if (!before(distance, id, k_ - 1)) return;
-    const auto at = static_cast<size_t>(std::find(ids_, ids_ + k_, id) - ids_);
-    if (at == k_) {
-      insert(distance, id, k_ - 1);
-    } else if (distance < distances_[at]) {
-      insert(distance, id, at);
-    }
-  }
-
- private:
-  bool before(int32_t distance, int64_t id, size_t i) const {
-    return distance < distances_[i] || (distance == distances_[i] &&
-                                        static_cast<uint64_t>(id) < static_cast<uint64_t>(ids_[i]));
-  }
-
-  // Overwrites entry i and moves the new one up to where it belongs.
-  void insert(int32_t distance, int64_t id, size_t i) {
-    for (; i > 0 && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
-    set(i, distance, id);
-  }
-
-  void set(size_t i, int32_t distance, int64_t id) {
-    distances_[i] = distance;
-    ids_[i] = id;
-  }
-
-  int64_t* ids_;
-  int32_t* distances_;
-  size_t k_;
-};
-
-// The nearest of several queries.
+// The k nearest that each of several queries has met so far, sorted, ties to the smaller id. Free
+// entries have id -1, which counts as larger than all others, and the limit as their distance.
 class Neighbours {
  public:
   // A query takes no neighbour beyond its limit.
@@ -80,11 +24,19 @@ class Neighbours {
   size_t queries() const { return ids_.size() / k_; }
   size_t k() const { return k_; }
   int32_t limit(size_t query) const { return distances_[query * k_ + k_ - 1]; }
-  TopK operator[](size_t query) {
-    return {ids_.data() + query * k_, distances_.data() + query * k_, k_};
-  }
   const int64_t* ids(size_t query) const { return ids_.data() + query * k_; }
   const int32_t* distances(size_t query) const { return distances_.data() + query * k_; }
+
+  // Takes a candidate; if ids come again, its id may be among the nearest, at another distance.
+  void offer(size_t query, int32_t distance, int64_t id, bool again) {
+    const size_t first = query * k_, last = first + k_ - 1;
+    if (!before(distance, id, last)) return;
+    size_t i = again ? first : last;
+    while (i < last && ids_[i] != id) ++i;
+    if (ids_[i] == id && distance >= distances_[i]) return;
+    for (; i > first && before(distance, id, i - 1); --i) set(i, distances_[i - 1], ids_[i - 1]);
+    set(i, distance, id);
+  }
 
   Neighbours part(Range queries) const {
     Neighbours result(k_, {});
@@ -95,12 +47,20 @@ class Neighbours {
   // Takes the neighbours of `part`, whose queries begin with `first`.
   void merge(size_t first, const Neighbours& part) {
     for (size_t i = 0; i < part.ids_.size(); ++i) {
-      if (part.ids_[i] < 0) continue;
-      (*this)[first + i / k_].offer_distinct(part.distances_[i], part.ids_[i]);
+      if (part.ids_[i] >= 0) offer(first + i / k_, part.distances_[i], part.ids_[i], true);
     }
   }
 
  private:
+  bool before(int32_t distance, int64_t id, size_t i) const {
+    return distance < distances_[i] || (distance == distances_[i] &&
+                                        static_cast<uint64_t>(id) < static_cast<uint64_t>(ids_[i]));
+  }
+  void set(size_t i, int32_t distance, int64_t id) {
+    distances_[i] = distance;
+    ids_[i] = id;
+  }
+
   size_t k_;
   std::vector<int64_t> ids_;
   std::vector<int32_t> distances_;
@@ -197,8 +157,8 @@ inline void write_answer(const Neighbours& nearest, std::span<const int32_t> nor
 // Returns room for the answer of a search. Throws std::invalid_argument if k is 0 or max_distance
 // is negative.
 inline Matches room_for_answer(size_t queries, size_t k, std::optional<int32_t> max_distance) {
-  if (k == 0) invalid("k must be at least 1");
-  if (max_distance && *max_distance < 0) invalid("max_distance must not be negative");
+  require(k != 0, "k must be at least 1");
+  require(!max_distance || *max_distance >= 0, "max_distance must not be negative");
   return {{queries, k}, {queries, k}};
 }
 

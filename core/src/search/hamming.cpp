@@ -26,21 +26,17 @@ void pack(Descriptors database, Range rows, size_t words, uint64_t* packed) {
 }
 
 void check(Descriptors queries, Descriptors database, const HammingOptions& options) {
-  if (queries.columns != database.columns) {
-    invalid("queries have ", queries.columns, " bytes, the database has ", database.columns);
-  }
-  if (queries.columns == 0 || queries.columns > 4096) {
-    invalid("a descriptor has 1 to 4096 bytes, not ", queries.columns);
-  }
-  if (database.rows > UINT32_MAX) invalid("the database has over 2^32 rows");
+  require(queries.columns == database.columns, "queries have ", queries.columns,
+          " bytes, the database has ", database.columns);
+  require(queries.columns >= 1 && queries.columns <= 4096, "a descriptor has 1 to 4096 bytes, not ",
+          queries.columns);
+  require(database.rows <= UINT32_MAX, "the database has over 2^32 rows");
   if (!options.landmarks) return;
   const std::span<const int64_t> landmarks = *options.landmarks;
-  if (landmarks.size() != database.rows) {
-    invalid("the database has ", database.rows, " rows, landmarks has ", landmarks.size());
-  }
-  for (const int64_t id : landmarks) {
-    if (id < 0) invalid("landmark ids must not be negative");
-  }
+  require(landmarks.size() == database.rows, "the database has ", database.rows,
+          " rows, landmarks has ", landmarks.size());
+  require(std::ranges::all_of(landmarks, [](int64_t id) { return id >= 0; }),
+          "landmark ids must not be negative");
 }
 
 // Compares queries with some rows, whose landmarks are nullptr if ids are rows.
@@ -68,11 +64,9 @@ void scan(Descriptors queries, Descriptors database, Range rows, const int64_t* 
         },
         [&](size_t q) { return nearest.limit(q); },
         [&](size_t q, int32_t distance, size_t row) {
-          if (landmarks != nullptr) {
-            nearest[q].offer_distinct(distance, landmarks[begin + row]);
-          } else {
-            nearest[q].offer(distance, static_cast<int64_t>(begin + row));
-          }
+          const size_t at = begin + row;
+          const bool again = landmarks != nullptr;
+          nearest.offer(q, distance, again ? landmarks[at] : static_cast<int64_t>(at), again);
         });
   }
 }

@@ -1,5 +1,7 @@
 #include "search/inverted_lists.h"
 
+#include <cmath>
+
 namespace protomark {
 namespace {
 
@@ -9,8 +11,6 @@ constexpr size_t kQueries = 1 << 14;
 // Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
 // which, or a nearer one, limits the distance.
 constexpr size_t kMinStep = 16, kMaxSampled = 64;
-// Up to this many lists a heap is faster than selection.
-constexpr size_t kFewProbes = 16;
 // Queries that are compared with centroids together.
 constexpr size_t kBatch = 256;
 
@@ -18,19 +18,15 @@ constexpr size_t kBatch = 256;
 // that ties go to the smaller index.
 using Found = std::vector<int64_t>;
 
-// Selects the lists nearest to a batch of queries, on one thread. (TopK is for a few neighbours;
-// these may be hundreds.)
+// Selects the lists nearest to a batch of queries, on one thread. (Neighbours are for a few; these
+// may be hundreds.)
 class Selection {
  public:
-  // `found` has room for each query of the batch.
-  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch,
-            std::vector<Found>& found)
+  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch)
       : centroids_(centroids),
         scan_(queries, batch),
         limits_(batch.size(), kNoLimit),
-        found_(found) {
-    for (Found& of_query : found_) of_query.clear();
-  }
+        found_(batch.size()) {}
 
   void nearest(size_t nprobe, uint32_t* to) {
     guess_limits(nprobe);
@@ -64,7 +60,7 @@ class Selection {
           row, std::min(kPackedRows, centroids_.rows - row),
           [&](size_t q) { return sample.limit(q); },
           [&](size_t q, int32_t distance, size_t list) {
-            sample[q].offer(distance, static_cast<int64_t>(list));
+            sample.offer(q, distance, static_cast<int64_t>(list), false);
           });
     }
     for (size_t q = 0; q < limits_.size(); ++q) limits_[q] = sample.limit(q);
@@ -72,12 +68,8 @@ class Selection {
 
   static void select(Found& found, size_t nprobe, uint32_t* to) {
     const auto end = found.begin() + static_cast<std::ptrdiff_t>(nprobe);
-    if (nprobe <= kFewProbes) {
-      std::partial_sort(found.begin(), end, found.end());
-    } else {
-      std::nth_element(found.begin(), end - 1, found.end());
-      std::iter_swap(found.begin(), std::min_element(found.begin(), end));
-    }
+    std::nth_element(found.begin(), end - 1, found.end());
+    std::iter_swap(found.begin(), std::min_element(found.begin(), end));
     for (size_t i = 0; i < nprobe; ++i) to[i] = static_cast<uint32_t>(found[i]);
   }
 
@@ -92,10 +84,9 @@ class Selection {
   const PackedPrototypes& centroids_;
   CodeScan scan_;
   std::vector<int32_t> limits_;
-  std::vector<Found>& found_;
+  std::vector<Found> found_;
 };
 
-// A query visits a list.
 struct Visit {
   uint32_t list;
   uint32_t query;
@@ -130,16 +121,75 @@ void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, Prot
   }
 }
 
+// Landmarks that are packed at a time: so many that the work on each query is small beside that on
+// rows, so few that they stay in the cache.
+constexpr size_t kPackedAtOnce = 1 << 14;
+// The time to read a row, and to pack one from anywhere, in comparisons of a row and a query.
+constexpr double kReading = 40, kPacking = 900;
+
+// Rows that were packed anew.
+class PackedPiece {
+ public:
+  void pack(const LandmarkRows& landmarks, std::span<const LandmarkIndex> some,
+            const PackedPrototypes& from) {
+    rows_.clear();
+    owners_.clear();
+    ids_.clear();
+    for (const LandmarkIndex landmark : some) {
+      landmarks.append(landmark, rows_);
+      owners_.resize(rows_.size(), landmark_at(ids_.size()));
+      const int64_t* ids = from.landmarks.ids;
+      ids_.push_back(ids != nullptr ? ids[landmark.value] : int64_t{landmark.value});
+    }
+    // What a row has in one place: 4 numbers or a word.
+    from.width == 0 ? copy_rows<4>(from) : copy_rows<1>(from);
+    view_ = {packed_.data(), rows_.size(), from.dim, from.width, from.table, {}};
+    view_.landmarks.of_row = owners_.data();
+    view_.landmarks.ids = ids_.data();
+  }
+
+  const PackedPrototypes& view() const { return view_; }
+
+ private:
+  template <size_t kBytes>
+  void copy_rows(const PackedPrototypes& from) {
+    constexpr size_t kAhead = 8;
+    const size_t block = packed_size(kPackedRows, from.dim, from.width);
+    packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector) + 1);
+    const auto* source = static_cast<const std::byte*>(from.data);
+    auto* to = reinterpret_cast<std::byte*>(packed_.data());
+    const auto start = [&](size_t row) {
+      return row / kPackedRows * block + row % kPackedRows * kBytes;
+    };
+    for (size_t i = 0; i < rows_.size(); ++i) {
+      if (i + kAhead < rows_.size()) {
+        const std::byte* next = source + start(rows_[i + kAhead].value);
+        for (size_t at = 0; at < block; at += sizeof(CodeVector)) __builtin_prefetch(next + at);
+      }
+      const std::byte* row = source + start(rows_[i].value);
+      std::byte* packed = to + start(i);
+      for (size_t at = 0; at < block; at += kPackedRows * kBytes) {
+        std::memcpy(packed + at, row + at, kBytes);
+      }
+    }
+  }
+
+  std::vector<Row> rows_;
+  std::vector<LandmarkIndex> owners_;
+  std::vector<int64_t> ids_;
+  std::vector<CodeVector> packed_;
+  PackedPrototypes view_;
+};
+
 }  // namespace
 
 std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const PreparedCodes& queries,
                                     size_t nprobe, int threads) {
   std::vector<uint32_t> result(queries.queries() * nprobe);
   parallel_for(threads, queries.queries(), 16, [&](size_t first, size_t last) {
-    std::vector<Found> found(std::min(kBatch, last - first));
     for (size_t q = first; q < last; q += kBatch) {
-      Selection(centroids, queries, {q, std::min(last, q + kBatch)}, found)
-          .nearest(nprobe, &result[q * nprobe]);
+      Selection batch(centroids, queries, {q, std::min(last, q + kBatch)});
+      batch.nearest(nprobe, &result[q * nprobe]);
     }
   });
   return result;
@@ -168,6 +218,66 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
     write_answer(nearest, prepared.norms(), options, begin, matches);
   }
   return matches;
+}
+
+Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
+                   const PackedPrototypes& centroids, const LandmarkRows& landmarks, size_t nprobe,
+                   Codes queries, size_t k, const SearchOptions& options) {
+  if (!options.among) {
+    return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
+  }
+  std::vector<LandmarkIndex> some;
+  for (const int64_t id : *options.among) some.push_back(landmarks.at(id));
+  sort_unique(some);
+  const double share =
+      static_cast<double>(some.size()) / static_cast<double>(std::max<size_t>(landmarks.end, 1));
+  if (options.recall && share > 0) {
+    const double wanted = std::ceil(static_cast<double>(nprobe) / share);
+    nprobe = wanted < static_cast<double>(lists.nlist()) ? static_cast<size_t>(wanted) : SIZE_MAX;
+  }
+  const double compared = nprobe < lists.nlist()
+                              ? static_cast<double>(nprobe) / static_cast<double>(lists.nlist())
+                              : 1.0;
+  const auto each = static_cast<double>(queries.rows);
+  if (options.nprobe || compared * (kReading + each) < share * (kPacking + each)) {
+    std::vector<bool> among(landmarks.end);
+    for (const LandmarkIndex landmark : some) among[landmark.value] = true;
+    prototypes.landmarks.among = &among;
+    return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
+  }
+  Matches matches = check_search(prototypes.dim, queries, k, options);
+  const PreparedCodes prepared(queries);
+  Neighbours nearest = prepared.neighbours(k, options);
+  PackedPiece piece;
+  for (size_t first = 0; first < some.size(); first += kPackedAtOnce) {
+    piece.pack(landmarks,
+               std::span(some).subspan(first, std::min(kPackedAtOnce, some.size() - first)),
+               prototypes);
+    scan_all(piece.view(), prepared, options.threads, nearest);
+  }
+  write_answer(nearest, prepared.norms(), options, 0, matches);
+  return matches;
+}
+
+size_t nprobe_for(const RecallTable& table, double recall, size_t nlist) {
+  if (recall >= 1 || table.empty()) return nlist;
+  // Two standard errors more, as the share that n test queries show is uncertain.
+  const auto n = static_cast<double>(table.size());
+  const double enough = n * recall + 2 * std::sqrt(n * recall * (1 - recall));
+  if (enough > n) return nlist;
+  return table[static_cast<size_t>(std::ceil(enough)) - 1];
+}
+
+void check_recall(double recall, size_t nlist, const char* remedy) {
+  require(recall > 0 && recall <= 1, "recall must be above 0 and at most 1");
+  require(nlist != 0, "recall needs an index: ", remedy);
+}
+
+void check_lists(const SearchOptions& options, size_t nlist, const char* remedy) {
+  require(!options.recall || !options.nprobe, "recall and nprobe exclude each other");
+  if (options.recall) check_recall(*options.recall, nlist, remedy);
+  require(!options.nprobe || nlist != 0, "nprobe needs an index: ", remedy);
+  require(options.nprobe.value_or(1) != 0, "nprobe must be at least 1");
 }
 
 }  // namespace protomark

@@ -1,4 +1,5 @@
-// Approximate search in the inverted lists whose centroids are nearest to a query.
+// Search in the inverted lists whose centroids are nearest to a query, as many as a recall takes,
+// or among some landmarks.
 #pragma once
 
 #include "search/list_blocks.h"
@@ -48,5 +49,35 @@ std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const Pre
 Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
                      const PackedPrototypes& centroids, size_t nprobe, Codes queries, size_t k,
                      const SearchOptions& options);
+
+struct LandmarkRows {
+  size_t end;  // all indices are below
+  std::function<LandmarkIndex(int64_t id)> at;
+  // Appends the rows of a landmark.
+  std::function<void(LandmarkIndex, std::vector<Row>&)> append;
+};
+
+// Searches as search_lists does, but with options.among only the rows of these landmarks. They are
+// packed anew, a piece at a time, and searched as a small map, at a cost that follows their number;
+// or, where that is less work, all rows are compared and those of other landmarks are passed over.
+// With options.recall more lists are then searched than `nprobe`, as many as hold so many of these
+// rows.
+Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
+                   const PackedPrototypes& centroids, const LandmarkRows& landmarks, size_t nprobe,
+                   Codes queries, size_t k, const SearchOptions& options);
+
+// For each of some test queries, how many lists a search visits until it finds the nearest
+// landmark; ascending.
+using RecallTable = std::vector<uint32_t>;
+
+inline constexpr size_t kTestQueries = 2048;  // at most
+
+// Returns how many lists to search for a recall above 0 and at most 1; all of them for 1.
+size_t nprobe_for(const RecallTable& table, double recall, size_t nlist);
+
+// Throws std::invalid_argument unless a map of `nlist` lists can be searched with this recall, or
+// with these options. `remedy` says what to do if there are no lists.
+void check_recall(double recall, size_t nlist, const char* remedy);
+void check_lists(const SearchOptions& options, size_t nlist, const char* remedy);
 
 }  // namespace protomark

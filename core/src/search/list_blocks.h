@@ -21,7 +21,6 @@ class ListBlocks {
     const List& l = lists_[list];
     return {static_cast<uint32_t>(l.last * kPackedRows + (l.rows - 1) % kPackedRows)};
   }
-  // Calls take(row) for each row of a list.
   template <typename Take>
   void each_row(uint32_t list, const Take& take) const {
     if (lists_[list].rows == 0) return;
@@ -43,7 +42,6 @@ class ListBlocks {
   void make_room() {
     if (blocks_.size() == blocks_.capacity()) reserve(std::max<size_t>(16, 2 * blocks()));
   }
-  // Adds a row to a list, and returns it.
   Row append(uint32_t list) {
     List& l = lists_[list];
     if (l.rows++ % kPackedRows == 0) {

@@ -4,7 +4,6 @@
 #include <functional>
 
 #include "base/rows.h"
-#include "protomark/types.h"
 
 namespace protomark {
 
@@ -39,12 +38,10 @@ struct alignas(64) CodeVector {
 
 std::vector<CodeVector> pack_codes(Codes codes);
 
-// The landmark of each row: by at most one of the first three members; by none, row i is of
-// landmark i.
+// The landmark of each row: by at most one of the first two members; by none, row i is of landmark
+// i.
 struct RowLandmarks {
   const LandmarkIndex* of_row = nullptr;
-  // Number of rows of each landmark, at least 1; landmark after landmark.
-  const uint8_t* row_counts = nullptr;
   std::function<LandmarkIndex(Row)> look_up;
   // Rows of this landmark and of later ones are padding.
   LandmarkIndex end = kNoLandmark;

@@ -34,12 +34,10 @@ Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k
 }
 
 Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options) {
-  if (queries.columns != dim) {
-    invalid("queries have ", queries.columns, " dimensions, prototypes ", dim);
-  }
-  if (options.ratio && !(*options.ratio > 0 && *options.ratio <= 1)) {
-    invalid("ratio must be above 0 and at most 1");
-  }
+  require(queries.columns == dim, "queries have ", queries.columns, " dimensions, prototypes ",
+          dim);
+  require(!options.ratio || (*options.ratio > 0 && *options.ratio <= 1),
+          "ratio must be above 0 and at most 1");
   return room_for_answer(queries.rows, k, options.max_distance);
 }
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstring>
+#include <numeric>
 
 #include "search/driver.h"
 #include "search/packed.h"
@@ -138,85 +139,24 @@ class CodeScan {
   std::vector<int32_t> biases_, prefix_biases_;
 };
 
-// Reads blocks of prototypes as int8 codes, on one thread.
-class BlockReader {
- public:
-  explicit BlockReader(const PackedPrototypes& prototypes)
-      : data_(static_cast<const uint8_t*>(prototypes.data)),
-        dim_(prototypes.dim),
-        width_(prototypes.width),
-        table_(prototypes.table),
-        block_bytes_(packed_size(kPackedRows, dim_, width_)),
-        code_bytes_(packed_size(kPackedRows, dim_)) {}
-
-  // Returns the codes of these blocks, one after the other, valid until the next call. Words are
-  // decoded into the cache, once for all queries.
-  const int8_t* read(size_t first_block, size_t n) {
-    const uint8_t* stored = data_ + first_block * block_bytes_;
-    if (width_ == 0) return reinterpret_cast<const int8_t*>(stored);
-    int8_t* codes = room(n);
-    copy(first_block, n, codes);
-    return codes;
-  }
-  const int8_t* read(std::span<const uint32_t> blocks) {
-    int8_t* codes = room(blocks.size());
-    for (size_t i = 0, n = 0; i < blocks.size(); i += n) {
-      for (n = 1; i + n < blocks.size() && blocks[i + n] == blocks[i] + n;) ++n;
-      if (n == blocks.size()) return read(blocks[0], n);
-      copy(blocks[i], n, codes + i * code_bytes_);
-    }
-    return codes;
-  }
-
- private:
-  void copy(size_t first_block, size_t n, int8_t* codes) const {
-    const uint8_t* stored = data_ + first_block * block_bytes_;
-    if (width_ == 0) {
-      std::memcpy(codes, stored, n * block_bytes_);
-    } else {
-      kernels::active().code_decode(stored, n, dim_, width_, table_, codes);
-    }
-  }
-  int8_t* room(size_t blocks) {
-    room_.resize(std::max(room_.size(), blocks * code_bytes_ / sizeof(CodeVector)));
-    return reinterpret_cast<int8_t*>(room_.data());
-  }
-
-  const uint8_t* data_;
-  size_t dim_;
-  size_t width_;
-  const int8_t* table_;
-  size_t block_bytes_;  // as stored
-  size_t code_bytes_;   // of a block as int8 codes
-  std::vector<CodeVector> room_;
-};
-
 // Finds the nearest landmarks of queries, on one thread.
 class PrototypeScan {
  public:
   // `nearest` are those of the queries of this range.
   PrototypeScan(const PackedPrototypes& prototypes, const PreparedCodes& queries, Range range,
                 Neighbours& nearest)
-      : blocks_(prototypes),
-        landmarks_(prototypes.landmarks),
-        scan_(queries, range),
-        nearest_(nearest) {}
+      : prototypes_(prototypes), scan_(queries, range), nearest_(nearest) {}
 
-  // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16. With
-  // RowLandmarks::row_counts, calls must ascend.
+  // Compares all queries with consecutive rows; `rows.begin` is a multiple of 16.
   void scan(Range rows) {
     const size_t chunk_rows = scan_.chunk_rows();
+    std::vector<uint32_t> blocks;
     for (size_t row = rows.begin; row < rows.end; row += chunk_rows) {
       const size_t n = std::min(chunk_rows, rows.end - row);
       scan_.choose_prefix(row - rows.begin);
-      chunk_ = {row, row + n};
-      of_chunk_.clear();
-      scan_.compare(
-          blocks_.read(row / kPackedRows, packed_blocks(n)), n,
-          [&](size_t q) { return nearest_.limit(q); },
-          [&](size_t q, int32_t distance, size_t i) {
-            offer(nearest_[q], distance, row_at(row + i));
-          });
+      blocks.resize(packed_blocks(n));
+      std::iota(blocks.begin(), blocks.end(), static_cast<uint32_t>(row / kPackedRows));
+      compare(blocks, n, [](size_t q) { return q; });
     }
   }
   // Compares some queries with the `rows` rows of some blocks, all full but the last.
@@ -225,75 +165,70 @@ class PrototypeScan {
     scan_.select(queries);
     for (size_t first = 0; first < blocks.size(); first += kChunk) {
       const auto chunk = blocks.subspan(first, std::min(kChunk, blocks.size() - first));
-      const size_t n = std::min(chunk.size() * kPackedRows, rows - first * kPackedRows);
-      scan_.compare(
-          blocks_.read(chunk), n, [&](size_t i) { return nearest_.limit(queries[i]); },
-          [&](size_t i, int32_t distance, size_t at) {
-            const size_t row = chunk[at / kPackedRows] * kPackedRows + at % kPackedRows;
-            offer(nearest_[queries[i]], distance, row_at(row));
-          });
+      compare(chunk, std::min(chunk.size() * kPackedRows, rows - first * kPackedRows),
+              [&](size_t i) { return queries[i]; });
     }
   }
 
  private:
+  // The i-th query that `scan_` compares is query_of(i).
+  template <typename QueryOf>
+  void compare(std::span<const uint32_t> blocks, size_t rows, const QueryOf& query_of) {
+    scan_.compare(
+        read(blocks), rows, [&](size_t i) { return nearest_.limit(query_of(i)); },
+        [&](size_t i, int32_t distance, size_t at) {
+          const size_t row = blocks[at / kPackedRows] * kPackedRows + at % kPackedRows;
+          offer(query_of(i), distance, row_at(row));
+        });
+  }
+  // Returns the codes of these blocks, one after the other, valid until the next call. Words are
+  // decoded into the cache, once for all queries.
+  const int8_t* read(std::span<const uint32_t> blocks) {
+    const auto& [data, rows, dim, width, table, landmarks] = prototypes_;
+    const size_t stored_bytes = packed_size(kPackedRows, dim, width);
+    const size_t code_bytes = packed_size(kPackedRows, dim);
+    for (size_t i = 0, n = 0; i < blocks.size(); i += n) {
+      for (n = 1; i + n < blocks.size() && blocks[i + n] == blocks[i] + n;) ++n;
+      const uint8_t* stored = static_cast<const uint8_t*>(data) + blocks[i] * stored_bytes;
+      if (width == 0 && n == blocks.size()) return reinterpret_cast<const int8_t*>(stored);
+      room_.resize(std::max(room_.size(), blocks.size() * code_bytes / sizeof(CodeVector)));
+      int8_t* codes = reinterpret_cast<int8_t*>(room_.data()) + i * code_bytes;
+      if (width == 0) {
+        std::memcpy(codes, stored, n * stored_bytes);
+      } else {
+        kernels::active().code_decode(stored, n, dim, width, table, codes);
+      }
+    }
+    return reinterpret_cast<const int8_t*>(room_.data());
+  }
   // Offers the landmark of a row to a query, unless the row is padding.
-  void offer(TopK best, int32_t distance, Row row) {
-    const LandmarkIndex landmark = landmark_of(row);
-    if (landmark >= landmarks_.end) return;
-    if (landmarks_.among != nullptr && !(*landmarks_.among)[landmark.value]) return;
-    const int64_t id =
-        landmarks_.ids != nullptr ? landmarks_.ids[landmark.value] : int64_t{landmark.value};
-    if (id < 0) return;
-    if (several_rows_) {
-      best.offer_distinct(distance, id);
-    } else {
-      best.offer(distance, id);
+  void offer(size_t query, int32_t distance, Row row) {
+    const auto& [of_row, look_up, end, ids, among] = prototypes_.landmarks;
+    LandmarkIndex landmark{row.value};
+    if (of_row != nullptr) {
+      landmark = of_row[row.value];
+    } else if (look_up) {
+      landmark = look_up(row);
     }
-  }
-  LandmarkIndex landmark_of(Row row) {
-    if (!several_rows_) return {row.value};
-    if (landmarks_.of_row != nullptr) return landmarks_.of_row[row.value];
-    if (landmarks_.look_up) return landmarks_.look_up(row);
-    // Most chunks have no hits and need not be counted.
-    if (of_chunk_.empty()) count_chunk();
-    return of_chunk_[row.value - chunk_.begin];
-  }
-  void count_chunk() {
-    const uint8_t* counts = landmarks_.row_counts;
-    while (counted_ + counts[landmark_.value] <= chunk_.begin)
-      counted_ += counts[landmark_.value++];
-    LandmarkIndex landmark = landmark_;
-    size_t end = counted_ + counts[landmark.value];
-    for (size_t row = chunk_.begin; row < chunk_.end; ++row) {
-      if (row == end) end += counts[++landmark.value];
-      of_chunk_.push_back(landmark);
-    }
+    if (landmark >= end || (among != nullptr && !(*among)[landmark.value])) return;
+    const int64_t id = ids != nullptr ? ids[landmark.value] : int64_t{landmark.value};
+    if (id >= 0) nearest_.offer(query, distance, id, of_row != nullptr || look_up);
   }
 
-  BlockReader blocks_;
-  const RowLandmarks& landmarks_;
+  const PackedPrototypes& prototypes_;
   CodeScan scan_;
   Neighbours& nearest_;
-  bool several_rows_ =
-      landmarks_.of_row != nullptr || landmarks_.row_counts != nullptr || landmarks_.look_up;
-  // With RowLandmarks::row_counts.
-  Range chunk_{};
-  std::vector<LandmarkIndex> of_chunk_;  // the landmarks of its rows
-  LandmarkIndex landmark_;               // no row of the chunk is of an earlier one
-  size_t counted_ = 0;                   // rows of earlier landmarks
+  std::vector<CodeVector> room_;
 };
 
-// Compares all queries with all prototypes.
 void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
               Neighbours& nearest);
 
-// Finds the nearest landmarks among all prototypes (protomark/search.h), whatever options.recall
-// and options.nprobe say. Throws std::invalid_argument if the arguments do not fit.
+// Searches all prototypes (protomark/search.h), whatever options.recall and options.nprobe say.
 Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
                      const SearchOptions& options);
 
-// Returns room for the answer of a search. Throws std::invalid_argument if its arguments do not
-// fit.
+// Returns room for the answer. Throws std::invalid_argument if the arguments do not fit.
 Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options);
 
 }  // namespace protomark
