@@ -1,12 +1,13 @@
 """Merges maps of two halves of each sequence, and tries to merge maps of different places.
 
-python benchmarks/scripts/merge_halves.py DATA MAPS castle toy [--part 0.6]
+python benchmarks/scripts/merge_halves.py DATA MAPS castle toy kitchen:120 [--part 0.6]
 
-Each sequence is the folder DATA/NAME with images/ and sparse/ (or true/). The first and the last
---part of its images are mapped apart, with unknown cameras, and merged with their frames; so are
-all images together. Maps are kept in MAPS. The table has the error of all camera centres against
-the sequence's poses after the best similarity, as a share of the trajectory's extent. Every pair of
-halves of different sequences has to be refused, in both orders.
+Each sequence is the folder DATA/NAME with images/ and sparse/ (or true/); NAME:COUNT takes the
+first COUNT images. The first and the last --part of its images are mapped apart, with unknown
+cameras, and merged with their frames; so are all images together. Maps are kept in MAPS. The table
+has the error of all camera centres against the sequence's poses after the best similarity, as a
+share of the trajectory's extent. Every pair of halves of different sequences has to be refused, in
+both orders.
 """
 
 from __future__ import annotations
@@ -74,14 +75,15 @@ def main() -> None:
     rows: list[tuple[str, ...]] = []
     halves: list[tuple[str, Path]] = []
     for name in args.sequences:
-        source = args.data / name
-        names = image_names(source / "images")
+        sequence, _, limit = name.partition(":")
+        source = args.data / sequence
+        names = image_names(source / "images")[: int(limit) if limit else None]
         count = round(args.part * len(names))
         parts = [
             mapped(source / "images", chosen, args.maps / f"{name}.{label}")
             for chosen, label in ((names[:count], "a"), (names[-count:], "b"))
         ]
-        halves += [(name, part) for part in parts]
+        halves += [(sequence, part) for part in parts]
         true = read_model(find_model(source / "true" if (source / "true").is_dir() else source))
         whole, _ = error_of(mapped(source / "images", names, args.maps / f"{name}.w"), true)
         started = time.perf_counter()

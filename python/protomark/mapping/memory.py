@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.features.descriptors import descriptor_kind
+from protomark.mapping.frame import Ids
 from protomark.mapping.options import MappingOptions
 from protomark.maps.build import chosen_dim
 from protomark.maps.info import matching_bytes
@@ -42,25 +43,25 @@ class Memory(ABC):
         """Encode descriptors (n, B) uint8 as (n, width), the form that is compared."""
 
     @abstractmethod
-    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+    def add(self, ids: Ids, encoded: NDArray[Any]) -> None:
         """Add observations; new ids are new landmarks."""
 
     @abstractmethod
-    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+    def subtract(self, ids: Ids, encoded: NDArray[Any]) -> None:
         """Remove observations that were added before, exactly."""
 
     @abstractmethod
-    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+    def merge_landmarks(self, into: Ids, source: Ids) -> None:
         """Merge each source landmark into the one in `into`."""
 
     @abstractmethod
-    def remove(self, ids: NDArray[np.int64]) -> None:
+    def remove(self, ids: Ids) -> None:
         """Remove landmarks."""
 
     @abstractmethod
     def search(
-        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        self, encoded: NDArray[Any], threads: int = 1, among: Ids | None = None
+    ) -> tuple[Ids, NDArray[np.int32]]:
         """The two nearest landmarks of each descriptor, exactly: ids and distances (q, 2).
 
         If there is none, the id is -1 and the distance 2^31 - 1. Euclidean distances are squared.
@@ -72,13 +73,11 @@ class Memory(ABC):
         """
 
     @abstractmethod
-    def distances(
-        self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
+    def distances(self, encoded: NDArray[Any], rows: Ids, ids: Ids) -> NDArray[np.float32]:
         """Distance (p,) of each row `rows[i]` of `encoded` from landmark `ids[i]`."""
 
     @abstractmethod
-    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def contains(self, ids: Ids) -> NDArray[np.bool_]:
         """Whether the memory holds each landmark."""
 
     @property
@@ -86,7 +85,7 @@ class Memory(ABC):
     def bytes(self) -> int:
         """Bytes that matching needs for all landmarks, without positions."""
 
-    def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
+    def accepted(self, distances: NDArray[np.int32]) -> Ids:
         """Rows of distances (q, 2) whose nearest landmark is accepted, the clearest first."""
         nearest, second = distances.T
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -98,9 +97,7 @@ class Memory(ABC):
         return 0.0
 
 
-def clearest_rows(
-    nearest: NDArray[np.int32], ambiguity: NDArray[np.floating], limit: float
-) -> NDArray[np.int64]:
+def clearest_rows(nearest: NDArray[np.int32], ambiguity: NDArray[np.floating], limit: float) -> Ids:
     """Rows (k,) whose ambiguity (q,) is below a limit, by ambiguity and then by distance."""
     rows = np.flatnonzero((nearest < NO_DISTANCE) & (ambiguity < limit))
     return rows[np.lexsort((nearest[rows], ambiguity[rows]))]
@@ -120,11 +117,11 @@ class Prototypes(Memory):
         """See `Memory.encode`."""
         return self.encoder.encode(descriptors, self.dim)
 
-    def add(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+    def add(self, ids: Ids, encoded: NDArray[Any]) -> None:
         """See `Memory.add`: Eq. 1 and Eq. 2 of the paper."""
         self.map.add_codes(ids, encoded)
 
-    def subtract(self, ids: NDArray[np.int64], encoded: NDArray[Any]) -> None:
+    def subtract(self, ids: Ids, encoded: NDArray[Any]) -> None:
         """See `Memory.subtract`; landmarks whose sums were halved keep what they lack."""
         try:
             self.map.subtract_codes(ids, encoded)
@@ -133,27 +130,25 @@ class Prototypes(Memory):
                 with contextlib.suppress(ValueError):
                     self.map.subtract_codes(ids[i : i + 1], encoded[i : i + 1])
 
-    def merge_landmarks(self, into: NDArray[np.int64], source: NDArray[np.int64]) -> None:
+    def merge_landmarks(self, into: Ids, source: Ids) -> None:
         """See `Memory.merge_landmarks`."""
         self.map.merge_landmarks(into, source)
 
-    def remove(self, ids: NDArray[np.int64]) -> None:
+    def remove(self, ids: Ids) -> None:
         """See `Memory.remove`."""
         self.map.remove(ids)
 
     def search(
-        self, encoded: NDArray[Any], threads: int = 1, among: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        self, encoded: NDArray[Any], threads: int = 1, among: Ids | None = None
+    ) -> tuple[Ids, NDArray[np.int32]]:
         """See `Memory.search`."""
         return self.map.search_codes(encoded, k=2, threads=threads, among=among)
 
-    def distances(
-        self, encoded: NDArray[Any], rows: NDArray[np.int64], ids: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
+    def distances(self, encoded: NDArray[Any], rows: Ids, ids: Ids) -> NDArray[np.float32]:
         """See `Memory.distances`."""
         return np.sqrt(self.map.distances(ids, encoded[rows]).astype(np.float32))
 
-    def contains(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def contains(self, ids: Ids) -> NDArray[np.bool_]:
         """See `Memory.contains`."""
         return np.isin(ids, self.map.ids)
 
@@ -162,7 +157,7 @@ class Prototypes(Memory):
         """See `Memory.bytes`: as in a sealed map without loss."""
         return round(matching_bytes(self.map) * len(self.map))
 
-    def accepted(self, distances: NDArray[np.int32]) -> NDArray[np.int64]:
+    def accepted(self, distances: NDArray[np.int32]) -> Ids:
         """See `Memory.accepted`; the probability decides if the encoder was calibrated."""
         if self.calibration is None:
             return super().accepted(distances)

@@ -68,9 +68,8 @@ def matching_bytes(scene: pm.PrototypeMap | pm.SealedMap) -> float:
     """Bytes per landmark for prototypes, without ids.
 
     A learning map counts int8 prototypes, and a byte for the number of observations, by which it
-    learns. The padding of a prototype to a
-    multiple of 4 bytes counts; the up to 15 rows that pad the whole section do not, as they do not
-    grow with the map.
+    learns. The padding of a prototype to a multiple of 4 bytes counts; the up to 15 rows that pad
+    the whole section do not, as they do not grow with the map.
     """
     if isinstance(scene, pm.SealedMap):
         return scene.bytes_per_landmark

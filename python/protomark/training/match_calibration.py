@@ -134,10 +134,11 @@ def calibrate(
     The quality on a sequence is that of a fit to the others, if there are any.
     """
     found: dict[str, dict[tuple[int, bool], LabelledMatches]] = {}
-    for path in tracked(paths, progress, "query maps"):
-        name = sequence_name(path)
-        if name in found:
+    names = [sequence_name(path) for path in paths]
+    for path, name in zip(paths, names, strict=True):
+        if names.count(name) > 1:
             raise ValueError(f"{path}: two files are of the sequence {name}, give one of them")
+    for path, name in tracked(list(zip(paths, names, strict=True)), progress, "query maps"):
         tracks = Tracks.load(path)
         try:
             found[name] = matches_by_kind(encoder, tracks, threads=threads)
