@@ -55,8 +55,11 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
                 "merge m.pmk atlas.osa -o s.pmk",
                 "split atlas.osa --parts 2 -o parts",
                 "localize atlas.osa photos",
-                "export atlas.osa --to ply -o s.ply",
             )
+        ),
+        (
+            "export atlas.osa --to ply -o s.ply",
+            "atlas.osa holds 2 maps, each in coordinates of its own",
         ),
         ("evaluate atlas.osa", "ORB-SLAM3, which `protomark tracks atlas.osa -o tracks` reads"),
         (
