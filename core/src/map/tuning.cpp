@@ -66,7 +66,7 @@ class Tuner {
     }
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
       Sum sum{};
-      for (size_t d = 0; d < dim_; ++d) sum[d] = rounded(rank, d);
+      for (size_t d = 0; d < dim_; ++d) sum[d] = int16_t{rounded(rank, d)};
       tuned_.set(rows_[rank], sum, 1);
     }
     if (indexed_) {
