@@ -288,10 +288,20 @@ def test_positions_on_the_globe(tmp_path: Path) -> None:
         "image, lat, lon, alt\na.jpg, 47, 8, 400\nb.jpg, 47.001, 8, 400\nc.jpg, 47, 8.001, 410\n"
     )
     poses = read_positions(file)
+    assert poses.frame == (
+        "metres east, north and up of latitude 47.000000000, longitude 8.000000000, altitude "
+        "400.000 (WGS 84)"
+    )
     at = {name: -pose[:, 3] for name, pose in poses.by_name.items()}
     np.testing.assert_allclose(at["a.jpg"], 0, atol=1e-6)
     np.testing.assert_allclose(at["b.jpg"], [0, 111.17, 0], atol=0.05)
     np.testing.assert_allclose(at["c.jpg"], [76.06, 0, 10], atol=0.05)
+    file.write_text(file.read_text().partition("\n")[2])
+    with pytest.raises(ValueError, match="look like degrees of latitude and longitude: write a"):
+        read_positions(file)
+    file.write_text("image;x;y;z\na.jpg;1;2;3\n")
+    with pytest.raises(ValueError, match="neither lines of image name, x, y, z"):
+        read_positions(file)
 
 
 def test_most_points_decide() -> None:

@@ -282,6 +282,8 @@ def test_a_bag_is_mapped_with_its_poses_and_localized_into_an_mcap(tmp_path: Pat
     assert [link.transform.translation.x for link in links] == pytest.approx(rows[:, 1])
     done = protomark("localize", scene, path, "--mcap", tmp_path / "found.bag")
     assert "name a file that ends in .mcap" in done.stderr
+    done = protomark("localize", scene, path, "--mcap", found)
+    assert "exists, and may be a recording: name a new file" in done.stderr
 
 
 def test_a_bag_is_mapped_and_localized_with_its_camera(tmp_path: Path) -> None:

@@ -179,3 +179,20 @@ def test_folders_are_swapped_in_one_step(tmp_path: Path, monkeypatch: pytest.Mon
         (new / "new").touch()
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
     assert [path.name for path in folder.iterdir()] == ["new"]
+
+
+def test_files_of_folders_that_are_read_are_not_replaced(tmp_path: Path) -> None:
+    """A bag is a folder of recordings, and the files of a map belong together."""
+    for name in ("bag", "kitchen", "hall"):
+        (tmp_path / name).mkdir()
+    recording = tmp_path / "bag" / "run_0.mcap"
+    recording.write_bytes(b"x")
+    with pytest.raises(ValueError, match="is part of an input of this command"):
+        check_outputs(recording, inputs=[tmp_path / "bag"])
+    (tmp_path / "kitchen" / "state.safetensors").write_bytes(b"x")
+    kitchen, hall = tmp_path / "kitchen", tmp_path / "hall"
+    for source, name in ((hall, "scene.pmk"), (hall, "part.pmk"), (kitchen, "scene.pmk")):
+        with pytest.raises(ValueError, match="the folder of a map, whose files belong together"):
+            check_outputs(maps=[kitchen / name], inputs=[source])
+    check_outputs(maps=[kitchen / "scene.sealed.pmk"], inputs=[kitchen])
+    check_outputs(maps=[kitchen / "part.pmk"], inputs=[kitchen / "scene.pmk"])

@@ -68,6 +68,7 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ),
         ("build data -o s.pmk", "data holds a map of kapture in kapture/: name that"),
         ("tracks data -o t", "data holds a map of kapture in kapture/: name that"),
+        ("info m.pmk --json atlas.osa", "--json atlas.osa exists and is no JSON: name another"),
         ("tracks atlas.osa -d freak -o t", "--descriptor is for images, which are not read"),
         ("tracks atlas.osa --partners 9 -o t", "--partners is for images, which are not read"),
         ("merge m.pmk kitchen -o s.pmk --renumber --fixed-scale", "--fixed-scale for others"),

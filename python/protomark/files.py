@@ -197,6 +197,16 @@ def check_outputs(
         check_folder(path.parent)
         if any(_same_file(path, other) for other in read):
             raise ValueError(f"{path} is an input of this command: name another file to write")
+        inside = any(other.is_dir() and _is_within(path, other) for other in read)
+        if path.exists() and inside and path.suffix not in (".pmk", ".ply", ".json"):
+            raise ValueError(f"{path} is part of an input of this command: name another file")
+        folders = [one for other in read for one in (other, other.parent)]
+        own = path.name != "scene.pmk" and any(_same_file(path.parent, f) for f in folders)
+        if is_map and not own and (path.parent / "state.safetensors").is_file():
+            raise ValueError(
+                f"{path.parent} is the folder of a map, whose files belong together: name a file "
+                "elsewhere"
+            )
         if any(_same_file(path, other) for other in written):
             raise ValueError(f"{path} would be written twice: name different files")
         if (path.suffix == ".pmk") != is_map:
@@ -226,6 +236,10 @@ def check_elsewhere(folder: Path) -> None:
     """Raise if a folder to replace is the current one: the shell would stay in the old one."""
     if folder.resolve() == Path.cwd():
         raise ValueError(f"{folder} is the folder you are in, and is replaced: leave it first")
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())
 
 
 def _same_file(path: Path, other: Path) -> bool:

@@ -90,6 +90,8 @@ def _show(facts: dict[str, Any]) -> None:
             ),
             ("largest", ", ".join(f"{name}: {residuals[name]:.4g}" for name in worst)),
         ]
+    if facts.get("frame"):
+        rows.append(("world", facts["frame"]))
     if facts["dropped_frame"] is not None:
         rows.append(("frame", f"{facts['dropped_frame']!r} is true no more: --frame says what is"))
     print_facts(rows)

@@ -115,6 +115,8 @@ def localize(
     if mcap is not None:
         if mcap.suffix != ".mcap":
             raise ValueError(f"--mcap {mcap}: name a file that ends in .mcap")
+        if mcap.exists():
+            raise ValueError(f"--mcap {mcap} exists, and may be a recording: name a new file")
         optional("rosbags")
     for line in filter(None, (passed_over(path) for path in images if not is_bag(path))):
         note(line)

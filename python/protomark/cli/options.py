@@ -9,9 +9,24 @@ import typer
 
 from protomark.threads import available_threads
 
+
+def _checked_json(path: Path | None) -> Path | None:
+    """The file of --json, which replaces nothing but JSON."""
+    if path is not None and path.is_file():
+        with path.open("rb") as file:
+            if file.read(1) not in (b"", b"{", b"["):
+                raise ValueError(f"--json {path} exists and is no JSON: name another file")
+    return path
+
+
 JsonFile = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", help="Write the results to this JSON file, too."),
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        callback=_checked_json,
+        help="Write the results to this JSON file, too.",
+    ),
 ]
 EncoderName = Annotated[
     str | None,

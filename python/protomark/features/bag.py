@@ -54,7 +54,7 @@ def image_topic(path: Path, topic: str | None = None) -> tuple[str, int]:
         found = {
             name: info.msgcount for name, info in bag.topics.items() if info.msgtype in _IMAGES
         }
-    listed = ", ".join(sorted(found)) or "none"
+    listed = ", ".join(sorted(found)) or "none (has the file been cut off? try `mcap recover`)"
     if topic is None:
         if len(found) != 1:
             raise ValueError(f"{path}: topics with images are {listed}: choose one with --topic")

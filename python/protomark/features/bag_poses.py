@@ -61,7 +61,10 @@ def bag_poses(
         if kinds.get(topic) not in (*_TF, *_STAMPED):
             known = ", ".join(sorted(n for n in kinds if kinds[n] in (*_TF, *_STAMPED))) or "none"
             raise ValueError(f"{path}: no poses on {topic}; topics with poses are {known}")
-        connection, _, first = next(bag.messages([c for c in bag.connections if c.topic == images]))
+        messages = bag.messages([c for c in bag.connections if c.topic == images])
+        connection, _, first = next(messages, (None, 0, b""))
+        if connection is None:
+            raise ValueError(f"{path}: none of its images can be read")
         camera = _name(bag.deserialize(first, connection.msgtype).header.frame_id)
         tree = topic if kinds[topic] in _TF else "/tf"
         links = _read_links(path, bag, [tree, f"{tree}_static"])

@@ -105,7 +105,7 @@ def find_model(folder: Path) -> Path:
     else:
         raise FileNotFoundError(
             f"{folder} has no COLMAP model (cameras and images, .bin or .txt) in sparse/ or "
-            "sparse/0/: name its folder with --model"
+            "sparse/0/: name the folder that has one (for `protomark tracks`: --model)"
         )
     others = [p for p in sorted((folder / "sparse").glob("*")) if p != candidate and is_model(p)]
     if others:

@@ -31,6 +31,7 @@ class ControlPoints:
     images: list[str]  # of the marks
     pixels: Array  # (n, 2), as in COLMAP
     points: NDArray[np.int64]  # (n,) index of the point that a mark shows
+    frame: str = ""  # the world's coordinates in words, if the file says
 
 
 def read_control_points(path: Path) -> ControlPoints | None:
@@ -57,13 +58,13 @@ def read_control_points(path: Path) -> ControlPoints | None:
     axes = {name.lower()[:3]: i for i, name in enumerate(header[3:6], 2)}
     if last and (header == ["WGS84"] or any(w in " ".join(header).lower() for w in _DEGREES)):
         axes = {"lon": 2, "lat": 3, "alt": 4}
-    at = values[:, 2:]
+    at, frame = values[:, 2:], ""
     if set(axes) == {"lat", "lon", "alt"}:
-        at = east_north_up(*values[:, [axes[name] for name in ("lat", "lon", "alt")]].T)
+        at, frame = east_north_up(*values[:, [axes[name] for name in ("lat", "lon", "alt")]].T)
     _, first, points = np.unique(values[:, 2:], axis=0, return_index=True, return_inverse=True)
     names = [(*rows[i][1][6:], f"line {rows[i][0]}")[0] for i in first.tolist()]
     return ControlPoints(
-        names, at[first], [w[0] for _, w in rows], values[:, :2], points.reshape(-1)
+        names, at[first], [w[0] for _, w in rows], values[:, :2], points.reshape(-1), frame
     )
 
 

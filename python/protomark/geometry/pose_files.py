@@ -30,6 +30,7 @@ class PoseSet:
         by_name: (3, 4) cam_from_world by image name.
         times: (n,) float64, ascending; empty if poses go by name.
         poses: (n, 3, 4) float64, the poses at these times.
+        frame: the world's coordinates in words, "" if the file does not say.
     """
 
     def __init__(
@@ -37,8 +38,9 @@ class PoseSet:
         by_name: Mapping[str, NDArray[np.float64]],
         times: NDArray[np.float64] | None = None,
         poses: NDArray[np.float64] | None = None,
+        frame: str = "",
     ) -> None:
-        self.by_name = by_name
+        self.by_name, self.frame = by_name, frame
         self.times = np.zeros(0) if times is None else times
         self.poses = np.zeros((0, 3, 4)) if poses is None else poses
         steps = np.diff(self.times)
@@ -160,26 +162,49 @@ def read_positions(path: Path) -> PoseSet:
         return read_poses(path)
     rows = table(path)
     if not rows or any(len(words) != 4 for _, words in rows):
-        return read_poses(path)
+        try:
+            return read_poses(path)
+        except ValueError as error:
+            raise ValueError(
+                f"{path} has neither lines of image name, x, y, z (or lat, lon, alt under a header "
+                f"that names them), nor control points, nor poses ({error})"
+            ) from None
     header = [word.lower() for word in rows[0][1]] if not is_number(rows[0][1][1]) else []
     rows = rows[1:] if header else rows
     if not rows:
         raise ValueError(f"{path} holds no positions: write a line of image name, x, y, z for each")
     at = np.array([numbers(path, number, words[1:]) for number, words in rows])
     columns = {name[:3]: i for i, name in enumerate(header[1:])}
+    frame = ""
     if {"lat", "lon", "alt"} == set(columns):
-        at = east_north_up(*at[:, [columns[name] for name in ("lat", "lon", "alt")]].T)
+        at, frame = east_north_up(*at[:, [columns[name] for name in ("lat", "lon", "alt")]].T)
+    elif not header and _look_like_degrees(at):
+        raise ValueError(
+            f"{path}: positions look like degrees of latitude and longitude: write a header, "
+            "image,lat,lon,alt (or image,x,y,z if they are not)"
+        )
     names = [words[0] for _, words in rows]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{path}: image {twice} has two positions: leave one out")
-    return PoseSet({n: np.column_stack([np.eye(3), -p]) for n, p in zip(names, at, strict=True)})
+    poses = {n: np.column_stack([np.eye(3), -p]) for n, p in zip(names, at, strict=True)}
+    return PoseSet(poses, frame=frame)
+
+
+def _look_like_degrees(at: NDArray[np.float64]) -> bool:
+    """Whether positions (n, 3) are within some kilometres of a place, if they were degrees."""
+    first, second = np.abs(at[:, :2]).max(axis=0)
+    span = float(np.ptp(at[:, :2], axis=0).max())
+    return bool(first <= 90 and second <= 180 and max(first, second) > 1 and 0 < span < 0.05)
 
 
 def east_north_up(
     latitude: NDArray[np.float64], longitude: NDArray[np.float64], altitude: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Metres (n, 3) east, north and up of the first of n positions (degrees, metres), in WGS 84."""
+) -> tuple[NDArray[np.float64], str]:
+    """Metres (n, 3) east, north and up of the first of n positions (degrees, metres), in WGS 84.
+
+    And a sentence that says so.
+    """
     a, e2 = 6378137.0, 6.69437999014e-3
     lat, lon = np.radians(latitude), np.radians(longitude)
     n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
@@ -187,7 +212,11 @@ def east_north_up(
     earth = np.column_stack([x, y, (n * (1 - e2) + altitude) * np.sin(lat)])
     (s, c), (sl, cl) = ((np.sin(v[0]), np.cos(v[0])) for v in (lat, lon))
     axes = np.array([[-sl, cl, 0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
-    return np.asarray((earth - earth[0]) @ axes.T)
+    frame = (
+        f"metres east, north and up of latitude {latitude[0]:.9f}, longitude {longitude[0]:.9f}, "
+        f"altitude {altitude[0]:.3f} (WGS 84)"
+    )
+    return np.asarray((earth - earth[0]) @ axes.T), frame
 
 
 def table(path: Path) -> list[tuple[int, list[str]]]:

@@ -336,6 +336,8 @@ def localize_files(
             results[:] = _with_shared_cameras(results)
             batch.write(output)
         raise
+    if not results:
+        raise ValueError(f"{queries[0].path}: none of its frames can be read")
     if all(result.found is None for result in results):
         raise ValueError(
             f"none of {len(results)} images is usable; {results[0].name}: {results[0].error}"

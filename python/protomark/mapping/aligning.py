@@ -96,7 +96,8 @@ def _align_folder(folder: Path, target: Target, progress: Progress) -> dict[str,
         motion, residuals = _motion(mapper, target)
         mapper.structure.move(motion)
         mapper.structure.recompute_views()
-        dropped = _describe_frame(mapper.scene, target.frame)
+        frame = target.frame or residuals.get("frame") or None
+        dropped = _describe_frame(mapper.scene, frame)
         mapper.history.events.append(
             f"aligned: scaled by {motion.scale:.6g}, turned by {motion.degrees:.1f} degrees"
         )
@@ -142,8 +143,11 @@ def _motion(mapper: Mapper, target: Target) -> tuple[Similarity, dict[str, Any]]
         marks = read_control_points(file) if file.is_file() else None
         try:
             if marks is not None:
-                return _fit(*_measured(mapper, marks), "control points")
-            return _fit(*_cameras(mapper, read_positions(file)), "cameras")
+                motion, facts = _fit(*_measured(mapper, marks), "control points")
+                return motion, facts | {"frame": marks.frame}
+            given = read_positions(file)
+            motion, facts = _fit(*_cameras(mapper, given), "cameras")
+            return motion, facts | {"frame": given.frame}
         except ValueError as error:
             told = str(error)
             raise ValueError(told if str(file) in told else f"{file}: {told}") from None

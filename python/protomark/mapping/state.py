@@ -79,9 +79,12 @@ def load_state(folder: Path, threads: int = 1) -> tuple[Mapper, dict[str, Any]]:
     """Load a map or a checkpoint, to continue it, and the facts that were saved with it.
 
     Raises:
-        FileError: the folder holds no state, or a broken one.
+        FileNotFoundError: the folder is none of `protomark map`.
+        FileError: its state is broken.
     """
     path = folder / STATE
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder} is no folder that `protomark map` has finished")
     try:
         arrays, state = _read(path)
         options = MappingOptions(**state["options"])
