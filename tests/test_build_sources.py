@@ -153,7 +153,7 @@ def test_what_is_refused(tmp_path: Path) -> None:
     for name, content, message in (
         ("cut.db", b"SQLite format 3\0 and no more", "cut.db is a database that is cut off"),
         ("a.keyframes", b"\0", "a.keyframes is a part of a map that osmap saved"),
-        ("a.pmk", b"PROTOMRK", "a.pmk is a file of Protomark already"),
+        ("a.pmk", b"PROTOMRK", "a.pmk is what Protomark wrote already"),
         ("rigs.json", b'[{"cameras": [{"camera_id": 1}]}]', "rigs.json is no map"),
     ):
         (tmp_path / name).write_bytes(content)

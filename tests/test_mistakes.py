@@ -35,6 +35,7 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     shutil.copy(tmp_path / "kitchen" / "scene.pmk", "m.pmk")
     scene.seal("sealed.pmk")
     (tmp_path / "photos" / "1.png").write_bytes(b"")
+    (tmp_path / "run.bag").write_bytes(b"#ROSBAG V2.0")
     (tmp_path / "atlas.osa").write_bytes(lzma.decompress(ATLAS.read_bytes()))
     export(sample.path(), tmp_path / "data" / "kapture", "kapture")
     return tmp_path
@@ -68,6 +69,10 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ),
         ("build data -o s.pmk", "data holds a map of kapture in kapture/: name that"),
         ("tracks data -o t", "data holds a map of kapture in kapture/: name that"),
+        ("map atlas.osa -o s", "ORB-SLAM3, which `protomark build atlas.osa -o scene.pmk` reads"),
+        ("build . -o s.pmk", ". holds a map of ORB-SLAM3 in atlas.osa: name that"),
+        ("build kitchen -o s.pmk", "kitchen is what Protomark wrote already"),
+        ("build run.bag -o s.pmk", "run.bag is a recording, which `protomark map` reads"),
         ("info m.pmk --json atlas.osa", "--json atlas.osa exists and is no JSON: name another"),
         ("tracks atlas.osa -d freak -o t", "--descriptor is for images, which are not read"),
         ("tracks atlas.osa --partners 9 -o t", "--partners is for images, which are not read"),

@@ -22,6 +22,7 @@ from protomark.geometry.pose_files import PoseSet, image_times, poses_of_images
 from protomark.mapping.frame import InputImage
 from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.structure import Structure
+from protomark.tracks.importers import check_own
 
 # Number of a video's frames that are held in memory to read it backward.
 _CHUNK = 64
@@ -349,6 +350,7 @@ def open_source(path: Path, every: int = 1, topic: str | None = None) -> FrameSo
         return ImageFolder(path / "images" if (path / "images").is_dir() else path, every)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such folder of images, video file or ROS bag")
+    check_own(path, "build {} -o scene.pmk")
     return Video(path, every)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 
 from protomark._core import FileError
+from protomark.features.bag import is_bag
 from protomark.tracks.file import Tracks
 
 # Asked in this order whether a file or folder is theirs.
@@ -20,6 +22,7 @@ _MODULES = (
     "kapture",
     "astrobee",
 )
+_BELOW = 100  # files and folders of a folder that are looked at
 _HEAD = 4096  # bytes by which a file is recognized
 MAGIC = b"PROTOMRK"  # with which the files of Protomark begin
 
@@ -66,17 +69,20 @@ def check_own(path: Path, command: str) -> None:
 
 
 def check_below(folder: Path) -> None:
-    """Raise ValueError if a folder's first folder with a map of another program is to be named."""
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if path.is_dir() and (module := find_importer(path)):
-            raise ValueError(f"{folder} holds a map of {module.PROGRAM} in {path.name}/: name that")
+    """Raise ValueError if something in a folder is a map of another program, which it names."""
+    for path in islice(sorted(folder.iterdir()), _BELOW) if folder.is_dir() else ():
+        if module := find_importer(path):
+            name = f"{path.name}{'/' if path.is_dir() else ''}"
+            raise ValueError(f"{folder} holds a map of {module.PROGRAM} in {name}: name that")
 
 
 def _guess(path: Path) -> str:
     """What a path that no module reads may be."""
     head = file_head(path)
-    if head.startswith(MAGIC):
-        return "a file of Protomark already, which `protomark seal` and `merge` take"
+    if head.startswith(MAGIC) or (path / "scene.pmk").is_file():
+        return "what Protomark wrote already, which `protomark seal` and `merge` take"
+    if is_bag(path):
+        return "a recording, which `protomark map` reads"
     if head.startswith(b"SQLite format 3\0"):
         return "a database that is cut off, broken, or of another program"
     if path.suffix in (".mappoints", ".keyframes", ".features"):
