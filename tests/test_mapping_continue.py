@@ -101,6 +101,11 @@ def test_another_scene_leaves_the_map_as_it_was(extended: Path, tmp_path: Path) 
     other = write_images(tmp_path / "other", walk(6), seed=50)
     fails(run(other, "--into", extended), "none of its frames fits the map", "not found in the map")
     assert contents(extended) == before
+    for path in other.iterdir():
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), cv2.resize(image, None, fx=0.75, fy=0.75))
+    fails(run(other, "--into", extended), "scene stays as it was")
+    assert contents(extended) == before
 
 
 def test_options_that_differ_from_the_map_are_refused(extended: Path, tmp_path: Path) -> None:
