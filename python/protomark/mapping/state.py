@@ -84,7 +84,7 @@ def load_state(folder: Path, threads: int = 1) -> tuple[Mapper, dict[str, Any]]:
     """
     path = folder / STATE
     if not path.is_file():
-        raise FileNotFoundError(f"{folder} is no folder that `protomark map` has finished")
+        raise FileNotFoundError(f"{folder} holds no map: name a folder that `protomark map` wrote")
     try:
         arrays, state = _read(path)
         options = MappingOptions(**state["options"])
