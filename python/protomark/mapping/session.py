@@ -269,11 +269,12 @@ class _Session:
         try:
             self._merge()
         except ValueError as problem:
-            self._extend(by_frame=True)
-            if (self.mapper.camera.width, self.mapper.camera.height) != source.size():
+            base, _ = load_state(self.request.output)
+            if (base.camera.width, base.camera.height) != source.size():
                 shutil.rmtree(self.request.output / CHECKPOINT, ignore_errors=True)
                 raise ValueError(f"{self.request.output} stays as it was: {problem}") from None
             self.note(f"not merged: {problem}; frames are now looked for in the map one by one")
+            self._extend(by_frame=True)
             return False
         return True
 

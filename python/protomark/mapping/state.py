@@ -110,8 +110,6 @@ def load_state(folder: Path, threads: int = 1) -> tuple[Mapper, dict[str, Any]]:
 
 def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     safetensors = optional("safetensors")
-    if not path.is_file():
-        raise FileError(f"{path}: no such file: name a folder that `protomark map` wrote")
     try:
         with safetensors.safe_open(path, "numpy") as file:
             metadata = file.metadata() or {}
