@@ -6,10 +6,8 @@ python benchmarks/scripts/gftt_tracks.py OUTPUT SEQUENCE... [--augmentations N]
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 
-from protomark.features.extractor import Extractor
 from protomark.tracks import augmentation, extract
 
 # RTAB-Map's settings, as its importer names them.
@@ -23,13 +21,10 @@ def main() -> None:
     parser.add_argument("sequences", type=Path, nargs="+")
     parser.add_argument("--augmentations", type=int, default=0)
     arguments = parser.parse_args()
-    for module in (extract, augmentation):
-        vars(module)["Extractor"] = partial(Extractor, detector=DETECTOR)
     arguments.output.mkdir(parents=True, exist_ok=True)
     for folder in arguments.sequences:
         sequence = extract.find_sequence(folder)
-        tracks = extract.extract(sequence, extract.TracksOptions("orb"))
-        tracks.info["detector"] = DETECTOR
+        tracks = extract.extract(sequence, extract.TracksOptions("orb", detector=DETECTOR))
         tracks.save(arguments.output / f"{sequence.name}.orb.safetensors")
         print(
             f"{sequence.name}: {len(tracks.keypoints):,} keypoints, {len(tracks.landmark_ids):,} "

@@ -85,7 +85,7 @@ def add_augmentations(
     plain = tracks.where(tracks.landmark_of_keypoint >= 0)
     options = tracks.info.get("options", {})
     limits = int(options.get("max_keypoints", 2000)), int(options.get("max_size", MAX_SIZE))
-    extractor = Extractor(tracks.descriptor, *limits)
+    extractor = Extractor(tracks.descriptor, *limits, tracks.info.get("detector"))
 
     def copies(index: int) -> list[tuple[Features, NDArray[np.int64]]]:
         image = read_gray(images / tracks.keyframe_names[index])

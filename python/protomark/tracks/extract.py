@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,8 @@ class TracksOptions:
     # Limit on keypoints without a landmark per keyframe, the strongest; None: no limit. A limit
     # makes smaller files, but query frames that lack keypoints which match nothing.
     max_unlabelled: int | None = None
+    # The detector of another program with its settings, as maps of it are read; None: OpenCV's.
+    detector: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)
@@ -143,7 +146,10 @@ def provenance(
     digest = hashlib.sha256(model.cam_from_world.tobytes())
     digest.update(repr((sorted(model.cameras.items()), model.camera_ids.tolist())).encode())
     digest.update(hash_files(paths.items()).encode())
-    return {"method": _METHOD, "options": asdict(options), "input": digest.hexdigest()}
+    settings = asdict(options)
+    detector = settings.pop("detector")
+    made = {"method": _METHOD, "options": settings, "input": digest.hexdigest()}
+    return made | ({"detector": detector} if detector else {})
 
 
 def _read_posed_model(folder: Path) -> colmap.ColmapModel:
@@ -445,7 +451,8 @@ def _detect(
 ) -> tuple[colmap.ColmapModel, list[Features], dict[str, str]]:
     """The images that can be read, their features, and what is wrong with each of the others."""
     cv2 = optional("cv2")
-    extractor = Extractor(options.descriptor, options.max_keypoints, options.max_size)
+    limits = options.max_keypoints, options.max_size
+    extractor = Extractor(options.descriptor, *limits, options.detector)
 
     def one(index: int) -> Features | str:
         path = sequence.images / model.names[index]
