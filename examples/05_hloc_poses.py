@@ -5,6 +5,7 @@ With a model of your own: `protomark tracks kitchen/ -o .`, and its file in plac
 """
 
 import sys
+import zlib  # noqa: F401  (pycolmap breaks it for the whole process if it comes first)
 from pathlib import Path
 
 import numpy as np
