@@ -13,11 +13,11 @@ import pytest
 from safetensors.numpy import save
 
 import protomark as pm
+from protomark.files import STATE
 from protomark.geometry.camera import CAMERA_MODELS, Camera
 from protomark.geometry.colmap import pycolmap
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.state import load_state
-from protomark.maps.open import STATE
 
 USES: list[Callable[[Camera], Any]] = [
     lambda camera: camera.rays(np.ones((2, 2))),

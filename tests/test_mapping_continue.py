@@ -14,6 +14,7 @@ from safetensors.numpy import load, save
 import protomark as pm
 from mapping_scene import PINHOLE, interrupted_at, walk, write_images
 from protomark import interrupt
+from protomark.files import SCENE_MAP, SEALED_MAP, STATE
 from protomark.geometry.colmap import find_model, read_model
 from protomark.geometry.pose import camera_centers
 from protomark.geometry.similarity import fit_similarity
@@ -24,7 +25,6 @@ from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.mapping.source import open_source
 from protomark.mapping.structure import Structure
-from protomark.maps.open import SCENE_MAP, SEALED_MAP, STATE
 from protomark.maps.seal import seal
 from test_mapping import CAMERA, SETTINGS, run
 from test_tracks_command import fails

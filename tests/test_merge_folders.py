@@ -11,6 +11,7 @@ import pytest
 import protomark as pm
 from conftest import protomark
 from mapping_scene import walk, write_images
+from protomark.files import STATE
 from protomark.geometry.colmap import find_model, read_model
 from protomark.geometry.pose import camera_centers
 from protomark.geometry.pose_files import read_poses
@@ -20,7 +21,6 @@ from protomark.mapping.merging_maps import merge_folders
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.mapping.state import load_state
-from protomark.maps.open import STATE
 from test_mapping import CAMERA, SETTINGS
 from test_mapping_continue import contents
 

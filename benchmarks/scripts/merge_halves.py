@@ -23,13 +23,14 @@ import numpy as np
 
 from protomark.cli.terminal import progress_bar
 from protomark.features.images import image_names
+from protomark.files import SCENE_MAP
 from protomark.geometry.colmap import ColmapModel, find_model, read_model
 from protomark.mapping.merging_maps import merge_folders
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.maps.alignment import align_maps
-from protomark.maps.open import SCENE_MAP, open_learning_map
+from protomark.maps.open import open_learning_map
 from protomark_bench.report import ReportTable
 from protomark_bench.trajectory import trajectory_error
 

@@ -17,6 +17,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+# The maps in the folder that `protomark map` writes: the one that learns, and the one that ships.
+SCENE_MAP = "scene.pmk"
+SEALED_MAP = "scene.sealed.pmk"
+# Beside them, what a later run continues with, and what observed the landmarks.
+STATE = "state.safetensors"
+
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
@@ -201,8 +207,8 @@ def check_outputs(
         if path.exists() and inside and path.suffix not in (".pmk", ".ply", ".json"):
             raise ValueError(f"{path} is part of an input of this command: name another file")
         folders = [one for other in read for one in (other, other.parent)]
-        own = path.name != "scene.pmk" and any(_same_file(path.parent, f) for f in folders)
-        if is_map and not own and (path.parent / "state.safetensors").is_file():
+        own = path.name != SCENE_MAP and any(_same_file(path.parent, f) for f in folders)
+        if is_map and not own and (path.parent / STATE).is_file():
             raise ValueError(
                 f"{path.parent} is the folder of a map, whose files belong together: name a file "
                 "elsewhere"

@@ -73,7 +73,7 @@ def merge(
         write_json,
     )
     from protomark.extras import optional
-    from protomark.files import check_outputs
+    from protomark.files import SCENE_MAP, check_outputs
     from protomark.maps.merge import merge_files
     from protomark.plot import check_suffix
 
@@ -123,7 +123,7 @@ def merge(
     for i, one in enumerate(facts["inputs"]):
         shared = f", {one['in_common']:,} of them in an earlier map" if i else ""
         file = Path(one["file"])
-        name = f"{file.parent.name}/{file.name}" if file.name == "scene.pmk" else file.name
+        name = f"{file.parent.name}/{file.name}" if file.name == SCENE_MAP else file.name
         rows.append((name, f"{one['landmarks']:,} landmarks{shared}"))
         if one["moved"]:
             rows.append(("", _moved(one["moved"])))

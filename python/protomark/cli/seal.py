@@ -77,9 +77,8 @@ def seal(
     """
     from protomark.cli.info import show
     from protomark.cli.terminal import note, note_replaced, progress_bar, write_json
-    from protomark.files import check_outputs
+    from protomark.files import SCENE_MAP, check_outputs
     from protomark.maps.info import describe
-    from protomark.maps.open import SCENE_MAP
     from protomark.maps.seal import SealRequest
     from protomark.maps.seal import seal as seal_source
 

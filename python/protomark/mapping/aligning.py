@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 import protomark as pm
-from protomark.files import check_elsewhere, check_folder, only_writer, replacing_folder
+from protomark.files import (
+    SEALED_MAP,
+    STATE,
+    check_elsewhere,
+    check_folder,
+    only_writer,
+    replacing_folder,
+)
 from protomark.geometry.camera import Camera
 from protomark.geometry.control_points import (
     ControlPoints,
@@ -24,7 +31,7 @@ from protomark.geometry.similarity import Array, Similarity, fit_robustly
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.outputs import link_files, write_outputs
 from protomark.mapping.state import CHECKPOINT, load_state, save_state
-from protomark.maps.open import SEALED_MAP, STATE, open_learning_map
+from protomark.maps.open import open_learning_map
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from protomark.files import check_elsewhere, only_writer, replacing_folder
+from protomark.files import SCENE_MAP, STATE, check_elsewhere, only_writer, replacing_folder
 from protomark.geometry.similarity import Similarity
 from protomark.mapping import adjustment
 from protomark.mapping.mapper import LOOP_LOSS_SCALE, Mapper
@@ -21,7 +21,6 @@ from protomark.mapping.state import load_state, save_state
 from protomark.mapping.structure import PER_LANDMARK
 from protomark.maps.alignment import Alignment, Ids, align_maps
 from protomark.maps.merge import Merged, check_inputs, find_alignment, merge_each
-from protomark.maps.open import SCENE_MAP, STATE
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread
 

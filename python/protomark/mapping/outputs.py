@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from protomark.files import replacing_folder, write_text
+from protomark.files import SCENE_MAP, SEALED_MAP, replacing_folder, write_text
 from protomark.geometry.pose_files import tum_trajectory
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.reconstruction import write_model
 from protomark.mapping.state import CHECKPOINT
 from protomark.mapping.summary import map_pictures, summarise
 from protomark.maps import cameras
-from protomark.maps.open import SCENE_MAP, SEALED_MAP
 from protomark.maps.seal import seal_map
 from protomark.report import map_page
 

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from protomark.files import STATE
 from protomark.geometry.camera import Camera
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.source import FrameSource
 from protomark.mapping.state import CHECKPOINT
-from protomark.maps.open import STATE
 
 
 @dataclass(frozen=True)

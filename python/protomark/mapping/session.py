@@ -11,7 +11,7 @@ from typing import Any
 
 from protomark.features.extractor import Features, pixel_size
 from protomark.features.static_regions import describe, read_mask, static_regions
-from protomark.files import only_writer
+from protomark.files import STATE, only_writer
 from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.given_poses import misfit
@@ -37,7 +37,6 @@ from protomark.mapping.state import CHECKPOINT, load_state, save_checkpoint, sav
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import are_elsewhere, no_map
 from protomark.maps.alignment import align_maps
-from protomark.maps.open import STATE
 from protomark.progress import Progress, silent
 from protomark.threads import one_blas_thread, read_ahead
 
@@ -266,10 +265,10 @@ class _Session:
         )
         if not self.apart:
             return True
+        base, _ = load_state(self.request.output, self.request.threads)
         try:
-            self._merge()
+            self._merge(base)
         except ValueError as problem:
-            base, _ = load_state(self.request.output)
             if (base.camera.width, base.camera.height) != source.size():
                 shutil.rmtree(self.request.output / CHECKPOINT, ignore_errors=True)
                 raise ValueError(f"{self.request.output} stays as it was: {problem}") from None
@@ -278,26 +277,25 @@ class _Session:
             return False
         return True
 
-    def _merge(self) -> None:
-        """Merge the map of the frames alone with the one in the output.
+    def _merge(self, base: Mapper) -> None:
+        """Merge the map of the frames alone with `base`, the one in the output.
 
         Raises:
             ValueError: it is empty, or not of the same place.
         """
-        own, request = self.mapper, self.request
+        own = self.mapper
         if not len(own.structure.ids):
             raise ValueError(no_map(own, self.source))
         self.progress("merge", 0, 0)
-        mapper, _ = load_state(request.output, request.threads)
         own.scene.set_positions(own.structure.ids, own.structure.positions[own.structure.ids])
-        found = align_maps(mapper.scene, own.scene, threads=request.threads)
+        found = align_maps(base.scene, own.scene, threads=self.request.threads)
         if found.problem:
             raise ValueError(found.problem)
-        self.known = len(mapper.structure.frames)
-        insert_map(mapper, own, found, self.source.path.name)
-        mapper.finish(progress=self.progress)
-        self.mapper = mapper
-        self.note(mapper.history.events[-1])
+        self.known = len(base.structure.frames)
+        insert_map(base, own, found, self.source.path.name)
+        base.finish(progress=self.progress)
+        self.mapper = base
+        self.note(base.history.events[-1])
 
     def _in_order(self, options: MappingOptions, surveyed: Survey) -> Survey:
         """What the first frames show in the order in which they match, if that is another one."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from protomark._core import FileError
 from protomark.extras import optional
-from protomark.files import replacing, replacing_folder
+from protomark.files import SCENE_MAP, STATE, replacing, replacing_folder
 from protomark.geometry.camera import cameras_from_json
 from protomark.mapping.frame import Frame
 from protomark.mapping.history import History
@@ -25,7 +25,7 @@ from protomark.mapping.memory import Prototypes
 from protomark.mapping.options import MappingOptions
 from protomark.mapping.self_calibration import Calibration
 from protomark.mapping.structure import PER_LANDMARK, Structure
-from protomark.maps.open import SCENE_MAP, STATE, open_learning_map
+from protomark.maps.open import open_learning_map
 
 CHECKPOINT = "checkpoint"
 _FORMAT, _VERSION = "protomark-mapping", "1"

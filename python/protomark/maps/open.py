@@ -8,12 +8,7 @@ from typing import Literal, overload
 
 from protomark import _core
 from protomark._core import PrototypeMap, SealedMap
-
-# The maps in the folder that `protomark map` writes: the one that learns, and the one that ships.
-SCENE_MAP = "scene.pmk"
-SEALED_MAP = "scene.sealed.pmk"
-# Beside them, what a later run continues with, and what observed the landmarks.
-STATE = "state.safetensors"
+from protomark.files import SCENE_MAP, SEALED_MAP
 
 
 def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.extras import optional
+from protomark.files import SCENE_MAP, STATE
 from protomark.maps.build import build_map
 from protomark.maps.info import is_tracks
-from protomark.maps.open import SCENE_MAP, STATE, open_learning_map
+from protomark.maps.open import open_learning_map
 from protomark.maps.origin import tracks_metadata
 from protomark.maps.selection import Views, select_landmarks
 from protomark.maps.sources import read_places

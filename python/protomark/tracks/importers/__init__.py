@@ -9,6 +9,7 @@ from types import ModuleType
 
 from protomark._core import FileError
 from protomark.features.bag import is_bag
+from protomark.files import SCENE_MAP
 from protomark.tracks.file import Tracks
 
 # Asked in this order whether a file or folder is theirs.
@@ -79,7 +80,7 @@ def check_below(folder: Path) -> None:
 def _guess(path: Path) -> str:
     """What a path that no module reads may be."""
     head = file_head(path)
-    if head.startswith(MAGIC) or (path / "scene.pmk").is_file():
+    if head.startswith(MAGIC) or (path / SCENE_MAP).is_file():
         return "what Protomark wrote already, which `protomark seal` and `merge` take"
     if is_bag(path):
         return "a recording, which `protomark map` reads"
