@@ -84,6 +84,16 @@ def test_what_is_no_image_of_the_scene_is_named(query: Path) -> None:
     fails(done, "the name of this image is not UTF-8, rename it")
 
 
+def test_an_image_that_is_named_twice_is_localized_once(query: Path) -> None:
+    folder = query / "images"
+    done = run_command(
+        *(query / "scene.pmk", folder, folder / "1.png", folder, "-o", query / "o"),
+        command="localize",
+    )
+    assert "warning: 4 images are named twice, such as" in done.stderr
+    assert len(list(csv.DictReader((query / "o" / "poses.csv").open()))) == 3
+
+
 @pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
 def test_what_was_localized_is_written_whatever_ends_the_run(
     query: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]

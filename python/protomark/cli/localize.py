@@ -105,7 +105,7 @@ def localize(
     from protomark.extras import optional
     from protomark.features.bag import is_bag
     from protomark.features.bag_poses import write_poses
-    from protomark.features.images import passed_over
+    from protomark.features.images import describe_folder
     from protomark.files import check_outputs, only_writer
     from protomark.localization.batch import LocalizationRequest, localize_files
 
@@ -118,8 +118,9 @@ def localize(
         if mcap.exists():
             raise ValueError(f"--mcap {mcap} exists, and may be a recording: name a new file")
         optional("rosbags")
-    for line in filter(None, (passed_over(path) for path in images if not is_bag(path))):
-        note(line)
+    for path in images:
+        for line in [] if is_bag(path) else describe_folder(path):
+            note(line)
     request = LocalizationRequest(
         scene,
         images,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
 from protomark.features.bag_poses import bag_poses
 from protomark.features.extractor import MAX_SIZE
-from protomark.features.images import image_names, read_gray
+from protomark.features.images import file_identity, image_names, read_gray
 from protomark.features.video import Decode, is_video, video_frames
 from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength
@@ -375,6 +376,8 @@ def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> lis
     if topic is not None and not any(is_bag(source) for source in sources):
         raise ValueError(f"--topic {topic}: no ROS bag (.bag, .mcap, .db3) is among the images")
     found: dict[str, _Query] = {}
+    files: set[object] = set()
+    again: list[Path] = []
     for source in sources:
         if source.exists() and is_bag(source):
             camera = bag_camera(source, image_topic(source, topic)[0])
@@ -394,12 +397,20 @@ def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> lis
         for query in queries:
             if not is_utf8(query.name):
                 raise ValueError(f"{query.path}: the name of this image is not UTF-8, rename it")
+            file = file_identity(query.path), "" if query.time is None else query.name
+            if file in files:
+                again.append(query.path)
+                continue
+            files.add(file)
             if query.name in found:
                 raise ValueError(
                     f"{found[query.name].path} and {query.path} have the same name {query.name}: "
                     "localize them apart"
                 )
             found[query.name] = query
+    if again:
+        told = f"{len(again)} images are named twice, such as {again[0]}, and localized once"
+        warnings.warn(told, stacklevel=3)
     return list(found.values())[::every]
 
 
