@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.mapping.source import open_source
+from protomark.mapping.state import load_state
 from protomark.mapping.structure import Structure
 from protomark.maps.seal import seal
 from test_mapping import CAMERA, SETTINGS, run
@@ -135,6 +137,13 @@ def test_times_stay_unique_and_the_old_map_is_kept(extended: Path, tmp_path: Pat
     rows = np.loadtxt(extended / "trajectory.txt")
     assert len(rows) == FRAMES + 4
     assert (np.diff(rows[:, 0]) > 0).all()
+    # The time is that of the new frames only.
+    report = json.loads((extended / "report.json").read_text())
+    assert report["frames_per_second"] == pytest.approx(4 / report["seconds_total"], rel=0.01)
+    history = load_state(extended)[0].history
+    for record in list(history.records.values())[:FRAMES]:
+        record.seconds["match"] = 1e6
+    assert sum(history.total_seconds().values()) < 1e6
     assert "those of more are shifted by 9" in done.stderr
     # The camera walks on along x, so the frames are in the order in which they were taken.
     along = rows[:, 1:4] @ np.linalg.svd(rows[:, 1:4] - rows[:, 1:4].mean(0))[2][0]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from conftest import random_descriptors
+from conftest import protomark, random_descriptors
 from protomark import sample
 from protomark.cli import app
 from protomark.exporters import export
@@ -116,6 +116,22 @@ def test_maps_that_are_replaced_are_named(folder: Path, capsys: Any) -> None:
         assert (
             "2 files were replaced, such as parts/m.0.pmk" in capsys.readouterr().err
         ) == expected
+
+
+def test_what_is_refused_is_not_said_to_be_replaced(folder: Path) -> None:
+    (folder / "s.ply").touch()
+    (folder / "file").touch()
+    for command, message in (
+        ("merge kitchen m.pmk -o kitchen/scene.pmk", "is an input of this command"),
+        ("crop kitchen --near 0,0,0,100 -o kitchen/scene.pmk", "is an input of this command"),
+        ("seal kitchen -o m.pmk", "m.pmk is a learning map"),
+        ("export s.ply --to ply -o s.ply", "is an input of this command"),
+        ("export kitchen --to colmap -o file", "file is not a folder"),
+    ):
+        done = protomark(*shlex.split(command))
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert "will be replaced" not in done.stderr
 
 
 def test_the_current_folder_is_not_replaced(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -215,6 +215,7 @@ class _Session:
         """Add the frames to a map, or map them apart if it shows none of the first."""
         request = self.request
         self.mapper, facts = load_state(request.output, request.threads)
+        self.mapper.history.begin_run()
         check_same_options(request, self.mapper.options)
         camera = self._camera()
         if camera is not None and not self.source.cameras:
@@ -314,6 +315,8 @@ class _Session:
         if found.problem:
             raise ValueError(found.problem)
         self.known = len(base.structure.frames)
+        base.history.begin_run()
+        base.history.closing_seconds = own.history.closing_seconds
         insert_map(base, own, found, self.source.path.name)
         base.finish(progress=self.progress)
         self.mapper = base
