@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -37,7 +38,7 @@ from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
 from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import Localization
-from protomark.maps.open import is_map
+from protomark.maps.open import is_map, open_map
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import map_ahead
 
@@ -139,6 +140,17 @@ class LocalizationBatch:
     def accepted(self, image: ImageResult) -> bool:
         """Whether the pose of an image is likely enough."""
         return self.pose(image) is not None
+
+    def reasons(self) -> dict[str, list[str]]:
+        """Each image without an accepted pose, and why, by reasons that differ in numbers only."""
+        out: dict[str, list[str]] = {}
+        for image in self.images:
+            if not self.accepted(image):
+                doubt = f"its confidence is only {image.confidence:.2f}"
+                told = image.error or (image.found and image.found.reason) or doubt
+                kind = re.sub(r"[\d.]+", "#", told.partition(image.name)[2] or told)
+                out.setdefault(kind, []).append(f"{image.name}: {told}")
+        return out
 
     def recall(self) -> list[dict[str, float]]:
         """Share of the images with a true pose that are accepted and within each threshold."""
@@ -299,8 +311,14 @@ def localize_files(
         raise ValueError(f"{maps[0]} is a map: name it first, and then the images")
     queries = _list_queries(request.images, request.every, request.topic)
     _check_folder(output)
+    scene = open_map(request.scene)
+    if request.recall is not None and not scene.nlist:
+        raise ValueError(
+            f"--recall {request.recall:g}: {request.scene} has no index: `protomark seal` makes a "
+            "map with one by --index yes"
+        )
     localizer = Localizer(
-        request.scene,
+        scene,
         max_keypoints=request.max_keypoints,
         max_size=request.max_size,
         recall=request.recall,
