@@ -67,6 +67,10 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             "info data/kapture",
             "data/kapture is a map of kapture, which `protomark build data/kapture",
         ),
+        *(
+            (command, "data holds a map of kapture in kapture/: name that")
+            for command in ("info data", "export data --to ply -o s.ply", "localize data photos")
+        ),
         ("build data -o s.pmk", "data holds a map of kapture in kapture/: name that"),
         ("tracks data -o t", "data holds a map of kapture in kapture/: name that"),
         ("map atlas.osa -o s", "ORB-SLAM3, which `protomark build atlas.osa -o scene.pmk` reads"),

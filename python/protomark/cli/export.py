@@ -31,7 +31,11 @@ def export(
         Path, typer.Option("--output", "-o", help="File to write; for a model, new folder.")
     ],
     images: Annotated[
-        Path | None, typer.Option(help="Folder of the images, which give landmarks colours.")
+        Path | None,
+        typer.Option(
+            help="Folder of the images, which give landmarks colours. Those of `map SECOND --into` "
+            "are in its folder SECOND/."
+        ),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:

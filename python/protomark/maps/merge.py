@@ -191,7 +191,7 @@ def find_alignment(
 ) -> Alignment | None:
     """How `scene` lies in the world of `merged`; None: in the same world, with the same ids.
 
-    Maps with hardly any id in common are parts of one, or of a job that numbers all landmarks; a
+    Maps with hardly any id in common are of one map, or of a job that numbers all landmarks; a
     warning says if they look otherwise. `align` says that they are not, whatever their ids. `hint`
     ends the sentence if a map is not recognized.
 
@@ -229,8 +229,8 @@ def _warn_of_another_world(merged: pm.PrototypeMap, scene: pm.PrototypeMap, thre
     if not (found.problem or found.stays):
         warnings.warn(
             f"{found.agreeing:,} landmarks of a map look like landmarks elsewhere in an earlier "
-            "one, with other ids: the maps are merged as parts of one world; if each has a world "
-            "of its own, --align moves it",
+            "one, with other ids: the maps are merged as they are, in one world; if each has a "
+            "world of its own, --align moves it",
             stacklevel=3,
         )
 
