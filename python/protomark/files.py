@@ -182,8 +182,7 @@ def check_outputs(
 
     Args:
         outputs: files to write; None: not asked for.
-        inputs: what the command reads: paths, of folders also their maps, texts that may be
-            paths, or None.
+        inputs: what the command reads: paths, texts that may be paths, or None.
         folder: folder of further files to write, see `check_folder`.
         maps: map files to write; None: not asked for.
     """
@@ -191,7 +190,6 @@ def check_outputs(
         check_folder(folder)
     written: list[Path] = []
     read = [Path(str(i)) for i in inputs if i is not None]
-    read += [folder / SCENE_MAP for folder in read if folder.is_dir()]
     named = [(path, True) for path in maps] + [(path, False) for path in outputs]
     for path, is_map in named:
         if path is None:

@@ -173,7 +173,7 @@ def _read_features(database: Database, version: str, detector: str) -> _Features
     words: dict[int, tuple[Any, ...]] | None = None
     while chunk := list(islice(rows, _CHUNK)):
         columns = list(zip(*chunk, strict=True))
-        cells = columns.pop() if "descriptor" in optional else [None] * len(chunk)
+        cells: Any = columns.pop() if "descriptor" in optional else [None] * len(chunk)
         if not all(cells):
             # Then the word has the descriptor, which is that of its first feature.
             words = dict(database.rows_by_id("Word", "descriptor")) if words is None else words

@@ -185,7 +185,7 @@ def _read_messagepack(path: Path) -> _Map:
         elif key == "landmarks":
             for name in data.map_keys():
                 usual = data.match(_USUAL_LANDMARK)
-                values = None if usual else data.value()
+                values = {} if usual else data.value()
                 with unexpected(path, f"landmark {name}"):
                     x, y, z = _POSITION.unpack(usual[1]) if usual else values["pos_w"]
                     found.landmark_ids.append(int(name))
