@@ -436,7 +436,8 @@ class _Session:
 
     def _stage(self) -> str:
         """The name of the stage: a progress bar starts anew with each."""
-        restarts = self.mapper.calibration.restarts if self.mapper.calibration else 0
+        calibration = None if self.known else self.mapper.calibration
+        restarts = calibration.restarts if calibration else 0
         return "map" if not restarts else f"map (start {restarts + 1})"
 
     def _save(self) -> None:
