@@ -194,5 +194,7 @@ def sealed_prototypes(
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+        sys.exit(__doc__)
     scene = Map(Path(sys.argv[1]).read_bytes())
     print(f"{len(scene.ids)} landmarks, prototypes {scene.prototypes.shape}, {scene.metadata}")

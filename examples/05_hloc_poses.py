@@ -17,6 +17,8 @@ from protomark.exporters import export
 from protomark.maps.build import build_map
 from protomark.tracks.file import Tracks
 
+if any(word.startswith("-") for word in sys.argv[1:]):
+    sys.exit(__doc__)
 source = Path(sys.argv[1] if len(sys.argv) > 1 else sample.path())
 tracks = Tracks.load(source)
 

@@ -28,6 +28,16 @@ def test_examples_of_maps(name: str, tmp_path: Path) -> None:
     assert "landmarks" in run(name, tmp_path)
 
 
+@pytest.mark.parametrize("name", ["02_read_map_without_protomark.py", "05_hloc_poses.py"])
+def test_examples_say_how_they_are_called(name: str) -> None:
+    if name.startswith("05"):
+        pytest.importorskip("pycolmap")
+    command = [sys.executable, str(EXAMPLES / name), "-h"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert f"python examples/{name}" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_hloc_poses(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     text = run("05_hloc_poses.py", tmp_path)

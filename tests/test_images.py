@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from protomark.features.extractor import Extractor
-from protomark.features.images import image_names, passed_over, read_gray
+from protomark.features.images import describe_folder, image_names, read_gray
 from protomark.mapping.source import EXIF, ImageFolder
 from tracks_scene import texture
 
@@ -33,12 +33,21 @@ def test_links_are_followed_and_hidden_files_are_not_taken(tmp_path: Path) -> No
     (folder / "circle").symlink_to(folder)
     with open(os.fsencode(folder) + b"/caf\xe9.jpg", "wb"):
         pass
+    (folder / "other").symlink_to(elsewhere)
+    for output in ("kitchen/scene.pmk", "kitchen/views/a.png", "demo/protomark_demo.png"):
+        (folder / output).parent.mkdir(parents=True, exist_ok=True)
+        (folder / output).touch()
     assert image_names(folder) == ["1²3.JPE", "9.jpg", "10.jpg", "linked/b.png"]
-    assert "1 heic" in passed_over(folder)
-    assert "1 folder Depth_maps/" in passed_over(folder)
+    several, twice, left_out = describe_folder(folder)
+    assert several == f"{folder}: 4 images of 2 folders"
+    assert twice == f"{folder}: images that links name twice are taken once: 1"
+    assert "1 heic" in left_out
+    assert "1 whose name is not UTF-8 (caf" in left_out
+    for name in ("Depth_maps", "kitchen", "demo"):
+        assert f"1 folder {name}/" in left_out
     assert image_names(folder / "Depth_maps") == ["9.png"]  # who names it wants it
-    assert "1 whose name is not UTF-8 (caf" in passed_over(folder)
-    assert passed_over(elsewhere) == ""
+    assert image_names(folder / "demo") == ["protomark_demo.png"]
+    assert describe_folder(elsewhere) == []
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

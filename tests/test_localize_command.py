@@ -84,6 +84,28 @@ def test_what_is_no_image_of_the_scene_is_named(query: Path) -> None:
     fails(done, "the name of this image is not UTF-8, rename it")
 
 
+def test_an_image_that_is_named_twice_is_localized_once(query: Path) -> None:
+    folder = query / "images"
+    done = run_command(
+        *(query / "scene.pmk", folder, folder / "1.png", folder, "-o", query / "o"),
+        command="localize",
+    )
+    assert "warning: 4 images are named twice, such as" in done.stderr
+    assert len(list(csv.DictReader((query / "o" / "poses.csv").open()))) == 3
+
+
+def test_the_exit_code_says_that_no_pose_is_found_and_reasons_are_counted(query: Path) -> None:
+    for i in range(3):
+        cv2.imwrite(str(query / f"black{i}.png"), np.zeros((240, 320), np.uint8))
+    (query / "torn.png").write_bytes((query / "images" / "1.png").read_bytes()[:999])
+    images = [query / name for name in ("black0.png", "torn.png", "black1.png", "black2.png")]
+    done = run(query / "scene.pmk", *images, "-o", query / "o")
+    assert done.exit_code == 1
+    assert "3 as black0.png: only 0 keypoints: blurred, dark or empty" in done.output
+    assert "1 as torn.png: " in done.output
+    assert run(query / "scene.pmk", *images, query / "images", "-o", query / "o").exit_code == 0
+
+
 @pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
 def test_what_was_localized_is_written_whatever_ends_the_run(
     query: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
@@ -245,7 +267,7 @@ def test_geographic_coordinates(query: Path, scene: pm.PrototypeMap) -> None:
     for name in ("scene", "utm"):
         done = run(
             *(query / f"{name}.pmk", query / "images", "-o", query / name),
-            *("--camera", "estimate"),
+            *("--camera", "estimate", "--min-confidence", 0),
         )
         assert done.exit_code == 0, done.output + str(done.exception)
     here, there = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from protomark.mapping.prediction import MAX_STEP
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
 from protomark.mapping.source import open_source
+from protomark.mapping.state import load_state
 from protomark.mapping.structure import Structure
 from protomark.maps.seal import seal
 from test_mapping import CAMERA, SETTINGS, run
@@ -117,6 +119,10 @@ def test_options_that_differ_from_the_map_are_refused(extended: Path, tmp_path: 
     fails(run(*into, "--camera", "PINHOLE:400,400,160,120"), "was made with PINHOLE 320 240 300")
     done = run(*into, "--camera", "SIMPLE_PINHOLE:300.5,160,120")
     assert done.returncode == 0, done.stderr
+    assert (
+        "camera: that of scene, PINHOLE 320 240 300 300 160 120, which SIMPLE_PINHOLE"
+        in done.stderr
+    )
     cameras = pm.open(extended).metadata["cameras"]
     assert len(cameras.splitlines()) == 1
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
@@ -131,11 +137,31 @@ def test_times_stay_unique_and_the_old_map_is_kept(extended: Path, tmp_path: Pat
     rows = np.loadtxt(extended / "trajectory.txt")
     assert len(rows) == FRAMES + 4
     assert (np.diff(rows[:, 0]) > 0).all()
+    # The time is that of the new frames only.
+    report = json.loads((extended / "report.json").read_text())
+    assert report["frames_per_second"] == pytest.approx(4 / report["seconds_total"], rel=0.01)
+    history = load_state(extended)[0].history
+    for record in list(history.records.values())[:FRAMES]:
+        record.seconds["match"] = 1e6
+    assert sum(history.total_seconds().values()) < 1e6
     assert "those of more are shifted by 9" in done.stderr
     # The camera walks on along x, so the frames are in the order in which they were taken.
     along = rows[:, 1:4] @ np.linalg.svd(rows[:, 1:4] - rows[:, 1:4].mean(0))[2][0]
     assert (np.diff(along) > 0).all() or (np.diff(along) < 0).all()
     assert contents(extended / "previous") == before
+
+
+def test_images_that_the_map_has_of_another_folder_are_left_out(
+    images: Path, extended: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = write_images(tmp_path / "all" / "more", walk(FRAMES + 4)[FRAMES:])
+    (more.parent / "again").symlink_to(images)
+    fails(run(more.parent / "again", "--into", extended), f"all its {FRAMES} frames are in this")
+    request, notes = MapRequest(more.parent, extended, SETTINGS, extend=True), list[str]()
+    interrupted_at(FRAMES + MAX_STEP + 2, request, monkeypatch, notes)
+    assert f"{FRAMES} images of all are in the map already" in notes
+    figures = make_map(replace(request, resume=True))
+    assert figures["frames"] == figures["registered"] == FRAMES + 4
 
 
 @pytest.mark.parametrize(

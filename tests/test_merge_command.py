@@ -103,8 +103,8 @@ def test_what_cannot_be_merged_or_split_is_refused(encoder: pm.Encoder, tmp_path
         (["split", one, "-o", tmp_path], "one of --ids, --parts and --cell-size"),
         (["split", one, "--parts", 2, "--ids", "1", "-o", tmp_path], "one of --ids"),
         (["split", one, "--parts", 3, "-o", tmp_path], "a map of 2 landmarks has 1 to 2"),
-        (["split", one, "--ids", "3,2", "-o", tmp_path], "boundaries of parts must ascend"),
-        (["split", one, "--cell-size", 0, "-o", tmp_path], "must be above 0"),
+        (["split", one, "--ids", "3,2", "-o", tmp_path], "--ids 3,2: ids must ascend"),
+        (["split", one, "--cell-size", 0, "-o", tmp_path], "--cell-size 0 is not above 0"),
         (["split", one, "--parts", 2, "-o", one], "one.pmk is not a folder"),
         (["split", sealed, "--parts", 2, "-o", tmp_path], "is a sealed map"),
     ]

@@ -187,6 +187,9 @@ def test_other_places_are_refused(
         with pytest.raises(ValueError, match=f"{path}: .*stand for other landmarks .*{reason}"):
             merge_files([even, path], output)
         assert not output.exists()
+    with pytest.raises(ValueError, match="cannot be recognized") as caught:
+        find_alignment(open_learning_map(even), open_learning_map(noise))
+    assert "--renumber" not in str(caught.value)  # it is for files
     with pytest.raises(ValueError, match="10 landmarks of a map have a position, too few"):
         align_maps(open_learning_map(even), open_learning_map(few))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from conftest import random_descriptors
+from conftest import protomark, random_descriptors
 from protomark import sample
 from protomark.cli import app
 from protomark.exporters import export
@@ -67,6 +67,10 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             "info data/kapture",
             "data/kapture is a map of kapture, which `protomark build data/kapture",
         ),
+        *(
+            (command, "data holds a map of kapture in kapture/: name that")
+            for command in ("info data", "export data --to ply -o s.ply", "localize data photos")
+        ),
         ("build data -o s.pmk", "data holds a map of kapture in kapture/: name that"),
         ("tracks data -o t", "data holds a map of kapture in kapture/: name that"),
         ("map atlas.osa -o s", "ORB-SLAM3, which `protomark build atlas.osa -o scene.pmk` reads"),
@@ -80,6 +84,10 @@ def folder(encoder: pm.Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ("localize photos kitchen", "kitchen is a map: name it first, and then the images"),
         ("localize photos/1.png m.pmk", "m.pmk is a map: name it first, and then the images"),
         ("localize m.pmk photos -o kitchen", "kitchen is the folder of a map: name another"),
+        ("localize m.pmk photos --recall 0.9", "m.pmk has no index: `protomark seal` makes a map"),
+        ("split m.pmk --cell-size -1 -o parts", "--cell-size -1 is not above 0"),
+        ("map photos -o s --window 0", "--window 0: it must be at least 2"),
+        ("tracks photos -o t --min-length 0", "--min-length 0: it must be at least 2"),
         ("localize m.pmk photos --topic /a", "no ROS bag (.bag, .mcap, .db3) is among the images"),
         ("localize m.pmk photos --prior-degrees 9", "are of --priors, which is missing"),
         ("merge m.pmk kitchen -o s.pmk --no-seal", "--no-seal is for folders"),
@@ -116,6 +124,22 @@ def test_maps_that_are_replaced_are_named(folder: Path, capsys: Any) -> None:
         assert (
             "2 files were replaced, such as parts/m.0.pmk" in capsys.readouterr().err
         ) == expected
+
+
+def test_what_is_refused_is_not_said_to_be_replaced(folder: Path) -> None:
+    (folder / "s.ply").touch()
+    (folder / "file").touch()
+    for command, message in (
+        ("merge kitchen m.pmk -o kitchen/scene.pmk", "is an input of this command"),
+        ("crop kitchen --near 0,0,0,100 -o kitchen/scene.pmk", "is an input of this command"),
+        ("seal kitchen -o m.pmk", "m.pmk is a learning map"),
+        ("export s.ply --to ply -o s.ply", "is an input of this command"),
+        ("export kitchen --to colmap -o file", "file is not a folder"),
+    ):
+        done = protomark(*shlex.split(command))
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert "will be replaced" not in done.stderr
 
 
 def test_the_current_folder_is_not_replaced(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,7 +201,7 @@ class TestBadInput:
         [("--ratio", "1.5"), ("--max-error", "0"), ("--min-length", "1"), ("--refine-poses", "x")],
     )
     def test_option_out_of_range(self, copy: Path, out: Path, option: str, value: str) -> None:
-        self.check(copy, out, option[2:].replace("-", "_"), value, options=[option, value])
+        self.check(copy, out, option, value, options=[option, value])
 
     def test_output_is_a_file(self, copy: Path, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")

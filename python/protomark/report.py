@@ -98,6 +98,8 @@ def map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     memory, each = facts["memory_bytes"], facts["bytes_per_landmark"]
     descriptors = facts["descriptor_bytes"]
     sealed = facts.get("sealed_bytes")
+    speed = facts["frames_per_second"]
+    rate = f", {speed:.1f} frames per second" if speed else ""
     return [
         ("registered", f"{facts['registered']} of {facts['frames']} frames registered"),
         ("keyframes", f"{facts['keyframes']}"),
@@ -110,10 +112,7 @@ def map_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         *([("sealed map", f"{sealed:,} bytes, with encoder and positions")] if sealed else []),
         ("camera", f"{camera['model']}, {camera['width']}x{camera['height']}: {params}"),
         *([("left out", facts["left_out"])] if facts["left_out"] else []),
-        (
-            "time",
-            f"{facts['seconds_total']:.1f} s, {facts['frames_per_second']:.1f} frames per second",
-        ),
+        ("time", f"{facts['seconds_total']:.1f} s{rate}"),
     ]
 
 

@@ -48,10 +48,10 @@ def crop(
         print_facts,
         write_json,
     )
-    from protomark.files import check_outputs
+    from protomark.files import SCENE_MAP, check_outputs
     from protomark.maps.split import crop_file
 
-    check_outputs(json_file, inputs=[scene], maps=[output])
+    check_outputs(json_file, inputs=[scene, scene / SCENE_MAP], maps=[output])
     note_replaced(output)
     corners, ball = decimal_numbers("--box", box), decimal_numbers("--near", near)
     facts = crop_file(scene, output, corners, ball, images or None)

@@ -31,7 +31,11 @@ def export(
         Path, typer.Option("--output", "-o", help="File to write; for a model, new folder.")
     ],
     images: Annotated[
-        Path | None, typer.Option(help="Folder of the images, which give landmarks colours.")
+        Path | None,
+        typer.Option(
+            help="Folder of the images, which give landmarks colours. Those of `map SECOND --into` "
+            "are in its folder SECOND/."
+        ),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -42,12 +46,13 @@ def export(
     protomark export kitchen --to ply -o kitchen.ply
     """
     from protomark.cli.terminal import note_replaced, print_facts, write_json
+    from protomark.exporters import FILES
     from protomark.exporters import export as export_scene
     from protomark.files import check_outputs
 
-    check_outputs(json_file, inputs=[scene, images])
-    if output.is_file():
-        note_replaced(output)
+    file = output if to in FILES else None
+    check_outputs(json_file, file, inputs=[scene, images])
+    note_replaced(file)
     facts = export_scene(scene, output, to, images)
     write_json(json_file, facts)
     rows = [(name.replace("_", " "), f"{count:,}") for name, count in facts.items()]

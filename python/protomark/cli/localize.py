@@ -83,8 +83,10 @@ def localize(
     recall: Annotated[
         float | None,
         typer.Option(
+            min=0,
+            max=1,
             help="Search a map with an index approximately: share of nearest landmarks that are "
-            "found, for example 0.98. Without it the search is exact."
+            "found, for example 0.98. Without it the search is exact.",
         ),
     ] = None,
     threads: Threads = 0,
@@ -97,7 +99,8 @@ def localize(
     """Find where images were taken in a map, and how sure that is.
 
     Reads a learning map or a sealed one, and images. Writes their poses, each with the probability
-    that it is right. An image that cannot be read, or was taken elsewhere, does not end the run.
+    that it is right. An image that cannot be read, or was taken elsewhere, does not end the run;
+    the exit code is 1 if no pose is found.
 
     protomark localize kitchen new-photos/
     """
@@ -105,7 +108,7 @@ def localize(
     from protomark.extras import optional
     from protomark.features.bag import is_bag
     from protomark.features.bag_poses import write_poses
-    from protomark.features.images import passed_over
+    from protomark.features.images import describe_folder
     from protomark.files import check_outputs, only_writer
     from protomark.localization.batch import LocalizationRequest, localize_files
 
@@ -118,8 +121,9 @@ def localize(
         if mcap.exists():
             raise ValueError(f"--mcap {mcap} exists, and may be a recording: name a new file")
         optional("rosbags")
-    for line in filter(None, (passed_over(path) for path in images if not is_bag(path))):
-        note(line)
+    for path in images:
+        for line in [] if is_bag(path) else describe_folder(path):
+            note(line)
     request = LocalizationRequest(
         scene,
         images,
@@ -145,10 +149,12 @@ def localize(
     _show(batch, output)
     if batch.interrupted:
         raise typer.Exit(130)
+    if not batch.summary()["localized"]:
+        raise typer.Exit(1)
 
 
 def _show(batch: LocalizationBatch, output: Path) -> None:
-    from protomark.cli.terminal import console, note, print_facts, printable
+    from protomark.cli.terminal import console, note, print_facts
     from protomark.localization.batch import CAMERAS, POSES, TABLE, TRAJECTORY
 
     facts = batch.summary()
@@ -157,11 +163,9 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
         ("localized", f"{facts['localized']:,} (confidence {batch.min_confidence:g} or more)"),
         ("not found", f"{facts['images'] - facts['localized'] - facts['unreadable']:,}"),
     ]
-    reasons = [(i.name, i.found.reason) for i in batch.images if i.found and not batch.accepted(i)]
-    if example := next((f"{name}: {reason}" for name, reason in reasons if reason), ""):
-        rows.append(("for example", example))
     if facts["unreadable"]:
         rows.append(("not usable", f"{facts['unreadable']:,}"))
+    rows += [("", f"{len(told)} as {told[0]}") for told in batch.reasons().values()]
     if facts["median_inliers"] is not None:
         rows.append(("median inliers", f"{facts['median_inliers']:,.0f}"))
     times = facts["median_seconds"]
@@ -177,10 +181,5 @@ def _show(batch: LocalizationBatch, output: Path) -> None:
     print_facts(rows)
     if sentence := batch.contradiction():
         note(f"warning: {sentence}")
-    failed = [f"{image.name}: {image.error}" for image in batch.images if image.error]
-    if len(failed) > 5:
-        failed[5:] = [f"... and {len(failed) - 5} more, in {output / TABLE}"]
-    for line in failed:
-        console.print(printable(line), markup=False, highlight=False)
     files = f"{output / POSES}, {CAMERAS}, {TRAJECTORY} and {TABLE}"
     console.print(files, markup=False, highlight=False, soft_wrap=True)

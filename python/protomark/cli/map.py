@@ -97,7 +97,7 @@ def map_(
     from protomark.cli.terminal import note, progress_bar, write_json
     from protomark.extras import optional
     from protomark.features.bag import is_bag
-    from protomark.features.images import passed_over
+    from protomark.features.images import describe_folder
     from protomark.files import check_outputs
     from protomark.mapping.options import MappingOptions
     from protomark.mapping.request import MapRequest
@@ -112,8 +112,7 @@ def map_(
         raise ValueError("--force makes a map anew: leave out --resume and --into")
     check_outputs(json_file, inputs=[images, camera, poses, mask, encoder], folder=scene)
     inner = images / "images"
-    line = "" if is_bag(images) else passed_over(inner if inner.is_dir() else images)
-    if line:
+    for line in [] if is_bag(images) else describe_folder(inner if inner.is_dir() else images):
         note(line)
     if view:
         optional("rerun")

@@ -88,7 +88,8 @@ def merge(
             raise ValueError("--renumber is for map files: name one to write, such as merged.pmk")
         check_outputs(draw, json_file, inputs=maps, folder=output)
     else:
-        check_outputs(draw, json_file, inputs=maps, maps=[output])
+        files = [path / SCENE_MAP for path in maps]
+        check_outputs(draw, json_file, inputs=[*maps, *files], maps=[output])
         note_replaced(output)
     with progress_bar() as progress:
         if to_folder:

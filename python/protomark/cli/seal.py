@@ -79,10 +79,11 @@ def seal(
     from protomark.cli.terminal import note, note_replaced, progress_bar, write_json
     from protomark.files import SCENE_MAP, check_outputs
     from protomark.maps.info import describe
-    from protomark.maps.seal import SealRequest
+    from protomark.maps.seal import SealRequest, check_replaceable
     from protomark.maps.seal import seal as seal_source
 
     check_outputs(json_file, inputs=[source, source / SCENE_MAP], maps=[output])
+    check_replaceable(output)
     note_replaced(output)
     request = SealRequest(
         bytes_per_landmark=bytes_per_landmark or None,

@@ -11,6 +11,7 @@ from protomark.tracks.file import Tracks
 from protomark.tracks.importers import find_importer
 
 Format = Literal["ply", "colmap", "kapture", "nerfstudio", "orbslam3", "stella"]
+FILES = ("ply", "orbslam3", "stella")  # formats of one file
 _PROGRAMS = {"kapture": "kapture", "orbslam3": "ORB-SLAM3", "stella": "stella_vslam"}
 
 
@@ -28,7 +29,7 @@ def export(source: Path, output: Path, to: Format, images: Path | None = None) -
         FileExistsError: the output folder holds files.
         FileNotFoundError, ValueError: the source lacks what the format needs.
     """
-    if to in ("ply", "orbslam3", "stella"):
+    if to in FILES:
         check_outputs(output, inputs=[source])
     else:
         check_outputs(folder=output)

@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
-from protomark.files import is_utf8, natural_key
+from protomark.files import SCENE_MAP, is_utf8, natural_key
 
 # Folders below a folder of images that, by their names, hold no images of the scene.
 _OTHER_FOLDERS = re.compile(
     r"(depth|mask|normal|semantic|segmentation|thumb(nail)?)s?(_?(map|image)s?)?", re.IGNORECASE
 )
+# Files of folders that commands wrote, whose pictures are none of the scene.
+_OUTPUTS = {SCENE_MAP, "protomark_demo.png"}
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"),
     *(".bmp", ".ppm", ".pgm", ".webp"),
@@ -28,30 +30,49 @@ IMAGE_SUFFIXES = (
 def image_names(folder: Path) -> list[str]:
     """Names of the images below a folder, relative to it, in natural order (img2 before img10).
 
-    Links are followed. Hidden files and folders, those of storage servers (@eaDir) and of depth
-    maps or masks do not count, and neither do names that are not UTF-8.
+    Links are followed, and an image that several lead to counts once. Hidden files and folders,
+    those of storage servers (@eaDir), of depth maps or masks and of maps do not count, and neither
+    do names that are not UTF-8.
     """
-    return sorted(filter(_is_image, _file_names(folder)), key=natural_key)
+    names = sorted(filter(_is_image, _file_names(folder)), key=natural_key)
+    by_file: dict[object, str] = {}
+    for name in names:
+        by_file.setdefault(file_identity(folder / name) or name, name)
+    return list(by_file.values())
 
 
-def passed_over(folder: Path) -> str:
-    """A sentence on what below a folder `image_names` leaves out, "" if nothing."""
-    others = [name for name in _file_names(folder) if not _is_image(name)]
-    kinds = Counter(_kind(name) for name in others)
-    if not kinds:
-        return ""
-    listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(5))
-    return f"{folder}: files that are no images are passed over: {listed}"
+def describe_folder(folder: Path) -> list[str]:
+    """Sentences on what below a folder `image_names` takes and leaves out, if it is not all."""
+    files, names = list(_file_names(folder)), image_names(folder)
+    out = []
+    if len(folders := {Path(name).parent for name in names}) > 1:
+        out.append(f"{folder}: {len(names)} images of {len(folders)} folders")
+    if twice := sum(map(_is_image, files)) - len(names):
+        out.append(f"{folder}: images that links name twice are taken once: {twice}")
+    if kinds := Counter(_kind(name) for name in files if not _is_image(name)):
+        listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(5))
+        out.append(f"{folder}: files that are no images are passed over: {listed}")
+    return out
+
+
+def file_identity(path: Path) -> tuple[int, int] | None:
+    """What tells files apart, whatever their names; None if there is no such file."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _file_names(folder: Path) -> Iterator[str]:
     for here, folders, files in os.walk(folder, followlinks=True):
         below = Path(here)
-        other = [f for f in folders if _OTHER_FOLDERS.fullmatch(f)]
-        yield from ((below / f).relative_to(folder).as_posix() + "/" for f in other)
-        folders[:] = [
-            f for f in folders if f[0] not in ".@" and f not in other and not _is_circle(below / f)
-        ]
+        name = below.relative_to(folder).as_posix() + "/"
+        if below != folder and (_OTHER_FOLDERS.fullmatch(below.name) or _OUTPUTS & {*files}):
+            yield name
+            folders.clear()
+            continue
+        folders[:] = [f for f in folders if f[0] not in ".@" and not _is_circle(below / f)]
         yield from ((below / f).relative_to(folder).as_posix() for f in files if f[0] not in ".@")
 
 

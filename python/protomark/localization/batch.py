@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
 from protomark.features.bag_poses import bag_poses
 from protomark.features.extractor import MAX_SIZE
-from protomark.features.images import image_names, read_gray
+from protomark.features.images import file_identity, image_names, read_gray
 from protomark.features.video import Decode, is_video, video_frames
 from protomark.files import is_utf8, write_text
 from protomark.geometry.absolute_pose import FocalLength
@@ -36,7 +38,7 @@ from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
 from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import Localization
-from protomark.maps.open import is_map
+from protomark.maps.open import is_map, open_map
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import map_ahead
 
@@ -138,6 +140,17 @@ class LocalizationBatch:
     def accepted(self, image: ImageResult) -> bool:
         """Whether the pose of an image is likely enough."""
         return self.pose(image) is not None
+
+    def reasons(self) -> dict[str, list[str]]:
+        """Each image without an accepted pose, and why, by reasons that differ in numbers only."""
+        out: dict[str, list[str]] = {}
+        for image in self.images:
+            if not self.accepted(image):
+                doubt = f"its confidence is only {image.confidence:.2f}"
+                told = image.error or (image.found and image.found.reason) or doubt
+                kind = re.sub(r"[\d.]+", "#", told.partition(image.name)[2] or told)
+                out.setdefault(kind, []).append(f"{image.name}: {told}")
+        return out
 
     def recall(self) -> list[dict[str, float]]:
         """Share of the images with a true pose that are accepted and within each threshold."""
@@ -298,8 +311,14 @@ def localize_files(
         raise ValueError(f"{maps[0]} is a map: name it first, and then the images")
     queries = _list_queries(request.images, request.every, request.topic)
     _check_folder(output)
+    scene = open_map(request.scene)
+    if request.recall is not None and not scene.nlist:
+        raise ValueError(
+            f"--recall {request.recall:g}: {request.scene} has no index: `protomark seal` makes a "
+            "map with one by --index yes"
+        )
     localizer = Localizer(
-        request.scene,
+        scene,
         max_keypoints=request.max_keypoints,
         max_size=request.max_size,
         recall=request.recall,
@@ -375,6 +394,8 @@ def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> lis
     if topic is not None and not any(is_bag(source) for source in sources):
         raise ValueError(f"--topic {topic}: no ROS bag (.bag, .mcap, .db3) is among the images")
     found: dict[str, _Query] = {}
+    files: set[object] = set()
+    again: list[Path] = []
     for source in sources:
         if source.exists() and is_bag(source):
             camera = bag_camera(source, image_topic(source, topic)[0])
@@ -394,12 +415,20 @@ def _list_queries(sources: Sequence[Path], every: int, topic: str | None) -> lis
         for query in queries:
             if not is_utf8(query.name):
                 raise ValueError(f"{query.path}: the name of this image is not UTF-8, rename it")
+            file = file_identity(query.path), "" if query.time is None else query.name
+            if file in files:
+                again.append(query.path)
+                continue
+            files.add(file)
             if query.name in found:
                 raise ValueError(
                     f"{found[query.name].path} and {query.path} have the same name {query.name}: "
                     "localize them apart"
                 )
             found[query.name] = query
+    if again:
+        told = f"{len(again)} images are named twice, such as {again[0]}, and localized once"
+        warnings.warn(told, stacklevel=3)
     return list(found.values())[::every]
 
 

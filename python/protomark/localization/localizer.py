@@ -87,8 +87,8 @@ class Localizer:
         if not _has_positions(self.scene):
             raise ValueError(
                 f"none of the map's {len(self.scene)} landmarks has a position, so images cannot "
-                "be localized in it: set positions with `set_positions`, or build the map from "
-                "tracks"
+                "be localized in it: build or seal the map with positions (in Python: "
+                "set_positions)"
             )
         if recall is not None:
             self.scene.nprobe(recall)  # an error here names what does not fit
@@ -273,7 +273,7 @@ class Localizer:
         if plain not in DESCRIPTORS:
             raise ValueError(
                 f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
-                "compute: describe the keypoints yourself and call localize_features"
+                "compute: describe the keypoints yourself (in Python: localize_features)"
             )
         detector, size = map_detector(self.scene), self.max_size
         if detector:  # of a program that describes images at their own size

@@ -38,11 +38,17 @@ class History:
     # Seconds by stage before the first frame and before a restart, and after the last frame
     # (retries, global adjustment).
     closing_seconds: dict[str, float] = field(default_factory=dict)
+    earlier: int = 0  # number of first records, of earlier runs, whose seconds do not count
+
+    def begin_run(self) -> None:
+        """Count seconds from here on."""
+        self.earlier, self.closing_seconds = len(self.records), {}
 
     def total_seconds(self) -> dict[str, float]:
-        """Seconds by stage over all frames and after them."""
+        """Seconds by stage over all frames of the last run and after them."""
         total: dict[str, float] = dict.fromkeys(STAGES, 0.0)
-        for parts in (*(r.seconds for r in self.records.values()), self.closing_seconds):
+        records = list(self.records.values())[self.earlier :]
+        for parts in (*(r.seconds for r in records), self.closing_seconds):
             for name, value in parts.items():
                 total[name] += value
         return total
@@ -53,6 +59,7 @@ class History:
             "records": [vars(record) for record in self.records.values()],
             "events": self.events,
             "closing_seconds": self.closing_seconds,
+            "earlier": self.earlier,
         }
 
     @classmethod
@@ -60,4 +67,5 @@ class History:
         """The history that `as_dict` returned."""
         records = [FrameRecord(**record) for record in values["records"]]
         by_name = {record.name: record for record in records}
-        return cls(by_name, list(values["events"]), dict(values["closing_seconds"]))
+        closing_seconds, earlier = dict(values["closing_seconds"]), int(values["earlier"])
+        return cls(by_name, list(values["events"]), closing_seconds, earlier)

@@ -95,6 +95,7 @@ def merge_folders(
             result.facts["inputs"][-1]["in_common"] = before - len(mapper.scene)
 
         merge_each(others, merge_one, progress)
+        mapper.history.begin_run()
         mapper.finish(progress=progress)
         progress("write", 0, 0)
         names = " + ".join(path.name for path in inputs)

@@ -45,4 +45,5 @@ class MappingOptions:
         )
         for name, valid, expected in checks:
             if not valid:
-                raise ValueError(f"{name} is {getattr(self, name)}, it must be {expected}")
+                told = f"--{name.replace('_', '-')} {getattr(self, name)}"
+                raise ValueError(f"{told}: it must be {expected}")

@@ -125,6 +125,7 @@ class _Session:
         self.cursor = self.known = 0
         self.apart = False
         self._order: list[str] = []  # names of photos that had none
+        self._left_out: list[str] = []  # names of images that the map has of other folders
         self.facts: dict[str, Any] = {}
         if request.resume:
             self._resume()
@@ -196,6 +197,7 @@ class _Session:
     def _resume(self) -> None:
         folder = self.request.output / CHECKPOINT
         self.mapper, facts = load_state(folder, self.request.threads)
+        self._leave_out(facts["left_out"])
         self._order = facts["order"]
         check_same_request(
             self.request.output, request_facts(self.request, self.source), facts["request"]
@@ -213,13 +215,21 @@ class _Session:
         """Add the frames to a map, or map them apart if it shows none of the first."""
         request = self.request
         self.mapper, facts = load_state(request.output, request.threads)
+        self.mapper.history.begin_run()
         check_same_options(request, self.mapper.options)
         camera = self._camera()
         if camera is not None and not self.source.cameras:
-            camera = same_camera(request, self.mapper.structure.cameras.values(), camera)
+            given = camera
+            camera = same_camera(request, self.mapper.structure.cameras.values(), given)
+            if camera != given:
+                self.note(
+                    f"camera: that of {request.output.name}, {camera}, which {given} resembles"
+                )
         self.mapper.camera_id = self.mapper.id_of_camera(camera)
         self._read_poses()
         inputs: dict[str, str] = facts.get("inputs", {})
+        if isinstance(self.source, ImageFolder):
+            self._leave_out(self.source.known_images(inputs, self.mapper.history.records))
         prefix = _prefix(self.mapper, self.source, inputs)
         self.known, self.cursor = len(self.mapper.structure.frames), 0
         surveyed = self._survey(self.mapper.options)
@@ -237,6 +247,19 @@ class _Session:
             )
             self.mapper.history.events.append(f"{told} by {shift:g}")
             self.note(self.mapper.history.events[-1])
+
+    def _leave_out(self, names: list[str]) -> None:
+        """Leave out images that the map has of other folders."""
+        source = self.source
+        if not names or not isinstance(source, ImageFolder):
+            return
+        known = set(names)
+        new = [name for name in source.names() if name not in known]
+        if not new:
+            raise ValueError(f"{source.path}: all its {len(names)} frames are in this map already")
+        source.reorder(new)
+        self._left_out += names
+        self.note(f"{len(names)} images of {source.path.name} are in the map already")
 
     def _is_found(self) -> bool:
         """Whether the map shows one of the first frames."""
@@ -292,6 +315,8 @@ class _Session:
         if found.problem:
             raise ValueError(found.problem)
         self.known = len(base.structure.frames)
+        base.history.begin_run()
+        base.history.closing_seconds = own.history.closing_seconds
         insert_map(base, own, found, self.source.path.name)
         base.finish(progress=self.progress)
         self.mapper = base
@@ -336,6 +361,7 @@ class _Session:
         self.facts = {
             "request": request_facts(self.request, source),
             "order": self._order,
+            "left_out": self._left_out,
             "prefix": prefix,
             "inputs": {**inputs, str(source.path.resolve()): prefix},
         }
@@ -410,7 +436,8 @@ class _Session:
 
     def _stage(self) -> str:
         """The name of the stage: a progress bar starts anew with each."""
-        restarts = self.mapper.calibration.restarts if self.mapper.calibration else 0
+        calibration = None if self.known else self.mapper.calibration
+        restarts = calibration.restarts if calibration else 0
         return "map" if not restarts else f"map (start {restarts + 1})"
 
     def _save(self) -> None:

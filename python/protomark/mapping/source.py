@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 
 from protomark.features.bag import bag_camera, bag_frames, camera_of_size, image_topic, is_bag
 from protomark.features.bag_poses import bag_poses
-from protomark.features.images import IMAGE_SUFFIXES, image_names, read_gray
+from protomark.features.images import IMAGE_SUFFIXES, file_identity, image_names, read_gray
 from protomark.features.video import Decode, check_video, video_frames
 from protomark.geometry.camera import DEFAULT_FOCAL_RATIO, Camera
 from protomark.geometry.camera_files import CameraSet, camera_from_exif
@@ -224,8 +224,24 @@ class ImageFolder(FrameSource):
         """See `FrameSource.listing`."""
         return list(zip(self._names, self._times, strict=True))
 
+    def known_images(self, inputs: Mapping[str, str], records: Collection[str]) -> list[str]:
+        """Names of images that a map has of other folders.
+
+        Args:
+            inputs: prefixes of the frames' names in the map, by folder.
+            records: names of the map's frames.
+        """
+        others = [(Path(f), p) for f, p in inputs.items() if f != str(self.path.resolve())]
+        known = {
+            file_identity(folder / name.removeprefix(prefix))
+            for folder, prefix in others
+            for name in records
+            if name.startswith(prefix)
+        } - {None}
+        return [name for name in self._names if file_identity(self.path / name) in known]
+
     def reorder(self, names: list[str]) -> None:
-        """Give the images another order, in which they then come and are numbered."""
+        """Give these images this order, in which they then come and are numbered."""
         times = dict(self.listing())
         self._names, self._times = names, [times[name] for name in names]
 

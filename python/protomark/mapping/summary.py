@@ -46,7 +46,7 @@ def summarise(mapper: Mapper, finished: bool = True) -> dict[str, Any]:
         "camera": camera.as_dict(),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "seconds_total": round(total, 3),
-        "frames_per_second": len(records) / total if total else 0.0,
+        "frames_per_second": (len(records) - mapper.history.earlier) / total if total else 0.0,
         "left_out": "" if mapper.mask is None else describe(mapper.mask),
         "warnings": warnings(mapper) if finished else [],
         "events": mapper.history.events,

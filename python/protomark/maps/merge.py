@@ -111,7 +111,13 @@ def merge_files(
             _merge_renumbered(merged, scene)
         elif (
             found := find_alignment(
-                merged, scene, align=align, fixed_scale=fixed_scale, threads=threads
+                merged,
+                scene,
+                align=align,
+                fixed_scale=fixed_scale,
+                threads=threads,
+                hint=" (--renumber merges maps of one world that number their landmarks each on "
+                "its own)",
             )
         ) is not None:
             _merge_aligned(merged, scene, found)
@@ -181,11 +187,13 @@ def find_alignment(
     align: bool = False,
     fixed_scale: bool = False,
     threads: int = 1,
+    hint: str = "",
 ) -> Alignment | None:
     """How `scene` lies in the world of `merged`; None: in the same world, with the same ids.
 
-    Maps with hardly any id in common are parts of one, or of a job that numbers all landmarks; a
-    warning says if they look otherwise. `align` says that they are not, whatever their ids.
+    Maps with hardly any id in common are of one map, or of a job that numbers all landmarks; a
+    warning says if they look otherwise. `align` says that they are not, whatever their ids. `hint`
+    ends the sentence if a map is not recognized.
 
     Raises:
         ValueError: common ids are the same landmarks in other places, or different landmarks and
@@ -210,10 +218,7 @@ def find_alignment(
     else:
         if not (problem := found.problem):
             return found
-    raise ValueError(
-        f"{told}it cannot be recognized in an earlier map: {problem} (--renumber merges maps of "
-        "one world that number their landmarks each on its own)"
-    )
+    raise ValueError(f"{told}it cannot be recognized in an earlier map: {problem}{hint}")
 
 
 def _warn_of_another_world(merged: pm.PrototypeMap, scene: pm.PrototypeMap, threads: int) -> None:
@@ -224,8 +229,8 @@ def _warn_of_another_world(merged: pm.PrototypeMap, scene: pm.PrototypeMap, thre
     if not (found.problem or found.stays):
         warnings.warn(
             f"{found.agreeing:,} landmarks of a map look like landmarks elsewhere in an earlier "
-            "one, with other ids: the maps are merged as parts of one world; if each has a world "
-            "of its own, --align moves it",
+            "one, with other ids: the maps are merged as they are, in one world; if each has a "
+            "world of its own, --align moves it",
             stacklevel=3,
         )
 

@@ -20,6 +20,7 @@ def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
     Raises:
         FileNotFoundError: the folder holds no such map.
         FileError: it is a map of another program.
+        ValueError: the folder holds one of another program.
     """
     path = Path(path)
     if not path.is_dir():
@@ -29,6 +30,9 @@ def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
         if (path / name).is_file():
             return path / name
     _check_own(path)
+    from protomark.tracks.importers import check_below
+
+    check_below(path)
     raise FileNotFoundError(f"{path} holds no {SCENE_MAP}: name a map file")
 
 

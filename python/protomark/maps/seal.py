@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -61,11 +62,7 @@ def seal(
 ) -> dict[str, Any]:
     """Seal a folder of `protomark map`, a learning map or tracks; returns facts, see `seal_map`."""
     request = request or SealRequest()
-    if output.is_file() and _learns(output):
-        raise ValueError(
-            f"{output} is a learning map, which a sealed one would replace: name another file, "
-            f"such as {sealed_path(output)}"
-        )
+    check_replaceable(output)
     progress("read the map", 0, 0)
     if is_tracks(source):
         tracks = read_places([source])
@@ -81,12 +78,15 @@ def seal(
     return seal_map(scene, output, request, views, codes_of(source, scene), progress)
 
 
-def _learns(path: Path) -> bool:
-    """Whether a file is a learning map."""
-    try:
-        return "sums" in dict(pm.file_sections(path))
-    except (pm.FileError, OSError):
-        return False
+def check_replaceable(output: Path) -> None:
+    """Raise ValueError if a file to write a sealed map to is a learning map."""
+    with suppress(pm.FileError, OSError):
+        if "sums" not in dict(pm.file_sections(output)):
+            return
+        raise ValueError(
+            f"{output} is a learning map, which a sealed one would replace: name another file, "
+            f"such as {sealed_path(output)}"
+        )
 
 
 def codes_of(folder: Path, scene: pm.PrototypeMap) -> Observations | None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,10 @@ def split_file(
     """
     if sum(option is not None for option in (ids, parts, cell_size)) != 1:
         raise ValueError("give one of --ids, --parts and --cell-size to split by")
+    if ids is not None and any(a >= b for a, b in pairwise(ids)):
+        raise ValueError(f"--ids {','.join(map(str, ids))}: ids must ascend")
+    if cell_size is not None and not 0 < cell_size < math.inf:
+        raise ValueError(f"--cell-size {cell_size:g} is not above 0")
     path = map_path(path, learning=True)
     scene = open_learning_map(path)
     named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)

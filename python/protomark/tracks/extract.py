@@ -86,7 +86,8 @@ class TracksOptions:
         )
         for name, valid, expected in checks:
             if not valid:
-                raise ValueError(f"{name} is {getattr(self, name)}, it must be {expected}")
+                told = f"--{name.replace('_', '-')} {getattr(self, name)}"
+                raise ValueError(f"{told}: it must be {expected}")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import struct
 import tarfile
 import tokenize
@@ -47,6 +48,18 @@ def unexpected(path: Path, what: str) -> Iterator[None]:
     else:
         return
     raise ValueError(f"{path}, {what}: {problem}: save the map anew")
+
+
+@contextmanager
+def without_collector() -> Iterator[None]:
+    """Do not look for garbage in the block: what is read has no cycles, and is looked at anew."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @dataclass

@@ -6,6 +6,7 @@ alike, so they are compared with the first one and read by NumPy.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -69,6 +70,12 @@ class Unpacker:
             if not isinstance(key, str):
                 self.fail(f"a key is {str(key)[:40]!r}, not a text")
             yield key
+
+    def match(self, pattern: re.Pattern[bytes]) -> re.Match[bytes] | None:
+        """What a pattern finds here, which is then read; None if it does not fit."""
+        if found := pattern.match(self.data, self.at):
+            self.at = found.end()
+        return found
 
     def value(self, depth: int = 0) -> Any:
         """The next value, of None, bool, int, float, str, bytes, list and dict."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from protomark.geometry.camera import Camera
 from protomark.tracks.importers.binary import Reader
-from protomark.tracks.importers.keyframes import unexpected
+from protomark.tracks.importers.keyframes import unexpected, without_collector
 
 VERSIONS = ("0.1", "0.2", "0.3")
 # cereal writes ids of types and objects; those that it writes for the first time have this bit.
@@ -63,7 +63,7 @@ def read_scene(path: Path) -> Scene:
         ValueError: it is broken.
     """
     data = path.read_bytes()
-    with unexpected(path, "sfm_data"):
+    with unexpected(path, "sfm_data"), without_collector():
         return _read_json(data) if data[:1] not in (b"\0", b"\1") else _read_binary(data, path)
 
 

@@ -27,6 +27,7 @@ _NOT_DELIMITED = "FEATURES_FILE_NOT_DELIMITED"
 # Pixels that an ORB descriptor describes, and the usual scale factor, which files lack.
 _PATCH, _SCALE_FACTOR = 31.0, 1.2
 _DESCRIPTOR, _MAX_OCTAVE, _MAX_PIXEL = 32, 32, 1e5
+_SIZES = (_PATCH * _SCALE_FACTOR ** np.arange(_MAX_OCTAVE)).astype(np.float32)
 _MAX_ID = 2**63 - 1
 _MAX_SKEW = 0.01
 _USUAL_SIZES = (
@@ -286,8 +287,8 @@ def _tracks(
     dropped["keypoints of keyframes that are not in the file"] = int((~present).sum())
     order = np.flatnonzero(present)[np.argsort(row[present], kind="stable")]
     row, seen, octaves = row[order], columns["point"][order], columns["octave"][order]
-    at = np.minimum(np.searchsorted(points["id"], seen), len(points) - 1)
-    known = points["id"][at] == seen
+    ids = points["id"]
+    known = ids[np.minimum(np.searchsorted(ids, seen), len(ids) - 1)] == seen
     dropped["observations of landmarks that are not in the file"] = int((~known & (seen > 0)).sum())
     angles = columns["angle"][order]
     angles = np.where(angles >= 0, angles % np.float32(360), np.float32(-1))
@@ -299,7 +300,7 @@ def _tracks(
         cam_from_world=poses,
         offsets=np.searchsorted(row, np.arange(len(keyframes) + 1)).astype(np.int64),
         keypoints=columns["xy"][order] + np.float32(0.5),
-        sizes=(_PATCH * _SCALE_FACTOR ** octaves.astype(np.float64)).astype(np.float32),
+        sizes=_SIZES[octaves],
         angles=angles,
         responses=np.zeros(len(order), np.float32),
         octaves=octaves.astype(np.int32),

@@ -25,7 +25,13 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.neighbours import runs
 from protomark.geometry.pose import compose, inverse, transform
 from protomark.tracks.file import Tracks
-from protomark.tracks.importers.keyframes import Keyframe, checked_features, join, unexpected
+from protomark.tracks.importers.keyframes import (
+    Keyframe,
+    checked_features,
+    join,
+    unexpected,
+    without_collector,
+)
 from protomark.tracks.importers.rtabmap_values import calibration, matrix, rigid
 from protomark.tracks.sqlite import Database, blob, has_tables, open_database
 
@@ -74,7 +80,11 @@ def read(path: Path) -> Tracks:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such database of {PROGRAM}")
     dropped: Counter[str] = Counter()
-    with open_database(path, f"a database of {PROGRAM}") as database, unexpected(path, "database"):
+    with (
+        open_database(path, f"a database of {PROGRAM}") as database,
+        unexpected(path, "database"),
+        without_collector(),
+    ):
         version = str(next((v for (v,) in database.rows("Admin", "version")), "unknown"))
         parameters = _parameters(database)
         strategy = parameters.get("Kp/DetectorStrategy", "unknown")
@@ -163,13 +173,13 @@ def _read_features(database: Database, version: str, detector: str) -> _Features
     words: dict[int, tuple[Any, ...]] | None = None
     while chunk := list(islice(rows, _CHUNK)):
         columns = list(zip(*chunk, strict=True))
-        cells = columns.pop() if "descriptor" in optional else [None] * len(chunk)
+        cells: Any = columns.pop() if "descriptor" in optional else [None] * len(chunk)
         if not all(cells):
             # Then the word has the descriptor, which is that of its first feature.
             words = dict(database.rows_by_id("Word", "descriptor")) if words is None else words
             pairs = zip(cells, columns[1], strict=True)
             cells = [cell or words.get(word, (None,))[0] for cell, word in pairs]
-        blobs = list(map(blob, cells))
+        blobs = cells if {*map(type, cells)} == {bytes} else list(map(blob, cells))
         sizes = set(map(len, blobs)) - {0}
         numbers = np.array(columns[2:], np.float64).T.astype(np.float32)  # None becomes NaN
         if "octave" not in optional:

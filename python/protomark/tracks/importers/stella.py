@@ -6,6 +6,8 @@ files of it. Keypoints are stored undistorted, with (0, 0) as the centre of the 
 
 from __future__ import annotations
 
+import re
+import struct
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,6 +47,15 @@ _NUMBERS = ("size", "angle", "response")
 _KEYPOINT = np.dtype(
     [("xy", "<f4", 2), *((n, "<f4") for n in _NUMBERS), ("octave", "<i4"), ("class", "<i4")]
 )
+
+# Landmarks as nearly all are, which are read in one step.
+_INT = rb"(?:[\0-\x7f]|\xcc.|\xcd..|\xce.{4})"
+_USUAL_LANDMARK = re.compile(
+    rb"\x85\xaa1st_keyfrm%b\xa5n_fnd%b\xa5n_vis%b\xa5pos_w\x93((?:\xcb.{8}){3})\xaaref_keyfrm%b"
+    % (_INT, _INT, _INT, _INT),
+    re.DOTALL,
+)
+_POSITION = struct.Struct(">xdxdxd")
 
 
 def recognizes(path: Path, head: bytes) -> bool:
@@ -173,9 +184,10 @@ def _read_messagepack(path: Path) -> _Map:
                     found.keyframes[int(name)] = _read_keyframe(data, versions)
         elif key == "landmarks":
             for name in data.map_keys():
-                values = data.value()
+                usual = data.match(_USUAL_LANDMARK)
+                values = {} if usual else data.value()
                 with unexpected(path, f"landmark {name}"):
-                    x, y, z = values["pos_w"]
+                    x, y, z = _POSITION.unpack(usual[1]) if usual else values["pos_w"]
                     found.landmark_ids.append(int(name))
                     found.positions.extend((x, y, z))
         else:
