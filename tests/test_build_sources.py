@@ -16,7 +16,7 @@ from protomark.geometry.colmap import ColmapModel
 from protomark.maps.origin import joint_origin, map_detector, source_rows
 from protomark.maps.places import map_places, places_text
 from protomark.maps.sources import find_sources, read_places
-from protomark.tracks.database import _read
+from protomark.tracks.database import read_features
 from protomark.tracks.file import Tracks
 from protomark.tracks.matching import View, match
 from protomark.tracks.triangulation import triangulate
@@ -31,7 +31,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toy3")
     toy = sample.load()
     database = unpacked(DATABASES[0], folder)
-    features = _read(database, "orb", 32)
+    features = read_features(database, "orb", 32)
     rows = [toy.keyframe_names.index(name) for name in features]
     poses = toy.cam_from_world[rows]
     posed = ColmapModel(

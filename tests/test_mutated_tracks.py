@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mutation import FILES, SEED, bounded, mutated
-from protomark.tracks.database import _read
+from protomark.tracks.database import read_features
 from protomark.tracks.file import Tracks
 from small_tracks import small_tracks
 
@@ -116,7 +116,7 @@ def database(tmp_path: Path) -> Path:
 
 
 def read_database(path: Path) -> None:
-    for name, features in _read(path, "orb", 32).items():
+    for name, features in read_features(path, "orb", 32).items():
         assert isinstance(name, str)
         assert len(features.descriptors) == len(features.keypoints) == len(features.sizes)
         for values in (features.keypoints, features.sizes, features.angles):

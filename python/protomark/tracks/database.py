@@ -84,7 +84,7 @@ def tracks_from_database(
             f"{model_path}: the model has no points, so the database's descriptors have no "
             "landmarks: run `protomark tracks` without --database to make them from the images"
         )
-    by_name = _read(database, kind.name, kind.bytes)
+    by_name = read_features(database, kind.name, kind.bytes)
     features, labels = [], []
     ids = {point_id: row for row, point_id in enumerate(sorted(reconstruction.points3D))}
     positions = np.array([reconstruction.points3D[i].xyz for i in sorted(ids)], np.float64)
@@ -133,7 +133,7 @@ def tracks_from_database(
     return Tracks.from_features(kind.name, model, features, number[label], positions[keep], info)
 
 
-def _read(database: Path, descriptor: str, width: int) -> dict[str, Features]:
+def read_features(database: Path, descriptor: str, width: int) -> dict[str, Features]:
     """Keypoints and descriptors by image name."""
     with open_database(database, "a COLMAP database") as tables:
         names = dict(tables.rows_by_id("images", "name", "image_id"))
