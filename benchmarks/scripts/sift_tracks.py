@@ -60,8 +60,11 @@ def describe(extractor: Extractor, path: Path, f: Features) -> tuple[Features, A
     octaves = np.log(f.sizes * SIFT_FACTOR / ORB_PATCH) / np.log(ORB_SCALE)
     octaves = np.clip(np.rint(octaves), 0, ORB_LEVELS - 1).astype(np.int32)
     sizes = f.sizes * (SIFT_FACTOR if extractor.kind.name in ("beblid", "teblid") else 1)
-    values = np.column_stack([f.keypoints - 0.5, sizes, f.angles]).tolist()
-    points = [cv2.KeyPoint(*v, 0, int(octaves[i]), i) for i, v in enumerate(values)]
+    values = zip(*(f.keypoints.T - 0.5).tolist(), sizes.tolist(), f.angles.tolist(), strict=True)
+    points = [
+        cv2.KeyPoint(x, y, size, angle, 0, int(octaves[i]), i)
+        for i, (x, y, size, angle) in enumerate(values)
+    ]
     kept, descriptors = extractor._compute(read_gray(path), points)
     rows = np.array([point.class_id for point in kept])
     angles = np.array([point.angle for point in kept], np.float32) % 360 % 360
