@@ -317,6 +317,12 @@ def main() -> None:
             parts += [f"### RTAB-Map's GFTT/ORB: `{descriptor}-gftt`", table]
             card = MODELS / f"{descriptor}-gftt.md"
             replace_tables(card, f"## Beside the encoder `{descriptor}`\n\n{table}")
+        sift = RESULTS / f"sift.{descriptor}.json"
+        if sift.is_file():
+            found = load_results(sift)
+            table = precision_table(found, list(COLUMNS)).markdown()
+            title = f"### {descriptor.upper()} at keypoints and matches of SIFT"
+            parts += [title, table, ratio_table(found)]
     replace_tables(DOCUMENT, "\n\n".join(part for part in parts if part))
 
 

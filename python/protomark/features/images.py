@@ -56,12 +56,12 @@ def describe_folder(folder: Path) -> list[str]:
 
 
 def file_identity(path: Path) -> tuple[int, int] | None:
-    """What tells files apart, whatever their names; None if there is no such file."""
+    """What tells files apart, whatever their names; None if the file system does not say."""
     try:
         found = path.stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return (found.st_dev, found.st_ino) if found.st_ino else None
 
 
 def _file_names(folder: Path) -> Iterator[str]:
