@@ -12,7 +12,7 @@ from conftest import random_descriptors
 from protomark.baselines import hashing, quantization
 from protomark.baselines.hashing import SignMap, iterative_quantization, random_hyperplanes
 from protomark.baselines.linear import mean_of_bits, principal_components
-from protomark.baselines.quantization import k_means, nearest_words, product_quantized_mean
+from protomark.baselines.quantization import k_means, nearest_words, product_quantized_mean, rabitq
 from protomark.baselines.support import Support
 from protomark.evaluation.methods import choose_methods, method_choices
 from protomark.features.descriptors import unpack_bits
@@ -100,6 +100,50 @@ def test_words_are_as_good_as_those_of_faiss() -> None:
         for i in range(0, 64, 8)
     )
     assert own == pytest.approx(error, rel=0.02)
+
+
+def test_rabitq_of_many_bits_is_the_mean() -> None:
+    # All 64 components of 64 bits, 8 bits each: distances are those of the means.
+    support, queries = support_of(300), random_descriptors(30)
+    built = rabitq(support, 64 + quantization.RABITQ_FACTORS, 8)
+    found, expected = built.match(queries), mean_of_bits(support).match(queries)
+    assert built.bytes_per_landmark == 64 + 8 + 1
+    assert found[1] == pytest.approx(expected[1], abs=0.05)
+
+
+def test_rabitq_of_one_bit_keeps_signs_and_estimates_without_bias() -> None:
+    support, queries = support_of(3000), random_descriptors(200)
+    built = rabitq(support, 8 + quantization.RABITQ_FACTORS, 1)
+    assert built.projection is not None
+    assert built.offset is not None
+    values = support.means @ built.projection - built.offset
+    asked = unpack_bits(queries).astype(np.float32) @ built.projection - built.offset
+    signs = np.sign(values) / 8
+    cosines = (signs * values).sum(axis=1) / np.linalg.norm(values, axis=1)
+    estimates = asked @ (signs * (np.linalg.norm(values, axis=1) / cosines)[:, None]).T
+    assert (estimates - asked @ values.T).mean() == pytest.approx(0, abs=0.02)
+    squared = (asked**2).sum(1)[:, None] + (values**2).sum(1)[None] - 2 * estimates
+    nearest = np.sort(squared, axis=1)[:, :2]
+    assert built.match(queries)[1] == pytest.approx(np.sqrt(nearest.clip(0)), abs=1e-2)
+
+
+def test_rabitq_finds_as_much_as_that_of_faiss() -> None:
+    faiss = pytest.importorskip("faiss")
+    support, queries = support_of(4000), random_descriptors(500)
+    nearest = mean_of_bits(support).match(queries)[0][:, 0]
+    for depth in (1, 2, 4):
+        built = rabitq(support, 8 * depth + quantization.RABITQ_FACTORS, depth)
+        assert built.projection is not None
+        rotated, asked = (
+            np.ascontiguousarray(values.astype(np.float32) @ built.projection - built.offset)
+            for values in (support.means, unpack_bits(queries))
+        )
+        index = faiss.IndexRaBitQ(64, faiss.METRIC_L2, depth)
+        index.qb = 0  # queries are not rounded
+        index.train(rotated)
+        index.add(rotated)
+        theirs = (support.ids[index.search(asked, 1)[1][:, 0]] == nearest).mean()
+        assert (built.match(queries)[0][:, 0] == nearest).mean() > 0.95 * theirs
 
 
 def plain_matches(

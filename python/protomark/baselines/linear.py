@@ -37,12 +37,14 @@ class EuclideanMap(Method):
     projection: NDArray[np.float32] | None = None  # (bits, k), None: the bits themselves
     offset: NDArray[np.float32] | None = None  # (k,), subtracted from a projected query
     scale: float = 1.0  # size of one step of `vectors`
+    norms: InitVar[NDArray[np.float32] | None] = None  # (l,), None: squared norms of `vectors`
 
-    def __post_init__(self, vectors: NDArray[Any]) -> None:
+    def __post_init__(self, vectors: NDArray[Any], norms: NDArray[np.float32] | None) -> None:
         # With |p|^2 / 2 as one more dimension, one product computes |p|^2 / 2 - p.q, which has the
         # order of the distance.
         values = np.asarray(vectors, dtype=np.float32)
-        norms = np.einsum("ij,ij->i", values, values)
+        if norms is None:
+            norms = np.einsum("ij,ij->i", values, values)
         self._extended = np.concatenate([values, norms[:, None] / 2], axis=1)
 
     def project(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Product quantisation of the landmark's mean of bits."""
+"""Quantisers of the landmark's mean of bits: product quantisation and RaBitQ."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.baselines.linear import EuclideanMap
+from protomark.baselines.linear import EuclideanMap, principal_components
 from protomark.baselines.support import Support
 
 WORDS = 256
 # Means that codebooks are learned from, and passes of k-means (as FAISS).
 MAX_MEANS = 64 * WORDS
 PASSES = 25
+# Bytes of RaBitQ's two floats, and scales of its grid that are tried.
+RABITQ_FACTORS, _SCALES = 8, 32
 # Distances of this many values to all words stay in the cache.
 _ROWS = 1024
 
@@ -36,6 +38,38 @@ def product_quantized_mean(support: Support, size: int) -> EuclideanMap:
         words = k_means(values[drawn], WORDS, rng)
         decoded[:, part] = words[nearest_words(values, words)]
     return EuclideanMap(decoded, support.ids, size + 1)
+
+
+def rabitq(support: Support, size: int, depth: int) -> EuclideanMap:
+    """RaBitQ, `size` bytes: principal components of the mean, `depth` bits each, and two floats.
+
+    Gao and Long, "RaBitQ", SIGMOD 2024, and Gao et al., "Practical and asymptotically optimal
+    quantization of high-dimensional vectors", SIGMOD 2025. Components are rotated at random; a
+    code is the point of the grid with the smallest angle to them, up to the best of `_SCALES`
+    scales of the grid, and estimates of products with a query, which is not rounded, are unbiased.
+    """
+    dim = 8 * (size - RABITQ_FACTORS) // depth
+    components = principal_components(support.moments).truncated(dim)
+    rng = np.random.default_rng(support.seed)
+    rotation, _ = np.linalg.qr(rng.standard_normal((components.matrix.shape[1],) * 2))
+    matrix = (components.matrix @ rotation).astype(np.float32)
+    values = (support.means - components.mean) @ matrix
+    lengths = np.linalg.norm(values, axis=1)
+    units = values / np.maximum(lengths, np.float32(1e-12))[:, None]
+    best = np.zeros(len(units), np.float32)
+    decoded = np.zeros_like(units)
+    highest = np.abs(units).max(axis=1, keepdims=True)
+    for step in np.linspace(0.3, 1, _SCALES if depth > 1 else 1, dtype=np.float32):
+        # Cells of the grid are 1 wide, and their middles the code's points.
+        half = np.float32(2 ** (depth - 1))
+        points = np.floor(units / (highest * step) * half).clip(-half, half - 1) + np.float32(0.5)
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+        cosines = np.einsum("ij,ij->i", points, units)
+        better = cosines > best
+        best[better], decoded[better] = cosines[better], points[better]
+    decoded *= (lengths / np.maximum(best, np.float32(1e-12)))[:, None]
+    offset = components.mean @ matrix
+    return EuclideanMap(decoded, support.ids, size + 1, matrix, offset, norms=lengths**2)
 
 
 def k_means(points: NDArray[Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:

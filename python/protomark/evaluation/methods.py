@@ -29,7 +29,7 @@ from protomark.baselines.linear import (
     projected_mean,
 )
 from protomark.baselines.method import Method
-from protomark.baselines.quantization import product_quantized_mean
+from protomark.baselines.quantization import RABITQ_FACTORS, product_quantized_mean, rabitq
 from protomark.baselines.support import Moments, Support
 from protomark.features.upright import SUFFIX
 from protomark.maps.info import matching_bytes
@@ -38,7 +38,8 @@ from protomark.maps.info import matching_bytes
 SEALED_BYTES = (9, 17, 25, 33, 65)
 # Signs that tell appearances apart in the learning maps that are sealed, as `protomark map` has.
 APPEARANCE_BITS = 5
-PROJECTED_DIMS = (8, 16, 32, 64)
+# Of projected means, which are compared as int8 by default; 10 floats are what maplab keeps.
+PROJECTED_DIMS = (8, 10, 16, 32, 64)
 # Bytes of codes of the mean, and those that are compared by default: one that takes little time.
 CODE_BYTES = (8, 16, 32, 64)
 DEFAULT_CODE_BYTES = 32
@@ -132,7 +133,7 @@ def method_choices(
                         f"{label}, {dim}{mark}",
                         family + tail,
                         build,
-                        default=rounded,
+                        default=rounded and dim != 10,
                     )
                 )
     for family, label, build_code in (
@@ -152,6 +153,19 @@ def method_choices(
             # There are no more components than bits.
             if family != "itq" or 8 * size <= bits
         ]
+    listed += [
+        MethodChoice(
+            f"rabitq{depth}-{size}",
+            f"RaBitQ, {depth} b, {size} B",
+            f"rabitq{depth}",
+            partial(rabitq, size=size, depth=depth),
+            default=False,
+        )
+        for depth in (1, 2, 3, 4)
+        for size in CODE_BYTES[1:]  # 8 bytes have no room beside its two floats
+        # There are no more components than bits.
+        if 8 * (size - RABITQ_FACTORS) <= depth * bits
+    ]
     for encoder in encoders:
         listed += _prototype_choices(encoder, len(encoders) > 1, threads)
     return listed
