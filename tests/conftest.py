@@ -86,7 +86,11 @@ CODEBOOKS = random_codebooks((5, 1), (6, 2), (4, 3))
 
 def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8]) -> Any:
     """The definition in core/include/protomark/encoder.h, in NumPy."""
-    x = np.unpackbits(descriptors, axis=1, bitorder="little")
+    return reference_codes(layers, np.unpackbits(descriptors, axis=1, bitorder="little"))
+
+
+def reference_codes(layers: list[dict[str, Any]], x: NDArray[np.uint8]) -> Any:
+    """The codes of what the first layer multiplies: bits, or bytes of vectors."""
     for layer in layers:
         # Sums stay far below 2^53, so float64 matrix products are exact, and fast.
         products = x.astype(np.float64) @ layer["weights"].T.astype(np.float64)
