@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import protomark as pm
-from conftest import protomark, reference_codes
+from conftest import protomark, reference_encode
 from evaluation_scene import ring_scene
 from protomark.baselines.binary import majority, medoid, unaggregated
 from protomark.baselines.clusters import mean_shift
@@ -60,7 +60,7 @@ def test_integer_encoders_are_what_training_computes(kind, hidden, tmp_path):
     model = QuantizedNetwork(network)
     model.calibrate(scaling.inputs(seen))
     layers = model.export()
-    codes = reference_codes(layers, scaling.whole(descriptors))
+    codes = reference_encode(layers, descriptors, kind, scaling.scale)
     simulated = np.rint(embed(model, descriptors) / float(model.scale))
     # Float32 rounds what lies within 1e-5 of a half now and then to the other side.
     assert np.abs(simulated - codes).max() <= 1
