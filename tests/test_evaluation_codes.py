@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from conftest import random_descriptors
 from protomark.baselines import hashing, quantization
 from protomark.baselines.hashing import SignMap, iterative_quantization, random_hyperplanes
-from protomark.baselines.linear import mean_of_bits, principal_components
+from protomark.baselines.linear import principal_components, real_mean
 from protomark.baselines.quantization import k_means, nearest_words, product_quantized_mean, rabitq
 from protomark.baselines.support import Support
 from protomark.evaluation.methods import choose_methods, method_choices
@@ -60,7 +60,7 @@ def test_words_of_fewer_values() -> None:
 
 def test_as_many_words_as_landmarks_are_the_means() -> None:
     support, queries = support_of(200), random_descriptors(30)
-    expected = mean_of_bits(support).match(queries)
+    expected = real_mean(support).match(queries)
     found = product_quantized_mean(support, 4).match(queries)
     assert found[1] == pytest.approx(expected[1], abs=1e-4)
 
@@ -106,7 +106,7 @@ def test_rabitq_of_many_bits_is_the_mean() -> None:
     # All 64 components of 64 bits, 8 bits each: distances are those of the means.
     support, queries = support_of(300), random_descriptors(30)
     built = rabitq(support, 64 + quantization.RABITQ_FACTORS, 8)
-    found, expected = built.match(queries), mean_of_bits(support).match(queries)
+    found, expected = built.match(queries), real_mean(support).match(queries)
     assert built.bytes_per_landmark == 64 + 8 + 1
     assert found[1] == pytest.approx(expected[1], abs=0.05)
 
@@ -130,7 +130,7 @@ def test_rabitq_of_one_bit_keeps_signs_and_estimates_without_bias() -> None:
 def test_rabitq_finds_as_much_as_that_of_faiss() -> None:
     faiss = pytest.importorskip("faiss")
     support, queries = support_of(4000), random_descriptors(500)
-    nearest = mean_of_bits(support).match(queries)[0][:, 0]
+    nearest = real_mean(support).match(queries)[0][:, 0]
     for depth in (1, 2, 4):
         built = rabitq(support, 8 * depth + quantization.RABITQ_FACTORS, depth)
         assert built.projection is not None
