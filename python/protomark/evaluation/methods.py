@@ -168,9 +168,9 @@ def method_choices(
             default=False,
         )
         for depth in (1, 2, 3, 4)
-        for size in CODE_BYTES[1:]  # 8 bytes have no room beside its two floats
-        # There are no more components than bits.
-        if 8 * (size - RABITQ_FACTORS) <= depth * bits
+        for size in CODE_BYTES[2:]  # fewer have no room beside its two floats
+        # There are no more components than numbers.
+        if 8 * (size - RABITQ_FACTORS) <= depth * width
     ]
     for encoder in encoders:
         listed += _prototype_choices(encoder, len(encoders) > 1, threads)
