@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
+from protomark.features.sift import colmap_sift, root_sift
 from protomark.geometry.neighbours import near_pairs, runs
 
 # Two keypoints closer than this (pixels) are one image point, detected at two pyramid levels or at
@@ -20,6 +21,7 @@ from protomark.geometry.neighbours import near_pairs, runs
 MIN_DISTANCE = 4.0
 
 _AKAZE_THRESHOLDS = (1e-3, 1e-4)  # the second is for images with little contrast
+_SIFT_THRESHOLDS = (0.02, 0.0067)  # COLMAP's, and one for images with little contrast
 
 # Images whose longer side is larger are reduced to this many pixels before detection.
 MAX_SIZE = 1600
@@ -39,7 +41,7 @@ class Features:
     angles: NDArray[np.float32]
     responses: NDArray[np.float32]  # (n,) float32, the detector's strength
     octaves: NDArray[np.int32]  # (n,) int32, the detector's pyramid level
-    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    descriptors: NDArray[np.uint8]  # (n, bytes) uint8
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -78,7 +80,8 @@ class Extractor(threading.local):
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
         max_size: images whose longer side has more pixels are reduced to it before detection.
         detector: how images were described that these will be matched with, as `Tracks.info` has
-            it: "levels" and "scale_factor" of ORB's image pyramid; "name" if it begins with GFTT.
+            it: "levels" and "scale_factor" of ORB's image pyramid; "name" if it begins with GFTT
+            or COLMAP, whose SIFT may be "upright".
 
     Raises:
         ValueError: a number or the name is out of range.
@@ -105,7 +108,8 @@ class Extractor(threading.local):
 
         # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
-        self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
+        # Detects and describes at once.
+        self._whole: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
         self._high_contrast = False
         if self.kind.name in ("freak", "brisk"):
             brisk = _opencv("BRISK_create")
@@ -113,7 +117,11 @@ class Extractor(threading.local):
         elif self.kind.name == "akaze":
             akaze = [_opencv("AKAZE_create")(threshold=t) for t in _AKAZE_THRESHOLDS]
             self._detect = [a.detect for a in akaze]
-            self._akaze = akaze[-1].detectAndCompute
+            self._whole = akaze[-1].detectAndCompute
+        elif self.kind.name == "sift" and str(settings.get("name")).startswith("COLMAP"):
+            self._detect, self._whole = [], colmap_sift(settings, 5 * max_keypoints)
+        elif self.kind.name == "sift":
+            self._detect = [_sift(t).detect for t in _SIFT_THRESHOLDS]
         elif str(settings.get("name")).startswith("GFTT"):  # RTAB-Map's
             self._detect = [_good_features(settings, 5 * max_keypoints).detect]
         else:
@@ -125,6 +133,7 @@ class Extractor(threading.local):
             "akaze": lambda: _opencv("AKAZE_create")(),
             "latch": lambda: _opencv("LATCH_create")(bytes=32),
             "beblid": lambda: _opencv("BEBLID_create")(1.0, _opencv("BEBLID_SIZE_512_BITS")),
+            "sift": lambda: _sift(_SIFT_THRESHOLDS[0]),
             "teblid": lambda: _opencv("TEBLID_create")(1.0, _opencv("TEBLID_SIZE_256_BITS")),
         }[self.kind.name]().compute
 
@@ -149,6 +158,8 @@ class Extractor(threading.local):
             ) from None
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
+        if self.kind.name == "sift" and descriptors.dtype != np.uint8:
+            descriptors = root_sift(descriptors)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
         if descriptors.shape != (len(described), self.kind.bytes):
             raise ValueError(
@@ -161,6 +172,8 @@ class Extractor(threading.local):
         angles = np.array([k.angle for k in described], np.float32)
         responses = np.array([k.response for k in described], np.float32)
         octaves = np.array([k.octave for k in described], np.int32)
+        if self.kind.name == "sift":  # OpenCV has the layer of the octave in the bits above
+            octaves = octaves.astype(np.int8).astype(np.int32)
         # OpenCV's angles are -1 for none, or in (-180, 180] or [0, 360).
         angles = np.where(angles == -1, -1, np.mod(angles, 360)).astype(np.float32)
         angles[angles >= 360] = 0
@@ -172,8 +185,12 @@ class Extractor(threading.local):
 
     def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
         """Selected keypoints and their descriptors."""
-        if self._akaze is not None:
-            return self._describe_akaze(image, self._akaze)
+        if self._whole is not None and not self._detect:
+            keypoints, descriptors = self._whole(image, None)
+            chosen = _spread(keypoints, image.shape[1], image.shape[0], self.max_keypoints)
+            return [keypoints[i] for i in chosen], descriptors[chosen] if chosen else None
+        if self._whole is not None:
+            return self._describe_akaze(image, self._whole)
         for detect in self._detect:
             selected, enough = self._select(detect(image), image)
             if enough:
@@ -205,6 +222,11 @@ class Extractor(threading.local):
         """The keypoints to keep, and whether they reach the limit."""
         chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
         return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
+
+
+def _sift(threshold: float) -> Any:
+    # Without the last option keypoints are a quarter of a pixel off.
+    return _opencv("SIFT_create")(contrastThreshold=threshold, enable_precise_upscale=True)
 
 
 def _good_features(detector: Mapping[str, Any], limit: int) -> Any:

@@ -84,8 +84,8 @@ def tracks_for(encoder: Encoder, tracks: Tracks) -> Tracks:
         tracks = tracks.upright()
     if (encoder.descriptor, encoder.bits) != (tracks.descriptor, tracks.bits):
         raise ValueError(
-            f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, the "
-            f"tracks hold {tracks.descriptor} with {tracks.bits}: choose an encoder for "
+            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bits // 8} bytes, "
+            f"the tracks hold {tracks.descriptor} of {tracks.bits // 8}: choose an encoder for "
             f"{tracks.descriptor}"
         )
     return tracks
