@@ -12,7 +12,7 @@
 #include <utility>
 #include <vector>
 
-#include "protomark/types.h"
+#include "protomark/encoder.h"
 
 namespace protomark::python {
 
@@ -51,8 +51,20 @@ Array array_of(nb::handle object, const char* type, int dimensions, const char* 
   return nb::cast<Array>(numpy("ascontiguousarray")(array));
 }
 
-inline Array2<std::uint8_t> descriptors(nb::handle object) {
-  return array_of<Array2<std::uint8_t>>(object, "uint8", 2, "descriptors: a (n, bits / 8) uint8");
+// Descriptors as an encoder takes them.
+using DescriptorArray = nb::ndarray<nb::ro, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+inline DescriptorArray descriptors(nb::handle object, const Encoder& encoder) {
+  const bool floats = encoder.input().kind == InputKind::float32;
+  const std::size_t columns = encoder.bytes() / (floats ? sizeof(float) : 1);
+  const char* type = floats ? "float32" : "uint8";
+  const std::string what = "descriptors: a (n, " + std::to_string(columns) + ") " + type;
+  return array_of<DescriptorArray>(object, type, 2, what.c_str());
+}
+
+inline Descriptors view(const DescriptorArray& array) {
+  return {static_cast<const std::uint8_t*>(array.data()), array.shape(0),
+          array.shape(1) * array.itemsize()};
 }
 
 inline Array2<std::int8_t> codes(nb::handle object) {

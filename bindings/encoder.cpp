@@ -76,6 +76,20 @@ nb::list from_codebooks(const std::vector<Codebook>& codebooks) {
   return result;
 }
 
+constexpr const char* kInputs[] = {"bits", "uint8", "float32"};
+
+const char* input_name(const Encoder& encoder) {
+  return kInputs[static_cast<std::size_t>(encoder.input().kind)];
+}
+
+EncoderInput to_input(const std::string& name, float scale) {
+  const auto* found = std::ranges::find(kInputs, name);
+  if (found == std::end(kInputs)) {
+    throw std::invalid_argument("input must be bits, uint8 or float32, not '" + name + "'");
+  }
+  return {static_cast<InputKind>(found - kInputs), scale};
+}
+
 // A text of the encoder's info.
 auto info(std::string EncoderInfo::* text) {
   return [text](const Encoder& encoder) { return encoder.info().*text; };
@@ -85,13 +99,14 @@ auto info(std::string EncoderInfo::* text) {
 
 void bind_encoder(nb::module_& m) {
   nb::class_<Encoder>(m, "Encoder",
-                      "A network from packed bits to int8 codes that gives the same bytes on every "
+                      "A network from descriptors to int8 codes that gives the same bytes on every "
                       "machine.")
       .def(
           "__init__",
           [](Encoder* self, nb::list layers, std::vector<std::size_t> dims, std::string name,
              std::string descriptor, float scale, std::string data, std::string licence,
-             std::map<std::string, std::string> notes, nb::object codebooks) {
+             std::map<std::string, std::string> notes, nb::object codebooks,
+             const std::string& input, float input_scale) {
             std::vector<Codebook> words = to_codebooks(codebooks);
             std::vector<Layer> built;
             for (nb::handle layer : layers) {
@@ -106,14 +121,16 @@ void bind_encoder(nb::module_& m) {
                               {notes.begin(), notes.end()}};
             const nb::gil_scoped_release release;
             new (self) Encoder(std::move(texts), std::move(built), std::move(dims), scale,
-                               std::move(words));
+                               std::move(words), to_input(input, input_scale));
           },
           "layers"_a, "dims"_a, "name"_a, "descriptor"_a, "scale"_a, "data"_a = "",
-          "licence"_a = "", "notes"_a = nb::dict(), "codebooks"_a = nb::tuple(),
+          "licence"_a = "", "notes"_a = nb::dict(), "codebooks"_a = nb::tuple(), "input"_a = "bits",
+          "input_scale"_a = 0.0f,
           nb::sig(
               "def __init__(self, layers: list[dict[str, Any]], dims: Sequence[int], name: str, "
               "descriptor: str, scale: float, data: str = '', licence: str = '', "
-              "notes: dict[str, str] = {}, codebooks: Sequence[NDArray[numpy.int8]] = ()) -> None"),
+              "notes: dict[str, str] = {}, codebooks: Sequence[NDArray[numpy.int8]] = (), "
+              "input: str = 'bits', input_scale: float = 0.0) -> None"),
           R"(Build an encoder from integer layers.
 
 Args:
@@ -126,14 +143,18 @@ Args:
     codebooks: each (subspaces, 256, width) int8, -127 to 127: the words by which sealed maps write
         prototypes, a byte for each `width` numbers, 1 to 4 (product quantization, Jegou et al.
         2011). Widths are distinct.
+    input: what descriptors consist of, bits, uint8 or float32 numbers.
+    input_scale: float32 numbers are quantised as bytes, clip(rint(x * input_scale), -127, 127) +
+        128; 0 for other inputs.
 
 Raises:
     TypeError: an array is of another type.
-    ValueError: layers or codebooks do not fit together, or a note has such a key.)")
+    ValueError: layers, codebooks or input do not fit together, or a note has such a key.)")
       .def(
           "with_codebooks",
           [](const Encoder& e, nb::object codebooks) {
-            return Encoder(e.info(), e.layers(), e.dims(), e.scale(), to_codebooks(codebooks));
+            return Encoder(e.info(), e.layers(), e.dims(), e.scale(), to_codebooks(codebooks),
+                           e.input());
           },
           "codebooks"_a,
           nb::sig("def with_codebooks(self, codebooks: Sequence[NDArray[numpy.int8]]) -> Encoder"),
@@ -147,18 +168,20 @@ Raises:
       .def(
           "encode",
           [](const Encoder& encoder, nb::object array, nb::object dim, nb::object threads) {
-            const auto d = descriptors(array);
+            const auto d = descriptors(array, encoder);
             const std::size_t length = code_length(dim);
             const auto workers = integer<int>(threads, "threads");
             return to_numpy(without_gil([&] { return encoder.encode(view(d), length, workers); }));
           },
           "descriptors"_a.none(), "dim"_a.none() = nb::none(), "threads"_a.none() = 1,
-          nb::sig("def encode(self, descriptors: NDArray[numpy.uint8], dim: int | None = None, "
-                  "threads: int = 1) -> NDArray[numpy.int8]"),
+          nb::sig(
+              "def encode(self, descriptors: NDArray[numpy.uint8 | numpy.float32], dim: int | None "
+              "= None, threads: int = 1) -> NDArray[numpy.int8]"),
           R"(Encode descriptors.
 
 Args:
-    descriptors: (n, bits / 8) uint8, the bytes that OpenCV gives.
+    descriptors: by `input`: bits, (n, bits / 8) uint8, the bytes that OpenCV gives; uint8 or
+        float32, (n, inputs) of that type.
     dim: length of a code, one of `dims`; None means the full length.
     threads: threads to use.
 
@@ -166,9 +189,9 @@ Returns:
     (n, dim) int8, -127 to 127.
 
 Raises:
-    TypeError: descriptors are not (n, bits / 8) uint8.
-    ValueError: they are of another size than the encoder's, dim is none of `dims`, or threads is
-        below 1.)")
+    TypeError: descriptors are of another type.
+    ValueError: they are of another size than the encoder's, a vector has a NaN or an infinity or is
+        all zeros (once quantised), dim is none of `dims`, or threads is below 1.)")
       .def(
           "match_calibration",
           [](const Encoder& encoder, nb::object dim, bool tuned) {
@@ -180,7 +203,13 @@ Raises:
           "How likely a match is right, by the distances to the two nearest landmarks, for codes "
           "of `dim` numbers, one of `dims` (None: the full length), in a map of mean or of tuned "
           "prototypes. Raises ValueError if the encoder was not calibrated for these.")
-      .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor.")
+      .def_prop_ro("input", &input_name, "What descriptors consist of: bits, uint8 or float32.")
+      .def_prop_ro("inputs", &Encoder::inputs, "Bits or numbers of a descriptor.")
+      .def_prop_ro(
+          "input_scale", [](const Encoder& e) { return e.input().scale; },
+          "What float32 numbers are multiplied by before they are rounded; 0 for other inputs.")
+      .def_prop_ro("bytes", &Encoder::bytes, "Bytes of a descriptor in memory.")
+      .def_prop_ro("bits", &Encoder::bits, "Bits of a descriptor in memory.")
       .def_prop_ro("dim", &Encoder::dim, "Dimensions of a full code.")
       .def_prop_ro("dims", &Encoder::dims, "Lengths at which a code may be cut, ascending.")
       .def_prop_ro("scale", &Encoder::scale, "Real value of one code unit.")
@@ -214,8 +243,8 @@ Raises:
           nb::sig("def layers(self) -> list[dict[str, Any]]"),
           "The integer layers, as the constructor takes them.")
       .def("__repr__", [](const Encoder& e) {
-        return "<protomark.Encoder '" + e.info().name + "': " + std::to_string(e.bits()) +
-               " bits -> " + std::to_string(e.dim()) + " int8>";
+        return "<protomark.Encoder '" + e.info().name + "': " + std::to_string(e.inputs()) + " " +
+               input_name(e) + " -> " + std::to_string(e.dim()) + " int8>";
       });
 }
 

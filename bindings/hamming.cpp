@@ -3,14 +3,21 @@
 #include "module.h"
 
 namespace protomark::python {
+namespace {
+
+Array2<std::uint8_t> binary(nb::handle object) {
+  return array_of<Array2<std::uint8_t>>(object, "uint8", 2, "descriptors: a (n, bits / 8) uint8");
+}
+
+}  // namespace
 
 void bind_hamming(nb::module_& m) {
   m.def(
       "hamming_search",
       [](nb::object queries, nb::object database, nb::object k, std::optional<nb::object> landmarks,
          std::optional<int> max_distance, nb::object threads) {
-        const auto q = descriptors(queries);
-        const auto d = descriptors(database);
+        const auto q = binary(queries);
+        const auto d = binary(database);
         std::optional<Array1<std::int64_t>> ids;
         const auto count = integer<std::size_t>(k, "k");
         HammingOptions options{std::nullopt, max_distance, integer<int>(threads, "threads")};

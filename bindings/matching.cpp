@@ -37,14 +37,14 @@ template <typename Map>
 void bind_match(nb::module_& m, const std::string& type) {
   const std::string signature =
       "def match(scene: " + type +
-      ", descriptors: NDArray[numpy.uint8], min_probability: float, threads: int, "
+      ", descriptors: NDArray[numpy.uint8 | numpy.float32], min_probability: float, threads: int, "
       "recall: float | None, among: ArrayLike | None) -> "
       "tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.float64]]";
   m.def(
       "match",
       [](const Map& map, nb::object array, double min_probability, int threads,
          std::optional<double> recall, std::optional<nb::object> among) {
-        const auto d = descriptors(array);
+        const auto d = descriptors(array, *map.encoder());
         MatchOptions options{min_probability, recall, std::nullopt, threads};
         std::vector<std::int64_t> searched;
         if (among) {

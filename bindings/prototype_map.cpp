@@ -14,7 +14,7 @@ namespace {
 auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Descriptors, int)) {
   return [method](PrototypeMap& self, nb::object ids, nb::object array, nb::object threads) {
     const auto l = landmark_ids(ids);
-    const auto d = descriptors(array);
+    const auto d = descriptors(array, *self.encoder());
     const auto workers = integer<int>(threads, "threads");
     const nb::gil_scoped_release release;
     (self.*method)(view(l), view(d), workers);
@@ -32,25 +32,25 @@ auto change(void (PrototypeMap::*method)(std::span<const std::int64_t>, Codes)) 
 void bind_changes(nb::class_<PrototypeMap>& map) {
   map.def("add", change(&PrototypeMap::add), "landmark_ids"_a, "descriptors"_a.none(),
           "threads"_a.none() = 1,
-          nb::sig("def add(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
-                  "threads: int = 1) -> None"),
+          nb::sig("def add(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8 | "
+                  "numpy.float32], threads: int = 1) -> None"),
           R"(Add observations (Komorowski and Trzcinski, Eq. 1 and Eq. 2).
 
 Args:
     landmark_ids: (n,) int64, not negative; ids that the map does not hold are new landmarks.
-    descriptors: (n, bits / 8) uint8.
+    descriptors: as Encoder.encode takes them.
     threads: threads to encode on.
 
 A prototype with 255 observations has its sum and count halved before one more is added.
 
 Raises:
-    TypeError: descriptors are not (n, bits / 8) uint8, or ids not integers.
-    ValueError: descriptors are of another size than the encoder's, there are not as many ids, an id
-        is negative, or threads is below 1. The map stays as it was.)")
+    TypeError: descriptors are of another type than the encoder's, or ids not integers.
+    ValueError: the encoder refuses the descriptors, there are not as many ids, an id is negative,
+        or threads is below 1. The map stays as it was.)")
       .def("subtract", change(&PrototypeMap::subtract), "landmark_ids"_a, "descriptors"_a.none(),
            "threads"_a.none() = 1,
-           nb::sig("def subtract(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8], "
-                   "threads: int = 1) -> None"),
+           nb::sig("def subtract(self, landmark_ids: ArrayLike, descriptors: NDArray[numpy.uint8 | "
+                   "numpy.float32], threads: int = 1) -> None"),
            R"(Undo `add`, exactly; a landmark without observations leaves the map.
 
 Raises:
@@ -318,7 +318,7 @@ Raises:
               self.seal_codes(path, options, view(l), view(c));
             } else {
               const auto l = landmark_ids(ids);
-              const auto d = descriptors(array);
+              const auto d = descriptors(array, *self.encoder());
               const nb::gil_scoped_release release;
               self.seal(path, options, view(l), view(d));
             }
@@ -328,18 +328,19 @@ Raises:
           "path"_a, "landmark_ids"_a = nb::none(), "descriptors"_a = nb::none(), nb::kw_only(),
           "bytes_per_landmark"_a = nb::none(), "position_bits"_a = 32, "tune"_a = true,
           "threads"_a = 1,
-          nb::sig("def seal(self, path: str | os.PathLike[str], landmark_ids: ArrayLike | None = "
-                  "None, descriptors: NDArray[numpy.uint8 | numpy.int8] | None = None, *, "
-                  "bytes_per_landmark: float | None = None, position_bits: int = 32, tune: bool = "
-                  "True, threads: int = "
-                  "1) -> SealedMap"),
+          nb::sig(
+              "def seal(self, path: str | os.PathLike[str], landmark_ids: ArrayLike | None = "
+              "None, descriptors: NDArray[numpy.uint8 | numpy.float32 | numpy.int8] | None = None, "
+              "*, bytes_per_landmark: float | None = None, position_bits: int = 32, tune: bool = "
+              "True, threads: int = "
+              "1) -> SealedMap"),
           R"(Write a sealed map, whole or not at all, and open it.
 
 Args:
     path: the file to write.
     landmark_ids: (n,), of descriptors.
-    descriptors: (n, bits / 8) uint8, or their codes, (n, dim) int8: the observations that the map
-        was built from, as far as they are at hand. Prototypes are tuned by them, or else by the
+    descriptors: as Encoder.encode takes them, or their codes, (n, dim) int8: the observations that
+        the map was built from, as far as they are at hand. Prototypes are tuned by them, or else by the
         map's appearances if only one prototype per landmark fits.
     bytes_per_landmark: bytes that a landmark may take on average for its prototypes and their
         number (not for position, id and index). None: the sealed map gives the answers of

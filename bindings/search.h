@@ -34,14 +34,14 @@ std::vector<std::int64_t> ids_or_mask(const Map& map, nb::handle among) {
   return result;
 }
 
-// Binds Map::search or Map::search_codes, whose queries are of type `Queries`.
-template <typename Map, typename Queries, typename Search>
-auto bind_search(Queries (*to_queries)(nb::handle), Search search) {
+// Binds Map::search or Map::search_codes, whose queries are to_queries(map, array).
+template <typename Map, typename ToQueries, typename Search>
+auto bind_search(ToQueries to_queries, Search search) {
   return
       [=](const Map& map, nb::object queries, nb::object k, std::optional<nb::object> max_distance,
           std::optional<double> ratio, nb::object threads, std::optional<double> recall,
           std::optional<nb::object> nprobe, std::optional<nb::object> among) {
-        const auto q = to_queries(queries);
+        const auto q = to_queries(map, queries);
         const auto count = integer<std::size_t>(k, "k");
         SearchOptions options;
         options.recall = recall;
@@ -89,6 +89,10 @@ std::string describe_map(const Map& map) {
 
 template <typename Map>
 void bind_answers(nb::class_<Map>& map) {
+  const auto to_descriptors = [](const Map& m, nb::handle q) {
+    return descriptors(q, *m.encoder());
+  };
+  const auto to_codes = [](const Map&, nb::handle q) { return codes(q); };
   map.def("__len__", &Map::size, ReleaseGil())
       .def_prop_ro("encoder", &Map::encoder, "The encoder of this map.")
       .def_prop_ro("dim", &Map::dim, "Dimensions of a prototype.")
@@ -130,19 +134,20 @@ Returns:
         or more at the last index; only of a learning map.
     landmarks_with_position: their number.
     extent: (2, 3) float64, the lowest and highest coordinates; None if no landmark has a position.)")
-      .def("search", bind_search<Map>(&descriptors, &Map::search), "descriptors"_a.none(),
-           "k"_a.none() = 2, "max_distance"_a = nb::none(), "ratio"_a = nb::none(),
-           "threads"_a.none() = 1, "recall"_a = nb::none(), "nprobe"_a = nb::none(),
-           "among"_a = nb::none(),
-           nb::sig("def search(self, descriptors: NDArray[numpy.uint8], k: int = 2, "
-                   "max_distance: int | None = None, ratio: float | None = None, "
-                   "threads: int = 1, recall: float | None = None, nprobe: int | None = None, "
-                   "among: ArrayLike | None = None) -> "
-                   "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
-           R"(Find the k nearest landmarks of each descriptor; ties go to the smaller id.
+      .def(
+          "search", bind_search<Map>(to_descriptors, &Map::search), "descriptors"_a.none(),
+          "k"_a.none() = 2, "max_distance"_a = nb::none(), "ratio"_a = nb::none(),
+          "threads"_a.none() = 1, "recall"_a = nb::none(), "nprobe"_a = nb::none(),
+          "among"_a = nb::none(),
+          nb::sig("def search(self, descriptors: NDArray[numpy.uint8 | numpy.float32], k: int = 2, "
+                  "max_distance: int | None = None, ratio: float | None = None, "
+                  "threads: int = 1, recall: float | None = None, nprobe: int | None = None, "
+                  "among: ArrayLike | None = None) -> "
+                  "tuple[NDArray[numpy.int64], NDArray[numpy.int32]]"),
+          R"(Find the k nearest landmarks of each descriptor; ties go to the smaller id.
 
 Args:
-    descriptors: (q, bits / 8) uint8.
+    descriptors: (q, ...), as Encoder.encode takes them.
     k: neighbours to return.
     max_distance: the largest squared distance at which a neighbour is reported.
     ratio: Lowe's ratio test, in (0, 1]: a query keeps its neighbours only if the nearest landmark
@@ -161,13 +166,13 @@ Returns:
     (q, k) int32, in code units, 2^31 - 1 where there is none.
 
 Raises:
-    TypeError: descriptors are not (q, bits / 8) uint8.
+    TypeError: descriptors are of another type than the encoder's.
     KeyError: `among` has an id that is not in the map.
-    ValueError: descriptors are of another size than the encoder's; k, threads or nprobe is below 1;
+    ValueError: the encoder refuses the descriptors; k, threads or nprobe is below 1;
         a mask is of another length than the map;
         max_distance is negative; ratio or recall is out of its range; recall and nprobe are both
         given, or one of them and the map has no index (PrototypeMap.build_index).)")
-      .def("search_codes", bind_search<Map>(&codes, &Map::search_codes), "codes"_a.none(),
+      .def("search_codes", bind_search<Map>(to_codes, &Map::search_codes), "codes"_a.none(),
            "k"_a.none() = 2, "max_distance"_a = nb::none(), "ratio"_a = nb::none(),
            "threads"_a.none() = 1, "recall"_a = nb::none(), "nprobe"_a = nb::none(),
            "among"_a = nb::none(),

@@ -8,11 +8,11 @@ import protomark as pm
 from conftest import reference_encode
 from protomark import models
 from protomark.training.network import (
+    BITS,
     MAX_WEIGHT_BYTES,
     EncoderNetwork,
     default_hidden,
     embed,
-    to_signs,
     weight_bytes,
 )
 from protomark.training.quantization import Layer, QuantizedNetwork
@@ -28,7 +28,7 @@ def quantized(bits: int, dim: int, hidden=None, seed: int = 0) -> QuantizedNetwo
     for layer in network.layers:
         torch.nn.init.normal_(layer.bias, std=0.3)
     found = QuantizedNetwork(network)
-    found.calibrate(to_signs(random_descriptors(1000, bits, seed=9)))
+    found.calibrate(BITS.inputs(random_descriptors(1000, bits, seed=9)))
     return found
 
 
@@ -114,7 +114,7 @@ def test_integer_arithmetic_by_hand():
 
 def test_gradients_reach_every_weight():
     model = quantized(64, 8, (32, 16))
-    model(to_signs(random_descriptors(500, 64))).square().sum().backward()
+    model(BITS.inputs(random_descriptors(500, 64))).square().sum().backward()
     for layer in model.network.layers:
         assert (layer.weight.grad.abs().sum(1) > 0).all()
         assert (layer.bias.grad != 0).all()

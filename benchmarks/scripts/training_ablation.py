@@ -121,9 +121,8 @@ def train(change: RecipeChange, steps: int, tracks: dict[str, Tracks]) -> dict[s
         descriptor=tracks[MEASURED[0]].descriptor,
         scale=float(trainer.quantized.scale),
     )
-    widths = [network.bits, *network.hidden, options.dims[-1]]
     found: dict[str, Any] = {
-        "multiply_adds": sum(a * b for a, b in pairwise(widths)),
+        "multiply_adds": sum(a * b for a, b in pairwise(network.widths)),
         "loss": trainer.history[-1].loss,
     }
     for trial, raw in zip(trials, plain, strict=True):

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from protomark.training.network import EncoderNetwork, embed, to_signs
+from protomark.training.network import EncoderNetwork, embed
 from protomark.training.sampling import Views
 from protomark.training.validation import Trial, mean_precision
 from protomark_bench.paper.objectives import (
@@ -230,5 +230,5 @@ def validation_loss(
 
 def _embed(network: EncoderNetwork, views: Views, rows: NDArray[np.int64], half: bool) -> Tensor:
     with torch.autocast("cpu", torch.bfloat16, enabled=half):
-        embeddings: Tensor = network(to_signs(views.descriptors[rows]))
+        embeddings: Tensor = network(network.scaling.inputs(views.descriptors[rows]))
     return embeddings.float()

@@ -1,4 +1,4 @@
-// The encoder: an integer network from packed bits to int8 codes, the same bytes on every machine.
+// The encoder: an integer network from descriptors to int8 codes, the same bytes on every machine.
 #pragma once
 
 #include <filesystem>
@@ -14,8 +14,8 @@ namespace protomark {
 //   t    = (sum * multipliers[o] + 2^(shift - 1)) >> shift      (64-bit product)
 //   next = table[clamp(t, -128, 127) + 128]                     (hidden layers)
 //   code = clamp(t, -127, 127)                                  (last layer)
-// x are the bits of the descriptor, 0 or 1, in the first layer, and the bytes that the layer before
-// gave in later ones.
+// x are the descriptor's bits, 0 or 1, or its bytes in the first layer, and the bytes that the
+// layer before gave in later ones.
 struct Layer {
   size_t inputs = 0;
   size_t outputs = 0;
@@ -24,6 +24,16 @@ struct Layer {
   std::vector<int32_t> multipliers;  // positive
   int shift = 1;                     // 1 to 62
   std::array<uint8_t, 256> table{};
+};
+
+// What descriptors consist of. Each float32 number f becomes a byte first, the product a float:
+//   x = clamp(rint(f * scale), -127, 127) + 128                 (halves to the even integer)
+enum class InputKind : uint32_t { bits, uint8, float32 };
+
+struct EncoderInput {
+  InputKind kind = InputKind::bits;
+  float scale = 0;  // positive for float32, 0 for others
+  bool operator==(const EncoderInput&) const = default;
 };
 
 // The words of a product quantizer (Jegou et al. 2011, doi:10.1109/TPAMI.2010.57), by which sealed
@@ -52,10 +62,10 @@ class PROTOMARK_API Encoder {
  public:
   // `dims` are the lengths at which a code serves alone, ascending, the last one the number of
   // outputs; a code times `scale` is the real value; `codebooks` are of distinct widths. Throws
-  // std::invalid_argument if layers or codebooks do not fit together, a sum could exceed 32 bits,
-  // or a note is named like a field of EncoderInfo.
+  // std::invalid_argument if layers, codebooks or input do not fit together, a sum could exceed 32
+  // bits, or a note is named like a field of EncoderInfo.
   Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale,
-          std::vector<Codebook> codebooks = {});
+          std::vector<Codebook> codebooks = {}, EncoderInput input = {});
 
   // Reads and checks a model file. Throws FileError.
   static Encoder load(const std::filesystem::path& path);
@@ -68,8 +78,12 @@ class PROTOMARK_API Encoder {
 
   const EncoderInfo& info() const { return info_; }
   const std::vector<Layer>& layers() const { return layers_; }
-  size_t bits() const { return layers_.front().inputs; }  // of a descriptor
-  size_t bytes() const { return bits() / 8; }
+  const EncoderInput& input() const { return input_; }
+  // The numbers of a descriptor, or its bits.
+  size_t inputs() const { return layers_.front().inputs; }
+  // The size of a descriptor in memory.
+  size_t bytes() const;
+  size_t bits() const { return 8 * bytes(); }
   size_t dim() const { return dims_.back(); }
   const std::vector<size_t>& dims() const { return dims_; }
   float scale() const { return scale_; }
@@ -79,9 +93,12 @@ class PROTOMARK_API Encoder {
   // Multiply-adds per descriptor.
   size_t multiply_adds() const;
 
-  // Encodes descriptors (n x bytes) to codes (n x dim), the first numbers of full ones; 0 stands
-  // for the full length, and dims() are those that serve best alone. Throws std::invalid_argument
-  // if shapes do not fit.
+  // Throws std::invalid_argument unless descriptors are rows of bytes() bytes and, if they are
+  // vectors, each row is finite and not zeros alone, also once quantised.
+  void check(Descriptors descriptors, int threads = 1) const;
+  // Encodes descriptors (n x bytes; floats as they are in memory, at any address) to codes
+  // (n x dim), the first numbers of full ones; 0 stands for the full length, and dims() are those
+  // that serve best alone. Throws std::invalid_argument as check() does, or if shapes do not fit.
   Matrix<int8_t> encode(Descriptors descriptors, size_t dim = 0, int threads = 1) const;
   // Encodes into memory of the caller; dim is codes.columns.
   void encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads = 1) const;
@@ -96,6 +113,7 @@ class PROTOMARK_API Encoder {
   std::vector<size_t> dims_;
   float scale_;
   std::vector<Codebook> codebooks_;
+  EncoderInput input_;
   std::string identity_;
   std::shared_ptr<const Packed> packed_;
 };

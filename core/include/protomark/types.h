@@ -66,7 +66,7 @@ struct Matrix {
 };
 
 // One descriptor per row, as OpenCV gives them: bit i of a descriptor is bit i % 8 (least
-// significant first) of byte i / 8.
+// significant first) of byte i / 8. Those of vectors are their bytes, or the bytes of their floats.
 using Descriptors = MatrixView<const uint8_t>;
 // One code per row, each number -127 to 127.
 using Codes = MatrixView<const int8_t>;

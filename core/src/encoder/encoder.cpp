@@ -1,5 +1,6 @@
 #include "protomark/encoder.h"
 
+#include <atomic>
 #include <cmath>
 
 #include "base/parallel.h"
@@ -11,7 +12,8 @@ namespace protomark {
 namespace {
 
 constexpr size_t kMinBits = 64;
-constexpr size_t kMaxBits = 1024;
+constexpr size_t kMinNumbers = 16;
+constexpr size_t kMaxInputs = 1024;  // bits or numbers
 constexpr size_t kMaxDim = 256;
 constexpr size_t kMaxWidth = 4096;
 constexpr size_t kMaxLayers = 16;
@@ -31,7 +33,7 @@ constexpr Field kFields[] = {{"name", &EncoderInfo::name},
                              {"data", &EncoderInfo::data},
                              {"licence", &EncoderInfo::licence}};
 
-void check_layer(const Layer& layer, size_t inputs, size_t index) {
+void check_layer(const Layer& layer, size_t inputs, size_t index, int64_t largest) {
   const std::string where = text("encoder: layer ", index);
   require(layer.inputs == inputs, where, " has ", layer.inputs, " inputs, ", inputs, " are needed");
   require(layer.outputs >= 1 && layer.outputs <= kMaxWidth, where, " has ", layer.outputs,
@@ -42,7 +44,6 @@ void check_layer(const Layer& layer, size_t inputs, size_t index) {
   require(layer.shift >= 1 && layer.shift <= 62, where, ": shift must be 1 to 62");
   require(std::ranges::all_of(layer.multipliers, [](int32_t m) { return m > 0; }), where,
           ": multipliers must be positive");
-  const int64_t largest = index == 0 ? 1 : 255;
   for (size_t o = 0; o < layer.outputs; ++o) {
     const auto [low, high] = sum_range(layer, o);
     require(
@@ -65,6 +66,61 @@ void check_codebooks(const std::vector<Codebook>& codebooks, size_t dim) {
     require(std::ranges::find(widths, width) == widths.end(),
             "encoder: two codebooks have words of ", width, " numbers");
     widths.push_back(width);
+  }
+}
+
+void check_input(const EncoderInput& input, size_t inputs) {
+  if (input.kind == InputKind::bits) {
+    require(inputs >= kMinBits && inputs <= kMaxInputs && inputs % 8 == 0,
+            "encoder: a descriptor has 64 to 1024 bits, a multiple of 8, not ", inputs);
+  } else {
+    require(inputs >= kMinNumbers && inputs <= kMaxInputs,
+            "encoder: a descriptor has 16 to 1024 numbers, not ", inputs);
+  }
+  if (input.kind == InputKind::float32) {
+    require(input.scale > 0 && std::isfinite(input.scale),
+            "encoder: input_scale must be positive for float32, not ", input.scale);
+  } else {
+    require(input.scale == 0, "encoder: input_scale is for float32 alone");
+  }
+}
+
+// Returns what is wrong with a vector, or nullptr.
+const char* fault_of(const EncoderInput& input, const uint8_t* row, size_t bytes) {
+  if (input.kind == InputKind::uint8) {
+    return std::all_of(row, row + bytes, [](uint8_t x) { return x == 0; }) ? "is all zeros"
+                                                                           : nullptr;
+  }
+  // Without their signs, the bits of floats ascend as the numbers do, NaN behind infinity.
+  int32_t largest = 0;
+  for (size_t at = 0; at < bytes; at += sizeof largest) {
+    int32_t bits;
+    std::memcpy(&bits, row + at, sizeof bits);
+    largest = std::max(largest, bits & INT32_MAX);
+  }
+  const auto magnitude = std::bit_cast<float>(largest);
+  if (!std::isfinite(magnitude)) return "has a NaN or an infinity";
+  return magnitude * input.scale <= 0.5f ? "is all zeros once quantised" : nullptr;
+}
+
+// Writes vectors as the first layer takes them: `inputs` bytes, zeros up to `padded`.
+void write_bytes(const EncoderInput& input, Descriptors descriptors, size_t inputs, size_t padded,
+                 MatrixView<uint8_t> x) {
+  for (size_t i = 0; i < descriptors.rows; ++i) {
+    const uint8_t* row = descriptors.row(i);
+    uint8_t* to = x.row(i);
+    std::memset(to + inputs, 0, padded - inputs);
+    if (input.kind == InputKind::uint8) {
+      std::memcpy(to, row, inputs);
+      continue;
+    }
+    for (size_t j = 0; j < inputs; ++j) {
+      float f;
+      std::memcpy(&f, row + j * sizeof f, sizeof f);
+      // Between 2^23 and 2^24 floats are integers: the sum is rounded as rint() would.
+      const float sum = std::min(std::max(f * input.scale, -127.0f), 127.0f) + 0x1.8p23f;
+      to[j] = static_cast<uint8_t>(std::bit_cast<uint32_t>(sum) + 128);
+    }
   }
 }
 
@@ -99,26 +155,31 @@ ContainerWriter file_of(const EncoderInfo& info, Bytes network,
 }  // namespace
 
 struct Encoder::Packed {
-  BitLayer first;
-  std::vector<DenseLayer> later;
-  size_t widest;
+  std::optional<BitLayer> first;  // if inputs are bits
+  std::vector<DenseLayer> dense;  // all others
+  size_t widest = 0;
 
-  explicit Packed(const std::vector<Layer>& layers)
-      : first(layers.front(), layers.size() == 1), widest(first.outputs()) {
-    for (size_t l = 1; l < layers.size(); ++l) {
-      later.emplace_back(layers[l], l + 1 == layers.size());
-      widest = std::max(widest, later.back().outputs());
+  Packed(const std::vector<Layer>& layers, InputKind input) {
+    for (const Layer& layer : layers) {
+      const bool last = &layer == &layers.back();
+      if (input == InputKind::bits && &layer == &layers.front()) {
+        widest = first.emplace(layer, last).outputs();
+      } else {
+        const DenseLayer& packed = dense.emplace_back(layer, last);
+        widest = std::max({widest, packed.inputs(), packed.outputs()});
+      }
     }
   }
 };
 
 Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t> dims, float scale,
-                 std::vector<Codebook> codebooks)
+                 std::vector<Codebook> codebooks, EncoderInput input)
     : info_(std::move(info)),
       layers_(std::move(layers)),
       dims_(std::move(dims)),
       scale_(scale),
-      codebooks_(std::move(codebooks)) {
+      codebooks_(std::move(codebooks)),
+      input_(input) {
   const auto check = [](bool ok, const auto&... what) { require(ok, "encoder: ", what...); };
   check(!info_.name.empty() && !info_.descriptor.empty(), "name and descriptor must be given");
   for (const Field& field : kFields) {
@@ -130,11 +191,10 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t
   }
   check(!layers_.empty() && layers_.size() <= kMaxLayers, "it has ", layers_.size(),
         " layers, 1 to ", kMaxLayers, " are allowed");
-  const size_t bits = layers_.front().inputs;
-  check(bits >= kMinBits && bits <= kMaxBits && bits % 8 == 0,
-        "a descriptor has 64 to 1024 bits, a multiple of 8, not ", bits);
+  check_input(input_, inputs());
   for (size_t l = 0; l < layers_.size(); ++l) {
-    check_layer(layers_[l], l == 0 ? bits : layers_[l - 1].outputs, l);
+    check_layer(layers_[l], l == 0 ? inputs() : layers_[l - 1].outputs, l,
+                l == 0 && input_.kind == InputKind::bits ? 1 : 255);
   }
   check(!dims_.empty() && dims_.front() != 0 && dims_.back() == layers_.back().outputs &&
             std::ranges::adjacent_find(dims_, std::greater_equal<>()) == dims_.end(),
@@ -143,7 +203,12 @@ Encoder::Encoder(EncoderInfo info, std::vector<Layer> layers, std::vector<size_t
   check(scale_ > 0 && std::isfinite(scale_), "scale must be positive");
   check_codebooks(codebooks_, dim());
   identity_ = sha256(network_bytes());
-  packed_ = std::make_shared<const Packed>(layers_);
+  packed_ = std::make_shared<const Packed>(layers_, input_.kind);
+}
+
+size_t Encoder::bytes() const {
+  if (input_.kind == InputKind::bits) return inputs() / 8;
+  return input_.kind == InputKind::uint8 ? inputs() : inputs() * sizeof(float);
 }
 
 size_t Encoder::multiply_adds() const {
@@ -158,11 +223,25 @@ Matrix<int8_t> Encoder::encode(Descriptors descriptors, size_t dimensions, int t
   return codes;
 }
 
-void Encoder::encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads) const {
+void Encoder::check(Descriptors descriptors, int threads) const {
   // OpenCV's descriptors of an image without keypoints have neither rows nor columns.
   const bool empty = descriptors.rows == 0 && descriptors.columns == 0;
   require(descriptors.columns == bytes() || empty, "descriptors have ", descriptors.columns,
           " bytes, encoder '", info_.name, "' takes ", bytes());
+  if (input_.kind == InputKind::bits) return;
+  const auto fault = [&](size_t i) { return fault_of(input_, descriptors.row(i), bytes()); };
+  std::atomic<size_t> bad = descriptors.rows;  // the first of them
+  parallel_for(threads, descriptors.rows, kGrain, [&](size_t i, size_t end) {
+    while (i < end && fault(i) == nullptr) ++i;
+    for (size_t known = bad; i < end && i < known && !bad.compare_exchange_weak(known, i);) {
+    }
+  });
+  require(bad == descriptors.rows, "descriptors: row ", bad, " ",
+          bad == descriptors.rows ? "" : fault(bad), ": leave such rows out");
+}
+
+void Encoder::encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads) const {
+  check(descriptors, threads);
   require(codes.rows == descriptors.rows, "codes must have as many rows as descriptors");
   require(codes.columns >= 1 && codes.columns <= dim(), "encoder '", info_.name, "' gives 1 to ",
           dim(), " dimensions, not ", codes.columns);
@@ -182,9 +261,15 @@ void Encoder::encode(Descriptors descriptors, MatrixView<int8_t> codes, int thre
       const auto outputs = [&](size_t l) {
         return l + 1 < depth ? layers_[l].outputs : codes.columns;
       };
-      network.first.run(kernel, {descriptors.row(begin), n, bytes()}, outputs(0), x);
-      for (size_t l = 1; l < depth; ++l) {
-        network.later[l - 1].run(kernel, x, outputs(l), next);
+      const Descriptors batch{descriptors.row(begin), n, bytes()};
+      size_t l = 0;
+      if (network.first) {
+        network.first->run(kernel, batch, outputs(l++), x);
+      } else {
+        write_bytes(input_, batch, inputs(), network.dense.front().inputs(), x);
+      }
+      for (const DenseLayer& layer : network.dense) {
+        layer.run(kernel, x, outputs(l++), next);
         std::swap(x, next);
       }
       for (size_t i = 0; i < n; ++i) {
@@ -210,6 +295,7 @@ std::vector<std::byte> Encoder::network_bytes() const {
     out.values(layer.table.data(), layer.table.size());
     out.values(layer.weights.data(), layer.weights.size());
   }
+  if (input_.kind != InputKind::bits) out.value(input_);
   return out.bytes();
 }
 
@@ -259,6 +345,12 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
     std::ranges::copy(in.values<uint8_t>(layer.table.size()), layer.table.begin());
     layer.weights = in.values<int8_t>(layer.inputs * layer.outputs);
   }
+  EncoderInput input;
+  if (!in.empty()) {
+    input = in.value<EncoderInput>();
+    file.require(input.kind == InputKind::uint8 || input.kind == InputKind::float32,
+                 "its kind of input is unknown");
+  }
   in.finish();
   std::vector<Codebook> codebooks;
   if (file.has(section::kCodebooks)) {
@@ -269,8 +361,8 @@ Encoder Encoder::parse(std::span<const std::byte> bytes, const std::string& name
     }
   }
   try {
-    return Encoder(std::move(info), std::move(layers), std::move(dims), scale,
-                   std::move(codebooks));
+    return Encoder(std::move(info), std::move(layers), std::move(dims), scale, std::move(codebooks),
+                   input);
   } catch (const std::invalid_argument& error) {
     file.fail(error.what());
   }

@@ -73,7 +73,7 @@ class PackedActivation {
   int shift_;
 };
 
-// A first layer, whose inputs are bits. For many descriptors it tabulates the sums of all subsets
+// A first layer whose inputs are bits. For many descriptors it tabulates the sums of all subsets
 // of every 4 inputs per block of outputs, so that one load and one 16-bit addition serve 4 inputs
 // ("four Russians"). For fewer it adds the weights of the bits that are set.
 class BitLayer {
@@ -177,7 +177,7 @@ class BitLayer {
   PackedActivation activation_;
 };
 
-// A later layer, whose inputs are bytes.
+// A layer whose inputs are bytes.
 class DenseLayer {
  public:
   DenseLayer(const Layer& layer, bool last)
@@ -192,6 +192,7 @@ class DenseLayer {
     }
   }
 
+  size_t inputs() const { return inputs_; }  // of which the last ones may have no weights
   size_t outputs() const { return activation_.outputs(); }
   // Computes the first `outputs` outputs of inputs (n x bytes), as BitLayer does.
   void run(const kernels::Kernels& kernel, MatrixView<const uint8_t> x, size_t outputs,

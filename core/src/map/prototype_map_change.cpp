@@ -101,7 +101,7 @@ void PrototypeMap::add(std::span<const int64_t> ids, Descriptors descriptors, in
     const auto chunk = codes(begin);
     change.add(ids.subspan(begin, chunk.rows), chunk, threads);
   };
-  // Also without descriptors, to check their length.
+  encoder()->check(descriptors, threads);  // all of them, before the first is added
   encode(0, codes(0), threads);
   size_t begin = 0;
   for (size_t next = kEncodeChunk; next < descriptors.rows; next += kEncodeChunk) {

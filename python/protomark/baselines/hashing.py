@@ -1,8 +1,9 @@
-"""Signs of projections of the landmark's mean of bits, searched by Hamming distance."""
+"""Signs of projections of the mean of a landmark's descriptors, searched by Hamming distance."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from protomark.baselines.binary import HammingMap
 from protomark.baselines.linear import Projection, principal_components
 from protomark.baselines.method import Method
 from protomark.baselines.support import Support
-from protomark.features.descriptors import unpack_bits
+from protomark.features.descriptors import InputKind, numbers_of
 
 # Means that the rotation of iterative quantisation is learned from, and its passes (the paper's).
 MAX_MEANS = 16_384
@@ -24,21 +25,22 @@ class SignMap(Method):
 
     projection: Projection
     codes: HammingMap
+    kind: InputKind  # what the descriptors are
 
     @classmethod
     def of(cls, support: Support, projection: Projection) -> SignMap:
         """The codes of the landmarks' means."""
         codes = _signs(support.means, projection)
-        return cls(projection, HammingMap(codes, support.ids, codes.shape[1]))
+        return cls(projection, HammingMap(codes, support.ids, codes.shape[1]), support.kind)
 
     def __post_init__(self) -> None:
         self.bytes_per_landmark = self.codes.bytes_per_landmark
 
     def match(
-        self, descriptors: NDArray[np.uint8], threads: int = 1
+        self, descriptors: NDArray[Any], threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Method.match`."""
-        values = unpack_bits(descriptors).astype(np.float32)
+        values = numbers_of(descriptors, self.kind).astype(np.float32)
         return self.codes.match(_signs(values, self.projection), threads)
 
 
@@ -48,7 +50,7 @@ def random_hyperplanes(support: Support, size: int) -> SignMap:
     Charikar, "Similarity estimation techniques from rounding algorithms", STOC 2002.
     """
     rng = np.random.default_rng(support.seed)
-    planes = rng.standard_normal((support.bits, 8 * size), dtype=np.float32)
+    planes = rng.standard_normal((support.width, 8 * size), dtype=np.float32)
     return SignMap.of(support, Projection(support.moments.mean.astype(np.float32), planes))
 
 
@@ -75,6 +77,6 @@ def iterative_quantization(support: Support, size: int) -> SignMap:
 
 
 def _signs(values: NDArray[np.float32], projection: Projection) -> NDArray[np.uint8]:
-    """Packed signs (n, k / 8) of projected values (n, bits)."""
+    """Packed signs (n, k / 8) of projected values (n, width)."""
     projected = (values - projection.mean) @ projection.matrix
     return np.packbits(projected >= 0, axis=1, bitorder="little")

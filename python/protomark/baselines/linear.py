@@ -1,13 +1,13 @@
-"""Linear baselines: one real vector per landmark, searched by Euclidean distance.
+"""Linear baselines: real vectors of landmarks, searched by Euclidean distance.
 
-The vectors are means of bits, of principal components, or of linear discriminants.
+The vectors are descriptors, their means, principal components, or linear discriminants.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import InitVar, dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from protomark.baselines.method import Method
 from protomark.baselines.support import Moments, Support
-from protomark.features.descriptors import unpack_bits
+from protomark.features.descriptors import InputKind, numbers_of
 from protomark.threads import one_blas_thread
 
 # One block of distances takes 2 MB and stays in the cache.
@@ -29,12 +29,13 @@ RIDGE = 1.0
 
 @dataclass(eq=False)
 class EuclideanMap(Method):
-    """One vector per landmark, of a linear projection of the bits."""
+    """Vectors of landmarks: of the numbers of descriptors, or of a linear projection of them."""
 
     vectors: InitVar[NDArray[Any]]  # (l, k), which times `scale` compare with projected queries
-    landmarks: NDArray[np.int64]  # (l,), strictly ascending
+    landmarks: NDArray[np.int64]  # (l,), ascending; several vectors may be of one
     bytes_per_landmark: float
-    projection: NDArray[np.float32] | None = None  # (bits, k), None: the bits themselves
+    kind: InputKind = "bits"  # what the descriptors are
+    projection: NDArray[np.float32] | None = None  # (width, k), None: the numbers themselves
     offset: NDArray[np.float32] | None = None  # (k,), subtracted from a projected query
     scale: float = 1.0  # size of one step of `vectors`
 
@@ -44,10 +45,11 @@ class EuclideanMap(Method):
         values = np.asarray(vectors, dtype=np.float32)
         norms = np.einsum("ij,ij->i", values, values)
         self._extended = np.concatenate([values, norms[:, None] / 2], axis=1)
+        self.landmarks, self._starts = np.unique(self.landmarks, return_index=True)
 
-    def project(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Project descriptors (q, bits / 8) uint8 to (q, k) float32, in steps of the vectors."""
-        values = unpack_bits(descriptors).astype(np.float32)
+    def project(self, descriptors: NDArray[Any]) -> NDArray[np.float32]:
+        """Project descriptors (q, b) to (q, k) float32, in steps of the vectors."""
+        values = numbers_of(descriptors, self.kind).astype(np.float32)
         if self.projection is not None:
             values = values @ self.projection
         if self.offset is not None:
@@ -55,7 +57,7 @@ class EuclideanMap(Method):
         return (values / np.float32(self.scale)).astype(np.float32)
 
     def match(
-        self, descriptors: NDArray[np.uint8], threads: int = 1
+        self, descriptors: NDArray[Any], threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Method.match`."""
         queries = self.project(descriptors)
@@ -76,13 +78,15 @@ class EuclideanMap(Method):
     def _nearest(
         self, queries: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Rows of the two nearest vectors, -1 if there is none, and their |p|^2 / 2 - p.q."""
+        """The two nearest landmarks, -1 if there is none, and |p|^2 / 2 - p.q of their nearest."""
         all_rows = np.arange(len(queries))
         extended = np.concatenate([-queries, np.ones_like(queries[:, :1])], axis=1)
         rows = np.full((len(queries), 2), -1, dtype=np.int64)
         values = np.full((len(queries), 2), np.inf, dtype=np.float32)
-        for start in range(0, len(self._extended), _VECTORS):
-            block = extended @ self._extended[start : start + _VECTORS].T
+        for start, starts, end in self._blocks:
+            block = extended @ self._extended[starts[0] : end].T
+            if len(starts) < block.shape[1]:
+                block = np.minimum.reduceat(block, starts - starts[0], axis=1)
             for _ in range(min(2, block.shape[1])):
                 row = block.argmin(axis=1)
                 value = block[all_rows, row]
@@ -94,10 +98,22 @@ class EuclideanMap(Method):
                 block[all_rows, row] = np.inf
         return rows, values
 
+    @cached_property
+    def _blocks(self) -> list[tuple[int, NDArray[np.int64], int]]:
+        """About `_VECTORS` vectors each: first landmark, first vector of each, end of the last."""
+        ends = np.append(self._starts[1:], len(self._extended))
+        blocks, first = [], 0
+        while first < len(ends):
+            last = int(np.searchsorted(ends, self._starts[first] + _VECTORS, side="right"))
+            last = max(last, first + 1)
+            blocks.append((first, self._starts[first:last], int(ends[last - 1])))
+            first = last
+        return blocks
+
 
 @dataclass(frozen=True)
 class Projection:
-    """The projection (x - mean) @ matrix, with (bits,) mean and (bits, k) matrix, float32."""
+    """The projection (x - mean) @ matrix, with (width,) mean and (width, k) matrix, float32."""
 
     mean: NDArray[np.float32]
     matrix: NDArray[np.float32]
@@ -144,15 +160,19 @@ def projected_mean(support: Support, projection: Projection, *, rounded: bool) -
     offset = projection.mean @ projection.matrix
     dim = means.shape[1]
     if not rounded:
-        return EuclideanMap(means, support.ids, 4 * dim + 1, projection.matrix, offset)
+        return EuclideanMap(
+            means, support.ids, 4 * dim + 1, support.kind, projection.matrix, offset
+        )
     step = float(np.abs(means).max()) / 127 or 1.0
     stored = np.rint(means / step).astype(np.int8)
-    return EuclideanMap(stored, support.ids, dim + 1, projection.matrix, offset, step)
+    return EuclideanMap(
+        stored, support.ids, dim + 1, support.kind, projection.matrix, offset, step
+    )
 
 
-def mean_of_bits(support: Support) -> EuclideanMap:
-    """The real-valued mean of all bits, in float32, and one byte for the count."""
-    return EuclideanMap(support.means, support.ids, 4 * support.bits + 1)
+def real_mean(support: Support) -> EuclideanMap:
+    """The real-valued mean of all numbers, in float32, and one byte for the count."""
+    return EuclideanMap(support.means, support.ids, 4 * support.width + 1, support.kind)
 
 
 def _projection(moments: Moments, matrix: NDArray[np.float64]) -> Projection:

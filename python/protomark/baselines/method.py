@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +20,12 @@ class Method(ABC):
 
     @abstractmethod
     def match(
-        self, descriptors: NDArray[np.uint8], threads: int = 1
+        self, descriptors: NDArray[Any], threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The two nearest distinct landmarks of each descriptor.
 
         Args:
-            descriptors: (q, bits / 8) uint8.
+            descriptors: (q, b), as those of the map.
             threads: threads to search on.
 
         Returns:

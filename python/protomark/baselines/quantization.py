@@ -1,4 +1,4 @@
-"""Product quantisation of the landmark's mean of bits."""
+"""Product quantisation of the mean of a landmark's descriptors."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _ROWS = 1024
 
 
 def product_quantized_mean(support: Support, size: int) -> EuclideanMap:
-    """The mean of all bits as `size` words of a byte each, and one byte for the count.
+    """The mean of all numbers as `size` words of a byte each, and one byte for the count.
 
     Jégou et al., "Product quantization for nearest neighbor search", TPAMI 2011. Each of `size`
     parts of the mean has a codebook of `WORDS` words, learned from the map's own means. Distances
-    are asymmetric: between the query's bits and the words.
+    are asymmetric: between the query's numbers and the words.
     """
     rng = np.random.default_rng(support.seed)
     means = support.means
@@ -31,11 +31,11 @@ def product_quantized_mean(support: Support, size: int) -> EuclideanMap:
     if len(means) > MAX_MEANS:
         drawn = np.sort(rng.choice(len(means), MAX_MEANS, replace=False))
     decoded = np.empty_like(means)
-    for part in np.array_split(np.arange(support.bits), size):
+    for part in np.array_split(np.arange(support.width), size):
         values = means[:, part]
         words = k_means(values[drawn], WORDS, rng)
         decoded[:, part] = words[nearest_words(values, words)]
-    return EuclideanMap(decoded, support.ids, size + 1)
+    return EuclideanMap(decoded, support.ids, size + 1, support.kind)
 
 
 def k_means(points: NDArray[Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.features.descriptors import unpack_bits
+from protomark.features.descriptors import InputKind, numbers_of
 
-# Unpacked bits are handled in pieces of about this many rows, to bound the memory.
+# Numbers of descriptors are handled in pieces of about this many rows, to bound the memory.
 _CHUNK = 1 << 15
 
 
@@ -20,16 +20,21 @@ class Support:
     """Descriptors grouped by landmark; derived sums and means are computed once, on first use.
 
     Attributes:
-        descriptors: (n, bits / 8) uint8, sorted by landmark, else in their given order.
+        descriptors: (n, b), sorted by landmark, else in their given order.
         landmarks: (n,) int64, the landmark of each row.
         ids: (l,) int64, the distinct landmarks, ascending.
         starts: (l,) int64, the first row of each landmark.
         counts: (l,) int64, observations of each landmark.
         seed: seed of methods that draw at random.
+        kind: what the descriptors are.
     """
 
     def __init__(
-        self, landmarks: NDArray[np.int64], descriptors: NDArray[np.uint8], seed: int = 0
+        self,
+        landmarks: NDArray[np.int64],
+        descriptors: NDArray[Any],
+        seed: int = 0,
+        kind: InputKind = "bits",
     ) -> None:
         if not len(landmarks):
             raise ValueError("there are no observations to build a map from: give longer tracks")
@@ -44,11 +49,12 @@ class Support:
             self.landmarks, return_index=True, return_counts=True
         )
         self.seed = seed
+        self.kind = kind
 
     @property
-    def bits(self) -> int:
-        """Length of a descriptor in bits."""
-        return 8 * int(self.descriptors.shape[1])
+    def width(self) -> int:
+        """How many numbers a descriptor has: bits, or those of a vector."""
+        return int(self.descriptors.shape[1]) * (8 if self.kind == "bits" else 1)
 
     def pieces(self, rows: int = _CHUNK) -> Iterator[tuple[int, int]]:
         """Ranges of whole landmarks with about `rows` observations each."""
@@ -60,38 +66,39 @@ class Support:
             first = last
 
     @cached_property
-    def bit_sums(self) -> NDArray[np.int32]:
-        """(l, bits) int32, number of each landmark's observations that set each bit."""
-        sums = np.empty((len(self.ids), self.bits), dtype=np.int32)
+    def sums(self) -> NDArray[Any]:
+        """(l, width) sums of the numbers of each landmark's descriptors, int32, or of floats."""
+        dtype = np.float64 if self.kind == "float32" else np.int32
+        sums = np.empty((len(self.ids), self.width), dtype=dtype)
         for first, last in self.pieces():
             start, end = self.starts[first], self.starts[last - 1] + self.counts[last - 1]
-            bits = unpack_bits(self.descriptors[start:end])
+            numbers = numbers_of(self.descriptors[start:end], self.kind)
             np.add.reduceat(
-                bits, self.starts[first:last] - start, axis=0, dtype=np.int32, out=sums[first:last]
+                numbers, self.starts[first:last] - start, axis=0, dtype=dtype, out=sums[first:last]
             )
         return sums
 
     @cached_property
     def means(self) -> NDArray[np.float32]:
-        """(l, bits) float32, the mean of each landmark's bits."""
-        return (self.bit_sums / self.counts[:, None]).astype(np.float32)
+        """(l, width) float32, the mean of each landmark's descriptors."""
+        return (self.sums / self.counts[:, None]).astype(np.float32)
 
     @cached_property
     def moments(self) -> Moments:
-        """Moments of the bits over at most `Moments.MAX_ROWS` of these observations."""
+        """Moments of the numbers over at most `Moments.MAX_ROWS` of these observations."""
         return Moments.of(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Mean and covariances of descriptor bits, from which linear projections are learned."""
+    """Mean and covariances of the numbers of descriptors, from which linear projections are learned."""
 
     # Far fewer rows than this estimate a quarter of a million numbers well.
     MAX_ROWS: ClassVar = 100_000
 
-    mean: NDArray[np.float64]  # (bits,) float64
-    total: NDArray[np.float64]  # (bits, bits) float64, covariance over all observations
-    # (bits, bits) float64, pooled covariance of observations of one landmark.
+    mean: NDArray[np.float64]  # (width,) float64
+    total: NDArray[np.float64]  # (width, width) float64, covariance over all observations
+    # (width, width) float64, pooled covariance of observations of one landmark.
     within: NDArray[np.float64]
 
     @classmethod
@@ -103,18 +110,19 @@ class Moments:
         chosen = np.zeros(len(support.ids), dtype=bool)
         chosen[drawn[:count]] = True
         rows = np.flatnonzero(np.repeat(chosen, support.counts))
-        sums = support.bit_sums[chosen].astype(np.float32)
-        counts = support.counts[chosen]
-
         # A piece sums fewer than 2^24 products of 0 and 1, which is exact in float32.
-        second = np.zeros((support.bits, support.bits))
+        dtype = np.float32 if support.kind == "bits" else np.float64
+        sums = support.sums[chosen].astype(dtype)
+        counts = support.counts[chosen]
+        second = np.zeros((support.width, support.width))
         for at in range(0, len(rows), _CHUNK):
-            bits = unpack_bits(support.descriptors[rows[at : at + _CHUNK]]).astype(np.float32)
-            second += bits.T @ bits
+            part = support.descriptors[rows[at : at + _CHUNK]]
+            numbers = numbers_of(part, support.kind).astype(dtype)
+            second += numbers.T @ numbers
         between = np.zeros_like(second)
         for at in range(0, len(sums), _CHUNK):
             scaled = sums[at : at + _CHUNK] / np.sqrt(counts[at : at + _CHUNK, None])
-            scaled = scaled.astype(np.float32)
+            scaled = scaled.astype(dtype)
             between += scaled.T @ scaled
         mean = sums.sum(axis=0, dtype=np.float64) / len(rows)
         total = second / len(rows) - np.outer(mean, mean)

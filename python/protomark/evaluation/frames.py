@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ class QueryFrame:
     camera: Camera  # its camera
     cam_from_world: NDArray[np.float64]  # (3, 4) float64, its true pose
     keypoints: NDArray[np.float64]  # (n, 2) float64, pixels
-    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    descriptors: NDArray[Any]  # (n, b), those of the tracks
     # (n,) int64, the true landmark of each keypoint, -1 if it is unknown.
     landmarks: NDArray[np.int64]
 

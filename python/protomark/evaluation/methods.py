@@ -21,16 +21,18 @@ from protomark.baselines.binary import (
     random_sample,
     unaggregated,
 )
+from protomark.baselines.clusters import mean_shift
 from protomark.baselines.hashing import iterative_quantization, random_hyperplanes
 from protomark.baselines.linear import (
     linear_discriminants,
-    mean_of_bits,
     principal_components,
     projected_mean,
+    real_mean,
 )
 from protomark.baselines.method import Method
 from protomark.baselines.quantization import product_quantized_mean
 from protomark.baselines.support import Moments, Support
+from protomark.features.descriptors import InputKind
 from protomark.features.upright import SUFFIX
 from protomark.maps.info import matching_bytes
 
@@ -40,7 +42,7 @@ SEALED_BYTES = (9, 17, 25, 33, 65)
 APPEARANCE_BITS = 5
 PROJECTED_DIMS = (8, 16, 32, 64)
 # Bytes of codes of the mean, and those that are compared by default: one that takes little time.
-CODE_BYTES = (8, 16, 32, 64)
+CODE_BYTES = (4, 8, 16, 32, 64)
 DEFAULT_CODE_BYTES = 32
 
 
@@ -65,7 +67,7 @@ class PrototypeMethod(Method):
         self.bytes_per_landmark = matching_bytes(scene)
 
     def match(
-        self, descriptors: NDArray[np.uint8], threads: int = 1
+        self, descriptors: NDArray[Any], threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Method.match`."""
         ids, squared = self.map.search(descriptors, k=2, threads=threads)
@@ -109,9 +111,10 @@ def method_choices(
     # Moments to learn linear discriminants from; None: those of the support.
     discriminant_from: Moments | None = None,
     threads: int = 1,
-    bits: int = 512,  # length of the descriptors
+    width: int = 512,  # how many numbers descriptors have: bits, or those of vectors
+    kind: InputKind = "bits",  # what the descriptors are
 ) -> list[MethodChoice]:
-    """Every method, in the order of tables."""
+    """Every method for these descriptors, in the order of tables."""
     listed = [
         MethodChoice("unaggregated", "Unaggregated", "unaggregated", unaggregated),
         MethodChoice("random", "Random sample", "random", random_sample),
@@ -119,8 +122,11 @@ def method_choices(
         MethodChoice("majority", "Quantised mean", "majority", majority),
         MethodChoice("and", "Bitwise AND", "and", bitwise_and),
         MethodChoice("medoid", "Medoid (ORB-SLAM)", "medoid", medoid),
-        MethodChoice("mean", "Mean of bits, float", "mean", mean_of_bits),
+        MethodChoice("clusters", "Mean-shift clusters", "clusters", mean_shift),
+        MethodChoice("mean", "Mean, float", "mean", real_mean),
     ]
+    other = "clusters" if kind == "bits" else "and"
+    listed = [choice for choice in listed if choice.name != other]
     for rounded in (True, False):
         for family, label in (("pca", "PCA mean"), ("discriminant", "Discriminant")):
             for dim in PROJECTED_DIMS:
@@ -149,8 +155,8 @@ def method_choices(
                 default=size == DEFAULT_CODE_BYTES,
             )
             for size in CODE_BYTES
-            # There are no more components than bits.
-            if family != "itq" or 8 * size <= bits
+            # There are no more components than numbers, nor more words.
+            if family == "lsh" or size * (8 if family == "itq" else 1) <= width
         ]
     for encoder in encoders:
         listed += _prototype_choices(encoder, len(encoders) > 1, threads)
@@ -221,7 +227,7 @@ def choose_methods(
     for name, found in chosen.items():
         if not found:
             raise ValueError(
-                f"there is no method {name!r}: choose from "
+                f"there is no method {name!r} for these descriptors: choose from "
                 + ", ".join(choice.name for choice in listed)
             )
     names_chosen = {choice.name for found in chosen.values() for choice in found}

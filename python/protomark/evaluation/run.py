@@ -59,15 +59,17 @@ def evaluate_files(
     for path in [*paths, *options.discriminant_from]:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such tracks file")
-    learned: dict[tuple[str, int], Moments | None] = {}
+    learned: dict[tuple[str, str, int], Moments | None] = {}
     for path in paths:
         tracks = Tracks.load(path)
-        kind = (tracks.descriptor, tracks.bits)
+        kind = (tracks.descriptor, tracks.input, tracks.bits)
         if kind not in learned:
             sources = options.discriminant_from
             learned[kind] = learn_moments(sources, tracks) if sources else None
         fitting = encoders_for(tracks, encoders, given=bool(options.encoders))
-        choices = method_choices(fitting, learned[kind], options.threads, tracks.bits)
+        choices = method_choices(
+            fitting, learned[kind], options.threads, tracks.width, tracks.input
+        )
         chosen = choose_methods(choices, options.methods)
         yield evaluate(tracks, sequence_name(path), chosen, options, progress)
 
@@ -79,11 +81,11 @@ def encoders_for(
 
     Unless the user gave them, only the one for what described the images counts.
     """
-    descriptor, bits = tracks.descriptor, tracks.bits
+    kind = (tracks.descriptor, tracks.input, tracks.bits)
     if not given:
         encoders = [encoder for encoder in encoders if encoder.name == tracks.encoder_name]
-    fitting = [e for e in encoders if (e.descriptor, e.bits) == (descriptor, bits)]
-    return fitting + [e for e in encoders if e.descriptor == descriptor + SUFFIX]
+    fitting = [e for e in encoders if (e.descriptor, e.input, e.bits) == kind]
+    return fitting + [e for e in encoders if e.descriptor == tracks.descriptor + SUFFIX]
 
 
 def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
@@ -91,7 +93,7 @@ def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
     landmarks, descriptors, offset = [], [], 0
     for path in paths:
         tracks = Tracks.load(path)
-        if (tracks.descriptor, tracks.bits) != (like.descriptor, like.bits):
+        if any(getattr(tracks, k) != getattr(like, k) for k in ("descriptor", "input", "bits")):
             raise ValueError(
                 f"{path} holds {tracks.descriptor} with {tracks.bits} bits, but the tracks to "
                 f"evaluate {like.descriptor} with {like.bits}: give tracks of the same descriptor"
@@ -102,7 +104,9 @@ def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
         landmarks.append(index[repeated] + offset)
         descriptors.append(tracks.descriptors[rows[repeated]])
         offset += len(tracks.landmark_ids)
-    return Support(np.concatenate(landmarks), np.concatenate(descriptors)).moments
+    return Support(
+        np.concatenate(landmarks), np.concatenate(descriptors), kind=like.input
+    ).moments
 
 
 def evaluate(
@@ -127,7 +131,7 @@ def evaluate(
         part = split(tracks, seed, options.split)
         landmarks = tracks.landmark_of_keypoint[part.support_rows]
         supports = {
-            upright: Support(landmarks, source.descriptors[part.support_rows], seed)
+            upright: Support(landmarks, source.descriptors[part.support_rows], seed, source.input)
             for upright, source in sources.items()
         }
         frames = {

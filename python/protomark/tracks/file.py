@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protomark.extras import optional
+from protomark.features.descriptors import DESCRIPTORS, VECTOR_SIZES, InputKind
 from protomark.features.extractor import FEATURE_ARRAYS, Features
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.files import is_utf8, replacing
@@ -44,6 +45,8 @@ _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "landmark_ids": (np.int64, ("l",)),
     "landmark_positions": (np.float64, ("l", 3)),
 }
+# Dtypes of descriptors by what they are.
+_INPUTS: dict[str, type] = {"bits": np.uint8, "uint8": np.uint8, "float32": np.float32}
 
 
 @dataclass
@@ -65,13 +68,14 @@ class Tracks:
         angles: (n,) float32, orientation in degrees, clockwise, [0, 360), -1 where there is none.
         responses: (n,) float32, the detector's strength.
         octaves: (n,) int32, the detector's pyramid level.
-        descriptors: (n, bits / 8) uint8, in OpenCV's bytes.
+        descriptors: (n, b), in OpenCV's bytes: uint8 of bits, or vectors of uint8 or float32.
         landmark_of_keypoint: (n,) int64, landmark id of each keypoint, -1 where there is none.
         landmark_ids: (l,) int64, ascending.
         landmark_positions: (l, 3) float64, in world coordinates.
         info: what the tracks were made from, and how (JSON values). "source" has the program, its
             version, a digest of its file, the maps in that, and counts of what was "dropped";
             "detector" has the name and the settings of what described the images.
+        input: what the descriptors are: "bits", "uint8" or "float32".
     """
 
     descriptor: str
@@ -85,11 +89,12 @@ class Tracks:
     angles: NDArray[np.float32]
     responses: NDArray[np.float32]
     octaves: NDArray[np.int32]
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[Any]
     landmark_of_keypoint: NDArray[np.int64]
     landmark_ids: NDArray[np.int64]
     landmark_positions: NDArray[np.float64]
     info: dict[str, Any] = field(default_factory=dict)
+    input: InputKind = "bits"
 
     @classmethod
     def from_features(
@@ -123,6 +128,7 @@ class Tracks:
             landmark_ids=np.arange(len(positions), dtype=np.int64),
             landmark_positions=positions,
             info=info,
+            input=DESCRIPTORS[descriptor].input if descriptor in DESCRIPTORS else "bits",
         )
         tracks.check()
         return tracks
@@ -130,7 +136,12 @@ class Tracks:
     @property
     def bits(self) -> int:
         """Length of a descriptor in bits."""
-        return 8 * int(self.descriptors.shape[1])
+        return 8 * int(self.descriptors.shape[1]) * self.descriptors.itemsize
+
+    @property
+    def width(self) -> int:
+        """How many numbers a descriptor has: bits, or those of a vector."""
+        return self.bits if self.input == "bits" else int(self.descriptors.shape[1])
 
     @property
     def encoder_name(self) -> str:
@@ -164,8 +175,12 @@ class Tracks:
         """The tracks with angles and sizes in the descriptors, named `<descriptor>-upright`.
 
         Raises:
-            ValueError: no keypoint has an angle.
+            ValueError: no keypoint has an angle, or the descriptors are vectors.
         """
+        if self.input != "bits":
+            raise ValueError(
+                f"{self.descriptor} has no upright form, as it is a vector: take the plain encoder"
+            )
         if not (self.angles >= 0).any():
             raise ValueError(
                 f"no keypoint of these {self.descriptor} tracks has an angle, which upright "
@@ -188,6 +203,10 @@ class Tracks:
             raise ValueError("tracks: keyframe_names are not a list of texts")
         if not _is_text(self.descriptor):
             raise ValueError("tracks: descriptor is not a text")
+        if self.input not in _INPUTS:
+            raise ValueError(
+                f"tracks: input is {self.input!r}: this Protomark knows {', '.join(_INPUTS)}"
+            )
         sizes = {
             "m": len(self.keyframe_names),
             "m+1": len(self.keyframe_names) + 1,
@@ -195,8 +214,10 @@ class Tracks:
             "l": len(self.landmark_ids),
             "b": self.descriptors.shape[1] if self.descriptors.ndim == 2 else 0,
         }
-        for name, (dtype, shape) in _ARRAYS.items():
-            array = getattr(self, name)
+        dtypes = {name: dtype for name, (dtype, _) in _ARRAYS.items()}
+        dtypes["descriptors"] = _INPUTS[self.input]
+        for name, (_, shape) in _ARRAYS.items():
+            array, dtype = getattr(self, name), dtypes[name]
             want = tuple(sizes[s] if isinstance(s, str) else s for s in shape)
             if array.dtype != dtype or array.shape != want:
                 raise ValueError(
@@ -205,15 +226,21 @@ class Tracks:
                 )
         ids, offsets = self.landmark_ids, self.offsets
         seen = self.landmark_of_keypoint[self.landmark_of_keypoint != -1]
-        floats = [name for name, (dtype, _) in _ARRAYS.items() if issubclass(dtype, np.floating)]
+        floats = [name for name, dtype in dtypes.items() if issubclass(dtype, np.floating)]
         endless = [name for name in floats if not np.isfinite(getattr(self, name)).all()]
         runs = offsets[0] == 0 and offsets[-1] == sizes["n"] and (np.diff(offsets) >= 0).all()
         lacking = [int(i) for i in self.keyframe_camera if int(i) not in self.cameras]
         has_texts = isinstance(self.info, dict) and _is_text(
             json.dumps(self.info, ensure_ascii=False)
         )
+        empty = [] if self.input == "bits" else np.flatnonzero(~self.descriptors.any(axis=1))
         for wrong, problem in (
             (sizes["b"] < 1, "descriptors have no bytes"),
+            (
+                self.input != "bits" and sizes["b"] not in VECTOR_SIZES,
+                f"vectors have {sizes['b']} numbers, not {VECTOR_SIZES[0]} to {VECTOR_SIZES[-1]}",
+            ),
+            (len(empty), f"descriptor {empty[:1]} is a vector of zeros: leave its keypoint out"),
             (not runs, "offsets do not run from 0 to the number of keypoints"),
             ((np.diff(ids) <= 0).any(), "landmark_ids are not strictly ascending"),
             ((ids[:1] < 0).any(), "landmark_ids contains a negative id"),
@@ -241,6 +268,7 @@ class Tracks:
             "format": FORMAT,
             "version": str(VERSION),
             "descriptor": self.descriptor,
+            **({} if self.input == "bits" else {"input": self.input}),
             "cameras": json.dumps({str(k): c.as_dict() for k, c in self.cameras.items()}),
             "keyframe_names": json.dumps(self.keyframe_names),
             "info": json.dumps(self.info),
@@ -276,6 +304,7 @@ class Tracks:
                 cameras=cameras_from_json(_json(header, "cameras")),
                 keyframe_names=_json(header, "keyframe_names"),
                 info=_json(header, "info"),
+                input=header.get("input", "bits"),
                 **arrays,
             )
             tracks.check()

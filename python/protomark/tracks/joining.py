@@ -78,4 +78,5 @@ def join_tracks(names: Sequence[str], parts: Sequence[Tracks], info: dict[str, A
         offsets=np.concatenate([[0], np.cumsum(np.concatenate(lengths))]).astype(np.int64),
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
         info=info,
+        input=parts[0].input,
     )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from protomark.features.descriptors import InputKind
 from protomark.report import markdown_table
 from protomark.training.data import TrainingSource
 
@@ -25,7 +26,8 @@ class SequencePrecision:
     seeds: int  # number of splits
     unaggregated: float  # precision of all raw descriptors
     medoid: float  # precision of one descriptor per landmark, the one closest to the others
-    majority: float  # precision of the quantised mean of each landmark's descriptors
+    # Precision of the mean of each landmark's descriptors, rounded to their type.
+    majority: float
     float_precision: dict[int, float]  # precision of the float network, by code length
     # Precision of the integer encoder with int8 prototypes, by code length.
     integer_precision: dict[int, float]
@@ -38,6 +40,7 @@ class EncoderCard:
     name: str
     descriptor: str  # descriptor that it encodes
     bits: int
+    input: InputKind  # what the descriptor is
     widths: list[int]  # units per layer, including input and output
     dims: list[int]  # prefixes that maps may use alone
     bytes: int  # size of the model file
@@ -63,10 +66,13 @@ class EncoderCard:
     def markdown(self) -> str:
         """The card as Markdown."""
         dims = ", ".join(map(str, self.dims))
+        size = f"{self.bits} bits"
+        if self.input != "bits":
+            size = f"{self.widths[0]} numbers ({self.input})"
         lines = [
             f"# Encoder `{self.name}`",
             "",
-            f"Turns {self.descriptor} descriptors of {self.bits} bits into int8 codes of "
+            f"Turns {self.descriptor} descriptors of {size} into int8 codes of "
             f"{dims} numbers (each shorter code is the start of the longer one).",
             "",
             f"- network: {'-'.join(map(str, self.widths))}, SELU, int8 weights; "
@@ -99,7 +105,7 @@ class EncoderCard:
             "",
             "Share of queries whose nearest prototype is their own landmark's: 90 % of the "
             "keyframes build the map, the others query it; mean of the splits. *Unaggregated*: all "
-            "raw descriptors of the landmarks; *medoid*, *majority*: one binary descriptor per "
+            "raw descriptors of the landmarks; *medoid*, *majority*: one descriptor per "
             "landmark; *float*: the network before rounding, *integer*: the encoder in this file "
             "with int8 prototypes.",
             "",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from protomark.features.descriptors import InputKind
 from protomark.progress import Progress, silent, tracked
 from protomark.tracks.file import Tracks, sequence_name
 from protomark.training.sampling import Views
@@ -39,7 +40,8 @@ class TrainingData:
     """The data of a training."""
 
     descriptor: str  # name of the descriptor of all tracks
-    bits: int
+    bits: int  # length of a descriptor
+    input: InputKind  # what the descriptors are
     views: list[Views]  # training sequences
     trials: list[Trial]  # splits of the validation sequences
     sources: list[TrainingSource]  # the training files
@@ -100,7 +102,7 @@ def load_training(
             f"a licence is given for {min(unknown)}, which is not one of the sequences: "
             "name a sequence by its file name up to the first dot"
         )
-    descriptor, bits = "", 0
+    kind: tuple[str, InputKind, int] | None = None
     views: list[Views] = []
     trials: list[Trial] = []
     sources: list[TrainingSource] = []
@@ -109,17 +111,18 @@ def load_training(
     known = len(training) + len(validation)
     for i, path in enumerate(tracked([*training, *validation, *report], progress, "read tracks")):
         tracks = read_tracks(path, upright)
-        if not views and not trials:
-            descriptor, bits = tracks.descriptor, tracks.bits
-            if not MIN_BITS <= bits <= MAX_BITS:
+        if kind is None:
+            kind = (tracks.descriptor, tracks.input, tracks.bits)
+            if tracks.input == "bits" and not MIN_BITS <= tracks.bits <= MAX_BITS:
                 raise ValueError(
-                    f"{path} has descriptors of {bits} bits: encoders are trained for "
+                    f"{path} has descriptors of {tracks.bits} bits: encoders are trained for "
                     f"{MIN_BITS} to {MAX_BITS} bits"
                 )
-        elif (tracks.descriptor, tracks.bits) != (descriptor, bits):
+        elif (tracks.descriptor, tracks.input, tracks.bits) != kind:
             raise ValueError(
-                f"{path} has {tracks.descriptor} descriptors of {tracks.bits} bits, but "
-                f"{training[0]} has {descriptor} of {bits}: give tracks of one descriptor"
+                f"{path} has {tracks.descriptor} descriptors of {tracks.bits} bits "
+                f"({tracks.input}), but {training[0]} has {kind[0]} of {kind[2]} ({kind[1]}): give "
+                "tracks of one descriptor"
             )
         if i >= known:
             load_trials(tracks, path, REPORT_SEEDS)  # whether it can be measured at the end
@@ -152,9 +155,11 @@ def load_training(
             f"only {learnable} landmarks have 3 or more views, but training needs "
             f"{MIN_LANDMARKS}: give more or longer tracks"
         )
+    assert kind is not None
     return TrainingData(
-        descriptor,
-        bits,
+        kind[0],
+        kind[2],
+        kind[1],
         views,
         trials,
         sources[: len(training)],

@@ -152,6 +152,8 @@ def train_encoder(
         dims=list(request.options.dims),
         name=name,
         descriptor=data.descriptor,
+        input=trainer.network.scaling.kind,
+        input_scale=trainer.network.scaling.scale,
         scale=float(trainer.quantized.scale),
         data=describe_data(data.sources),
         licence=request.licence,
@@ -171,7 +173,8 @@ def train_encoder(
         name=name,
         descriptor=data.descriptor,
         bits=data.bits,
-        widths=[data.bits, *trainer.network.hidden, request.options.dims[-1]],
+        input=trainer.network.scaling.kind,
+        widths=trainer.network.widths,
         dims=list(request.options.dims),
         bytes=request.output.stat().st_size,
         licence=request.licence,
@@ -283,7 +286,7 @@ def _measure(
 
 def binary_precision(trial: Trial, threads: int = 1) -> list[float]:
     """Precision of all raw descriptors, of medoids and of majorities, one each per landmark."""
-    support = Support(trial.landmarks, trial.support)
+    support = Support(trial.landmarks, trial.support, kind=trial.kind)
     shares = []
     for method in (binary.unaggregated, binary.medoid, binary.majority):
         nearest, _ = method(support).match(trial.queries, threads=threads)

@@ -94,6 +94,7 @@ class QuantizedNetwork(nn.Module):
     def __init__(self, network: EncoderNetwork) -> None:
         super().__init__()
         self.network = network
+        self.scaling = network.scaling
         hidden = len(network.layers) - 1
         device = next(network.parameters()).device
         self.register_buffer("low", torch.full((hidden,), -4.0, device=device))
@@ -101,9 +102,9 @@ class QuantizedNetwork(nn.Module):
         self.register_buffer("scale", torch.tensor(1 / 16, device=device))
 
     @torch.no_grad()
-    def calibrate(self, signs: Tensor) -> None:
-        """Set ranges and code scale by the float network's activations for `signs` (n, bits)."""
-        x = signs
+    def calibrate(self, inputs: Tensor) -> None:
+        """Set ranges and code scale by the float network's activations for `inputs` (n, d)."""
+        x = inputs
         *hidden, last = self.network.layers
         for i, layer in enumerate(hidden):
             pre = layer(x)
@@ -117,11 +118,12 @@ class QuantizedNetwork(nn.Module):
             return None
         return _Activation.between(self.low[layer], self.high[layer])
 
-    def forward(self, signs: Tensor) -> Tensor:
+    def forward(self, inputs: Tensor) -> Tensor:
         """Embeddings (n, dim) float32: integer codes times `scale`."""
         # x is the layer's integer input minus its zero point. It and the weights have at most 8
         # bits and a sign, which bfloat16 represents exactly, so this may run under autocast.
-        x, unit, zero = signs / 2, 2.0, 0.5
+        unit, zero = self.scaling.unit, self.scaling.zero
+        x = inputs / unit
         for i, layer in enumerate(self.network.layers):
             weights, bias, real = _whole_numbers(layer, unit, zero, self._activation(i))
             sums = functional.linear(x, weights).float() + (bias + zero * weights.sum(1))
@@ -142,7 +144,7 @@ class QuantizedNetwork(nn.Module):
     def export(self) -> list[Layer]:
         """The integer layers of this network."""
         layers: list[Layer] = []
-        unit, zero = 2.0, 0.5
+        unit, zero = self.scaling.unit, self.scaling.zero
         for i, layer in enumerate(self.network.layers):
             activation = self._activation(i)
             weights, bias, real = _whole_numbers(layer, unit, zero, activation)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.descriptors import InputKind
 from protomark.tracks.file import Tracks
 
 
@@ -20,9 +22,10 @@ class Views:
     """All views of one sequence's landmarks, grouped by landmark."""
 
     name: str
-    descriptors: NDArray[np.uint8]  # (n, B) uint8, sorted by landmark
+    descriptors: NDArray[Any]  # (n, b), sorted by landmark
     # (l + 1,) int64; the views of landmark i are rows starts[i]:starts[i + 1].
     starts: NDArray[np.int64]
+    kind: InputKind = "bits"  # what the descriptors are
 
     @classmethod
     def from_tracks(cls, tracks: Tracks, name: str) -> Views:
@@ -32,7 +35,8 @@ class Views:
         order = np.argsort(landmarks, kind="stable")
         _, counts = np.unique(landmarks, return_counts=True)
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        return cls(name, np.ascontiguousarray(tracks.descriptors[rows[order]]), starts)
+        descriptors = np.ascontiguousarray(tracks.descriptors[rows[order]])
+        return cls(name, descriptors, starts, tracks.input)
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -47,7 +51,7 @@ class Views:
 class Batch:
     """The views of a batch's landmarks."""
 
-    descriptors: NDArray[np.uint8]  # (n, B) uint8, grouped by landmark
+    descriptors: NDArray[Any]  # (n, b), grouped by landmark
     landmarks: NDArray[np.int64]  # (n,) int64, 0..m-1, ascending
     # (q,) int64, rows whose landmark has at least two other views in the batch.
     queries: NDArray[np.int64]
@@ -75,6 +79,22 @@ def random_views(
     return rows[order][keep], group[keep], rank[keep]
 
 
+def with_noise(
+    descriptors: NDArray[Any], kind: InputKind, noise: float, rng: np.random.Generator
+) -> NDArray[Any]:
+    """Descriptors (n, b) with a share `noise` of the bits flipped.
+
+    Vectors have Gaussian noise added, whose mean square is this share of their own.
+    """
+    if kind == "bits":
+        flips = rng.random((len(descriptors), 8 * descriptors.shape[1]), np.float32) < noise
+        return descriptors ^ np.packbits(flips, axis=1, bitorder="little")
+    x = descriptors.astype(np.float32)
+    size = np.sqrt(noise * np.square(x).mean(1, keepdims=True))
+    x += size * rng.standard_normal(x.shape, np.float32)
+    return x if kind == "float32" else np.rint(x).clip(0, 255).astype(np.uint8)
+
+
 @dataclass
 class BatchSampler:
     """Draws batches from several sequences."""
@@ -86,7 +106,7 @@ class BatchSampler:
     # The probability of a sequence is proportional to (number of landmarks with 3 or more views)
     # ** balance: 0 favours no sequence, 1 favours no landmark.
     balance: float = 0.5
-    noise: float = 0.0  # probability that a bit is flipped
+    noise: float = 0.0  # see `with_noise`
 
     def __post_init__(self) -> None:
         sizes = np.array([(s.counts >= 3).sum() for s in self.sequences], float)
@@ -106,7 +126,6 @@ class BatchSampler:
         rows, group, rank = random_views(views, chosen, self.views, rng)
         descriptors = views.descriptors[rows]
         if self.noise:
-            flips = rng.random((len(rows), 8 * descriptors.shape[1]), np.float32) < self.noise
-            descriptors = descriptors ^ np.packbits(flips, axis=1, bitorder="little")
+            descriptors = with_noise(descriptors, views.kind, self.noise, rng)
         enough = np.bincount(group)[group] >= 3
         return Batch(descriptors, group, np.flatnonzero(enough & (rank < self.queries)))

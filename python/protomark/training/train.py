@@ -22,7 +22,7 @@ from torch import Tensor
 from protomark.files import replacing
 from protomark.interrupt import Interrupted, deferred_interrupt
 from protomark.training.loss import PrototypeLoss
-from protomark.training.network import EncoderNetwork, embed, to_signs
+from protomark.training.network import EncoderNetwork, InputScaling, embed
 from protomark.training.quantization import QuantizedNetwork
 from protomark.training.sampling import BatchSampler, Views
 from protomark.training.validation import Trial, mean_precision
@@ -44,7 +44,7 @@ class TrainingOptions:
     views: int = 9  # limit on views per landmark in a batch
     queries: int = 3  # limit on queries per landmark in a batch
     balance: float = 0.5  # see `BatchSampler`
-    noise: float = 0.03  # probability that a bit is flipped
+    noise: float = 0.03  # share of bits that are flipped, or see `sampling.with_noise`
     # Peak rate of AdamW after a warm-up, from which it falls as a cosine.
     learning_rate: float = 5e-3
     weight_decay: float = 0.1  # weight decay of AdamW
@@ -129,8 +129,17 @@ class Trainer:
             options.noise,
         )
         torch.manual_seed(options.seed)
-        bits = 8 * sequences[0].descriptors.shape[1]
-        self.network = EncoderNetwork(bits, options.dims[-1], options.hidden).to(self.device)
+        part = max(4096 // len(sequences), 1)
+        self._calibration = np.concatenate(
+            [s.descriptors[:: max(len(s.descriptors) // part, 1)][:part] for s in sequences]
+        )
+        kind, width = sequences[0].kind, self._calibration.shape[1]
+        self.network = EncoderNetwork(
+            8 * width if kind == "bits" else width,
+            options.dims[-1],
+            options.hidden,
+            InputScaling.fit(kind, self._calibration),
+        ).to(self.device)
         self.quantized = QuantizedNetwork(self.network)
         self.loss = PrototypeLoss(options.dims).to(self.device)
         self.optimizer = torch.optim.AdamW(
@@ -139,10 +148,6 @@ class Trainer:
                 {"params": self.loss.parameters(), "weight_decay": 0.0},
             ],
             lr=options.learning_rate,
-        )
-        part = max(4096 // len(sequences), 1)
-        self._calibration = np.concatenate(
-            [s.descriptors[:: max(len(s.descriptors) // part, 1)][:part] for s in sequences]
         )
         self.step = 0
         self.seconds = 0.0
@@ -187,9 +192,9 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = options.rate(self.step)
         model = self.quantized if self.step >= options.quantized_from else self.network
-        signs = to_signs(batch.descriptors, self.device)
+        inputs = self.network.scaling.inputs(batch.descriptors, self.device)
         with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.half):
-            embeddings = model(signs)
+            embeddings = model(inputs)
         loss = self.loss(
             embeddings,
             torch.from_numpy(batch.landmarks).to(self.device),
@@ -210,7 +215,7 @@ class Trainer:
 
     def calibrate(self) -> None:
         """Set the ranges of `quantized` by descriptors of all training sequences."""
-        self.quantized.calibrate(to_signs(self._calibration, self.device))
+        self.quantized.calibrate(self.network.scaling.inputs(self._calibration, self.device))
 
     def _validate(self) -> ValidationStep:
         in_loop = self.step > self.options.quantized_from

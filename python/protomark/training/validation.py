@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protomark.evaluation.protocol import split
+from protomark.features.descriptors import InputKind
 from protomark.tracks.file import Tracks
 
-Embed = Callable[[NDArray[np.uint8]], NDArray[np.floating] | NDArray[np.int8]]
+Embed = Callable[[NDArray[Any]], NDArray[np.floating] | NDArray[np.int8]]
 
 
 @dataclass(frozen=True)
@@ -19,10 +21,11 @@ class Trial:
     """Support and queries of a sequence at a seed."""
 
     name: str
-    support: NDArray[np.uint8]  # (n, B) uint8, grouped by landmark
+    support: NDArray[Any]  # (n, b), grouped by landmark
     starts: NDArray[np.int64]  # (l,) int64, first row of each landmark in `support`
-    queries: NDArray[np.uint8]  # (q, B) uint8
+    queries: NDArray[Any]  # (q, b)
     targets: NDArray[np.int64]  # (q,) int64, landmarks of the queries, 0..l-1
+    kind: InputKind = "bits"  # what the descriptors are
 
     @property
     def landmarks(self) -> NDArray[np.int64]:
@@ -48,6 +51,7 @@ class Trial:
             starts,
             tracks.descriptors[drawn.query_rows],
             np.searchsorted(ids, landmark[drawn.query_rows]),
+            tracks.input,
         )
 
 
