@@ -54,6 +54,8 @@ def with_calibration(
         encoder.licence,
         {**encoder.notes, **notes, SOURCE_KEY: source},
         encoder.codebooks,
+        encoder.input,
+        encoder.input_scale,
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
-from protomark.features.sift import colmap_sift, root_sift
+from protomark.features.sift import OpenCvSift, colmap_sift
 from protomark.geometry.neighbours import near_pairs, runs
 
 # Two keypoints closer than this (pixels) are one image point, detected at two pyramid levels or at
@@ -121,7 +121,7 @@ class Extractor(threading.local):
         elif self.kind.name == "sift" and str(settings.get("name")).startswith("COLMAP"):
             self._detect, self._whole = [], colmap_sift(settings, 5 * max_keypoints)
         elif self.kind.name == "sift":
-            self._detect = [_sift(t).detect for t in _SIFT_THRESHOLDS]
+            self._detect = [OpenCvSift(t).detect for t in _SIFT_THRESHOLDS]
         elif str(settings.get("name")).startswith("GFTT"):  # RTAB-Map's
             self._detect = [_good_features(settings, 5 * max_keypoints).detect]
         else:
@@ -133,7 +133,7 @@ class Extractor(threading.local):
             "akaze": lambda: _opencv("AKAZE_create")(),
             "latch": lambda: _opencv("LATCH_create")(bytes=32),
             "beblid": lambda: _opencv("BEBLID_create")(1.0, _opencv("BEBLID_SIZE_512_BITS")),
-            "sift": lambda: _sift(_SIFT_THRESHOLDS[0]),
+            "sift": lambda: OpenCvSift(_SIFT_THRESHOLDS[0]),
             "teblid": lambda: _opencv("TEBLID_create")(1.0, _opencv("TEBLID_SIZE_256_BITS")),
         }[self.kind.name]().compute
 
@@ -158,14 +158,15 @@ class Extractor(threading.local):
             ) from None
         if descriptors is None or not len(described):
             descriptors = np.zeros((0, self.kind.bytes), np.uint8)
-        if self.kind.name == "sift" and descriptors.dtype != np.uint8:
-            descriptors = root_sift(descriptors)
         descriptors = np.ascontiguousarray(descriptors, np.uint8)
         if descriptors.shape != (len(described), self.kind.bytes):
             raise ValueError(
                 f"OpenCV returns {self.kind.name} descriptors of {descriptors.shape[1]} bytes, not "
                 f"{self.kind.bytes}: install another version"
             )
+        if self.kind.input != "bits":  # in an image of one grey they may be zero
+            rows = np.flatnonzero(descriptors.any(1))
+            described, descriptors = [described[i] for i in rows], descriptors[rows]
         n = len(described)
         xy = np.array([k.pt for k in described], np.float32).reshape(n, 2)
         sizes = np.array([k.size for k in described], np.float32)
@@ -222,11 +223,6 @@ class Extractor(threading.local):
         """The keypoints to keep, and whether they reach the limit."""
         chosen = _spread(found, image.shape[1], image.shape[0], self.max_keypoints)
         return [found[i] for i in chosen], len(chosen) >= self.max_keypoints
-
-
-def _sift(threshold: float) -> Any:
-    # Without the last option keypoints are a quarter of a pixel off.
-    return _opencv("SIFT_create")(contrastThreshold=threshold, enable_precise_upscale=True)
 
 
 def _good_features(detector: Mapping[str, Any], limit: int) -> Any:

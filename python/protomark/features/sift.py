@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,30 @@ def is_rooted(descriptors: NDArray[np.uint8]) -> bool:
             f"{NORM:.0f}"
         )
     return not len(rows) or float((rows.sum(1) / lengths).mean()) > _ROOTED_SUM
+
+
+class OpenCvSift:
+    """OpenCV's SIFT at COLMAP's scales, as RootSIFT.
+
+    Args:
+        threshold: smallest contrast of a keypoint, as OpenCV counts it: 0.02 is COLMAP's default.
+    """
+
+    def __init__(self, threshold: float) -> None:
+        # Without the last option keypoints are a quarter of a pixel off.
+        create = optional("cv2").SIFT_create
+        self._sift = create(contrastThreshold=threshold, enable_precise_upscale=True)
+
+    def detect(self, image: NDArray[np.uint8]) -> Sequence[Any]:
+        """OpenCV's keypoints of a (height, width) image."""
+        return self._sift.detect(image, None)
+
+    def compute(
+        self, image: NDArray[np.uint8], keypoints: Sequence[Any]
+    ) -> tuple[Sequence[Any], NDArray[np.uint8] | None]:
+        """Keypoints and their descriptors (n, 128)."""
+        keypoints, found = self._sift.compute(image, keypoints)
+        return keypoints, None if found is None else root_sift(found)
 
 
 def colmap_sift(

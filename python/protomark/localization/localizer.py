@@ -208,7 +208,7 @@ class Localizer:
 
         Args:
             keypoints: (n, 2) pixels; the centre of the upper left pixel is (0.5, 0.5).
-            descriptors: (n, bits / 8) uint8, of the kind that the map's encoder takes.
+            descriptors: (n, bytes) uint8, or (n, numbers) float32, as the map's encoder takes them.
             camera: the frame's camera.
             prior: see `localize`.
             focal_length: see `localize`.
@@ -223,7 +223,7 @@ class Localizer:
         """
         camera.check_lens()
         if descriptors is None:  # what OpenCV computes for no keypoints
-            descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)
+            descriptors = np.zeros((0, self.scene.encoder.bytes), np.uint8)
         if len(keypoints) != len(descriptors):
             raise ValueError(f"{len(keypoints)} keypoints, but {len(descriptors)} descriptors")
         _check_pixels(np.asarray(keypoints), camera)
@@ -272,8 +272,8 @@ class Localizer:
         plain = descriptor.removesuffix(SUFFIX)
         if plain not in DESCRIPTORS:
             raise ValueError(
-                f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
-                "compute: describe the keypoints yourself (in Python: localize_features)"
+                f"the map's encoder takes {descriptor} descriptors, which are not "
+                "computed here: describe the keypoints yourself (in Python: localize_features)"
             )
         detector, size = map_detector(self.scene), self.max_size
         if detector:  # of a program that describes images at their own size
