@@ -26,6 +26,7 @@ _SIFT_THRESHOLDS = (0.02, 0.0067)  # COLMAP's, and one for images with little co
 # Images whose longer side is larger are reduced to this many pixels before detection.
 MAX_SIZE = 1600
 _MIN_MAX_SIZE = 64
+MAX_KEYPOINTS = 2000  # per image, unless somebody wants others
 
 FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
 
@@ -90,7 +91,7 @@ class Extractor(threading.local):
     def __init__(
         self,
         name: str,
-        max_keypoints: int = 2000,
+        max_keypoints: int = MAX_KEYPOINTS,
         max_size: int = MAX_SIZE,
         detector: Mapping[str, Any] | None = None,
     ) -> None:
@@ -119,7 +120,7 @@ class Extractor(threading.local):
             self._detect = [a.detect for a in akaze]
             self._whole = akaze[-1].detectAndCompute
         elif self.kind.name == "sift" and str(settings.get("name")).startswith("COLMAP"):
-            self._detect, self._whole = [], colmap_sift(settings, 5 * max_keypoints)
+            self._detect, self._whole = [], colmap_sift(settings, max_keypoints)
         elif self.kind.name == "sift":
             self._detect = [OpenCvSift(t).detect for t in _SIFT_THRESHOLDS]
         elif str(settings.get("name")).startswith("GFTT"):  # RTAB-Map's
@@ -186,11 +187,9 @@ class Extractor(threading.local):
 
     def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
         """Selected keypoints and their descriptors."""
-        if self._whole is not None and not self._detect:
-            keypoints, descriptors = self._whole(image, None)
-            chosen = _spread(keypoints, image.shape[1], image.shape[0], self.max_keypoints)
-            return [keypoints[i] for i in chosen], descriptors[chosen] if chosen else None
         if self._whole is not None:
+            if not self._detect:  # COLMAP chooses keypoints itself
+                return self._whole(image, None)
             return self._describe_akaze(image, self._whole)
         for detect in self._detect:
             selected, enough = self._select(detect(image), image)
@@ -240,6 +239,11 @@ def _pyramid(detector: Mapping[str, Any]) -> dict[str, Any]:
         "nlevels": int(_setting(detector, "levels", 8, 1, 32)),
         "scaleFactor": _setting(detector, "scale_factor", 1.2, 1.01, 4),
     }
+
+
+def described_keypoints(detector: Mapping[str, Any]) -> int:
+    """How many keypoints a detector of other images gave at most: 2000 unless it says."""
+    return int(_setting(detector, "max_keypoints", MAX_KEYPOINTS, 1, 1_000_000))
 
 
 def _setting(

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from protomark.extras import optional
 
 NORM = 512.0  # of a descriptor, up to rounding
-# SIFT is cut at 0.2 of its length and RootSIFT is its root, so that the sum of its numbers, in
-# lengths, is 7.9 to 9.0 on average over an image, and 5.9 to 6.7 without the root.
-_ROOTED_SUM = 7.25
+# Of the numbers from 1 to 16, this share of RootSIFT's, and of SIFT's without the root, is 4 or less
+# at the most and at the least: small numbers are common, and their roots are not small.
+_ROOTED_SMALL, _PLAIN_SMALL = 0.34, 0.40
 
 
 def root_sift(descriptors: NDArray[Any]) -> NDArray[np.uint8]:
@@ -23,21 +23,18 @@ def root_sift(descriptors: NDArray[Any]) -> NDArray[np.uint8]:
     return np.minimum(np.rint(NORM * np.sqrt(share)), 255).astype(np.uint8)
 
 
-def is_rooted(descriptors: NDArray[np.uint8]) -> bool:
-    """Whether (n, 128) bytes of many keypoints are RootSIFT already, which their sum tells.
+def is_rooted(descriptors: NDArray[np.uint8]) -> tuple[bool, bool]:
+    """Whether (n, 128) bytes of many keypoints are RootSIFT already, and whether that is certain.
 
     Raises:
         ValueError: they are not SIFT, as their length is not 512.
     """
-    rows = descriptors.astype(np.float32)
-    rows = rows[rows.any(1)]
-    lengths = np.linalg.norm(rows, axis=1)
-    if len(rows) and abs(float(np.median(lengths)) / NORM - 1) > 0.1:
-        raise ValueError(
-            f"descriptors of 128 numbers with a length of {np.median(lengths):.0f}, where SIFT has "
-            f"{NORM:.0f}"
-        )
-    return not len(rows) or float((rows.sum(1) / lengths).mean()) > _ROOTED_SUM
+    length = float(np.median(np.linalg.norm(descriptors.astype(np.float32), axis=1)))
+    if not 0.9 < length / NORM < 1.1:
+        raise ValueError(f"vectors of length {length:.0f}, where SIFT has {NORM:.0f}")
+    counts = np.bincount(descriptors.ravel(), minlength=256)
+    small = counts[1:5].sum() / max(counts[1:17].sum(), 1)
+    return small < (_ROOTED_SMALL + _PLAIN_SMALL) / 2, not _ROOTED_SMALL < small < _PLAIN_SMALL
 
 
 class OpenCvSift:
@@ -53,8 +50,15 @@ class OpenCvSift:
         self._sift = create(contrastThreshold=threshold, enable_precise_upscale=True)
 
     def detect(self, image: NDArray[np.uint8]) -> Sequence[Any]:
-        """OpenCV's keypoints of a (height, width) image."""
-        return self._sift.detect(image, None)
+        """Keypoints of a (height, width) image, the largest first.
+
+        Their size is their response, as large ones are found again more often than contrasting
+        ones (docs/results/sift.md).
+        """
+        found = sorted(self._sift.detect(image, None), key=lambda k: -k.size)
+        for keypoint in found:
+            keypoint.response = keypoint.size
+        return found
 
     def compute(
         self, image: NDArray[np.uint8], keypoints: Sequence[Any]
@@ -67,11 +71,10 @@ class OpenCvSift:
 def colmap_sift(
     detector: Mapping[str, Any], limit: int
 ) -> Callable[[NDArray[np.uint8], None], tuple[list[Any], NDArray[np.uint8]]]:
-    """COLMAP's extractor with its defaults, for up to about `limit` keypoints of the largest scale.
+    """COLMAP's extractor with its defaults, for up to `limit` keypoints, the largest.
 
     Returns:
-        A function like OpenCV's `detectAndCompute`. COLMAP knows no response, and prefers large
-        keypoints: their scale is their response.
+        A function like OpenCV's `detectAndCompute`; a keypoint's response is its size.
     """
     from protomark.geometry.colmap import pycolmap, quiet
 
@@ -86,9 +89,11 @@ def colmap_sift(
         found, descriptors = extractor.extract_from_uint8_array(image)
         keypoints = []
         for k in found:
-            scale, turn = k.compute_scale(), np.degrees(k.compute_orientation())
-            at = (k.x - 0.5, k.y - 0.5, 2 * scale, turn % 360, scale, round(np.log2(scale)))
-            keypoints.append(cv2.KeyPoint(*at))
-        return keypoints, np.asarray(descriptors.data, np.uint8)
+            size, turn = 2 * k.compute_scale(), np.degrees(k.compute_orientation())
+            octave = round(np.log2(size / 2))
+            keypoints.append(cv2.KeyPoint(k.x - 0.5, k.y - 0.5, size, turn % 360, size, octave))
+        # COLMAP leaves out whole octaves, and keeps some more than the limit.
+        order = np.argsort([-k.size for k in keypoints], kind="stable")[:limit]
+        return [keypoints[i] for i in order], np.asarray(descriptors.data, np.uint8)[order]
 
     return extract

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.features.descriptors import DESCRIPTORS
-from protomark.features.extractor import MAX_SIZE, Extractor, Features
+from protomark.features.extractor import MAX_SIZE, Extractor, Features, described_keypoints
 from protomark.features.images import read_gray, to_gray
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.geometry.absolute_pose import FocalLength
@@ -56,7 +56,8 @@ class Localizer:
     Args:
         scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
             that `protomark map` wrote.
-        max_keypoints: limit on keypoints per image: the strongest, spread over the image.
+        max_keypoints: limit on keypoints per image: the strongest, spread over the image; None: as
+            many as an image of the map had, if the map knows, or 2000.
         max_size: images whose longer side has more pixels are reduced to it before detection.
         min_probability: smallest probability of an accepted match, in [0, 1].
         recall: in a map with an index, the share of nearest landmarks that an approximate search
@@ -73,7 +74,7 @@ class Localizer:
         self,
         scene: pm.PrototypeMap | pm.SealedMap | str | Path,
         *,
-        max_keypoints: int = 2000,
+        max_keypoints: int | None = None,
         max_size: int = MAX_SIZE,
         min_probability: float = MIN_PROBABILITY,
         recall: float | None = None,
@@ -279,7 +280,8 @@ class Localizer:
         if detector:  # of a program that describes images at their own size
             sides = [max(c.width, c.height) for c in self.cameras.cameras]
             size = min([size, max(sides, default=size)])
-        return Extractor(plain, self.max_keypoints, size, detector)
+        limit = self.max_keypoints or described_keypoints(detector)
+        return Extractor(plain, limit, size, detector)
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:
         features = self._extractor(image)

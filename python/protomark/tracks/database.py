@@ -179,9 +179,11 @@ def _to_root_sift(
         if not full.all():
             empty += int((~full).sum())
             features[i], labels[i] = found.where(full), labels[i][full]
-    sample = [f.descriptors for f in features[:: -(-len(features) // _SAMPLE)]]
+    sample = [f.descriptors for f in features[:: -(-len(features) // _SAMPLE)] if len(f)]
+    if not sample:
+        raise ValueError(f"{database}: no keypoint of the model's images has a descriptor")
     try:
-        rooted = is_rooted(np.concatenate(sample))
+        rooted, certain = is_rooted(np.concatenate(sample))
     except ValueError as error:
         raise ValueError(
             f"{database} has {error}: name the folder of the images in its place, which are "
@@ -191,10 +193,13 @@ def _to_root_sift(
         for found in features:
             found.descriptors = root_sift(found.descriptors)
     upright = all(not (found.angles % 360).any() for found in features)
-    source: dict[str, Any] = {} if rooted else {"note": "SIFT, its root taken here"}
+    source: dict[str, Any] = {}
+    if not (rooted and certain):
+        source["note"] = "taken for RootSIFT" if rooted else "SIFT, whose root is taken"
     if empty:
         source["dropped"] = {"keypoints whose descriptor is zero": empty}
-    return {"source": source, "detector": {"name": "COLMAP"} | ({"upright": True} if upright else {})}
+    detector: dict[str, Any] = {"name": "COLMAP", "max_keypoints": max(map(len, features))}
+    return {"source": source, "detector": detector | ({"upright": True} if upright else {})}
 
 
 def read_features(database: Path, descriptor: str, width: int) -> dict[str, Features]:
