@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 ENCODER, LEARNING_MAP, SEALED_MAP = 1, 2, 3
+BITS, UINT8, FLOAT32 = 0, 1, 2  # what descriptors consist of
 
 
 def sections(data: bytes, *kinds: int) -> dict[str, bytes]:
@@ -115,10 +116,16 @@ class Encoder:
             bias, multipliers, table = take("<i4", outputs), take("<i4", outputs), take("u1", 256)
             weights = take("i1", outputs * inputs).reshape(outputs, inputs).astype(np.int64)
             self.layers.append((weights, bias, multipliers, shift, table))
+        self.input, self.input_scale = struct.unpack("<If", network.read() or bytes(8))
 
     def encode(self, descriptors: Any, dim: int) -> Any:
-        """Encode descriptors (n, bits / 8) uint8 as codes (n, dim), integers."""
-        x = np.unpackbits(descriptors, axis=1, bitorder="little").astype(np.int64)
+        """Encode descriptors (n, bits / 8) or vectors (n, d) as codes (n, dim), integers."""
+        x = descriptors
+        if self.input == BITS:
+            x = np.unpackbits(x, axis=1, bitorder="little")
+        elif self.input == FLOAT32:
+            x = np.clip(np.rint(x * np.float32(self.input_scale)), -127, 127) + 128
+        x = x.astype(np.int64)
         for weights, bias, multipliers, shift, table in self.layers:
             t = ((x @ weights.T + bias) * multipliers + (1 << (shift - 1))) >> shift
             x = table[np.clip(t, -128, 127) + 128].astype(np.int64)

@@ -48,14 +48,14 @@ def protomark(*arguments: Any) -> subprocess.CompletedProcess[str]:
 
 
 def random_layers(
-    widths: list[int], seed: int = 0, weight_limit: int = 127
+    widths: list[int], seed: int = 0, weight_limit: int = 127, input: str = "bits"
 ) -> list[dict[str, Any]]:
     """Integer layers whose sums spread over the whole range of the activation table."""
     rng = np.random.default_rng(seed)
     layers = []
     for i, (inputs, outputs) in enumerate(pairwise(widths)):
         last = i == len(widths) - 2
-        spread = (0.5 if i == 0 else 128) * weight_limit * inputs**0.5
+        spread = (0.5 if i == 0 and input == "bits" else 128) * weight_limit * inputs**0.5
         layers.append(
             {
                 "weights": rng.integers(-weight_limit, weight_limit + 1, (outputs, inputs)).astype(
@@ -84,9 +84,18 @@ def random_codebooks(*shapes: tuple[int, int]) -> list[NDArray[np.int8]]:
 CODEBOOKS = random_codebooks((5, 1), (6, 2), (4, 3))
 
 
-def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8]) -> Any:
+def reference_encode(
+    layers: list[dict[str, Any]],
+    descriptors: NDArray[Any],
+    input: str = "bits",
+    input_scale: float = 0.0,
+) -> Any:
     """The definition in core/include/protomark/encoder.h, in NumPy."""
-    x = np.unpackbits(descriptors, axis=1, bitorder="little")
+    x: NDArray[Any] = descriptors
+    if input == "bits":
+        x = np.unpackbits(descriptors, axis=1, bitorder="little")
+    elif input == "float32":
+        x = np.clip(np.rint(descriptors * np.float32(input_scale)), -127, 127) + 128
     for layer in layers:
         # Sums stay far below 2^53, so float64 matrix products are exact, and fast.
         products = x.astype(np.float64) @ layer["weights"].T.astype(np.float64)
@@ -100,6 +109,32 @@ def reference_encode(layers: list[dict[str, Any]], descriptors: NDArray[np.uint8
 
 def random_descriptors(n: int, bits: int = 64, seed: int = 0) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, (n, bits // 8), dtype=np.uint8)
+
+
+def vector_encoder(input: str, width: int = 20) -> pm.Encoder:
+    """Numbers of a type to 12 dimensions."""
+    layers = random_layers([width, 24, 12], seed=3, input=input)
+    scale = 30.0 if input == "float32" else 0.0
+    return pm.Encoder(
+        layers,
+        [5, 12],
+        name="vectors",
+        descriptor="test",
+        scale=0.02,
+        codebooks=CODEBOOKS,
+        input=input,
+        input_scale=scale,
+    )
+
+
+def descriptors_for(encoder: pm.Encoder, n: int, seed: int = 0) -> NDArray[Any]:
+    """Random descriptors that an encoder takes."""
+    rng = np.random.default_rng(seed)
+    if encoder.input != "float32":
+        return rng.integers(0, 256, (n, encoder.bytes), dtype=np.uint8)
+    # Halves of quantised numbers, up to twice as large as the largest one.
+    halves = rng.integers(-508, 509, (n, encoder.inputs)) / 2
+    return (halves / encoder.input_scale).astype(np.float32)
 
 
 def rounded(means: Any) -> Any:

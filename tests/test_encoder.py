@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import CODEBOOKS, random_descriptors, random_layers, reference_encode
+from conftest import (
+    CODEBOOKS,
+    descriptors_for,
+    random_descriptors,
+    random_layers,
+    reference_encode,
+    vector_encoder,
+)
 
 
 @settings(max_examples=40, deadline=None)
@@ -33,6 +40,31 @@ def test_codes_follow_their_definition(
     expected = reference_encode(layers, descriptors)
     np.testing.assert_array_equal(encoder.encode(descriptors), expected)
     np.testing.assert_array_equal(encoder.encode(descriptors, threads=3), expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    input=st.sampled_from(["uint8", "float32"]),
+    width=st.one_of(st.sampled_from([16, 64, 128, 130, 1024]), st.integers(16, 300)),
+    hidden=st.lists(st.integers(1, 70), max_size=2),
+    dim=st.integers(1, 70),
+    n=st.integers(0, 140),
+    input_scale=st.floats(2.0**-100, 2.0**100, width=32),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_codes_of_vectors_follow_their_definition(
+    input: str, width: int, hidden: list[int], dim: int, n: int, input_scale: float, seed: int
+) -> None:
+    kind: dict[str, Any] = {"input": input}
+    if input == "float32":
+        kind["input_scale"] = input_scale
+    layers = random_layers([width, *hidden, dim], seed, input=input)
+    encoder = pm.Encoder(layers, [dim], name="x", descriptor="x", scale=1.0, **kind)
+    descriptors = descriptors_for(encoder, n, seed)
+    with np.errstate(over="ignore"):
+        expected = reference_encode(layers, descriptors, **kind)
+    for threads in (1, 3):
+        np.testing.assert_array_equal(encoder.encode(descriptors, threads=threads), expected)
 
 
 @pytest.mark.parametrize(
@@ -219,6 +251,122 @@ def test_codebooks(encoder: pm.Encoder) -> None:
 def test_dims_that_do_not_fit(layers: list[dict[str, Any]], dims: list[int]) -> None:
     with pytest.raises(ValueError, match="dims must ascend"):
         pm.Encoder(layers, dims, name="x", descriptor="x", scale=1.0)
+
+
+@pytest.mark.parametrize("input", ["uint8", "float32"])
+def test_model_file_of_vectors(input: str, tmp_path: Path) -> None:
+    made = vector_encoder(input)
+    made.save(tmp_path / "x.pme")
+    read = pm.Encoder.load(tmp_path / "x.pme")
+    size = 20 if input == "uint8" else 80
+    for encoder in (made, read, read.with_codebooks(())):
+        assert (encoder.input, encoder.inputs) == (input, 20)
+        assert (encoder.bytes, encoder.bits) == (size, 8 * size)
+        assert encoder.input_scale == (30 if input == "float32" else 0)
+        assert encoder.identity == made.identity
+    assert repr(read) == f"<protomark.Encoder 'vectors': 20 {input} -> 12 int8>"
+    descriptors = descriptors_for(made, 50)
+    np.testing.assert_array_equal(read.encode(descriptors), made.encode(descriptors))
+
+
+@pytest.mark.parametrize(
+    ("width", "kind", "message"),
+    [
+        (64, {"input": "int8"}, "input must be bits, uint8 or float32, not 'int8'"),
+        (64, {"input_scale": 1.0}, "input_scale is for float32 alone"),
+        (64, {"input": "uint8", "input_scale": 1.0}, "input_scale is for float32 alone"),
+        (64, {"input": "float32"}, "input_scale must be positive for float32, not 0"),
+        (64, {"input": "float32", "input_scale": -1.0}, "must be positive"),
+        (64, {"input": "float32", "input_scale": float("nan")}, "must be positive"),
+        (64, {"input": "float32", "input_scale": float("inf")}, "must be positive"),
+        (15, {"input": "uint8"}, "has 16 to 1024 numbers, not 15"),
+        (1025, {"input": "uint8"}, "has 16 to 1024 numbers, not 1025"),
+        (72, {}, None),
+        (16, {}, "64 to 1024 bits"),
+    ],
+)
+def test_inputs_that_do_not_fit(width: int, kind: dict[str, Any], message: str | None) -> None:
+    layers = random_layers([width, 12])
+
+    def make() -> pm.Encoder:
+        return pm.Encoder(layers, [12], name="x", descriptor="x", scale=1.0, **kind)
+
+    if message is None:
+        assert make().input == "bits"
+        return
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_sums_of_bytes_beyond_32_bits() -> None:
+    layers = random_layers([1024, 12])
+    layers[0]["weights"][:] = 127
+    layers[0]["bias"][:] = 2**31 - 1 - 127 * 1024 * 255
+    kind: dict[str, Any] = {"dims": [12], "name": "x", "descriptor": "x", "scale": 1.0}
+    encoder = pm.Encoder(layers, **kind, input="uint8")
+    extreme = np.full((2, 1024), 255, np.uint8)
+    np.testing.assert_array_equal(
+        encoder.encode(extreme), reference_encode(layers, extreme, "uint8")
+    )
+    layers[0]["bias"][3] += 1
+    with pytest.raises(ValueError, match="sums of output 3 could leave 32 bits"):
+        pm.Encoder(layers, **kind, input="uint8")
+    assert pm.Encoder(layers, **kind).bits == 1024
+
+
+@pytest.mark.parametrize("input", ["uint8", "float32"])
+def test_vectors_that_are_refused(input: str, tmp_path: Path) -> None:
+    encoder = vector_encoder(input)
+    n = 9000  # more than are encoded at a time
+    good = descriptors_for(encoder, n)
+    ids = np.arange(n) // 2
+    scene = pm.PrototypeMap(encoder)
+    scene.add(ids, good)
+    prototypes = scene.prototypes(scene.ids)
+    sealed = scene.seal(tmp_path / "sealed.pmk", ids, good, bytes_per_landmark=4)
+    path = tmp_path / "no.pmk"
+    calls = (
+        encoder.encode,
+        lambda d: scene.add(ids, d),
+        lambda d: scene.add(ids, d, threads=3),
+        lambda d: scene.subtract(ids, d),
+        lambda d: scene.seal(path, ids, d, bytes_per_landmark=4),
+        scene.search,
+        sealed.search,
+        lambda d: pm.match(scene, d),
+        lambda d: pm.match(sealed, d),
+    )
+
+    def refused(descriptors: Any, error: type[Exception], message: str) -> None:
+        for call in calls[:-2] if error is ValueError else calls:  # match asks for a calibration
+            with pytest.raises(error, match=message):
+                call(descriptors)
+
+    kind = {"uint8": np.uint8, "float32": np.float32}[input]
+    for other in (np.uint8, np.float32, np.float64, np.float16, np.int32, bool, ">f4"):
+        if other is not kind:
+            wrong = rf"descriptors: a \(n, 20\) {input} array is needed, not .* \(9000, 20\)"
+            refused(good.astype(other), TypeError, wrong)
+    refused(good[0], TypeError, rf"{input} array is needed, not {input} \(20,\)")
+    size = good.dtype.itemsize
+    refused(
+        good[:, :19],
+        ValueError,
+        f"descriptors have {19 * size} bytes, encoder 'vectors' takes {20 * size}",
+    )
+    for value in (0, np.nan, np.inf, -np.inf) if input == "float32" else (0,):
+        bad = good.copy()
+        bad[8500, :] = value
+        bad[8700] = value
+        why = "has a NaN or an infinity" if value else "is all zeros"
+        refused(bad, ValueError, f"descriptors: row 8500 {why}")
+    assert not path.exists()
+    np.testing.assert_array_equal(scene.prototypes(scene.ids), prototypes)
+    # Whatever the strides.
+    np.testing.assert_array_equal(encoder.encode(good[::-2]), encoder.encode(good)[::-2])
+    np.testing.assert_array_equal(encoder.encode(np.asfortranarray(good)), encoder.encode(good))
+    scene.subtract(ids, good)
+    assert len(scene) == 0
 
 
 def test_unknown_encoder_is_named() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from conftest import random_descriptors
 from protomark.baselines import hashing, quantization
 from protomark.baselines.hashing import SignMap, iterative_quantization, random_hyperplanes
-from protomark.baselines.linear import mean_of_bits, principal_components
+from protomark.baselines.linear import real_mean, principal_components
 from protomark.baselines.quantization import k_means, nearest_words, product_quantized_mean
 from protomark.baselines.support import Support
 from protomark.evaluation.methods import choose_methods, method_choices
@@ -60,7 +60,7 @@ def test_words_of_fewer_values() -> None:
 
 def test_as_many_words_as_landmarks_are_the_means() -> None:
     support, queries = support_of(200), random_descriptors(30)
-    expected = mean_of_bits(support).match(queries)
+    expected = real_mean(support).match(queries)
     found = product_quantized_mean(support, 4).match(queries)
     assert found[1] == pytest.approx(expected[1], abs=1e-4)
 

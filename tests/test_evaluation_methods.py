@@ -27,7 +27,7 @@ from protomark.baselines.binary import (
 from protomark.baselines.linear import (
     RIDGE,
     linear_discriminants,
-    mean_of_bits,
+    real_mean,
     principal_components,
     projected_mean,
 )
@@ -61,7 +61,7 @@ def test_support_groups_and_counts(data: Observations, rows: int) -> None:
         start, count = support.starts[i], support.counts[i]
         assert support.ids[i] == landmark
         assert np.array_equal(support.descriptors[start : start + count], descriptors)
-        assert np.array_equal(support.bit_sums[i], unpack_bits(descriptors).astype(int).sum(axis=0))
+        assert np.array_equal(support.sums[i], unpack_bits(descriptors).astype(int).sum(axis=0))
     pieces = list(support.pieces(rows))
     assert [first for first, _ in pieces] == [0, *[last for _, last in pieces[:-1]]]
     assert pieces[-1][1] == len(support.ids)
@@ -147,10 +147,10 @@ def test_unaggregated_finds_distinct_landmarks(data: Observations, seed: int) ->
 
 
 @given(observations(), st.integers(0, 2**32 - 1), st.integers(1, 2))
-def test_mean_of_bits_finds_the_nearest_means(data: Observations, seed: int, threads: int) -> None:
+def test_real_mean_finds_the_nearest_means(data: Observations, seed: int, threads: int) -> None:
     queries = random_descriptors(5, bits=16, seed=seed)
     own = {i: unpack_bits(d).mean(axis=0, dtype=np.float64) for i, d in groups(data).items()}
-    ids, distances = mean_of_bits(Support(*data)).match(queries, threads=threads)
+    ids, distances = real_mean(Support(*data)).match(queries, threads=threads)
     for query, row, far in zip(unpack_bits(queries).astype(float), ids, distances, strict=True):
         every = {i: float(np.linalg.norm(query - own[i])) for i in own}
         expected = sorted(every.values())[:2]
@@ -167,7 +167,7 @@ def test_equal_vectors_give_the_smaller_id_across_blocks() -> None:
     """More landmarks than one block of the search holds, all with the same descriptor."""
     ids = np.arange(5000)
     support = Support(np.repeat(ids, 2), np.tile(random_descriptors(1), (10_000, 1)))
-    for method in (mean_of_bits(support), unaggregated(support)):
+    for method in (real_mean(support), unaggregated(support)):
         found, _ = method.match(random_descriptors(3, seed=1))
         assert found.tolist() == [[0, 1]] * 3
 

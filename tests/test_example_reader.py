@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import protomark as pm
-from conftest import random_descriptors, rounded
+from conftest import descriptors_for, random_descriptors, rounded, vector_encoder
 from map_container import READER
 from sealing import in_words
 
@@ -24,10 +24,13 @@ def scene(encoder: pm.Encoder, dim: int, appearance_bits: int, step: int) -> pm.
     return scene
 
 
-def test_the_same_codes(encoder: pm.Encoder, tmp_path: Path) -> None:
+@pytest.mark.parametrize("input", ["bits", "uint8", "float32"])
+def test_the_same_codes(input: str, encoder: pm.Encoder, tmp_path: Path) -> None:
+    if input != "bits":
+        encoder = vector_encoder(input)
     encoder.save(tmp_path / "x.pme")
     read = READER["Encoder"]((tmp_path / "x.pme").read_bytes())
-    descriptors = random_descriptors(200)
+    descriptors = descriptors_for(encoder, 200)
     assert read.dims == encoder.dims
     for dim in encoder.dims:
         np.testing.assert_array_equal(

@@ -16,7 +16,8 @@ namespace fs = std::filesystem;
 
 namespace {
 
-std::shared_ptr<const Encoder> small_encoder(std::size_t dim, std::size_t layers) {
+std::shared_ptr<const Encoder> small_encoder(std::size_t dim, std::size_t layers,
+                                             EncoderInput input = {}) {
   test::Random random(static_cast<std::uint32_t>(dim + layers));
   std::vector<Layer> built;
   std::size_t width = 64;
@@ -32,7 +33,8 @@ std::shared_ptr<const Encoder> small_encoder(std::size_t dim, std::size_t layers
                              dim % 3 == 0 ? 3
                              : dim > 1    ? 2
                                           : 1,
-                             dim)}));
+                             dim)},
+      input));
 }
 
 void fill(PrototypeMap& map, std::size_t landmarks, std::int64_t step, bool positions) {
@@ -96,6 +98,8 @@ int main(int argc, char** argv) try {
   plain->save(folder / "encoder" / "plain");
   deep->save(folder / "encoder" / "deep");
   flat->save(folder / "encoder" / "flat");
+  small_encoder(4, 2, {InputKind::uint8, 0})->save(folder / "encoder" / "bytes");
+  small_encoder(4, 2, {InputKind::float32, 30})->save(folder / "encoder" / "floats");
 
   int number = 0;
   for (const auto& encoder : {plain, deep, flat}) {
