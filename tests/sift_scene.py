@@ -75,9 +75,7 @@ def sift_encoder() -> pm.Encoder:
     books: list[NDArray[np.int8]] = [
         rng.integers(-127, 128, (48 // width, 256, width)).astype(np.int8) for width in (1, 2, 4)
     ]
-    encoder = pm.Encoder(
-        [layer], [16, 48], "sift", "sift", 0.02, codebooks=books, input="uint8"
-    )
+    encoder = pm.Encoder([layer], [16, 48], "sift", "sift", 0.02, codebooks=books, input="uint8")
     fitted = MatchCalibration((-2.0, -1e-4, 3e-4))
     return with_calibration(
         encoder, {(d, tuned): fitted for d in (16, 48) for tuned in (False, True)}, "none"

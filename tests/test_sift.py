@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import sqlite3
 from pathlib import Path
@@ -26,7 +26,7 @@ from protomark.maps.origin import map_detector
 from protomark.tracks.database import read_features, stored_descriptor, tracks_from_database
 from sift_scene import sift_encoder, write_sift_scene
 
-SHARED = Path(__file__).parents[1] / "shared" / "data"
+SHARED = Path(os.environ.get("PROTOMARK_SHARED", Path(__file__).parents[2] / "shared")) / "data"
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,8 @@ def test_a_map_of_a_database(scene: Path, built: Path) -> None:
     made = pm.open(built)
     assert len(made) == len(found.landmark_ids)
     assert np.allclose(made.positions(np.array([7])), [point.xyz])
-    assert map_detector(made)["name"] == "COLMAP"
+    most = max(len(one) for one in features.values())
+    assert map_detector(made) == {"name": "COLMAP", "max_keypoints": most}
     assert len(pm.open(built.with_suffix(".sealed.pmk"))) == len(made)
 
 
@@ -115,8 +116,8 @@ def test_sift_without_root(scene: Path, tmp_path: Path) -> None:
     model = scene / "points"
     rooted = tracks_from_database(scene / "database.db", model, "sift")
     found = tracks_from_database(path, model, "sift")
-    off = np.abs(found.descriptors.astype(int) - rooted.descriptors)
-    assert off.mean() < 2  # small numbers lose most of their digits
+    off = distances(found.descriptors, rooted.descriptors, "uint8")
+    assert float(np.median(off)) < 40  # small numbers lose most of their digits
     assert "root" in found.info["source"]["note"]
     assert "note" not in rooted.info["source"]
 
@@ -142,7 +143,7 @@ def test_keypoints_without_a_descriptor(scene: Path, tmp_path: Path) -> None:
 
 def test_databases_that_are_no_sift(scene: Path, tmp_path: Path) -> None:
     path = changed(scene, tmp_path / "half.db", lambda _, rows: rows // 2)
-    with pytest.raises(ValueError, match=r"half.db has .* length of 2\d\d, where SIFT has 512"):
+    with pytest.raises(ValueError, match=r"half.db has .* length 2\d\d, where SIFT has 512"):
         tracks_from_database(path, scene / "points", "sift")
 
 
@@ -161,9 +162,7 @@ def test_keypoints_of_another_model(scene: Path, tmp_path: Path) -> None:
     shutil.copy(scene / "database.db", path)
     connection.close()
     connection = sqlite3.connect(path)
-    (data,) = connection.execute(
-        f"SELECT data FROM keypoints WHERE image_id = {number}"
-    ).fetchone()
+    (data,) = connection.execute(f"SELECT data FROM keypoints WHERE image_id = {number}").fetchone()
     points = np.frombuffer(data, "<f4") * np.float32(1.1)
     connection.execute(
         f"UPDATE keypoints SET data = ? WHERE image_id = {number}", (points.tobytes(),)
@@ -177,14 +176,14 @@ def test_keypoints_of_another_model(scene: Path, tmp_path: Path) -> None:
 def test_both_extractors_see_the_same(scene: Path) -> None:
     image = read_gray(scene / "images" / "img3.png")
     opencv = Extractor("sift", 2000)(image)
-    colmap = Extractor("sift", 2000, detector={"name": "COLMAP"})(image)
+    colmap = Extractor("sift", 600, detector={"name": "COLMAP"})(image)
     stored = read_features(scene / "database.db", "sift", 128)["img3.png"]
     for features in (opencv, colmap, stored):
-        assert is_rooted(features.descriptors)
+        assert is_rooted(features.descriptors)[0]
         assert features.descriptors.any(1).all()
     gap = np.linalg.norm(colmap.keypoints[:, None] - stored.keypoints, axis=2)
     same = (gap < 0.1) & (np.abs(colmap.angles[:, None] - stored.angles) < 1)
-    assert same.any(0).mean() > 0.9
+    assert same.any(1).mean() > 0.9
     gap = np.linalg.norm(opencv.keypoints[:, None] - colmap.keypoints, axis=2)
     turn = np.abs((opencv.angles[:, None] - colmap.angles + 180) % 360 - 180)
     one, other = np.nonzero((gap < 0.5) & (turn < 5))
@@ -227,7 +226,9 @@ def test_distances_are_exact(seed: int, rows: int, queries: int, top: int) -> No
     assert np.array_equal(index, order)
     expected = np.sqrt(np.take_along_axis(squares, order, 1).astype(np.float32))
     assert np.array_equal(off, expected)
-    assert np.array_equal(distances(one[:1], other[:1], "uint8"), np.sqrt(squares[:1, 0], dtype=np.float32))
+    assert np.array_equal(
+        distances(one[:1], other[:1], "uint8"), np.sqrt(squares[:1, 0], dtype=np.float32)
+    )
 
 
 def test_root_sift() -> None:
@@ -245,6 +246,5 @@ def test_root_sift() -> None:
 def test_real_images_tell_the_norm(sequence: str) -> None:
     path = sorted((SHARED / sequence / "images").iterdir())[0]
     rooted = Extractor("sift", 1000)(read_gray(path)).descriptors
-    assert is_rooted(rooted)
-    assert not is_rooted(without_root(rooted))
-    assert json.dumps(sequence)
+    assert is_rooted(rooted) == (True, True)
+    assert is_rooted(without_root(rooted)) == (False, True)

@@ -280,7 +280,8 @@ class Localizer:
         if detector:  # of a program that describes images at their own size
             sides = [max(c.width, c.height) for c in self.cameras.cameras]
             size = min([size, max(sides, default=size)])
-        limit = self.max_keypoints or described_keypoints(detector)
+        limit = self.max_keypoints
+        limit = described_keypoints(detector) if limit is None else limit
         return Extractor(plain, limit, size, detector)
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:

@@ -99,7 +99,8 @@ def survey(
         if i + step < len(frames)
     ]
     following = [
-        len(_pair(one, other, kind).first) >= _FOLLOWING * len(one[1]) for one, other in pairwise(frames)
+        len(_pair(one, other, kind).first) >= _FOLLOWING * len(one[1])
+        for one, other in pairwise(frames)
     ]
     return Survey(
         [pair for pair in pairs if len(pair.first) >= _MIN_MATCHES],

@@ -426,9 +426,7 @@ def _complete(
     added = merged = 0
     for step in range(_COMPLETION_PASSES):
         progress("complete", step, _COMPLETION_PASSES)
-        counts = completion.complete(
-            scene, partners, options.max_error, max_distance, options.kind
-        )
+        counts = completion.complete(scene, partners, options.max_error, max_distance, options.kind)
         added, merged = added + counts[0], merged + counts[1]
         completion.clean(scene, options.max_error, options.min_angle, 2)
     completion.clean(scene, options.max_error, options.min_angle, options.min_length)
