@@ -145,7 +145,9 @@ def test_methods_of_vectors_by_their_definition(seed, spread):
     order = np.argsort(nearest, axis=1, kind="stable")[:, :2]
     found, distances = unaggregated(support).match(queries)
     np.testing.assert_array_equal(found, ids[order])
-    np.testing.assert_array_equal(np.rint(distances**2), np.take_along_axis(nearest, order, axis=1))
+    np.testing.assert_array_equal(
+        np.rint(distances**2), np.take_along_axis(nearest, order, axis=1)
+    )
     for i in ids:
         own = x[landmarks == i].astype(int)
         each = np.sort(np.square(own[:, None] - own[None]).sum(2), axis=1)

@@ -46,7 +46,7 @@ def tracks(
         Path | None,
         typer.Option(
             "--database",
-            help="COLMAP database with SIFT or binary descriptors: its descriptors and the model's points "
+            help="COLMAP database with SIFT or binary descriptors: these and the model's points "
             "become the tracks, and images are not read.",
         ),
     ] = None,

@@ -166,7 +166,7 @@ class Extractor(threading.local):
                 f"{self.kind.bytes}: install another version"
             )
         if self.kind.input != "bits":  # in an image of one grey they may be zero
-            rows = np.flatnonzero(descriptors.any(1))
+            rows = np.flatnonzero(descriptors.any(1)).tolist()
             described, descriptors = [described[i] for i in rows], descriptors[rows]
         n = len(described)
         xy = np.array([k.pt for k in described], np.float32).reshape(n, 2)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from protomark.extras import optional
 
 NORM = 512.0  # of a descriptor, up to rounding
-# Of the numbers from 1 to 16, this share of RootSIFT's, and of SIFT's without the root, is 4 or less
-# at the most and at the least: small numbers are common, and their roots are not small.
+# Of the numbers from 1 to 16 at most the first share of RootSIFT's is 4 or less, and at least the
+# second of SIFT's without the root: small numbers are common, and their roots are not small.
 _ROOTED_SMALL, _PLAIN_SMALL = 0.34, 0.40
 
 

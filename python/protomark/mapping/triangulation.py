@@ -18,9 +18,10 @@ def triangulate(
 ) -> list[tuple[int, int]]:
     """Match a frame with those of the window, create landmarks, and continue existing tracks.
 
-    Matches are mutual nearest neighbours that pass the ratio test and lie near the epipolar line. Two keypoints without a landmark create one if the angle of their rays is
-    wide enough and the landmark projects back to both. If one of them observes a landmark already,
-    the other observes it, too, provided that it projects there.
+    Matches are mutual nearest neighbours that pass the ratio test and lie near the epipolar line.
+    Two keypoints without a landmark create one if the angle of their rays is wide enough and the
+    landmark projects back to both. If one of them observes a landmark already, the other observes
+    it, too, provided that it projects there.
 
     Returns pairs of landmarks whose keypoints match, so that they may be duplicates.
     """

@@ -16,7 +16,7 @@ from protomark.tracks.file import Tracks
 from protomark.tracks.sqlite import has_tables, open_database
 
 _MAX_PIXEL = 1e9  # a product of two such numbers is still a float32
-# Pixels between a keypoint of model and database: some programs count from the first pixel's corner.
+# Pixels between a keypoint of model and database, as some programs count from another corner.
 _MAX_SHIFT = 1.0
 _SAMPLE = 100  # so many images tell whether SIFT is RootSIFT
 
@@ -175,7 +175,7 @@ def _to_root_sift(
     """Make the descriptors of all images RootSIFT, in place; returns what `info` says of it."""
     empty = 0
     for i, found in enumerate(features):
-        full = found.descriptors.any(1)
+        full = np.asarray(found.descriptors.any(1))
         if not full.all():
             empty += int((~full).sum())
             features[i], labels[i] = found.where(full), labels[i][full]

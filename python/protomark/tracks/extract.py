@@ -285,7 +285,7 @@ class _Matching:
         poses = map(turned, self.model.cam_from_world, self.turns)
         parts = (self.features, self.rays, poses, self.focal)
         kind = self.options.kind
-        return [View(f.descriptors, *rest, kind) for f, *rest in zip(*parts, strict=True)]
+        return [View(f.descriptors, *rest, kind=kind) for f, *rest in zip(*parts, strict=True)]
 
     def _match(self, chosen: list[tuple[int, int]], stage: str) -> None:
         def one(pair: tuple[int, int]) -> VerifiedMatches:
