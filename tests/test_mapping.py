@@ -359,7 +359,7 @@ def test_refusals(images: Path, finished: Path, tmp_path: Path) -> None:
     fails(run(images, "--into", tmp_path / "mine"), "name a folder that `protomark map` wrote")
     fails(run(images, "-o", tmp_path / "x", "--resume"), "no interrupted map")
     fails(run(images, "-o", tmp_path / "x", "--dim", "17"), "--dim 17")
-    fails(run(images, "-o", tmp_path / "x", "-d", "sift"), "is not a descriptor of OpenCV")
+    fails(run(images, "-o", tmp_path / "x", "-d", "surf"), "is not a descriptor of OpenCV")
     assert not (tmp_path / "x").exists()
 
 

@@ -17,7 +17,8 @@ def build(
             metavar="SOURCE",
             help="Tracks of `protomark tracks`; a map of ORB-SLAM3 (.osa), ORB-SLAM2 (osmap), "
             "stella_vslam, RTAB-Map, OpenMVG, OpenSfM, kapture or Astrobee; images or a "
-            "COLMAP database with binary descriptors, followed by the folder of the COLMAP model.",
+            "COLMAP database with SIFT or binary descriptors, followed by the folder of the COLMAP "
+            "model.",
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],

@@ -35,7 +35,7 @@ def map_(
     descriptor: Annotated[
         str,
         typer.Option(
-            "--descriptor", "-d", help="freak, orb, brisk, akaze, latch, beblid or teblid."
+            "--descriptor", "-d", help="freak, orb, brisk, akaze, latch, beblid, teblid or sift."
         ),
     ] = "akaze",
     camera: CameraText = None,

@@ -36,7 +36,7 @@ def tracks(
         typer.Option(
             "--descriptor",
             "-d",
-            help="freak, orb, brisk, akaze, latch, beblid or teblid; may be repeated.",
+            help="freak, orb, brisk, akaze, latch, beblid, teblid or sift; may be repeated.",
             show_default="freak",
         ),
     ] = None,
@@ -46,7 +46,7 @@ def tracks(
         Path | None,
         typer.Option(
             "--database",
-            help="COLMAP database with binary descriptors: its descriptors and the model's points "
+            help="COLMAP database with SIFT or binary descriptors: these and the model's points "
             "become the tracks, and images are not read.",
         ),
     ] = None,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from protomark.extras import optional
 from protomark.features.descriptors import descriptor_kind
+from protomark.features.sift import OpenCvSift, colmap_sift
 from protomark.geometry.neighbours import near_pairs, runs
 
 # Two keypoints closer than this (pixels) are one image point, detected at two pyramid levels or at
@@ -20,10 +21,12 @@ from protomark.geometry.neighbours import near_pairs, runs
 MIN_DISTANCE = 4.0
 
 _AKAZE_THRESHOLDS = (1e-3, 1e-4)  # the second is for images with little contrast
+_SIFT_THRESHOLDS = (0.02, 0.0067)  # COLMAP's, and one for images with little contrast
 
 # Images whose longer side is larger are reduced to this many pixels before detection.
 MAX_SIZE = 1600
 _MIN_MAX_SIZE = 64
+MAX_KEYPOINTS = 2000  # per image, unless somebody wants others
 
 FEATURE_ARRAYS = ("keypoints", "sizes", "angles", "responses", "octaves", "descriptors")
 
@@ -39,7 +42,7 @@ class Features:
     angles: NDArray[np.float32]
     responses: NDArray[np.float32]  # (n,) float32, the detector's strength
     octaves: NDArray[np.int32]  # (n,) int32, the detector's pyramid level
-    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    descriptors: NDArray[np.uint8]  # (n, bytes) uint8
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -78,7 +81,8 @@ class Extractor(threading.local):
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
         max_size: images whose longer side has more pixels are reduced to it before detection.
         detector: how images were described that these will be matched with, as `Tracks.info` has
-            it: "levels" and "scale_factor" of ORB's image pyramid; "name" if it begins with GFTT.
+            it: "levels" and "scale_factor" of ORB's image pyramid; "name" if it begins with GFTT
+            or COLMAP, whose SIFT may be "upright".
 
     Raises:
         ValueError: a number or the name is out of range.
@@ -87,7 +91,7 @@ class Extractor(threading.local):
     def __init__(
         self,
         name: str,
-        max_keypoints: int = 2000,
+        max_keypoints: int = MAX_KEYPOINTS,
         max_size: int = MAX_SIZE,
         detector: Mapping[str, Any] | None = None,
     ) -> None:
@@ -105,7 +109,8 @@ class Extractor(threading.local):
 
         # The first detector has a strict threshold, the others lower ones for little contrast.
         self._detect: list[Callable[[Any], Sequence[Any]]]
-        self._akaze: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
+        # Detects and describes at once.
+        self._whole: Callable[[Any, None], tuple[Sequence[Any], Any]] | None = None
         self._high_contrast = False
         if self.kind.name in ("freak", "brisk"):
             brisk = _opencv("BRISK_create")
@@ -113,7 +118,11 @@ class Extractor(threading.local):
         elif self.kind.name == "akaze":
             akaze = [_opencv("AKAZE_create")(threshold=t) for t in _AKAZE_THRESHOLDS]
             self._detect = [a.detect for a in akaze]
-            self._akaze = akaze[-1].detectAndCompute
+            self._whole = akaze[-1].detectAndCompute
+        elif self.kind.name == "sift" and str(settings.get("name")).startswith("COLMAP"):
+            self._detect, self._whole = [], colmap_sift(settings, max_keypoints)
+        elif self.kind.name == "sift":
+            self._detect = [OpenCvSift(t).detect for t in _SIFT_THRESHOLDS]
         elif str(settings.get("name")).startswith("GFTT"):  # RTAB-Map's
             self._detect = [_good_features(settings, 5 * max_keypoints).detect]
         else:
@@ -125,6 +134,7 @@ class Extractor(threading.local):
             "akaze": lambda: _opencv("AKAZE_create")(),
             "latch": lambda: _opencv("LATCH_create")(bytes=32),
             "beblid": lambda: _opencv("BEBLID_create")(1.0, _opencv("BEBLID_SIZE_512_BITS")),
+            "sift": lambda: OpenCvSift(_SIFT_THRESHOLDS[0]),
             "teblid": lambda: _opencv("TEBLID_create")(1.0, _opencv("TEBLID_SIZE_256_BITS")),
         }[self.kind.name]().compute
 
@@ -155,12 +165,17 @@ class Extractor(threading.local):
                 f"OpenCV returns {self.kind.name} descriptors of {descriptors.shape[1]} bytes, not "
                 f"{self.kind.bytes}: install another version"
             )
+        if self.kind.input != "bits":  # in an image of one grey they may be zero
+            rows = np.flatnonzero(descriptors.any(1)).tolist()
+            described, descriptors = [described[i] for i in rows], descriptors[rows]
         n = len(described)
         xy = np.array([k.pt for k in described], np.float32).reshape(n, 2)
         sizes = np.array([k.size for k in described], np.float32)
         angles = np.array([k.angle for k in described], np.float32)
         responses = np.array([k.response for k in described], np.float32)
         octaves = np.array([k.octave for k in described], np.int32)
+        if self.kind.name == "sift":  # OpenCV has the layer of the octave in the bits above
+            octaves = octaves.astype(np.int8).astype(np.int32)
         # OpenCV's angles are -1 for none, or in (-180, 180] or [0, 360).
         angles = np.where(angles == -1, -1, np.mod(angles, 360)).astype(np.float32)
         angles[angles >= 360] = 0
@@ -172,8 +187,10 @@ class Extractor(threading.local):
 
     def _describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[Any], Any]:
         """Selected keypoints and their descriptors."""
-        if self._akaze is not None:
-            return self._describe_akaze(image, self._akaze)
+        if self._whole is not None:
+            if not self._detect:  # COLMAP chooses keypoints itself
+                return self._whole(image, None)
+            return self._describe_akaze(image, self._whole)
         for detect in self._detect:
             selected, enough = self._select(detect(image), image)
             if enough:
@@ -222,6 +239,11 @@ def _pyramid(detector: Mapping[str, Any]) -> dict[str, Any]:
         "nlevels": int(_setting(detector, "levels", 8, 1, 32)),
         "scaleFactor": _setting(detector, "scale_factor", 1.2, 1.01, 4),
     }
+
+
+def described_keypoints(detector: Mapping[str, Any]) -> int:
+    """How many keypoints a detector of other images gave at most: 2000 unless it says."""
+    return int(_setting(detector, "max_keypoints", MAX_KEYPOINTS, 1, 1_000_000))
 
 
 def _setting(

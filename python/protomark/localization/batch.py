@@ -74,7 +74,7 @@ class LocalizationRequest:
     prior_distance: float = 1.0  # largest error of a prior's position, in world units
     prior_degrees: float = 15.0  # largest error of a prior's orientation
     min_confidence: float = 0.9  # smallest probability of an accepted pose
-    max_keypoints: int = 2000  # limit on keypoints per image
+    max_keypoints: int | None = None  # limit on keypoints per image, see `Localizer`
     max_size: int = MAX_SIZE  # larger images are reduced to it before detection
     recall: float | None = None  # see `Localizer`
     threads: int = 1  # number of images to localize at a time

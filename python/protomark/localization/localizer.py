@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import protomark as pm
 from protomark.features.descriptors import DESCRIPTORS
-from protomark.features.extractor import MAX_SIZE, Extractor, Features
+from protomark.features.extractor import MAX_SIZE, Extractor, Features, described_keypoints
 from protomark.features.images import read_gray, to_gray
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.geometry.absolute_pose import FocalLength
@@ -56,7 +56,8 @@ class Localizer:
     Args:
         scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
             that `protomark map` wrote.
-        max_keypoints: limit on keypoints per image: the strongest, spread over the image.
+        max_keypoints: limit on keypoints per image: the strongest, spread over the image; None: as
+            many as an image of the map had, if the map knows, or 2000.
         max_size: images whose longer side has more pixels are reduced to it before detection.
         min_probability: smallest probability of an accepted match, in [0, 1].
         recall: in a map with an index, the share of nearest landmarks that an approximate search
@@ -73,7 +74,7 @@ class Localizer:
         self,
         scene: pm.PrototypeMap | pm.SealedMap | str | Path,
         *,
-        max_keypoints: int = 2000,
+        max_keypoints: int | None = None,
         max_size: int = MAX_SIZE,
         min_probability: float = MIN_PROBABILITY,
         recall: float | None = None,
@@ -208,7 +209,7 @@ class Localizer:
 
         Args:
             keypoints: (n, 2) pixels; the centre of the upper left pixel is (0.5, 0.5).
-            descriptors: (n, bits / 8) uint8, of the kind that the map's encoder takes.
+            descriptors: (n, bytes) uint8, or (n, numbers) float32, as the map's encoder takes them.
             camera: the frame's camera.
             prior: see `localize`.
             focal_length: see `localize`.
@@ -223,7 +224,7 @@ class Localizer:
         """
         camera.check_lens()
         if descriptors is None:  # what OpenCV computes for no keypoints
-            descriptors = np.zeros((0, self.scene.encoder.bits // 8), np.uint8)
+            descriptors = np.zeros((0, self.scene.encoder.bytes), np.uint8)
         if len(keypoints) != len(descriptors):
             raise ValueError(f"{len(keypoints)} keypoints, but {len(descriptors)} descriptors")
         _check_pixels(np.asarray(keypoints), camera)
@@ -272,14 +273,16 @@ class Localizer:
         plain = descriptor.removesuffix(SUFFIX)
         if plain not in DESCRIPTORS:
             raise ValueError(
-                f"the map's encoder takes {descriptor} descriptors, which OpenCV does not "
-                "compute: describe the keypoints yourself (in Python: localize_features)"
+                f"the map's encoder takes {descriptor} descriptors, which are not "
+                "computed here: describe the keypoints yourself (in Python: localize_features)"
             )
         detector, size = map_detector(self.scene), self.max_size
         if detector:  # of a program that describes images at their own size
             sides = [max(c.width, c.height) for c in self.cameras.cameras]
             size = min([size, max(sides, default=size)])
-        return Extractor(plain, self.max_keypoints, size, detector)
+        limit = self.max_keypoints
+        limit = described_keypoints(detector) if limit is None else limit
+        return Extractor(plain, limit, size, detector)
 
     def _extract(self, image: NDArray[np.uint8]) -> Features:
         features = self._extractor(image)

@@ -179,7 +179,9 @@ class Initialiser:
         if key not in self._matches:
             assert one.descriptors is not None
             assert other.descriptors is not None
-            self._matches[key] = mutual_matches(one.descriptors, other.descriptors, RATIO)
+            self._matches[key] = mutual_matches(
+                one.descriptors, other.descriptors, RATIO, self._structure.options.kind
+            )
         return self._matches[key]
 
     def _support(

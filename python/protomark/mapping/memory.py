@@ -191,7 +191,7 @@ def prototypes_for(options: MappingOptions) -> Prototypes:
     encoder = pm.Encoder.load(options.encoder or kind.name)
     if encoder.descriptor != kind.name or encoder.bits != kind.bits:
         raise ValueError(
-            f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, "
+            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bits // 8} bytes, "
             f"not for {kind.name}"
         )
     return Prototypes(encoder, options.dim, options.appearance_bits)

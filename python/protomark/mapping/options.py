@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protomark.features.descriptors import descriptor_kind
+from protomark.features.descriptors import InputKind, descriptor_kind
 from protomark.features.extractor import MAX_SIZE, Extractor
 from protomark.maps.build import APPEARANCE_BITS, DIM
 
@@ -29,6 +29,11 @@ class MappingOptions:
     min_inliers: int = 20  # number of matches that must agree with a frame's pose
     calibrate: bool = False  # whether focal length and distortion are refined while mapping
     fixed_poses: bool = False  # whether poses are given and not adjusted
+
+    @property
+    def kind(self) -> InputKind:
+        """What the descriptor is of."""
+        return descriptor_kind(self.descriptor).input
 
     def extractor(self) -> Extractor:
         """What detects and describes the keypoints of frames."""

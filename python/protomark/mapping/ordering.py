@@ -35,6 +35,7 @@ def matching_order(
     if count > _MAX_IMAGES:
         return []
     names: list[str] = []
+    kind = extractor.kind.input
     described: list[NDArray[np.uint8]] = []
     for image in images:
         progress("look for an order", len(names), count)
@@ -51,7 +52,7 @@ def matching_order(
     for i, first in enumerate(described):
         progress("match all photos", i, count)
         for j, second in enumerate(described[:i]):
-            shared[i, j] = shared[j, i] = len(mutual_matches(first, second, RATIO))
+            shared[i, j] = shared[j, i] = len(mutual_matches(first, second, RATIO, kind))
     # A walk from anywhere ends at an end of the scene, where the next begins.
     order = _walk(shared, _walk(shared, int(shared.sum(1).argmax()))[-1])
     given = np.arange(len(names))

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.descriptors import InputKind
 from protomark.features.extractor import Extractor, Features
 from protomark.geometry.camera import Camera
 from protomark.geometry.given_poses import agreeing, pose_errors
@@ -78,6 +79,7 @@ def survey(
 ) -> Survey:
     """Match the first frames that moved with each other; images of another size do not count."""
     frames: list[tuple[InputImage, Features]] = []
+    kind = extractor.kind.input
     for count, image in enumerate(images):
         if len(frames) == _FRAMES or count == _MAX_READ:
             break
@@ -85,17 +87,20 @@ def survey(
             continue
         features = known.get(image.name) or extractor(image.image)
         new = replace(image, image=None), features
-        if len(features) < _MIN_MATCHES or (frames and not _moved(_pair(frames[-1], new), size)):
+        if len(features) < _MIN_MATCHES:
+            continue
+        if frames and not _moved(_pair(frames[-1], new, kind), size):
             continue
         frames.append(new)
     pairs = [
-        _pair(frame, frames[i + step])
+        _pair(frame, frames[i + step], kind)
         for i, frame in enumerate(frames)
         for step in _STEPS
         if i + step < len(frames)
     ]
     following = [
-        len(_pair(one, other).first) >= _FOLLOWING * len(one[1]) for one, other in pairwise(frames)
+        len(_pair(one, other, kind).first) >= _FOLLOWING * len(one[1])
+        for one, other in pairwise(frames)
     ]
     return Survey(
         [pair for pair in pairs if len(pair.first) >= _MIN_MATCHES],
@@ -104,8 +109,10 @@ def survey(
     )
 
 
-def _pair(one: tuple[InputImage, Features], other: tuple[InputImage, Features]) -> MatchedPair:
-    rows = mutual_matches(one[1].descriptors, other[1].descriptors, RATIO)
+def _pair(
+    one: tuple[InputImage, Features], other: tuple[InputImage, Features], kind: InputKind
+) -> MatchedPair:
+    rows = mutual_matches(one[1].descriptors, other[1].descriptors, RATIO, kind)
     first, second = one[1].keypoints[rows[:, 0]], other[1].keypoints[rows[:, 1]]
     images = one[0], other[0]
     return MatchedPair(images, first.astype(np.float64), second.astype(np.float64))

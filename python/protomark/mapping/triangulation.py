@@ -18,10 +18,10 @@ def triangulate(
 ) -> list[tuple[int, int]]:
     """Match a frame with those of the window, create landmarks, and continue existing tracks.
 
-    Matches are mutual nearest neighbours in Hamming distance that pass the ratio test and lie near
-    the epipolar line. Two keypoints without a landmark create one if the angle of their rays is
-    wide enough and the landmark projects back to both. If one of them observes a landmark already,
-    the other observes it, too, provided that it projects there.
+    Matches are mutual nearest neighbours that pass the ratio test and lie near the epipolar line.
+    Two keypoints without a landmark create one if the angle of their rays is wide enough and the
+    landmark projects back to both. If one of them observes a landmark already, the other observes
+    it, too, provided that it projects there.
 
     Returns pairs of landmarks whose keypoints match, so that they may be duplicates.
     """
@@ -49,7 +49,8 @@ def _view(structure: Structure, frame: Frame) -> View:
     if frame.descriptors is None:
         raise ValueError(f"{frame.name}: the frame has left the window and has no descriptors")
     poses = frame.local_poses(np.arange(len(frame.rays)))
-    return View(frame.descriptors, frame.rays, poses, structure.focal(frame.camera_id))
+    focal, kind = structure.focal(frame.camera_id), structure.options.kind
+    return View(frame.descriptors, frame.rays, poses, focal, kind)
 
 
 def _create_landmarks(

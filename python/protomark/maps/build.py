@@ -82,10 +82,11 @@ def tracks_for(encoder: Encoder, tracks: Tracks) -> Tracks:
     """
     if encoder.descriptor == tracks.descriptor + SUFFIX:
         tracks = tracks.upright()
-    if (encoder.descriptor, encoder.bits) != (tracks.descriptor, tracks.bits):
+    kind = (tracks.descriptor, tracks.input, tracks.bits)
+    if (encoder.descriptor, encoder.input, encoder.bits) != kind:
         raise ValueError(
-            f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, the "
-            f"tracks hold {tracks.descriptor} with {tracks.bits}: choose an encoder for "
+            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bits // 8} bytes, "
+            f"the tracks hold {tracks.descriptor} of {tracks.bits // 8}: choose an encoder for "
             f"{tracks.descriptor}"
         )
     return tracks

@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from protomark.features.descriptors import InputKind
+from protomark.features.distances import distances
 from protomark.geometry.neighbours import near_pairs
 from protomark.geometry.pose import transform
 from protomark.geometry.triangulation import refine_points, widest_angle
 from protomark.tracks.merging import merge
 from protomark.tracks.scene import Scene
-
-_POPCOUNT = np.array([bin(i).count("1") for i in range(256)], np.uint8)
 
 
 def clean(scene: Scene, max_error: float, min_angle: float, min_length: int) -> None:
@@ -63,14 +63,15 @@ def complete(
     scene: Scene,  # labelled keypoints; labels and positions change
     partners: list[NDArray[np.int64]],  # for each keyframe, the keyframes with an overlapping view
     max_error: float,  # largest distance in pixels between projection and keypoint
-    max_distance: int,  # largest Hamming distance in bits to the nearest descriptor of the landmark
+    max_distance: float,  # largest distance to the nearest descriptor of the landmark
+    kind: InputKind,  # what descriptors are of
 ) -> tuple[int, int]:
     """Add observations in one pass over the keyframes, merge landmarks; returns both numbers."""
     added = 0
     votes: list[NDArray[np.int64]] = []
     rows = scene.observations()
     for i in range(len(partners)):
-        candidates, keypoint, distance = _candidates(scene, i, partners[i], rows, max_error)
+        candidates, keypoint, distance = _candidates(scene, i, partners[i], rows, max_error, kind)
         fits = distance <= max_distance
         candidates, keypoint, distance = candidates[fits], keypoint[fits], distance[fits]
         label = scene.labels[keypoint]
@@ -87,12 +88,12 @@ def complete(
     return added, merge(scene, np.concatenate(votes), max_error)
 
 
-def _best(key: NDArray[np.int64], distance: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _best(key: NDArray[np.int64], distance: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Whether each entry has the smallest distance of all entries with its key."""
     if not len(key):
         return np.zeros(0, bool)
     _, group_of = np.unique(key, return_inverse=True)
-    smallest = np.full(group_of.max() + 1, np.iinfo(np.int64).max)
+    smallest = np.full(group_of.max() + 1, np.inf, np.float32)
     np.minimum.at(smallest, group_of, distance)
     out: NDArray[np.bool_] = distance == smallest[group_of]
     return out
@@ -104,10 +105,11 @@ def _candidates(
     partners: NDArray[np.int64],
     rows: NDArray[np.int64],
     radius: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    kind: InputKind,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
     """Landmarks that partners but not this keyframe observe, and keypoints they project to.
 
-    The third array is the Hamming distance of the keypoint to the landmark's nearest descriptor.
+    The third array is the distance of the keypoint to the landmark's nearest descriptor.
     """
     nothing = np.zeros(0, np.int64)
     here = slice(int(scene.offsets[keyframe]), int(scene.offsets[keyframe + 1]))
@@ -125,11 +127,10 @@ def _candidates(
     landmarks, pixels = landmarks[inside], pixels[inside]
     a, b = near_pairs(pixels, scene.keypoints[here].astype(np.float64), radius)
     if not len(a):
-        return nothing, nothing, nothing
+        return nothing, nothing, np.zeros(0, np.float32)
     landmarks, keypoints = landmarks[a], b + here.start
     # Pair all descriptors of each landmark with the keypoint's.
     at, length = scene.rows_of(landmarks, rows)
-    bits = scene.descriptors[at] ^ scene.descriptors[np.repeat(keypoints, length)]
-    distance = _POPCOUNT[bits].sum(1, dtype=np.int64)
-    smallest = np.minimum.reduceat(distance, np.cumsum(length) - length)
+    pair = scene.descriptors[at], scene.descriptors[np.repeat(keypoints, length)]
+    smallest = np.minimum.reduceat(distances(*pair, kind), np.cumsum(length) - length)
     return landmarks, keypoints, smallest

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import protomark
 from protomark.extras import optional
-from protomark.features.descriptors import descriptor_kind
+from protomark.features.descriptors import InputKind, descriptor_kind
 from protomark.features.extractor import MAX_SIZE, Extractor, Features, reduced_size
 from protomark.features.images import image_names, read_gray
 from protomark.features.static_regions import Mask, describe, outside, static_regions
@@ -60,7 +60,7 @@ class TracksOptions:
     # Images with a longer side are reduced to it before detection; errors count in their pixels.
     max_size: int = MAX_SIZE
     partners: int = 24  # about how many keyframes each keyframe is matched with
-    ratio: float = 0.8  # limit on the ratio of the nearest to the second nearest Hamming distance
+    ratio: float = 0.8  # limit on the ratio of the nearest to the second nearest distance
     max_error: float = 3.0  # largest epipolar and reprojection error, pixels
     min_angle: float = 1.0  # smallest triangulation angle of a landmark, degrees
     min_length: int = 3  # smallest number of observations of a landmark
@@ -70,6 +70,11 @@ class TracksOptions:
     max_unlabelled: int | None = None
     # The detector of another program with its settings, as maps of it are read; None: OpenCV's.
     detector: Mapping[str, Any] | None = None
+
+    @property
+    def kind(self) -> InputKind:
+        """What the descriptor is of."""
+        return descriptor_kind(self.descriptor).input
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "descriptor", descriptor_kind(self.descriptor).name)
@@ -279,7 +284,8 @@ class _Matching:
     def _make_views(self) -> list[View]:
         poses = map(turned, self.model.cam_from_world, self.turns)
         parts = (self.features, self.rays, poses, self.focal)
-        return [View(f.descriptors, *rest) for f, *rest in zip(*parts, strict=True)]
+        kind = self.options.kind
+        return [View(f.descriptors, *rest, kind=kind) for f, *rest in zip(*parts, strict=True)]
 
     def _match(self, chosen: list[tuple[int, int]], stage: str) -> None:
         def one(pair: tuple[int, int]) -> VerifiedMatches:
@@ -295,9 +301,10 @@ class _Matching:
         Keypoints of what never moves get no rays, so that nothing matches them.
         """
         chosen = pairs.neighbour_pairs(len(self.views), _SAMPLE)
-        descriptors = [f.descriptors for f in self.features]
+        described = [f.descriptors for f in self.features]
+        how = self.options.ratio, self.options.kind
         found = parallel_map(
-            lambda p: mutual_matches(descriptors[p[0]], descriptors[p[1]], self.options.ratio),
+            lambda p: mutual_matches(described[p[0]], described[p[1]], *how),
             chosen,
             self.threads,
             self.progress,
@@ -419,7 +426,7 @@ def _complete(
     added = merged = 0
     for step in range(_COMPLETION_PASSES):
         progress("complete", step, _COMPLETION_PASSES)
-        counts = completion.complete(scene, partners, options.max_error, max_distance)
+        counts = completion.complete(scene, partners, options.max_error, max_distance, options.kind)
         added, merged = added + counts[0], merged + counts[1]
         completion.clean(scene, options.max_error, options.min_angle, 2)
     completion.clean(scene, options.max_error, options.min_angle, options.min_length)

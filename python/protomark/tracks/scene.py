@@ -22,7 +22,7 @@ class Scene:
     keypoints: NDArray[np.float32]  # (n, 2) float32, pixels
     rays: NDArray[np.float64]  # (n, 2) float64, undistorted, NaN where undistortion fails
     focal: NDArray[np.float64]  # (n,) float64, focal length in pixels
-    descriptors: NDArray[np.uint8]  # (n, bits / 8) uint8
+    descriptors: NDArray[np.uint8]  # (n, bytes) uint8
     labels: NDArray[np.int64]  # (n,) int64, row of the landmark in positions, -1 for none
     positions: NDArray[np.float64]  # (l, 3) float64
     turns: NDArray[np.float64] | None = None  # (n, 3, 3) float64, see `Camera.local_rays`
