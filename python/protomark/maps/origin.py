@@ -73,7 +73,7 @@ def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
     return "[]"
 
 
-def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
+def map_detector(scene: pm.PrototypeMap | pm.SealedMap | pm.ShardedMap) -> dict[str, Any]:
     """The detector of the images that a map was built from, by name, with its settings.
 
     Empty if nobody stored it, or if its sources had several.
