@@ -72,4 +72,6 @@ __all__ = [
 def __getattr__(name: str) -> object:
     if name in _LAZY:
         return getattr(_import_module(_LAZY[name]), name)
+    if name == "distributed":
+        return _import_module("protomark.distributed")
     raise AttributeError(f"module 'protomark' has no attribute {name!r}")

@@ -20,6 +20,7 @@ from protomark.maps.shards import (
     Manifest,
     Shard,
     ShardFile,
+    describe_file,
     describe_shard,
     disjoint,
     encoder_facts,
@@ -339,7 +340,7 @@ class _Part:
             return self._shard
         kind = "sealed" if isinstance(self.map, pm.SealedMap) else "learning"
         name = self.path.name.removesuffix(".pmk")
-        return describe_shard(name, self.map, **{kind: self.path})
+        return describe_shard(name, self.map, **{kind: describe_file(self.path)})
 
     @property
     def nlist(self) -> int:

@@ -76,8 +76,12 @@ class Manifest:
             ValueError: it would replace another file.
         """
         check_manifest(folder)
+        write_text(folder / MANIFEST, self.text())
+
+    def text(self) -> str:
+        """The manifest as JSON."""
         facts = {"format": FORMAT, "version": VERSION, **asdict(self)}
-        write_text(folder / MANIFEST, json.dumps(facts, indent=1) + "\n")
+        return json.dumps(facts, indent=1) + "\n"
 
     @classmethod
     def load(cls, folder: Path) -> Manifest:
@@ -109,7 +113,7 @@ class Manifest:
                 raise ValueError(
                     f"version {facts['version']!r}, but this Protomark reads {VERSION}: update it"
                 )
-            shards = [_shard(one) for one in facts["shards"]]
+            shards = [shard_from(one) for one in facts["shards"]]
             made = {key: facts[key] for key in ("encoder", "dim", "appearance_bits", "metadata")}
             manifest = cls(**made, shards=shards, build=facts["build"])
             manifest.check()
@@ -130,7 +134,8 @@ class Manifest:
             raise ValueError("a shard's file is outside the folder")
 
 
-def _shard(facts: dict[str, Any]) -> Shard:
+def shard_from(facts: dict[str, Any]) -> Shard:
+    """A shard by JSON values; raises ValueError, KeyError or TypeError."""
     rest = dict(facts)
     files = {
         kind: ShardFile(**found) if (found := rest.pop(kind)) else None
@@ -164,8 +169,8 @@ def is_sharded(path: str | os.PathLike[str]) -> bool:
 def describe_shard(
     name: str,
     scene: pm.PrototypeMap | pm.SealedMap,
-    learning: Path | None = None,
-    sealed: Path | None = None,
+    learning: ShardFile | None = None,
+    sealed: ShardFile | None = None,
 ) -> Shard:
     """What a manifest says of a map and of the files that hold it."""
     summary, ids = scene.summary(), scene.ids
@@ -180,8 +185,8 @@ def describe_shard(
         (int(ids[0]), int(ids[-1])),
         summary["landmarks_with_position"],
         None if extent is None else (tuple(extent[0].tolist()), tuple(extent[1].tolist())),
-        None if learning is None else describe_file(learning),
-        None if sealed is None else describe_file(sealed),
+        learning,
+        sealed,
     )
 
 

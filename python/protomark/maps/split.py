@@ -16,7 +16,13 @@ import protomark as pm
 from protomark.files import check_outputs
 from protomark.geometry.colmap import find_model, landmarks_by_image
 from protomark.maps.open import map_path, open_learning_map
-from protomark.maps.shards import Manifest, check_manifest, describe_shard, encoder_facts
+from protomark.maps.shards import (
+    Manifest,
+    check_manifest,
+    describe_file,
+    describe_shard,
+    encoder_facts,
+)
 from protomark.progress import Progress, silent, tracked
 
 
@@ -45,7 +51,7 @@ def split_file(
     path = map_path(path, learning=True)
     scene = open_learning_map(path)
     named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)
-    ending = ".sealed.pmk" if sealed else ".pmk"
+    kind, ending = ("sealed", ".sealed.pmk") if sealed else ("learning", ".pmk")
     files = [(folder / f"{path.stem}.{name}{ending}", part) for name, part in named if len(part)]
     for file, _ in files:
         if file.exists() and file.samefile(path):
@@ -60,7 +66,7 @@ def split_file(
         else:
             part.save(file)
         name = file.name.removesuffix(ending)
-        shards.append(describe_shard(name, part, **{"sealed" if sealed else "learning": file}))
+        shards.append(describe_shard(name, part, **{kind: describe_file(file)}))
         written.append(
             {
                 "file": str(file),
