@@ -242,7 +242,7 @@ def write_shard(
         if not np.isfinite(positions).all():
             raise ValueError(f"{one.source.shown}: landmark_positions contains NaN or infinity")
         scene.set_positions(known[kept] + one.source.shift, positions)
-    shard = None
+    shard: Shard | None = None
     if len(scene):
         scene.metadata = metadata
         files: dict[str, ShardFile] = {}
