@@ -183,9 +183,12 @@ clean:
 	.venv-test/bin/pip install --quiet --no-deps ./benchmarks
 	touch $@
 
-.venv-ray/installed: $(SOURCES)
+# Ray beside what the other tests have.
+.venv-ray/installed: .venv-test/installed
 	test -x .venv-ray/bin/python || $(PYTHON) -m venv .venv-ray
-	.venv-ray/bin/pip install --quiet -c constraints.txt '.[ray]' hypothesis pytest
+	ls -d $(abspath .venv-test)/lib/python3*/site-packages > \
+	  $$(ls -d .venv-ray/lib/python3*/site-packages)/tests.pth
+	.venv-ray/bin/pip install --quiet -c constraints.txt fsspec ray
 	touch $@
 
 .venv-sanitize/tools:

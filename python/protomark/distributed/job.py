@@ -33,8 +33,6 @@ from protomark.progress import Progress
 from protomark.tracks.file import shipped_encoder
 from protomark.tracks.joining import MAX_ID, shifted_ids
 
-_SHARD = "shard-"
-
 
 @dataclass(frozen=True)
 class Request:
@@ -287,9 +285,7 @@ class Job:
                     ],
                 ]
             )
-            first = own[0].firsts[segments[0].start // plan.BUCKET] + own[0].shift
-            name = f"{_SHARD}{first}-{recipe[:8]}"
-            plans.append(ShardPlan(tuple(segments), metadata, recipe, name))
+            plans.append(ShardPlan(tuple(segments), metadata, recipe))
         return plans
 
     def _finished(self, plans: Sequence[ShardPlan]) -> dict[str, Shard | None]:
@@ -333,7 +329,7 @@ class Job:
                 self.running.start(
                     partial(finished, shard.recipe),
                     tasks.write_shard,
-                    *(shard.name, shard.recipe, [other.input(s) for other, s in inputs]),
+                    *(shard.recipe, [other.input(s) for other, s in inputs]),
                     *(shard.metadata, *common, self.bits, request.seal, request.output),
                 )
                 for other, _ in inputs:
@@ -412,8 +408,7 @@ class Job:
         output.write(MANIFEST, manifest.text().encode())
         kept = {file.name for shard in manifest.shards for file in shard.files}
         for name in output.names():
-            # Also what workers that were killed began to write.
-            if re.match(_SHARD + r"\d+-[0-9a-f]{8}\.", name) and name not in kept:
+            if re.fullmatch(r"shard-\d+-[0-9a-f]{8}(\.sealed)?\.pmk", name) and name not in kept:
                 output.remove(name)
         output.remove(tasks.WORK)
 

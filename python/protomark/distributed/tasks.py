@@ -7,8 +7,9 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from protomark.extras import optional
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.maps import sources
 from protomark.maps.seal import SealRequest, seal_map
-from protomark.maps.shards import Shard, ShardFile, describe_file, describe_shard
+from protomark.maps.shards import Shard, describe_file, describe_shard
 
 # Parts that a shard's task asks for at a time.
 _FETCHED = 8
@@ -59,8 +60,9 @@ def open_source(
             kept = f"{WORK}/{digest}.safetensors"
             if output.size(kept) is None:
                 (tracks,) = sources.read_sources([source], descriptor)
-                with output.new_file(kept) as path:
-                    tracks.save(path)
+                with output.workspace(WORK) as folder:
+                    tracks.save(folder / f"{digest}.new.safetensors")
+                    output.publish(folder / f"{digest}.new.safetensors", kept)
             url = output.url_of(kept)
     file = TracksFile(url)
     count = file.rows("landmark_ids")
@@ -211,7 +213,6 @@ class Input:
 
 
 def write_shard(
-    name: str,
     recipe: str,
     inputs: Sequence[Input],
     metadata: dict[str, str],
@@ -245,17 +246,25 @@ def write_shard(
     shard: Shard | None = None
     if len(scene):
         scene.metadata = metadata
-        files: dict[str, ShardFile] = {}
-        with output.new_file(f"{name}.pmk") as path:
-            scene.save(path)
-            files["learning"] = describe_file(path)
-        if seal:
-            with output.new_file(f"{name}.sealed.pmk") as path:
-                seal_map(scene, path, SealRequest())
-                files["sealed"] = describe_file(path)
-        shard = describe_shard(name, scene, **files)
+        with output.workspace(WORK) as folder:
+            shard = _saved(scene, folder / f"{recipe}.pmk", seal, output)
     output.write(f"{WORK}/{recipe}.json", json.dumps(shard and asdict(shard)).encode())
     return shard, Work(total, time.perf_counter() - began, 0, _attempts())
+
+
+def _saved(scene: pm.PrototypeMap, path: Path, seal: bool, output: Folder) -> Shard:
+    """Write the files of a shard, named by its first id and what is in it."""
+    scene.save(path)
+    learning, sealed = describe_file(path), None
+    name = f"shard-{scene.ids[0]}-{learning.identity[:8]}"
+    if seal:
+        sealed_to = path.with_suffix(".sealed.pmk")
+        seal_map(scene, sealed_to, SealRequest())
+        sealed = replace(describe_file(sealed_to), name=f"{name}.sealed.pmk")
+        output.publish(sealed_to, sealed.name)
+    learning = replace(learning, name=f"{name}.pmk")
+    output.publish(path, learning.name)
+    return describe_shard(name, scene, learning, sealed)
 
 
 def _fetched(parts: Sequence[Any]) -> Iterator[Part]:
