@@ -11,9 +11,11 @@ from urllib.parse import unquote, urlparse
 # Module -> its name, and the extra of this package that installs it.
 _EXTRAS = {
     "cv2": ("OpenCV (opencv-contrib-python-headless)", "localize"),
+    "fsspec": ("fsspec", "ray"),
     "matplotlib": ("matplotlib", "map"),
     "poselib": ("PoseLib", "localize"),
     "pycolmap": ("pycolmap", "localize"),
+    "ray": ("Ray", "ray"),
     "rerun": ("the Rerun SDK (rerun-sdk)", "view"),
     "rich": ("Rich", "cli"),
     "rosbags": ("rosbags", "ros"),

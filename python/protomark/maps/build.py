@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from protomark import Encoder, PrototypeMap
+from protomark.features.descriptors import InputKind
 from protomark.features.upright import SUFFIX
 from protomark.tracks.file import Tracks
 
@@ -66,7 +67,7 @@ def build_map(
         )
     dim = chosen_dim(encoder, dim)
     if appearance_bits is None:
-        appearance_bits = min(APPEARANCE_BITS, dim)
+        appearance_bits = chosen_appearance_bits(dim)
     scene = PrototypeMap(encoder, dim, appearance_bits)
     scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
     ids = ids[counts >= min_observations]
@@ -82,11 +83,19 @@ def tracks_for(encoder: Encoder, tracks: Tracks) -> Tracks:
     """
     if encoder.descriptor == tracks.descriptor + SUFFIX:
         tracks = tracks.upright()
-    kind = (tracks.descriptor, tracks.input, tracks.bits)
-    if (encoder.descriptor, encoder.input, encoder.bits) != kind:
-        raise ValueError(
-            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bits // 8} bytes, "
-            f"the tracks hold {tracks.descriptor} of {tracks.bits // 8}: choose an encoder for "
-            f"{tracks.descriptor}"
-        )
+    check_encoder(encoder, tracks.descriptor, tracks.input, tracks.bits)
     return tracks
+
+
+def check_encoder(encoder: Encoder, descriptor: str, kind: InputKind, bits: int) -> None:
+    """Raise ValueError if an encoder is for other descriptors."""
+    if (encoder.descriptor, encoder.input, encoder.bits) != (descriptor, kind, bits):
+        raise ValueError(
+            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bytes} bytes, "
+            f"the tracks hold {descriptor} of {bits // 8}: choose an encoder for {descriptor}"
+        )
+
+
+def chosen_appearance_bits(dim: int) -> int:
+    """`APPEARANCE_BITS`, or as many as there are numbers."""
+    return min(APPEARANCE_BITS, dim)
