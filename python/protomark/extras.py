@@ -10,16 +10,22 @@ from urllib.parse import unquote, urlparse
 
 # Module -> its name, and the extra of this package that installs it.
 _EXTRAS = {
+    "PIL": ("Pillow", "serve"),
     "cv2": ("OpenCV (opencv-contrib-python-headless)", "localize"),
+    "fastapi": ("FastAPI", "serve"),
+    "fastapi_offline": ("fastapi-offline", "serve"),
     "matplotlib": ("matplotlib", "map"),
     "poselib": ("PoseLib", "localize"),
     "pycolmap": ("pycolmap", "localize"),
+    "prometheus_client": ("prometheus-client", "serve"),
+    "python_multipart": ("python-multipart", "serve"),
     "rerun": ("the Rerun SDK (rerun-sdk)", "view"),
     "rich": ("Rich", "cli"),
     "rosbags": ("rosbags", "ros"),
     "safetensors": ("safetensors", "map"),
     "torch": ("PyTorch", "train"),
     "typer": ("Typer", "cli"),
+    "uvicorn": ("uvicorn", "serve"),
 }
 
 
