@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from protomark.geometry.camera import Camera as Camera
     from protomark.localization import Localizer as Localizer
     from protomark.localization import PosePrior as PosePrior
+    from protomark.maps.sharded_map import ShardedMap as ShardedMap
     from protomark.matching import match as match
 
 __version__ = _version("protomark")
@@ -42,6 +43,7 @@ _LAZY = {
     "Camera": "protomark.geometry.camera",
     "Localizer": "protomark.localization",
     "PosePrior": "protomark.localization",
+    "ShardedMap": "protomark.maps.sharded_map",
     "match": "protomark.matching",
     "upright_descriptors": "protomark.features.upright",
 }
@@ -54,6 +56,7 @@ __all__ = [
     "PosePrior",
     "PrototypeMap",
     "SealedMap",
+    "ShardedMap",
     "__version__",
     "file_journal",
     "file_sections",
@@ -69,4 +72,6 @@ __all__ = [
 def __getattr__(name: str) -> object:
     if name in _LAZY:
         return getattr(_import_module(_LAZY[name]), name)
+    if name == "distributed":
+        return _import_module("protomark.distributed")
     raise AttributeError(f"module 'protomark' has no attribute {name!r}")

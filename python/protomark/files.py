@@ -22,6 +22,8 @@ SCENE_MAP = "scene.pmk"
 SEALED_MAP = "scene.sealed.pmk"
 # Beside them, what a later run continues with, and what observed the landmarks.
 STATE = "state.safetensors"
+# What a folder of shards holds.
+MANIFEST = "manifest.json"
 
 
 @contextmanager

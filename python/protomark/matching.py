@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import protomark as pm
 from protomark import _core
+from protomark.maps.sharded_map import ShardedMap
 
 # Smallest probability of an accepted match, chosen on the training and validation sequences.
 MIN_PROBABILITY = 0.2
@@ -33,7 +34,7 @@ class MatchList:
 
 
 def match(
-    scene: pm.PrototypeMap | pm.SealedMap,
+    scene: pm.PrototypeMap | pm.SealedMap | ShardedMap,
     descriptors: NDArray[np.uint8],
     *,
     min_probability: float = MIN_PROBABILITY,
@@ -44,7 +45,7 @@ def match(
     """Match the keypoints of a frame with the landmarks of a map.
 
     Args:
-        scene: a learning or a sealed map whose encoder has a match calibration.
+        scene: a learning, sealed or sharded map whose encoder has a match calibration.
         descriptors: (n, bits / 8) uint8.
         min_probability: smallest probability of an accepted match, in [0, 1].
         threads: threads to encode and search on.
@@ -58,6 +59,10 @@ def match(
         ValueError: the map's encoder was not calibrated or takes other descriptors, or
             `min_probability` is not 0 to 1.
     """
+    if isinstance(scene, ShardedMap):
+        calibration = scene.encoder.match_calibration(scene.dim, scene.tuned)
+        ids, distances = scene.search(descriptors, 2, threads=threads, recall=recall, among=among)
+        return accept(ids[:, 0], calibration.probability(distances), min_probability)
     return MatchList(*_core.match(scene, descriptors, min_probability, threads, recall, among))
 
 

@@ -12,15 +12,24 @@ from protomark.cli.options import EncoderName, JsonFile, NoSeal, Threads
 
 def build(
     sources: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(
             metavar="SOURCE",
             help="Tracks of `protomark tracks`; a map of ORB-SLAM3 (.osa), ORB-SLAM2 (osmap), "
             "stella_vslam, RTAB-Map, OpenMVG, OpenSfM, kapture or Astrobee; images or a "
-            "COLMAP database with binary descriptors, followed by the folder of the COLMAP model.",
+            "COLMAP database with binary descriptors, followed by the folder of the COLMAP model. "
+            "With --ray, also URLs of tracks files.",
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write (.pmk).")],
+    output: Annotated[
+        str,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PATH",
+            help="Map file to write (.pmk); with --ray, a folder of shards, or its URL.",
+        ),
+    ],
     encoder: EncoderName = None,
     dim: Annotated[int | None, typer.Option(help="Numbers per prototype; by default 48.")] = None,
     min_observations: Annotated[
@@ -46,6 +55,26 @@ def build(
         ),
     ] = None,
     no_seal: NoSeal = False,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS|local",
+            help="Build shards on a Ray cluster: HOST:PORT, auto for the one that runs on this "
+            "machine, or local to start one.",
+        ),
+    ] = None,
+    memory: Annotated[
+        float | None,
+        typer.Option(help="MB of memory of a worker of the cluster, by default 1000."),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Take over what the build had finished before it was cut."),
+    ] = False,
+    add: Annotated[
+        bool,
+        typer.Option("--add", help="Add the sources to the shards in the folder, which stay."),
+    ] = False,
     threads: Threads = 1,
     json_file: JsonFile = None,
 ) -> None:
@@ -61,10 +90,14 @@ def build(
     protomark build atlas.osa -o scene.pmk
 
     protomark build database.db sparse/ -o scene.pmk
+
+    protomark build session*.safetensors --ray local -o city/
     """
     from protomark import Encoder
     from protomark.cli.info import show
     from protomark.cli.terminal import note_replaced, progress_bar, write_json
+    from protomark.distributed.build import MEMORY
+    from protomark.distributed.build import build as build_shards
     from protomark.files import check_outputs
     from protomark.maps.build import build_map, tracks_for
     from protomark.maps.info import describe
@@ -74,29 +107,53 @@ def build(
     from protomark.maps.selection import Views
     from protomark.maps.sources import read_places
 
-    sealed = None if no_seal else sealed_path(output)
-    check_outputs(json_file, inputs=[*sources, encoder], maps=[output, sealed])
-    note_replaced(output, sealed)
     texts = command_metadata(frame, metadata or [])
+    if ray is not None:
+        check_outputs(json_file, inputs=[*sources, encoder])
+        with progress_bar() as progress:
+            facts = build_shards(
+                sources,
+                output,
+                ray=ray,
+                memory=memory or MEMORY,
+                encoder=Encoder.load(encoder) if encoder else None,
+                dim=dim,
+                min_observations=min_observations,
+                metadata=texts,
+                seal=not no_seal,
+                resume=resume,
+                add=add,
+                progress=progress,
+            )
+        write_json(json_file, facts)
+        show(facts)
+        return
+    if memory is not None or resume or add:
+        told = "--memory" if memory is not None else "--resume" if resume else "--add"
+        raise ValueError(f"{told} is for shards: add --ray local")
+    paths, target = [Path(source) for source in sources], Path(output)
+    sealed = None if no_seal else sealed_path(target)
+    check_outputs(json_file, inputs=[*paths, encoder], maps=[target, sealed])
+    note_replaced(target, sealed)
     with progress_bar() as progress:
         progress("read sources", 0, 0)
         network = Encoder.load(encoder) if encoder else None
         descriptor = network.descriptor if network else None
-        seen = read_places(sources, descriptor, min_observations, threads, progress)
+        seen = read_places(paths, descriptor, min_observations, threads, progress)
         network = network or Encoder.load(seen.encoder_name)
         seen = tracks_for(network, seen)
         progress("build the map", 0, 0)
         scene = build_map(seen, network, dim, min_observations=1, threads=threads)
         scene.metadata = tracks_metadata(seen) | texts
         progress("write the map", 0, 0)
-        scene.save(output)
+        scene.save(target)
         if sealed:
             sealed.unlink(missing_ok=True)  # it would not be of this map
             request = SealRequest(threads=threads)
             seal_map(
                 scene, sealed, request, lambda: Views.of_tracks(seen), observed(seen), progress
             )
-        facts = describe(output) | {"sources": seen.info["sources"]}
+        facts = describe(target) | {"sources": seen.info["sources"]}
         if sealed:
             facts["sealed"] = {"file": str(sealed), "bytes": sealed.stat().st_size}
     write_json(json_file, facts)

@@ -29,11 +29,12 @@ def info(
 
     protomark info kitchen/scene.pmk --verify
     """
-    from protomark import verify_file
+    from protomark import ShardedMap, verify_file
     from protomark.cli.terminal import error_console, write_json
     from protomark.files import check_outputs
     from protomark.maps.info import describe, is_tracks
     from protomark.maps.open import map_path
+    from protomark.maps.shards import is_sharded
 
     check_outputs(json_file, inputs=[file])
     with error_console.status(f"Reading {file.name}"):
@@ -41,7 +42,10 @@ def info(
         if verify and is_tracks(file):
             facts["checksums"] = "none in a tracks file, which is checked whole whenever it is read"
         elif verify:
-            verify_file(map_path(file))
+            if is_sharded(file):
+                ShardedMap(file).verify()
+            else:
+                verify_file(map_path(file))
             facts["checksums"] = "all right"
     write_json(json_file, facts)
     show(facts)
@@ -51,7 +55,8 @@ def show(facts: dict[str, Any]) -> None:
     """Print the most important of what `protomark.maps.info.describe` returned."""
     from protomark.cli.terminal import print_facts
 
-    rows = {"tracks": _track_rows, "encoder": _encoder_rows}.get(facts["kind"], _map_rows)
+    known = {"tracks": _track_rows, "encoder": _encoder_rows, "map in shards": _shard_rows}
+    rows = known.get(facts["kind"], _map_rows)
     checked = [("checksums", facts["checksums"])] if "checksums" in facts else []
     # A text of a stranger's file must not pass for another row.
     lines = [
@@ -61,8 +66,6 @@ def show(facts: dict[str, Any]) -> None:
 
 
 def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    from protomark.maps.origin import SOURCES, source_rows
-
     landmarks, encoder = facts["landmarks"], facts["encoder"]
     several = facts["prototypes_per_landmark"]
     each = f"{several:.2f} prototypes" if several else "a prototype"
@@ -86,14 +89,41 @@ def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "positions", where
     if facts["extent"]:
         yield "extent", " to ".join(_vector(corner) for corner in facts["extent"])
-    yield from source_rows(facts["metadata"])
-    for name, text in facts["metadata"].items():
-        if name != SOURCES:
-            yield f"metadata: {name}", text
+    yield from _metadata_rows(facts["metadata"])
     if facts["journal"]:
         yield "journal", f"{facts['journal']['commits']:,} commits since the file was written"
     if sealed := facts.get("sealed"):
         yield "sealed map", f"{sealed['file']}, {sealed['bytes']:,} bytes"
+
+
+def _shard_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    landmarks = facts["landmarks"]
+    each = facts["prototypes"] / landmarks
+    yield "landmarks", f"{landmarks:,}, each with {each:.2f} prototypes of {facts['dim']} numbers"
+    if facts["observations"] is not None:
+        yield "observations", f"{facts['observations']:,}"
+    yield "shards", f"{facts['shards']:,}, the largest of {facts['largest_shard']:,} bytes"
+    yield "bytes", f"{facts['bytes']:,} in all files"
+    yield "encoder", f"{facts['encoder']['name']}, for {facts['encoder']['descriptor']}"
+    yield "positions", f"of {facts['landmarks_with_position']:,} landmarks"
+    yield from _metadata_rows(facts["metadata"])
+    if run := facts.get("run"):
+        yield (
+            "this run",
+            f"{run['observations']:,} observations in {run['seconds']:.1f} s, "
+            f"{run['observations_per_worker_second']:,.0f} per second of a worker; "
+            f"{run['bytes_moved'] / 1e6:,.1f} MB moved, {run['retries']} retries; "
+            f"{run['shards_written']} shards written, {run['shards_taken_over']} taken over",
+        )
+
+
+def _metadata_rows(metadata: dict[str, str]) -> Iterator[tuple[str, str]]:
+    from protomark.maps.origin import SOURCES, source_rows
+
+    yield from source_rows(metadata)
+    for name, text in metadata.items():
+        if name != SOURCES:
+            yield f"metadata: {name}", text
 
 
 def _encoder_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:

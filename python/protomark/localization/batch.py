@@ -38,7 +38,8 @@ from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
 from protomark.localization.shared_camera import check_shared_cameras
 from protomark.localization.solve import Localization
-from protomark.maps.open import is_map, open_map
+from protomark.maps.open import is_map
+from protomark.maps.sharded_map import open_scene
 from protomark.progress import Progress, silent, tracked
 from protomark.threads import map_ahead
 
@@ -311,7 +312,7 @@ def localize_files(
         raise ValueError(f"{maps[0]} is a map: name it first, and then the images")
     queries = _list_queries(request.images, request.every, request.topic)
     _check_folder(output)
-    scene = open_map(request.scene)
+    scene = open_scene(request.scene)
     if request.recall is not None and not scene.nlist:
         raise ValueError(
             f"--recall {request.recall:g}: {request.scene} has no index: `protomark seal` makes a "

@@ -31,9 +31,9 @@ from protomark.localization.solve import (
     solve_pose,
 )
 from protomark.maps.cameras import map_cameras
-from protomark.maps.open import open_map
 from protomark.maps.origin import map_detector
 from protomark.maps.places import map_places
+from protomark.maps.sharded_map import ShardedMap, open_scene
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
@@ -54,8 +54,8 @@ class Localizer:
     Threads may share a localizer.
 
     Args:
-        scene: a learning or a sealed map whose landmarks have positions, its file, or the folder
-            that `protomark map` wrote.
+        scene: a learning, sealed or sharded map whose landmarks have positions, its file, or its
+            folder.
         max_keypoints: limit on keypoints per image: the strongest, spread over the image.
         max_size: images whose longer side has more pixels are reduced to it before detection.
         min_probability: smallest probability of an accepted match, in [0, 1].
@@ -71,7 +71,7 @@ class Localizer:
 
     def __init__(
         self,
-        scene: pm.PrototypeMap | pm.SealedMap | str | Path,
+        scene: pm.PrototypeMap | pm.SealedMap | ShardedMap | str | Path,
         *,
         max_keypoints: int = 2000,
         max_size: int = MAX_SIZE,
@@ -79,7 +79,7 @@ class Localizer:
         recall: float | None = None,
         threads: int = 1,
     ) -> None:
-        self.scene = open_map(scene) if isinstance(scene, (str, Path)) else scene
+        self.scene = open_scene(scene) if isinstance(scene, (str, Path)) else scene
         self.max_keypoints, self.max_size = max_keypoints, max_size
         self.min_probability = min_probability
         self.recall = recall
@@ -94,7 +94,7 @@ class Localizer:
             self.scene.nprobe(recall)  # an error here names what does not fit
         self.cameras = map_cameras(self.scene)
         self.places = map_places(self.scene.metadata)
-        tuned = isinstance(self.scene, pm.SealedMap) and self.scene.tuned
+        tuned = not isinstance(self.scene, pm.PrototypeMap) and self.scene.tuned
         self.calibration = self.scene.encoder.match_calibration(self.scene.dim, tuned)
 
     def localize(
@@ -233,8 +233,7 @@ class Localizer:
         with _timed(stages, "search"):
             among = None
             if prior is not None:
-                landmarks, positions = self._all_positions
-                among = landmarks[visible(prior, camera, positions)]
+                among = self._visible(prior, camera)
             ids, distances = self.scene.search_codes(
                 codes, k=CANDIDATES, threads=self.threads, recall=self.recall, among=among
             )
@@ -252,6 +251,18 @@ class Localizer:
             else:
                 result = solve_pose(candidates, *request)
         return replace(result, seconds={**stages, "total": sum(stages.values())})
+
+    def _visible(self, prior: PosePrior, camera: Camera) -> NDArray[np.int64]:
+        """Ids of the landmarks that are visible from near a pose."""
+        if isinstance(self.scene, ShardedMap):
+
+            def test(positions: NDArray[np.float64], off: float) -> NDArray[np.bool_]:
+                # What is seen there is seen here from a camera that is moved by as much.
+                return visible(replace(prior, distance=prior.distance + off), camera, positions)
+
+            return self.scene.visible(test)
+        landmarks, positions = self._all_positions
+        return landmarks[visible(prior, camera, positions)]
 
     @cached_property
     def _all_positions(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -316,7 +327,7 @@ def _check_pixels(keypoints: NDArray[np.floating], camera: Camera) -> None:
         )
 
 
-def _has_positions(scene: pm.PrototypeMap | pm.SealedMap) -> bool:
+def _has_positions(scene: pm.PrototypeMap | pm.SealedMap | ShardedMap) -> bool:
     # To look at all of a sealed map would read it whole; its landmarks have positions or none does.
     if isinstance(scene, pm.SealedMap):
         return scene.position_bits > 0

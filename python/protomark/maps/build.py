@@ -66,7 +66,7 @@ def build_map(
         )
     dim = chosen_dim(encoder, dim)
     if appearance_bits is None:
-        appearance_bits = min(APPEARANCE_BITS, dim)
+        appearance_bits = chosen_appearance_bits(dim)
     scene = PrototypeMap(encoder, dim, appearance_bits)
     scene.add(landmarks[keep], tracks.descriptors[rows[keep]], threads=threads)
     ids = ids[counts >= min_observations]
@@ -82,10 +82,19 @@ def tracks_for(encoder: Encoder, tracks: Tracks) -> Tracks:
     """
     if encoder.descriptor == tracks.descriptor + SUFFIX:
         tracks = tracks.upright()
-    if (encoder.descriptor, encoder.bits) != (tracks.descriptor, tracks.bits):
+    check_encoder(encoder, tracks.descriptor, tracks.bits)
+    return tracks
+
+
+def check_encoder(encoder: Encoder, descriptor: str, bits: int) -> None:
+    """Raise ValueError if an encoder is for other descriptors."""
+    if (encoder.descriptor, encoder.bits) != (descriptor, bits):
         raise ValueError(
             f"encoder '{encoder.name}' is for {encoder.descriptor} with {encoder.bits} bits, the "
-            f"tracks hold {tracks.descriptor} with {tracks.bits}: choose an encoder for "
-            f"{tracks.descriptor}"
+            f"tracks hold {descriptor} with {bits}: choose an encoder for {descriptor}"
         )
-    return tracks
+
+
+def chosen_appearance_bits(dim: int) -> int:
+    """`APPEARANCE_BITS`, or as many as there are numbers."""
+    return min(APPEARANCE_BITS, dim)

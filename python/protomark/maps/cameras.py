@@ -17,7 +17,7 @@ def cameras_text(cameras: Iterable[Camera]) -> str:
     return "".join(f"{number} {line}\n" for number, line in enumerate(lines, 1))
 
 
-def map_cameras(scene: pm.PrototypeMap | pm.SealedMap) -> CameraSet:
+def map_cameras(scene: pm.PrototypeMap | pm.SealedMap | pm.ShardedMap) -> CameraSet:
     """The cameras that a map was made with; none if nobody stored them."""
     cameras = []
     for line in scene.metadata.get(KEY, "").splitlines():

@@ -9,6 +9,7 @@ import numpy as np
 
 import protomark as pm
 from protomark.maps.open import map_path
+from protomark.maps.shards import Manifest, is_sharded
 from protomark.tracks.file import Tracks
 from protomark.tracks.summary import summarise
 
@@ -26,11 +27,33 @@ def describe(path: Path) -> dict[str, Any]:
     """
     if is_tracks(path):
         return _describe_tracks(path)
+    if is_sharded(path):
+        return describe_shards(path, Manifest.load(path))
     path = map_path(path)
     kinds = dict(pm.file_sections(path))
     if "network" in kinds:
         return _describe_encoder(path)
     return _describe_map(path, kinds)
+
+
+def describe_shards(path: Path | str, manifest: Manifest) -> dict[str, Any]:
+    """Facts about a folder of shards, by its manifest."""
+    shards = manifest.shards
+    counts = [shard.observations for shard in shards]
+    return {
+        "kind": "map in shards",
+        "folder": str(path),
+        "landmarks": sum(shard.landmarks for shard in shards),
+        "prototypes": sum(shard.prototypes for shard in shards),
+        "observations": None if None in counts else sum(count or 0 for count in counts),
+        "landmarks_with_position": sum(shard.placed for shard in shards),
+        "dim": manifest.dim,
+        "shards": len(shards),
+        "largest_shard": max(shard.answering.bytes for shard in shards),
+        "bytes": sum(file.bytes for shard in shards for file in shard.files),
+        "metadata": dict(manifest.metadata),
+        "encoder": dict(manifest.encoder),
+    }
 
 
 def _describe_tracks(path: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Literal, overload
 
 from protomark import _core
 from protomark._core import PrototypeMap, SealedMap
-from protomark.files import SCENE_MAP, SEALED_MAP
+from protomark.files import MANIFEST, SCENE_MAP, SEALED_MAP
 
 
 def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
@@ -29,6 +29,8 @@ def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
     for name in (SCENE_MAP,) if learning else (SEALED_MAP, SCENE_MAP):
         if (path / name).is_file():
             return path / name
+    if (path / MANIFEST).is_file():
+        raise ValueError(f"{path} is a folder of shards: name one of its map files")
     _check_own(path)
     from protomark.tracks.importers import check_below
 
@@ -39,7 +41,7 @@ def map_path(path: str | os.PathLike[str], *, learning: bool = False) -> Path:
 def is_map(path: Path) -> bool:
     """Whether a path is a map file by its suffix, or the folder of a map."""
     if path.is_dir():
-        return any((path / name).is_file() for name in (SCENE_MAP, SEALED_MAP))
+        return any((path / name).is_file() for name in (SCENE_MAP, SEALED_MAP, MANIFEST))
     return path.suffix == ".pmk"
 
 

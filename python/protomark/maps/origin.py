@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import protomark as pm
+from protomark.geometry.camera import Camera
 from protomark.maps.cameras import KEY, cameras_text
 from protomark.maps.places import KEY as PLACES
 from protomark.maps.places import MAX_TEXT, places_text
@@ -15,24 +16,33 @@ from protomark.tracks.file import Tracks
 from protomark.tracks.joining import shifted_ids
 
 SOURCES, DETECTOR = "sources", "detector"
+# What `sources_metadata` says; all else is the user's.
+OF_SOURCES = (KEY, SOURCES, PLACES, DETECTOR)
 _COUNTED = ("keyframes", "landmarks", "observations")
 
 
 def tracks_metadata(tracks: Tracks) -> dict[str, str]:
-    """The metadata of a map of tracks that `protomark.maps.sources.read_places` read.
+    """The metadata of a map of tracks that `protomark.maps.sources.read_places` read."""
+    info = tracks.info
+    return sources_metadata(info["sources"], info["detectors"], tracks.cameras.values())
+
+
+def sources_metadata(
+    sources: Sequence[Mapping[str, Any]],
+    detectors: Sequence[Mapping[str, Any]],
+    cameras: Iterable[Camera],
+) -> dict[str, str]:
+    """The metadata of a map by facts on its sources, their detectors and all cameras.
 
     They name cameras, sources, places if there are several, and the detector if all sources had
     the same.
     """
-    texts = {
-        KEY: cameras_text(tracks.cameras.values()),
-        SOURCES: _sources_text(tracks.info["sources"]),
-    }
-    if places := places_text(tracks.info["sources"]):
+    texts = {KEY: cameras_text(cameras), SOURCES: _sources_text(sources)}
+    if places := places_text(sources):
         texts[PLACES] = places
-    detectors = {json.dumps(one, sort_keys=True) for one in tracks.info["detectors"]}
-    if len(detectors) == 1 and detectors != {"{}"}:
-        texts[DETECTOR] = detectors.pop()
+    found = {json.dumps(one, sort_keys=True) for one in detectors}
+    if len(found) == 1 and found != {"{}"}:
+        texts[DETECTOR] = found.pop()
     return texts
 
 
@@ -73,7 +83,7 @@ def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
     return "[]"
 
 
-def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
+def map_detector(scene: pm.PrototypeMap | pm.SealedMap | pm.ShardedMap) -> dict[str, Any]:
     """The detector of the images that a map was built from, by name, with its settings.
 
     Empty if nobody stored it, or if its sources had several.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +13,7 @@ from protomark.features.images import image_names
 from protomark.features.upright import SUFFIX
 from protomark.files import natural_key
 from protomark.geometry import colmap
+from protomark.geometry.camera import Camera
 from protomark.maps.info import is_tracks
 from protomark.progress import Progress, silent, tracked
 from protomark.tracks.database import is_database, stored_descriptor, tracks_from_database
@@ -147,9 +148,7 @@ def _read(source: Source, descriptor: str | None, threads: int, progress: Progre
     plain = descriptor.removesuffix(SUFFIX) if descriptor else None
     if source.kind == "tracks":
         tracks = Tracks.load(source.path)
-        made = {"version": tracks.info.get("software", {}).get("protomark", "unknown")}
-        made |= {"digest": tracks.info["input"]} if "input" in tracks.info else {}
-        tracks.info.setdefault("source", {"program": "Protomark", **made})
+        tracks.info["source"] = source_of_tracks(tracks.info)
         return tracks
     if source.kind == "map":
         return read_source(source.path)
@@ -166,6 +165,13 @@ def _read(source: Source, descriptor: str | None, threads: int, progress: Progre
     model = {"program": "images and a COLMAP model", "version": "unknown"}
     tracks.info["source"] = {**model, "digest": tracks.info["input"]}
     return tracks
+
+
+def source_of_tracks(info: dict[str, Any]) -> dict[str, Any]:
+    """What the `info` of tracks says of their source."""
+    made = {"version": info.get("software", {}).get("protomark", "unknown")}
+    made |= {"digest": info["input"]} if "input" in info else {}
+    return info.get("source", {"program": "Protomark", **made})
 
 
 def read_places(
@@ -218,35 +224,66 @@ def _often_seen(tracks: Tracks, min_observations: int | None) -> Tracks:
     _, landmark, counts = np.unique(
         tracks.landmark_of_keypoint[rows], return_inverse=True, return_counts=True
     )
-    limit = min(2, counts.max(initial=0)) if min_observations is None else min_observations
-    if not (counts >= max(limit, 1)).any():
+    limit = fewest_observations(int(counts.max(initial=0)), min_observations)
+    labels = tracks.landmark_of_keypoint.copy()
+    labels[rows[counts[landmark] < limit]] = -1
+    source = with_dropped(tracks.info["source"], limit, int((counts < limit).sum()))
+    return replace(tracks, landmark_of_keypoint=labels, info={**tracks.info, "source": source})
+
+
+def fewest_observations(highest: int, min_observations: int | None) -> int:
+    """How many observations a landmark needs in a source whose landmarks have up to `highest`.
+
+    Raises:
+        ValueError: none has so many.
+    """
+    limit = min(2, highest) if min_observations is None else min_observations
+    if highest < max(limit, 1):
         raise ValueError(
             f"no landmark has {max(limit, 1)} observations: give longer tracks or lower "
             "--min-observations"
         )
-    labels = tracks.landmark_of_keypoint.copy()
-    labels[rows[counts[landmark] < limit]] = -1
-    info = tracks.info
-    if short := int((counts < limit).sum()):
-        source = info["source"]
-        dropped = {
-            **source.get("dropped", {}),
-            f"landmarks of fewer observations than {limit}": short,
-        }
-        info = {**info, "source": {**source, "dropped": dropped}}
-    return replace(tracks, landmark_of_keypoint=labels, info=info)
+    return limit
+
+
+def with_dropped(source: dict[str, Any], limit: int, short: int) -> dict[str, Any]:
+    """The `info["source"]` of tracks of which so many landmarks had fewer observations."""
+    if not short:
+        return source
+    text = f"landmarks of fewer observations than {limit}"
+    return {**source, "dropped": {**source.get("dropped", {}), text: short}}
 
 
 def _facts(name: str, tracks: Tracks) -> dict[str, Any]:
-    """What the metadata of a map say of a source."""
+    return source_facts(
+        name,
+        tracks.info,
+        {
+            "keyframes": len(tracks.keyframe_names),
+            "landmarks": len(tracks.landmark_ids),
+            "observations": len(tracks.observations),
+        },
+        tracks.descriptor,
+        tracks.cameras.values(),
+        tracks.landmark_ids[[0, -1]].tolist(),
+    )
+
+
+def source_facts(
+    name: str,
+    info: dict[str, Any],
+    counts: dict[str, int],
+    descriptor: str,
+    cameras: Iterable[Camera],
+    ids: list[int],
+) -> dict[str, Any]:
+    """What the metadata of a map say of a source, by the `info` of its tracks."""
     return {
         "name": name,
-        **tracks.info["source"],
-        "keyframes": len(tracks.keyframe_names),
-        "landmarks": len(tracks.landmark_ids),
-        "observations": len(tracks.observations),
-        "descriptor": tracks.descriptor,
-        "cameras": sorted({f"{c.model} {c.width}x{c.height}" for c in tracks.cameras.values()}),
-        **({"detector": detector} if (detector := tracks.info.get("detector")) else {}),
-        "ids": tracks.landmark_ids[[0, -1]].tolist(),
+        **info["source"],
+        **counts,
+        "descriptor": descriptor,
+        "cameras": sorted({f"{c.model} {c.width}x{c.height}" for c in cameras}),
+        **({"detector": detector} if (detector := info.get("detector")) else {}),
+        "ids": ids,
     }

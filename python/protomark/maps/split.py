@@ -16,6 +16,13 @@ import protomark as pm
 from protomark.files import check_outputs
 from protomark.geometry.colmap import find_model, landmarks_by_image
 from protomark.maps.open import map_path, open_learning_map
+from protomark.maps.shards import (
+    Manifest,
+    check_manifest,
+    describe_file,
+    describe_shard,
+    encoder_facts,
+)
 from protomark.progress import Progress, silent, tracked
 
 
@@ -32,7 +39,8 @@ def split_file(
     """Split a learning map by `ids`, `parts` or `cell_size`; returns facts as JSON values.
 
     The files are NAME.0.pmk, NAME.1.pmk, ... by id, and NAME.I_J_K.pmk and NAME.nowhere.pmk by
-    space; sealed ones are NAME.0.sealed.pmk and so on. A part without landmarks has no file.
+    space; sealed ones are NAME.0.sealed.pmk and so on. A part without landmarks has no file. With
+    the manifest beside them the folder opens as one map (`pm.ShardedMap`).
     """
     if sum(option is not None for option in (ids, parts, cell_size)) != 1:
         raise ValueError("give one of --ids, --parts and --cell-size to split by")
@@ -43,28 +51,33 @@ def split_file(
     path = map_path(path, learning=True)
     scene = open_learning_map(path)
     named = _by_space(scene, cell_size) if cell_size is not None else _by_id(scene, ids, parts)
-    ending = ".sealed.pmk" if sealed else ".pmk"
+    kind, ending = ("sealed", ".sealed.pmk") if sealed else ("learning", ".pmk")
     files = [(folder / f"{path.stem}.{name}{ending}", part) for name, part in named if len(part)]
     for file, _ in files:
         if file.exists() and file.samefile(path):
             raise ValueError(f"{file} is the map itself: name another folder")
+    check_manifest(folder)
     folder.mkdir(parents=True, exist_ok=True)
     replaced = [str(file) for file, _ in files if file.exists()]
-    written = []
+    written, shards = [], []
     for file, part in tracked(files, progress, "write"):
         if sealed:
             part.seal(file)
         else:
             part.save(file)
-        part_ids = part.ids
+        name = file.name.removesuffix(ending)
+        shards.append(describe_shard(name, part, **{kind: describe_file(file)}))
         written.append(
             {
                 "file": str(file),
                 "landmarks": len(part),
-                "ids": [int(part_ids[0]), int(part_ids[-1])],
+                "ids": list(shards[-1].ids),
                 "bytes": file.stat().st_size,
             }
         )
+    Manifest(
+        encoder_facts(scene.encoder), scene.dim, scene.appearance_bits, dict(scene.metadata), shards
+    ).save(folder)
     return {"map": str(path), "landmarks": len(scene), "parts": written, "replaced": replaced}
 
 

@@ -30,7 +30,7 @@ FORMAT = "protomark-tracks"
 VERSION = 1
 
 # Dtypes and shapes, with m keyframes, n keypoints, l landmarks, b bytes per descriptor.
-_ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "keyframe_camera": (np.int32, ("m",)),
     "cam_from_world": (np.float64, ("m", 3, 4)),
     "offsets": (np.int64, ("m+1",)),
@@ -136,8 +136,7 @@ class Tracks:
     def encoder_name(self) -> str:
         """Name of the encoder that ships for what described the images."""
         detectors = self.info.get("detectors", [self.info.get("detector", {})])
-        corners = all(str(one.get("name")).startswith("GFTT") for one in detectors)
-        return "orb-gftt" if corners and self.descriptor == "orb" else self.descriptor
+        return shipped_encoder(self.descriptor, detectors)
 
     @property
     def keyframe_of_keypoint(self) -> NDArray[np.int64]:
@@ -156,7 +155,7 @@ class Tracks:
     def where(self, keep: NDArray[np.bool_]) -> Tracks:
         """The tracks with the keypoints for which `keep` (n,) is true, and with all landmarks."""
         counts = np.bincount(self.keyframe_of_keypoint[keep], minlength=len(self.keyframe_names))
-        rows = {name: getattr(self, name)[keep] for name, (_, s) in _ARRAYS.items() if s[0] == "n"}
+        rows = {name: getattr(self, name)[keep] for name, (_, s) in ARRAYS.items() if s[0] == "n"}
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         return replace(self, offsets=offsets, **rows)
 
@@ -195,7 +194,7 @@ class Tracks:
             "l": len(self.landmark_ids),
             "b": self.descriptors.shape[1] if self.descriptors.ndim == 2 else 0,
         }
-        for name, (dtype, shape) in _ARRAYS.items():
+        for name, (dtype, shape) in ARRAYS.items():
             array = getattr(self, name)
             want = tuple(sizes[s] if isinstance(s, str) else s for s in shape)
             if array.dtype != dtype or array.shape != want:
@@ -205,7 +204,7 @@ class Tracks:
                 )
         ids, offsets = self.landmark_ids, self.offsets
         seen = self.landmark_of_keypoint[self.landmark_of_keypoint != -1]
-        floats = [name for name, (dtype, _) in _ARRAYS.items() if issubclass(dtype, np.floating)]
+        floats = [name for name, (dtype, _) in ARRAYS.items() if issubclass(dtype, np.floating)]
         endless = [name for name in floats if not np.isfinite(getattr(self, name)).all()]
         runs = offsets[0] == 0 and offsets[-1] == sizes["n"] and (np.diff(offsets) >= 0).all()
         lacking = [int(i) for i in self.keyframe_camera if int(i) not in self.cameras]
@@ -245,7 +244,7 @@ class Tracks:
             "keyframe_names": json.dumps(self.keyframe_names),
             "info": json.dumps(self.info),
         }
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _ARRAYS}
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in ARRAYS}
         with replacing(path) as file:
             file.write(save(arrays, metadata=header))
 
@@ -263,21 +262,12 @@ class Tracks:
             raise FileNotFoundError(f"{path}: no such tracks file")
         try:
             with safetensors.safe_open(path, framework="numpy") as file:
-                header = file.metadata() or {}
-                if header.get("format") != FORMAT:
-                    raise ValueError("a safetensors file, but not a Protomark tracks file")
-                _check_version(header["version"])
-                missing = set(_ARRAYS) - set(file.keys())
+                fields = header_fields(file.metadata() or {})
+                missing = set(ARRAYS) - set(file.keys())
                 if missing:
                     raise ValueError(f"tracks file lacks {', '.join(sorted(missing))}")
-                arrays = {name: file.get_tensor(name) for name in _ARRAYS}
-            tracks = cls(
-                descriptor=header["descriptor"],
-                cameras=cameras_from_json(_json(header, "cameras")),
-                keyframe_names=_json(header, "keyframe_names"),
-                info=_json(header, "info"),
-                **arrays,
-            )
+                arrays = {name: file.get_tensor(name) for name in ARRAYS}
+            tracks = cls(**fields, **arrays)
             tracks.check()
         except safetensors.SafetensorError as error:
             from protomark.tracks.importers import check_own
@@ -289,6 +279,25 @@ class Tracks:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return tracks
+
+
+def header_fields(header: dict[str, str]) -> dict[str, Any]:
+    """The attributes of `Tracks` that a file keeps as text; raises ValueError or KeyError."""
+    if header.get("format") != FORMAT:
+        raise ValueError("a safetensors file, but not a Protomark tracks file")
+    _check_version(header["version"])
+    return {
+        "descriptor": header["descriptor"],
+        "cameras": cameras_from_json(_json(header, "cameras")),
+        "keyframe_names": _json(header, "keyframe_names"),
+        "info": _json(header, "info"),
+    }
+
+
+def shipped_encoder(descriptor: str, detectors: Sequence[dict[str, Any]]) -> str:
+    """Name of the encoder that ships for a descriptor at the keypoints of these detectors."""
+    corners = all(str(one.get("name")).startswith("GFTT") for one in detectors)
+    return "orb-gftt" if corners and descriptor == "orb" else descriptor
 
 
 def _check_version(text: str) -> None:
