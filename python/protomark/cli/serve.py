@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from protomark.cli.options import MaxKeypoints, MaxSize, Threads
+
+if TYPE_CHECKING:
+    from protomark.maps.sharded_map import ShardedMap
 
 
 def serve(
     scene: Annotated[
         Path,
         typer.Argument(
-            metavar="MAP", help="Map file (.pmk) with positions, or a folder of `protomark map`."
+            metavar="MAP",
+            help="Map file (.pmk) with positions, a folder of `protomark map`, or one of shards.",
         ),
     ],
     host: Annotated[
@@ -47,6 +51,18 @@ def serve(
     queue: Annotated[
         int, typer.Option(min=0, help="Requests that may wait for a thread; more are refused.")
     ] = 32,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Search in replicas of Ray Serve: local for a cluster on this machine, auto for "
+            "the one that runs on it, or HOST:PORT. All nodes see the map under the same path.",
+        ),
+    ] = None,
+    replicas: Annotated[
+        int | None,
+        typer.Option(min=1, show_default="2", help="With --ray: processes that hold each shard."),
+    ] = None,
 ) -> None:
     """Answer where images were taken in a map, over HTTP.
 
@@ -57,6 +73,8 @@ def serve(
 
     protomark serve kitchen
     """
+    from contextlib import ExitStack
+
     from protomark.cli.terminal import note
     from protomark.extras import optional
 
@@ -66,9 +84,17 @@ def serve(
     from protomark.serving.reading import Limits
     from protomark.serving.run import listen, serve_map
 
+    if replicas is not None and ray is None:
+        raise ValueError("--replicas is of --ray, which is missing")
     limits = Limits(max_megabytes, max_megapixels, timeout, threads, queue)
-    localizer = Localizer(scene, max_keypoints=max_keypoints, max_size=max_size, recall=recall)
-    with listen(host, port) as at:
+    with ExitStack() as until_end:
+        opened: Path | ShardedMap = scene
+        if ray is not None:
+            from protomark.serving.replicas import replicated
+
+            opened = until_end.enter_context(replicated(scene, ray, replicas or 2))
+        localizer = Localizer(opened, max_keypoints=max_keypoints, max_size=max_size, recall=recall)
+        at = until_end.enter_context(listen(host, port))
         count = f"{len(localizer.scene):,} landmarks"
         serve_map(
             scene, localizer, limits, at, lambda address: note(f"{address} serves {count}; /docs")

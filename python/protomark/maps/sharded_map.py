@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -265,17 +265,7 @@ class ShardedMap:
         limit = max_distance if ratio is None else None
 
         def look(view: _View) -> Found:
-            answers = [
-                part.map.search_codes(
-                    codes,
-                    width,
-                    limit,
-                    threads=threads,
-                    recall=recall if part.nlist else None,
-                    among=some,
-                )
-                for part, some in view.chosen(among)
-            ]
+            answers = self._searches(view.chosen(among), codes, width, limit, threads, recall)
             # Among no landmarks: what any map says to that.
             return merged(
                 answers or [view.parts[0].map.search_codes(codes, width, limit, among=[])],
@@ -284,6 +274,51 @@ class ShardedMap:
             )
 
         return _accepted(*self._ask(look), k, max_distance, ratio)
+
+    def search_shards(
+        self,
+        chosen: Sequence[tuple[str, Ids | None]],
+        codes: NDArray[np.int8],
+        k: int,
+        max_distance: int | None = None,
+        recall: float | None = None,
+    ) -> Found:
+        """Search some shards: the identities of their files, and ids to search there or None.
+
+        Raises:
+            FileNotFoundError: the folder holds another version of a shard.
+        """
+
+        def look(view: _View) -> Found:
+            parts = {part.shard.answering.identity: part for part in view.parts}
+            if gone := [identity for identity, _ in chosen if identity not in parts]:
+                raise FileNotFoundError(f"{self.path} holds no shard {gone[0]}: open it anew")
+            named = [(parts[identity], some) for identity, some in chosen]
+            return merged(self._searches(named, codes, k, max_distance, 1, recall), k)
+
+        return self._ask(look)
+
+    def _searches(
+        self,
+        chosen: Iterable[tuple[_Part, Ids | None]],
+        codes: NDArray[np.int8],
+        k: int,
+        max_distance: int | None,
+        threads: int,
+        recall: float | None,
+    ) -> list[Found]:
+        """What each of these shards finds, see `_View.chosen`; a subclass may ask elsewhere."""
+        return [
+            part.map.search_codes(
+                codes,
+                k,
+                max_distance,
+                threads=threads,
+                recall=recall if part.nlist else None,
+                among=some,
+            )
+            for part, some in chosen
+        ]
 
     def _ask(self, question: Callable[[_View], T]) -> T:
         try:

@@ -9,6 +9,7 @@ from protomark.geometry.pose import camera_centers, quaternion_from_rotation
 from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.solve import Localization
 from protomark.serving.messages import Answer, CameraMessage, MatchesMessage, Pose
+from protomark.serving.metrics import log
 from protomark.serving.reading import Limits, Query, Refusal, Upload, feature_camera, parse
 
 
@@ -44,6 +45,9 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
     decoded = time.perf_counter() - began
     try:
         found = localize_query(localizer, query)
+    except OSError as error:  # FileError, too
+        log.error("the map cannot be read: %s", error)
+        raise Refusal(503, "the map cannot be read now: try again in 5 s", 5) from None
     except ValueError as error:
         raise Refusal(422, str(error)) from None
     stages = {"wait": waited, "decode": decoded, **found.seconds}

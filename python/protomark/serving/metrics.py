@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 from prometheus_client import (
@@ -35,15 +36,15 @@ class Metrics:
 
     Args:
         workers: whose queue to report.
-        landmarks: number of landmarks of the map.
+        landmarks: says how many landmarks the map has.
     """
 
-    def __init__(self, workers: Workers, landmarks: int) -> None:
+    def __init__(self, workers: Workers, landmarks: Callable[[], int]) -> None:
         registry = self._registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         Info("protomark", "What runs here.", registry=registry).info({"version": __version__})
         for name, text, value in (
-            ("map_landmarks", "Landmarks of the map.", lambda: landmarks),
+            ("map_landmarks", "Landmarks of the map.", landmarks),
             ("requests_in_progress", "Requests to /localize now.", lambda: workers.in_progress),
             ("requests_waiting", "Those that wait for a thread.", lambda: workers.waiting),
         ):

@@ -49,8 +49,8 @@ def make_app(localizer: Localizer, limits: Limits, view: TopView) -> FastAPI:
         view: makes the picture of the map for the page, see `top_view`.
     """
     workers = Workers(limits)
-    landmarks, descriptor = len(localizer.scene), localizer.scene.encoder.descriptor
-    figures = Metrics(workers, landmarks)
+    descriptor = localizer.scene.encoder.descriptor
+    figures = Metrics(workers, lambda: len(localizer.scene))
     app = FastAPIOffline(
         title="Protomark", version=__version__, description=_DESCRIPTION, redoc_url=None
     )
@@ -100,7 +100,7 @@ def make_app(localizer: Localizer, limits: Limits, view: TopView) -> FastAPI:
         return Health(
             status="ok",
             version=__version__,
-            landmarks=landmarks,
+            landmarks=len(localizer.scene),
             descriptor=descriptor,
             in_progress=workers.in_progress,
             waiting=workers.waiting,
@@ -117,7 +117,7 @@ def make_app(localizer: Localizer, limits: Limits, view: TopView) -> FastAPI:
     def picture() -> JSONResponse:
         with once:
             places = seen()
-        return JSONResponse({"landmarks": landmarks, "places": places})
+        return JSONResponse({"landmarks": len(localizer.scene), "places": places})
 
     @app.get("/", include_in_schema=False)
     async def page() -> HTMLResponse:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import protomark as pm
 from protomark.geometry.pose import camera_centers, ground_plane
 from protomark.maps.places import Place
+from protomark.maps.sharded_map import ShardedMap
 
 MAX_LANDMARKS = 20_000
 # The plane of the widest spread, whatever this share of stray points does.
@@ -20,7 +21,7 @@ _STRAY = 0.03
 
 
 def top_view(
-    scene: pm.PrototypeMap | pm.SealedMap,
+    scene: pm.PrototypeMap | pm.SealedMap | ShardedMap,
     places: Sequence[Place],
     poses: NDArray[np.float64] | None,
 ) -> list[dict[str, Any]]:
