@@ -10,12 +10,13 @@ JOBS := $(shell nproc 2>/dev/null || echo 2)
 cmake = $(1)/bin/cmake -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(1)/bin/ninja) -DCMAKE_BUILD_TYPE=Release
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo bench test test-python test-cpp test-cpp-bridges test-arm sanitize sanitize-memory sanitize-threads \
+.PHONY: help demo bench test test-python test-ray test-cpp test-cpp-bridges test-arm sanitize sanitize-memory sanitize-threads \
   sanitize-python-memory sanitize-python-threads coverage fuzz torture check docs format clean
 help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick')"
 	@echo "make test      run the tests (C++ and Python)"
+	@echo "make test-ray  run the tests of builds on a Ray cluster"
 	@echo "make test-cpp-bridges  run the C++ tests and examples that need OpenCV and Eigen"
 	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
 	@echo "make sanitize  run the tests of the core under sanitizers (memory, undefined behaviour, threads)"
@@ -39,6 +40,10 @@ test: test-cpp test-python
 # One thread each, as there is a process for each core; a file's tests share what they made.
 test-python: .venv-test/installed .venv-test/bench
 	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n $(JOBS) --dist loadfile
+
+# Distributed builds on a Ray cluster of this machine.
+test-ray: .venv-ray/installed
+	OMP_NUM_THREADS=1 .venv-ray/bin/python -m pytest tests/test_distributed_ray.py
 
 test-cpp: .venv-test/installed
 	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \
@@ -155,7 +160,7 @@ format: .venv-check/installed
 	.venv-check/bin/clang-format -i $(CPP)
 
 clean:
-	rm -rf build .venv .venv-bench .venv-test .venv-sanitize .venv-check
+	rm -rf build .venv .venv-bench .venv-ray .venv-test .venv-sanitize .venv-check
 
 .venv/installed: $(SOURCES)
 	test -x .venv/bin/python || $(PYTHON) -m venv .venv
@@ -176,6 +181,11 @@ clean:
 # Without the peers: the tests that need one are skipped.
 .venv-test/bench: .venv-test/installed $(BENCH)
 	.venv-test/bin/pip install --quiet --no-deps ./benchmarks
+	touch $@
+
+.venv-ray/installed: $(SOURCES)
+	test -x .venv-ray/bin/python || $(PYTHON) -m venv .venv-ray
+	.venv-ray/bin/pip install --quiet -c constraints.txt '.[ray]' hypothesis pytest
 	touch $@
 
 .venv-sanitize/tools:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import socket
 from collections.abc import Callable, Iterator
@@ -14,6 +15,10 @@ from protomark.extras import optional
 LOCAL = "local"
 # Seconds in which an address has to answer.
 _TIMEOUT = 5.0
+# What a client of gRPC, which Ray speaks, sends first, and the type of the frame that it gets
+# (RFC 9113, 3.4 and 6.5).
+_SETTINGS = b"\4"
+_GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0" + _SETTINGS + bytes(5)
 # Tries of a task whose worker or node dies; an error of ours ends the build at once.
 TRIES = 50
 
@@ -69,9 +74,15 @@ def _check_answers(address: str) -> None:
     if not found:
         raise ValueError(f"--ray {address} is no address: give local, auto or HOST:PORT")
     try:
-        socket.create_connection((found[1], int(found[2])), _TIMEOUT).close()
+        with socket.create_connection((found[1], int(found[2])), _TIMEOUT) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") == "1":
+                return
+            connection.sendall(_GREETING)
+            answer = connection.recv(9)
     except (OSError, OverflowError) as error:
         raise ConnectionError(str(error)) from None
+    if answer[3:4] != _SETTINGS:
+        raise ConnectionError("something else listens there")
 
 
 def _check_nodes(ray: Any, memory: int) -> None:

@@ -70,8 +70,8 @@ class Folder:
         with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
             path = Path(folder) / Path(name).name
             yield path
-            fs, root = file_system(self.url)
-            fs.put_file(str(path), f"{root}/{name}")
+            fs, target = self._target(name)
+            fs.put_file(str(path), target)
 
     def write(self, name: str, content: bytes) -> None:
         """Write a small file, whole or not at all."""
@@ -80,8 +80,14 @@ class Folder:
             with replacing(self.local / name) as file:
                 file.write(content)
         else:
-            fs, root = file_system(self.url)
-            fs.pipe_file(f"{root}/{name}", content)
+            fs, target = self._target(name)
+            fs.pipe_file(target, content)
+
+    def _target(self, name: str) -> tuple[Any, str]:
+        fs, root = file_system(self.url)
+        target = f"{root}/{name}"
+        fs.makedirs(target.rpartition("/")[0], exist_ok=True)
+        return fs, target
 
     def read(self, name: str) -> bytes | None:
         """The content of a small file; None: there is none."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 import time
 from collections import defaultdict
@@ -411,7 +412,8 @@ class Job:
         output.write(MANIFEST, manifest.text().encode())
         kept = {file.name for shard in manifest.shards for file in shard.files}
         for name in output.names():
-            if name.startswith(_SHARD) and name.endswith(".pmk") and name not in kept:
+            # Also what workers that were killed began to write.
+            if re.match(_SHARD + r"\d+-[0-9a-f]{8}\.", name) and name not in kept:
                 output.remove(name)
         output.remove(tasks.WORK)
 
