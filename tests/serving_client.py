@@ -70,15 +70,15 @@ class Server:
         return self
 
     def __exit__(self, *error: object) -> None:
-        with suppress(subprocess.TimeoutExpired, AssertionError):
+        with suppress(subprocess.TimeoutExpired):
             self.stop()
         self.process.kill()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal, and wait for the end; returns the exit code."""
+        """Send a signal, 0 for none, and wait for the end; returns the exit code."""
         if self.process.poll() is None:
             self.process.send_signal(number)
-            self.log = self.process.communicate(timeout=60)[1]
+        self.log = self.log or self.process.communicate(timeout=60)[1]
         return self.process.returncode
 
     def connect(self) -> http.client.HTTPConnection:

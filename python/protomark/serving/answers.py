@@ -45,6 +45,9 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
     decoded = time.perf_counter() - began
     try:
         found = localize_query(localizer, query)
+        details = _details(localizer, found) if query.details else None
+    except KeyError:  # a shard has gone between the pose and its details
+        raise Refusal(503, "the map is changing: try again in 1 s", 1) from None
     except OSError as error:  # FileError, too
         log.error("the map cannot be read: %s", error)
         raise Refusal(503, "the map cannot be read now: try again in 5 s", 5) from None
@@ -53,13 +56,6 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
     stages = {"wait": waited, "decode": decoded, **found.seconds}
     stages["total"] = waited + time.perf_counter() - began
     pose = found.cam_from_world
-    details = None
-    if query.details:
-        details = MatchesMessage(
-            pixels=found.pixels.tolist(),
-            landmarks=found.landmarks.tolist(),
-            positions=localizer.scene.positions(found.landmarks).tolist(),
-        )
     return Answer(
         cam_from_world=None
         if pose is None
@@ -77,6 +73,14 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
         warnings=_doubts(query.camera, found.camera),
         seconds=stages,
         details=details,
+    )
+
+
+def _details(localizer: Localizer, found: Localization) -> MatchesMessage:
+    return MatchesMessage(
+        pixels=found.pixels.tolist(),
+        landmarks=found.landmarks.tolist(),
+        positions=localizer.scene.positions(found.landmarks).tolist(),
     )
 
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from protomark.distributed.cluster import connected
 from protomark.extras import optional
-from protomark.maps.sharded_map import Found, Ids, ShardedMap, merged
+from protomark.maps.neighbours import Found, merged
+from protomark.maps.sharded_map import Ids, ShardedMap
 
 # A replica that dies is replaced within seconds; until then another one is asked.
 _RETRY_SECONDS, _PAUSE = 20.0, 0.1
@@ -39,6 +40,10 @@ class Holder:
     ) -> Found:
         """See `ShardedMap.search_shards`."""
         return await asyncio.to_thread(self._map.search_shards, chosen, codes, *how)
+
+    def process(self) -> int:
+        """The id of this replica's process."""
+        return os.getpid()
 
 
 class ReplicatedMap(ShardedMap):

@@ -28,6 +28,7 @@ from protomark.threads import one_blas_thread
 
 # Between two looks at the manifest of a folder of shards.
 _LOOK_SECONDS = 2.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -67,7 +68,7 @@ def serve_map(
         optional(module)  # what is missing shows now, and the first request is as fast as others
     import protomark.geometry.colmap  # noqa: F401
 
-    for number in (signal.SIGINT, signal.SIGTERM):  # libraries take them for themselves
+    for number in _SIGNALS:  # libraries take them for themselves
         signal.signal(number, signal.default_int_handler)
     warnings.simplefilter("ignore")  # about cameras of requests: they stand in the answers
     _log_requests()
@@ -95,6 +96,8 @@ def serve_map(
     except KeyboardInterrupt:
         pass  # uvicorn raises the signal again once all is done
     finally:
+        for number in _SIGNALS:  # one was enough
+            signal.signal(number, signal.SIG_IGN)
         ended.set()
         follower.join()
         app.state.workers.close()
