@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import protomark as pm
 from conftest import balanced_encoder, random_descriptors
-from protomark.maps.sharded_map import merged
+from protomark.maps.neighbours import merged
 from protomark.maps.shards import Manifest
 from protomark.maps.split import split_file
 

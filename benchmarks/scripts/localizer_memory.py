@@ -48,14 +48,23 @@ def center(places: NDArray[np.int64] | np.int64) -> NDArray[np.float64]:
     return np.asarray(10.0 * np.stack([column, np.zeros_like(row), row], axis=-1))
 
 
+def learning_map(
+    synthetic: SyntheticLandmarks, encoder: pm.Encoder, first: int, last: int
+) -> pm.PrototypeMap:
+    """A learning map of synthetic landmarks from `first` to before `last`."""
+    scene = pm.PrototypeMap(encoder, DIM)
+    parts = range(first, last, _PART)
+    with progress_bar() as progress:
+        for begin in tracked(parts, progress, "make the map", len(parts)):
+            ids = np.arange(begin, min(begin + _PART, last))
+            scene.add_codes(ids, synthetic.prototypes(len(ids), begin))
+            scene.set_positions(ids, positions(begin, len(ids)))
+    return scene
+
+
 def make_map(path: Path, synthetic: SyntheticLandmarks, encoder: pm.Encoder, count: int) -> None:
     """Seal a map of so many synthetic landmarks."""
-    scene = pm.PrototypeMap(encoder, DIM)
-    with progress_bar() as progress:
-        for first in tracked(range(0, count, _PART), progress, "make the map", -(-count // _PART)):
-            ids = np.arange(first, min(first + _PART, count))
-            scene.add_codes(ids, synthetic.prototypes(len(ids), first))
-            scene.set_positions(ids, positions(first, len(ids)))
+    scene = learning_map(synthetic, encoder, 0, count)
     scene.build_index(threads=THREADS, in_place=True)
     scene.seal(path, position_bits=16)
 

@@ -10,11 +10,16 @@ from urllib.parse import unquote, urlparse
 
 # Module -> its name, and the extra of this package that installs it.
 _EXTRAS = {
+    "PIL": ("Pillow", "serve"),
     "cv2": ("OpenCV (opencv-contrib-python-headless)", "localize"),
+    "fastapi": ("FastAPI", "serve"),
+    "fastapi_offline": ("fastapi-offline", "serve"),
     "fsspec": ("fsspec", "ray"),
     "matplotlib": ("matplotlib", "map"),
     "poselib": ("PoseLib", "localize"),
+    "prometheus_client": ("prometheus-client", "serve"),
     "pycolmap": ("pycolmap", "localize"),
+    "python_multipart": ("python-multipart", "serve"),
     "ray": ("Ray", "ray"),
     "rerun": ("the Rerun SDK (rerun-sdk)", "view"),
     "rich": ("Rich", "cli"),
@@ -22,6 +27,7 @@ _EXTRAS = {
     "safetensors": ("safetensors", "map"),
     "torch": ("PyTorch", "train"),
     "typer": ("Typer", "cli"),
+    "uvicorn": ("uvicorn", "serve"),
 }
 
 

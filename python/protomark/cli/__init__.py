@@ -25,6 +25,7 @@ from protomark.cli.map import map_
 from protomark.cli.merge import merge
 from protomark.cli.plugins import CommandGroup
 from protomark.cli.seal import seal
+from protomark.cli.serve import serve
 from protomark.cli.split import split
 from protomark.cli.tracks import tracks
 from protomark.cli.train import train
@@ -42,6 +43,7 @@ app = typer.Typer(
 _COMMANDS: dict[str, Callable[..., Any]] = {
     "map": map_,
     "localize": localize,
+    "serve": serve,
     "tracks": tracks,
     "build": build,
     "seal": seal,

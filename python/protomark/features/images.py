@@ -102,23 +102,31 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
         FileNotFoundError: there is no such file.
         ValueError: the file is not an image, or it is truncated.
     """
-    cv2 = optional("cv2")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image")
-    data = np.fromfile(path, dtype=np.uint8)
+    return decode_gray(np.fromfile(path, dtype=np.uint8), str(path))
+
+
+def decode_gray(data: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """Decode the bytes (n,) of an image file as `read_gray` does; errors begin with the name.
+
+    Raises:
+        ValueError: the bytes are no image, or a truncated one.
+    """
+    cv2 = optional("cv2")
     # OpenCV fills the missing rows of a truncated image with grey and only warns.
     if _is_truncated(data.tobytes()):
-        raise ValueError(f"{path}: the image is truncated (no end marker), copy it anew")
+        raise ValueError(f"{name}: the image is truncated (no end marker), copy it anew")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(data, flags | cv2.IMREAD_ANYDEPTH) if len(data) else None
         if image is not None and image.dtype not in (np.uint8, np.uint16):
             image = cv2.imdecode(data, flags)
     except cv2.error as error:
-        raise ValueError(f"{path}: OpenCV cannot decode this image ({error.err})") from None
+        raise ValueError(f"{name}: OpenCV cannot decode this image ({error.err})") from None
     if image is None:
         raise ValueError(
-            f"{path}: the image is truncated, or its format is unknown: copy it anew, or convert it"
+            f"{name}: the image is truncated, or its format is unknown: copy it anew, or convert it"
         )
     return to_8_bits(image)
 

@@ -237,7 +237,12 @@ class Camera:
                 of view is below 1 or above 170 degrees (wide-angle models may see more), or its
                 distortion cannot be undone all over the image.
         """
-        _check_lens(self)
+        if doubt := self.lens_doubt():
+            warnings.warn(doubt, stacklevel=1)  # of one place, so that it is shown once per camera
+
+    def lens_doubt(self) -> str:
+        """A sentence if the camera is unlikely to be the image's, else ""; see `check_lens`."""
+        return _check_lens(self)
 
     @property
     def colmap(self) -> Any:
@@ -324,13 +329,13 @@ def _pixels(word: str) -> int:
 
 
 @lru_cache(maxsize=256)
-def _check_lens(camera: Camera) -> None:
+def _check_lens(camera: Camera) -> str:
     size = np.array([camera.width, camera.height])
     middle = np.array(camera.colmap.params)[camera.colmap.principal_point_idxs()]
     if camera.model == "EQUIRECTANGULAR":
         if camera.params != (camera.width, camera.height):
             raise ValueError(f"camera {camera}: its parameters are not the size of the image")
-        return
+        return ""
     if not ((middle > 0) & (middle < size)).all():
         raise ValueError(
             f"camera {camera}: its principal point lies outside the image: was it calibrated at "
@@ -344,11 +349,11 @@ def _check_lens(camera: Camera) -> None:
         raise ValueError(f"camera {camera}: its field of view is {view:.2g} degrees, below 1")
     if (abs(middle - size / 2) > _MAX_OFFSET * size).any():
         at = "{:.0f} x {:.0f}".format(*(2 * middle))
-        warnings.warn(
+        return (
             f"camera {camera}: its principal point is far from the middle of the image: was it "
-            f"calibrated at {at} pixels?",
-            stacklevel=4,
+            f"calibrated at {at} pixels?"
         )
+    return ""
 
 
 def _perspective_view(camera: Camera, middle: NDArray[np.float64]) -> float:

@@ -37,6 +37,7 @@ from protomark.maps.sharded_map import ShardedMap, open_scene
 from protomark.matching import MIN_PROBABILITY
 from protomark.threads import available_threads, parallel_map
 
+Scene = pm.PrototypeMap | pm.SealedMap | ShardedMap
 # With more keypoints outside the image they are not pixels (x, y).
 _MAX_OUTSIDE = 0.01
 # In place of a camera: have it estimated, although the map has one.
@@ -72,7 +73,7 @@ class Localizer:
 
     def __init__(
         self,
-        scene: pm.PrototypeMap | pm.SealedMap | ShardedMap | str | Path,
+        scene: Scene | str | Path,
         *,
         max_keypoints: int | None = None,
         max_size: int = MAX_SIZE,
@@ -229,20 +230,22 @@ class Localizer:
             raise ValueError(f"{len(keypoints)} keypoints, but {len(descriptors)} descriptors")
         _check_pixels(np.asarray(keypoints), camera)
         stages = dict(seconds or {})
+        # Shards may come and go, but not between a search and the positions of what it found.
+        scene = self.scene.snapshot() if isinstance(self.scene, ShardedMap) else self.scene
         with _timed(stages, "encode"):
-            codes = self.scene.encoder.encode(descriptors, self.scene.dim, self.threads)
+            codes = scene.encoder.encode(descriptors, scene.dim, self.threads)
         with _timed(stages, "search"):
             among = None
             if prior is not None:
-                among = self._visible(prior, camera)
-            ids, distances = self.scene.search_codes(
+                among = self._visible(scene, prior, camera)
+            ids, distances = scene.search_codes(
                 codes, k=CANDIDATES, threads=self.threads, recall=self.recall, among=among
             )
         with _timed(stages, "pose"):
             candidates = Candidates(
                 np.asarray(keypoints, np.float64).reshape(-1, 2),
                 ids,
-                self._positions_of(ids),
+                _positions_of(scene, ids),
                 self.calibration.probability(distances),
             )
             of_map = any(camera.resembles(c) for c in self.cameras.cameras)
@@ -253,15 +256,15 @@ class Localizer:
                 result = solve_pose(candidates, *request)
         return replace(result, seconds={**stages, "total": sum(stages.values())})
 
-    def _visible(self, prior: PosePrior, camera: Camera) -> NDArray[np.int64]:
+    def _visible(self, scene: Scene, prior: PosePrior, camera: Camera) -> NDArray[np.int64]:
         """Ids of the landmarks that are visible from near a pose."""
-        if isinstance(self.scene, ShardedMap):
+        if isinstance(scene, ShardedMap):
 
             def test(positions: NDArray[np.float64], off: float) -> NDArray[np.bool_]:
                 # What is seen there is seen here from a camera that is moved by as much.
                 return visible(replace(prior, distance=prior.distance + off), camera, positions)
 
-            return self.scene.visible(test)
+            return scene.visible(test)
         landmarks, positions = self._all_positions
         return landmarks[visible(prior, camera, positions)]
 
@@ -270,13 +273,6 @@ class Localizer:
         """Ids and positions of all landmarks, which only a prior needs."""
         ids = self.scene.ids
         return ids, self.scene.positions(ids)
-
-    def _positions_of(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions (..., 3) of ids (...), NaN where the id is -1 or has no position."""
-        positions = np.full((*ids.shape, 3), np.nan)
-        found = ids >= 0
-        positions[found] = self.scene.positions(ids[found])
-        return positions
 
     @cached_property
     def _extractor(self) -> Extractor:
@@ -330,7 +326,15 @@ def _check_pixels(keypoints: NDArray[np.floating], camera: Camera) -> None:
         )
 
 
-def _has_positions(scene: pm.PrototypeMap | pm.SealedMap | ShardedMap) -> bool:
+def _positions_of(scene: Scene, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Positions (..., 3) of ids (...), NaN where the id is -1 or has no position."""
+    positions = np.full((*ids.shape, 3), np.nan)
+    found = ids >= 0
+    positions[found] = scene.positions(ids[found])
+    return positions
+
+
+def _has_positions(scene: Scene) -> bool:
     # To look at all of a sealed map would read it whole; its landmarks have positions or none does.
     if isinstance(scene, pm.SealedMap):
         return scene.position_bits > 0

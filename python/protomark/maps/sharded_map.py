@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import protomark as pm
 from protomark.files import SCENE_MAP, SEALED_MAP
+from protomark.maps.neighbours import Found, accepted, merged
 from protomark.maps.open import map_path, open_map
 from protomark.maps.shards import (
     Manifest,
@@ -28,10 +30,8 @@ from protomark.maps.shards import (
     is_sharded,
 )
 
-NO_DISTANCE = 2**31 - 1  # where there is no neighbour
 Ids = NDArray[np.int64]
 T = TypeVar("T")
-Found = tuple[NDArray[np.int64], NDArray[np.int32]]
 
 
 class ShardedMap:
@@ -126,6 +126,10 @@ class ShardedMap:
             if len(rest) == len(self._view.parts):
                 raise KeyError(f"there is no shard {name}")
             self._view = _View(rest)
+
+    def snapshot(self) -> ShardedMap:
+        """This map with the shards that it has now, whatever comes and goes meanwhile."""
+        return copy.copy(self)
 
     @property
     def shards(self) -> tuple[Shard, ...]:
@@ -265,17 +269,7 @@ class ShardedMap:
         limit = max_distance if ratio is None else None
 
         def look(view: _View) -> Found:
-            answers = [
-                part.map.search_codes(
-                    codes,
-                    width,
-                    limit,
-                    threads=threads,
-                    recall=recall if part.nlist else None,
-                    among=some,
-                )
-                for part, some in view.chosen(among)
-            ]
+            answers = self._searches(view.chosen(among), codes, width, limit, threads, recall)
             # Among no landmarks: what any map says to that.
             return merged(
                 answers or [view.parts[0].map.search_codes(codes, width, limit, among=[])],
@@ -283,7 +277,52 @@ class ShardedMap:
                 view.ascending,
             )
 
-        return _accepted(*self._ask(look), k, max_distance, ratio)
+        return accepted(*self._ask(look), k, max_distance, ratio)
+
+    def search_shards(
+        self,
+        chosen: Sequence[tuple[str, Ids | None]],
+        codes: NDArray[np.int8],
+        k: int,
+        max_distance: int | None = None,
+        recall: float | None = None,
+    ) -> Found:
+        """Search some shards: the identities of their files, and ids to search there or None.
+
+        Raises:
+            FileNotFoundError: the folder holds another version of a shard.
+        """
+
+        def look(view: _View) -> Found:
+            parts = {part.shard.answering.identity: part for part in view.parts}
+            if gone := [identity for identity, _ in chosen if identity not in parts]:
+                raise FileNotFoundError(f"{self.path} holds no shard {gone[0]}: open it anew")
+            named = [(parts[identity], some) for identity, some in chosen]
+            return merged(self._searches(named, codes, k, max_distance, 1, recall), k)
+
+        return self._ask(look)
+
+    def _searches(
+        self,
+        chosen: Iterable[tuple[_Part, Ids | None]],
+        codes: NDArray[np.int8],
+        k: int,
+        max_distance: int | None,
+        threads: int,
+        recall: float | None,
+    ) -> list[Found]:
+        """What each of these shards finds, see `_View.chosen`; a subclass may ask elsewhere."""
+        return [
+            part.map.search_codes(
+                codes,
+                k,
+                max_distance,
+                threads=threads,
+                recall=recall if part.nlist else None,
+                among=some,
+            )
+            for part, some in chosen
+        ]
 
     def _ask(self, question: Callable[[_View], T]) -> T:
         try:
@@ -328,7 +367,7 @@ class _Part:
         scene = pm.open(self.path)
         _check_alike(self.path, scene, manifest.encoder, manifest.dim)
         if len(scene) != shard.landmarks:
-            raise ValueError(
+            raise pm.FileError(
                 f"{self.path} has {len(scene)} landmarks, its manifest says {shard.landmarks}"
             )
         return scene
@@ -405,41 +444,6 @@ class _View:
         yield from ((part, ids[rows]) for part, rows in self.locate(ids))
 
 
-def merged(answers: Sequence[Found], k: int, ascending: bool = False) -> Found:
-    """The k nearest of several searches for the same queries; ties go to the smaller id.
-
-    Args:
-        answers: ids (q, k) and distances (q, k) of each search, of different landmarks.
-        k: neighbours to return.
-        ascending: whether all ids of an answer are above those of the answers before it.
-    """
-    if len(answers) == 1:
-        return answers[0]
-    ids = np.concatenate([one[0] for one in answers], axis=1)
-    distances = np.concatenate([one[1] for one in answers], axis=1)
-    if ascending:
-        order = np.argsort(distances, axis=1, kind="stable")[:, :k]
-    else:
-        order = np.lexsort((ids, distances), axis=1)[:, :k]
-    return np.take_along_axis(ids, order, 1), np.take_along_axis(distances, order, 1)
-
-
-def _accepted(
-    ids: Ids, distances: NDArray[np.int32], k: int, max_distance: int | None, ratio: float | None
-) -> Found:
-    """Neighbours that pass the ratio test and the limit, as in core/src/search/driver.h."""
-    if ratio is None:
-        return ids, distances
-    if not 0 < ratio <= 1:
-        raise ValueError("ratio must be above 0 and at most 1")
-    passed = (ids[:, 1] < 0) | (distances[:, 0] < ratio * ratio * distances[:, 1])
-    keep = np.broadcast_to(passed[:, None], ids.shape)
-    if max_distance is not None:
-        keep = keep & (distances <= max_distance)
-    ids, distances = np.where(keep, ids, -1), np.where(keep, distances, NO_DISTANCE)
-    return ids[:, :k], distances[:, :k].astype(np.int32)
-
-
 def open_scene(path: str | os.PathLike[str]) -> pm.PrototypeMap | pm.SealedMap | ShardedMap:
     """Open a map: one file, the folder of `protomark map`, or a folder of shards."""
     return ShardedMap(path) if is_sharded(path) else open_map(path)
@@ -452,18 +456,18 @@ def _check_file(path: Path, file: ShardFile) -> None:
         )
     found = path.stat().st_size
     if found != file.bytes:
-        raise ValueError(
+        raise pm.FileError(
             f"{path} has {found:,} bytes, but its manifest says {file.bytes:,}: copy it again"
         )
     if file_identity(path) != file.identity:
-        raise ValueError(f"{path} is another file than its manifest says: copy it again")
+        raise pm.FileError(f"{path} is another file than its manifest says: copy it again")
 
 
 def _check_alike(
     path: Path, scene: pm.PrototypeMap | pm.SealedMap, encoder: Mapping[str, str], dim: int
 ) -> None:
     if (scene.encoder.identity, scene.dim) != (encoder["identity"], dim):
-        raise ValueError(
+        raise pm.FileError(
             f"{path} is of encoder '{scene.encoder.name}' with {scene.dim} numbers, the other "
             f"shards of '{encoder['name']}' with {dim}: build all with the same"
         )

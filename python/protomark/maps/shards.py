@@ -100,7 +100,7 @@ class Manifest:
         try:
             return cls.parse(path.read_bytes())
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise pm.FileError(f"{path}: {error}") from None
 
     @classmethod
     def parse(cls, text: str | bytes) -> Manifest:

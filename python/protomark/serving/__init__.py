@@ -1,0 +1,1 @@
+"""Serves a map over HTTP: an image or features go in, a pose comes out."""
