@@ -224,9 +224,12 @@ def warnings(mapper: Mapper) -> list[str]:
     out = []
     calibration, camera = mapper.calibration, mapper.camera
     if calibration is not None and not calibration.determined and not calibration.given:
+        span = [round(f) for f in sorted([camera.focal_length, *calibration.others])]
+        others = f", but {span[0]} to {span[-1]} fit as well" if calibration.others else ""
         out.append(
             f"the images do not determine the focal length, it stays at {camera.focal_length:.0f} "
-            "pixels: give the camera with --camera, or add images that turn and that come closer"
+            f"pixels{others}: give the camera with --camera or its focal length with --focal, or "
+            "add images that turn and that come closer"
         )
     if calibration is None and not mapper.options.fixed_poses:
         out += wrong_focal_lengths(mapper.structure)
