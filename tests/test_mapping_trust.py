@@ -131,19 +131,44 @@ def test_what_cannot_be_determined_is_said(tmp_path: Path) -> None:
     assert "do not determine the focal length" in done.stdout
     report = json.loads((tmp_path / "scene/report.json").read_text())
     assert "do not determine the focal length" in report["warnings"][0]
+    assert "320 to 461 fit as well" in report["warnings"][0]
     assert 0.3 * 320 <= report["camera"]["params"][0] <= 3 * 320
     assert "do not determine" in (tmp_path / "scene/report.html").read_text()
 
 
-def structure_of(poses: np.ndarray, points: np.ndarray) -> Structure:
+@pytest.mark.parametrize("turning", [True, False])
+def test_a_calibration_is_open_if_another_focal_length_fits_as_well(turning: bool) -> None:
+    """A straight road on which an early adjustment claimed a focal length, and a winding one."""
+    poses = walk(30)
+    for i, pose in enumerate(poses):
+        turn = 0.02 * i * turning
+        pose[:, :3] = cv2.Rodrigues(np.array([0.0, turn, 0.0]))[0]
+        pose[:, 3] = -pose[:, :3] @ [i * turn / 2, 0.02 * np.sin(i), 0.3 * i]
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-6, -2, 12], [10, 1, 30], (300, 3))
+    camera = Camera("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, 0.0))
+    mapper = Mapper(MappingOptions(descriptor="orb", calibrate=True), camera)
+    assert mapper.calibration is not None
+    mapper.calibration.deviation = 0.005
+    mapper.structure = structure_of(poses, points, camera)
+    codes = mapper.memory.encode(rng.integers(0, 256, (300, 32), np.uint8))
+    mapper.memory.add(mapper.structure.ids, codes)
+    mapper.finish()
+    warnings = trust.warnings(mapper)
+    assert any("250 to 360 fit as well" in one for one in warnings) != turning
+    mapper.calibration.given = True
+    assert trust.warnings(mapper) == []
+
+
+def structure_of(poses: np.ndarray, points: np.ndarray, camera: Camera = PINHOLE) -> Structure:
     """Frames that all see the same points, exactly."""
     rng = np.random.default_rng(0)
-    structure = Structure({1: PINHOLE}, MappingOptions(max_error=0.01))
+    structure = Structure({1: camera}, MappingOptions(max_error=0.01))
     ids = structure.create(points)
     for i, pose in enumerate(poses):
-        pixels = PINHOLE.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
+        pixels = camera.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
         frame = Frame(
-            *(i, str(i), float(i), 1, pixels.astype(np.float32), PINHOLE.rays(pixels)),
+            *(i, str(i), float(i), 1, pixels.astype(np.float32), camera.rays(pixels)),
             np.ones(len(ids)),
         )
         frame = frame.at(pose)

@@ -17,6 +17,8 @@ from protomark.mapping.self_calibration import Calibration
 # if its first keyframes leave the focal length open.
 _RIVALS = (0.6, 2.4)
 _KEYFRAMES = 16
+# A rival wins if it explains so many times as much.
+_LEAD = 1.1
 _EVENT = "the map restarts"
 
 
@@ -65,7 +67,9 @@ def compete(
             return None
         for rival in rivals:
             rival.add(image)
-    best = max([mapper, *rivals], key=_explained)
+    best = max(rivals, key=_explained)
+    if _explained(best) < _LEAD * _explained(mapper):
+        best = mapper
     for other in (mapper, *rivals):
         if other is not best:
             best.history.count(other.history.total_seconds())
