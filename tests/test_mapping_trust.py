@@ -180,7 +180,8 @@ def test_the_start_that_explains_most_goes_on() -> None:
     assert starts.needs_rivals(mapper, at_end=True)
     assert starts.compete(mapper, images, lambda: True) is None
     best = starts.compete(mapper, images, lambda: False)
-    assert best is not None and best.calibration is not None
+    assert best is not None
+    assert best.calibration is not None
     assert best.calibration.start == pytest.approx(0.6 * 320)
     assert not starts.needs_rivals(best, at_end=True), "starts compete once"
 
