@@ -41,7 +41,7 @@ _MAX_NAMED = 3
 _MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
 # A frame is of another lens if it fits a focal length that is this share longer or shorter than
 # most frames fit, and so many standard deviations: its own, and that of most frames.
-_MAX_STRETCH, _STRETCH_SIGMAS, _MOST_SIGMAS = 0.04, 3.0, 3.5
+_MAX_STRETCH, _STRETCH_SIGMAS, _MOST_SIGMAS = 0.04, 3.0, 5.0
 # A given pose is wrong if it is this share of the longer side off in the image (median). A map is
 # not extended if that share of the new frames contradict their given poses.
 _MAX_OFFSET = 0.05
