@@ -18,10 +18,10 @@ _MAX_FIXED = 15
 # Steps that show whether other focal lengths fit better.
 _FREE_STEPS = 30
 # The images leave the focal length open if one that is by this factor longer or shorter has at most
-# so many times the loss: on a straight road 1.00 to 1.01 times, with turns 1.04 times and more.
-_OTHER, _AS_GOOD = 1.2, 1.02
-# One of so many landmarks is enough to tell.
-_SAMPLED = 4
+# so many times the loss: on a straight road 1.00 times, with a turn 1.03 times and more.
+_OTHER, _AS_GOOD = 1.2, 1.015
+# So many landmarks are enough to tell.
+_SAMPLED = 2500
 
 
 def adjust_local_bundle(structure: Structure, newest: int, size: int, iterations: int) -> list[int]:
@@ -113,24 +113,25 @@ def other_factors(structure: Structure) -> list[float]:
     whole = _whole(structure, True, _SAMPLED)
     if whole is None:
         return []
-    bundle = whole[1]
-    losses = []
-    for factor in (1.0, 1 / _OTHER, _OTHER):
+    _, bundle = whole
+
+    def loss(factor: float) -> float:
         lenses = np.where(bundle.refined, bundle.lenses * [factor, 1], bundle.lenses)
         other = replace(bundle, lenses=lenses, refined=bundle.refined & [False, True])
-        losses.append((other.adjust(_FREE_STEPS), factor))
-    return [factor for loss, factor in losses[1:] if loss <= _AS_GOOD * losses[0][0]]
+        return other.adjust(_FREE_STEPS)
+
+    limit = _AS_GOOD * loss(1.0)
+    return [factor for factor in (1 / _OTHER, _OTHER) if loss(factor) <= limit]
 
 
 def _whole(
-    structure: Structure, calibrate: bool, sampled: int = 1
+    structure: Structure, calibrate: bool, limit: int = 10**9
 ) -> tuple[Observations, Bundle] | None:
-    """What all keyframes observe of one in `sampled` landmarks, all but the first moving."""
+    """What all keyframes, all but the first moving, observe of at most `limit` landmarks."""
     keyframes = structure.keyframes()
     seen = structure.observations(keyframes)
-    chosen = structure.counts() >= 2
-    chosen[chosen] = np.arange(chosen.sum()) % sampled == 0
-    seen = seen.where(chosen[seen.landmarks])
+    ids = np.flatnonzero(structure.counts() >= 2)
+    seen = seen.where(np.isin(seen.landmarks, ids[:: 1 + len(ids) // limit]))
     if not len(seen.frames):
         return None
     moves = np.zeros(len(structure.frames), bool)
