@@ -34,7 +34,7 @@ def simulated(moved: float = 0.0, lens: tuple[float, float] = (FOCAL, DISTORTION
         moving=moving,
         camera=np.zeros(10, np.int64),
         lenses=np.array([lens]),
-        refined=np.array([lens != (FOCAL, DISTORTION)]),
+        refined=np.array([[lens != (FOCAL, DISTORTION)] * 2]),
         points=points + moved * rng.normal(size=points.shape),
         frame=frame,
         point=point,

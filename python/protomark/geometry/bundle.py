@@ -42,7 +42,7 @@ class Bundle:
     moving: Flags  # (f,) whether each pose moves
     camera: Ids  # (f,) int64, camera of each frame
     lenses: Array  # (c, 2) float64, focal length in pixels, and distortion
-    refined: Flags  # (c,) whether each lens is refined
+    refined: Flags  # (c, 2) whether focal length and distortion of each lens are refined
     points: Array  # (l, 3) float64
     frame: Ids  # (n,) int64, frame of each observation
     point: Ids  # (n,) int64, its point
@@ -72,8 +72,8 @@ class Bundle:
         self._size = self._first_lens + 2 * len(self.lenses) * bool(self.refined.any())
         self._column = np.where(self.moving, np.cumsum(self.moving) - 1, -1)
 
-    def adjust(self, iterations: int, loss_scale: float = 1.0) -> None:
-        """Move poses, points and lenses to the least (Cauchy) reprojection error.
+    def adjust(self, iterations: int, loss_scale: float = 1.0) -> float:
+        """Move poses, points and lenses to the least (Cauchy) reprojection error; returns the loss.
 
         Args:
             iterations: limit on the steps.
@@ -97,6 +97,7 @@ class Bundle:
             damping = max(0.1 * damping, 1e-9)
             if gain <= _MIN_GAIN * state[0]:
                 break
+        return state[0]
 
     def errors(self) -> Array:
         """Reprojection errors (n,) in pixels, in the order of `frame` and `point`."""
@@ -285,8 +286,9 @@ class Bundle:
             along = (u * out[0, :6] + v * out[1, :6]) * (2 * distortion / (1 + distortion * square))
             out[:, :6] += rays[:, None] * along
         if out.shape[1] > 6:
-            out[:, 6] = self.refined[self._lens_of] * stretch * rays
-            out[:, 7] = self.refined[self._lens_of] * weight * focal * square * rays
+            of_focal, of_distortion = self.refined[self._lens_of].T
+            out[:, 6] = of_focal * stretch * rays
+            out[:, 7] = of_distortion * weight * focal * square * rays
         if self.turns is not None:
             for part in (slice(3), slice(3, 6)):
                 out[:, part] = np.einsum("rin,nij->rjn", out[:, part], self.turns)

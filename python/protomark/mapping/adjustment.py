@@ -17,6 +17,11 @@ from protomark.mapping.structure import Observations, Structure
 _MAX_FIXED = 15
 # Steps that show whether other focal lengths fit better.
 _FREE_STEPS = 30
+# The images leave the focal length open if one that is by this factor longer or shorter has at most
+# so many times the loss: on a straight road 1.000 times, elsewhere 1.014 times and more.
+_OTHER, _AS_GOOD = 1.2, 1.01
+# So many landmarks are enough to tell.
+_SAMPLED = 2500
 
 
 def adjust_local_bundle(structure: Structure, newest: int, size: int, iterations: int) -> list[int]:
@@ -93,19 +98,45 @@ def adjust(
 
 def free_focal_lengths(structure: Structure) -> dict[int, tuple[float, float]]:
     """Focal lengths that fit best, and their relative deviations, by camera; the map stays."""
-    keyframes = structure.keyframes()
-    seen = structure.observations(keyframes)
-    counts = np.bincount(seen.landmarks, minlength=len(structure.positions))
-    seen = seen.where(counts[seen.landmarks] >= 2)
-    if not len(seen.frames) or any(camera.wide for camera in structure.cameras.values()):
+    whole = _whole(structure, False)
+    if whole is None or any(camera.wide for camera in structure.cameras.values()):
         return {}
-    moves = np.zeros(len(structure.frames), bool)
-    moves[keyframes[1:]] = True
-    bundle = _bundle(structure, seen, moves, False)
-    bundle = replace(bundle, refined=np.ones(len(bundle.lenses), bool))
+    seen, bundle = whole
+    bundle = replace(bundle, refined=np.ones_like(bundle.refined))
     bundle.adjust(_FREE_STEPS)
     found = zip(bundle.lenses[:, 0].tolist(), bundle.focal_deviations().tolist(), strict=True)
     return dict(zip(_camera_ids(structure, seen), found, strict=True))
+
+
+def other_factors(structure: Structure) -> list[float]:
+    """Factors of the calibrated focal lengths that fit the images as well; the map stays."""
+    whole = _whole(structure, True, _SAMPLED)
+    if whole is None:
+        return []
+    _, bundle = whole
+
+    def loss(factor: float) -> float:
+        lenses = np.where(bundle.refined, bundle.lenses * [factor, 1], bundle.lenses)
+        other = replace(bundle, lenses=lenses, refined=bundle.refined & [False, True])
+        return other.adjust(_FREE_STEPS)
+
+    limit = _AS_GOOD * loss(1.0)
+    return [factor for factor in (1 / _OTHER, _OTHER) if loss(factor) <= limit]
+
+
+def _whole(
+    structure: Structure, calibrate: bool, limit: int = 10**9
+) -> tuple[Observations, Bundle] | None:
+    """What all keyframes, all but the first moving, observe of at most `limit` landmarks."""
+    keyframes = structure.keyframes()
+    seen = structure.observations(keyframes)
+    ids = np.flatnonzero(structure.counts() >= 2)
+    seen = seen.where(np.isin(seen.landmarks, ids[:: 1 + len(ids) // limit]))
+    if not len(seen.frames):
+        return None
+    moves = np.zeros(len(structure.frames), bool)
+    moves[keyframes[1:]] = True
+    return seen, _bundle(structure, seen, moves, calibrate)
 
 
 def _camera_ids(structure: Structure, seen: Observations) -> list[int]:
@@ -121,10 +152,9 @@ def _bundle(
     cameras = _camera_ids(structure, seen)
     camera = np.array([cameras.index(structure.frames[i].camera_id) for i in frames.tolist()])
     models = [structure.cameras[i] for i in cameras]
-    refined = np.array([calibrate and one.model == CALIBRATED_MODEL for one in models])
-    lenses = np.array(
-        [(c.focal_length, c.params[3] if r else 0.0) for c, r in zip(models, refined, strict=True)]
-    )
+    refined = np.array([[calibrate and one.model == CALIBRATED_MODEL] * 2 for one in models])
+    distortions = [c.params[3] if r else 0.0 for c, r in zip(models, refined[:, 1], strict=True)]
+    lenses = np.column_stack([[c.focal_length for c in models], distortions])
     focal, distortion = lenses[camera[frame]].T
     stretch = focal * (1 + distortion * (seen.rays * seen.rays).sum(1))
     poses = np.array([structure.frames[i].pose for i in frames.tolist()])
@@ -150,7 +180,7 @@ def _calibrated(structure: Structure, seen: Observations, bundle: Bundle) -> dic
     """The cameras that an adjustment refined."""
     out = {}
     for k, i in enumerate(_camera_ids(structure, seen)):
-        if bundle.refined[k]:
+        if bundle.refined[k].all():
             old, (focal, distortion) = structure.cameras[i], bundle.lenses[k].tolist()
             out[i] = replace(old, params=(focal, *old.params[1:3], distortion))
     return out

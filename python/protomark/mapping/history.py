@@ -44,6 +44,11 @@ class History:
         """Count seconds from here on."""
         self.earlier, self.closing_seconds = len(self.records), {}
 
+    def count(self, seconds: dict[str, float]) -> None:
+        """Count further seconds by stage."""
+        for name, value in seconds.items():
+            self.closing_seconds[name] = self.closing_seconds.get(name, 0.0) + value
+
     def total_seconds(self) -> dict[str, float]:
         """Seconds by stage over all frames of the last run and after them."""
         total: dict[str, float] = dict.fromkeys(STAGES, 0.0)

@@ -222,7 +222,7 @@ class Initialiser:
             moving=np.arange(len(poses)) > 0,
             camera=np.zeros(len(poses), np.int64),
             lenses=np.array([[self._focal, 0.0]]),
-            refined=np.zeros(1, bool),
+            refined=np.zeros((1, 2), bool),
             points=points,
             frame=np.repeat(np.arange(len(poses)), counts),
             point=np.concatenate(observed),

@@ -37,7 +37,7 @@ _LOCAL_SIZE = 10
 _LOCAL_ITERATIONS = 2
 # Global bundle adjustment follows whenever the number of keyframes has grown by this factor.
 _GROWTH = 1.5
-_FIRST_GLOBAL = 6
+FIRST_GLOBAL = 6
 # A map with fewer keyframes that loses this many frames in a row was initialised wrongly.
 _YOUNG_KEYFRAMES = 4
 _MAX_YOUNG_LOSSES = 3
@@ -58,13 +58,13 @@ class Mapper:
         new_memory: Callable[[MappingOptions], Memory] = prototypes_for,
     ) -> None:
         self.options, self.threads = options, threads
-        self._new_memory = new_memory
+        self.new_memory = new_memory
         self.structure = Structure({1: camera}, options)
         self.memory = new_memory(options)
         self.history = History()
         self.clock = Clock()
         self.camera_id = 1
-        self.next_global = _FIRST_GLOBAL
+        self.next_global = FIRST_GLOBAL
         self.lost_in_row = 0
         self.retrying = False
         self.calibration = Calibration(camera.focal_length) if options.calibrate else None
@@ -271,15 +271,15 @@ class Mapper:
         if drift:
             with self.clock.stage("adjust"):
                 adjustment.adjust_global_bundle(self.structure, 20, loss_scale=LOOP_LOSS_SCALE)
-            self._adjust_global_bundle(1)
+            self.adjust_global_bundle(1)
 
     def _adjust_global_bundle_if_grown(self) -> None:
         keyframes = len(self.structure.keyframes())
         if keyframes >= self.next_global:
             self.next_global = int(keyframes * _GROWTH) + 1
-            self._adjust_global_bundle(1, iterations=4)
+            self.adjust_global_bundle(1, iterations=4)
 
-    def _adjust_global_bundle(self, rounds: int, iterations: int = 10) -> None:
+    def adjust_global_bundle(self, rounds: int, iterations: int = 10) -> None:
         """Adjust and cull the whole map, and the camera if it is being calibrated."""
         structure = self.structure
         with self.clock.stage("adjust"):
@@ -390,8 +390,8 @@ class Mapper:
         record.outcome = reason
         waiting = self.initialiser.waiting[-1:]
         self.structure = Structure(self.structure.cameras, self.options)
-        self.memory = self._new_memory(self.options)
-        self.next_global, self.lost_in_row = _FIRST_GLOBAL, 0
+        self.memory = self.new_memory(self.options)
+        self.next_global, self.lost_in_row = FIRST_GLOBAL, 0
         self._reset_initialiser()
         self.initialiser.waiting = waiting
 
@@ -400,33 +400,6 @@ class Mapper:
         young = len(self.structure.keyframes()) < _YOUNG_KEYFRAMES and not self.retrying
         if young and self.lost_in_row >= _MAX_YOUNG_LOSSES:
             self._abort_initialisation(record, "the map lost the camera when it had just started")
-
-    # The camera.
-
-    def needs_restart(self, at_end: bool = False) -> bool:
-        """Whether the camera proved so different from the start that the map has to restart.
-
-        Once no frame is left, the existing keyframes decide.
-        """
-        if self.calibration is None:
-            return False
-        if at_end and len(self.structure.keyframes()) >= _FIRST_GLOBAL:
-            self._adjust_global_bundle(2)
-        return self.calibration.needs_restart(self.camera.focal_length)
-
-    def restart(self) -> Mapper:
-        """An empty map that starts with the camera which this one calibrated."""
-        assert self.calibration is not None
-        new = Mapper(self.options, self.camera, self.threads, self._new_memory)
-        new.calibration = self.calibration.restarted(self.camera.focal_length)
-        new.features, new.mask = self.features, self.mask
-        new.history.closing_seconds = self.history.total_seconds()
-        new.history.events = [e for e in self.history.events if e.startswith("the map restarts")]
-        new.history.events.append(
-            f"the map restarts: focal length {new.calibration.start:.0f}, not "
-            f"{self.calibration.start:.0f} pixels"
-        )
-        return new
 
     # The end.
 
@@ -437,7 +410,7 @@ class Mapper:
             self._retry_lost_frames(reread, progress)
         progress("adjust", 0, 0)
         if self.structure.frames:
-            self._adjust_global_bundle(2)
+            self.adjust_global_bundle(2)
             self._remove_untrusted_frames()
         for frame in self.structure.frames:
             frame.descriptors = None
@@ -445,12 +418,18 @@ class Mapper:
         with self.clock.stage("adjust"):
             culling.cull_landmarks(self.structure, self.memory, self.structure.ids)
         if self.structure.frames:
-            self._adjust_global_bundle(1)
+            self.adjust_global_bundle(1)
+            self._check_calibration()
         for frame in self.structure.frames:
             frame.leave_window()
-        for name, seconds in self.clock.lap().items():
-            total = self.history.closing_seconds
-            total[name] = total.get(name, 0.0) + seconds
+        self.history.count(self.clock.lap())
+
+    def _check_calibration(self) -> None:
+        """Note which other focal lengths fit as well."""
+        if self.calibration is not None and not self.calibration.given:
+            with self.clock.stage("adjust"):
+                factors = adjustment.other_factors(self.structure)
+            self.calibration.others = [k * self.camera.focal_length for k in factors]
 
     def _remove_untrusted_frames(self) -> None:
         """Remove frames whose poses fail the checks: they do not count as registered."""

@@ -1,10 +1,10 @@
-"""Self-calibration: which focal length the first frames vote for, and whether the map proves it."""
+"""Self-calibration: which focal lengths a map may start with, and whether it proves its own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -48,11 +48,14 @@ class Calibration:
     deviation: float = math.inf
     restarts: int = 0  # number of times that the map has started again
     given: bool = False  # whether the start comes from the user or the camera and not from a guess
+    guessed: bool = False  # whether it is a guess, and no other start has competed with it yet
+    # Focal lengths that fit the finished map as well as its own, pixels.
+    others: list[float] = field(default_factory=list)
 
     @property
     def determined(self) -> bool:
         """Whether the images determine the focal length."""
-        return math.isfinite(self.deviation)
+        return math.isfinite(self.deviation) and not self.others
 
     def accept(self, cameras: Sequence[Camera], deviation: float) -> bool:
         """Whether adjusted cameras are plausible, and the images determine them.
@@ -77,7 +80,8 @@ class Calibration:
     def restarted(self, focal_length: float) -> Calibration:
         """The calibration of a map that starts with what this one determined."""
         limit = min(self.limit, _RESTART_SLACK * self.deviation)
-        return Calibration(focal_length, limit, self.deviation, self.restarts + 1, self.given)
+        again = self.restarts + 1
+        return Calibration(focal_length, limit, self.deviation, again, self.given, self.guessed)
 
 
 def is_plausible(camera: Camera) -> bool:

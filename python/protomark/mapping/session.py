@@ -16,6 +16,7 @@ from protomark.geometry.camera import Camera
 from protomark.geometry.camera_files import read_cameras
 from protomark.geometry.given_poses import misfit
 from protomark.interrupt import Interrupted, deferred_interrupt
+from protomark.mapping import starts
 from protomark.mapping.frame import InputImage
 from protomark.mapping.mapper import Mapper
 from protomark.mapping.merging_maps import insert_map
@@ -32,12 +33,12 @@ from protomark.mapping.request import (
     same_camera,
 )
 from protomark.mapping.self_calibration import MAX_RESTARTS, elect_focal_length
-from protomark.mapping.source import EXIF, GIVEN, FrameSource, ImageFolder, open_source
+from protomark.mapping.source import EXIF, GIVEN, GUESS, FrameSource, ImageFolder, open_source
 from protomark.mapping.state import CHECKPOINT, load_state, save_checkpoint, save_state
 from protomark.mapping.survey import Survey, survey
 from protomark.mapping.trust import are_elsewhere, no_map
 from protomark.maps.alignment import align_maps
-from protomark.progress import Progress, silent
+from protomark.progress import Progress, silent, tracked
 from protomark.threads import one_blas_thread, read_ahead
 
 RECORDING = "recording.rrd"
@@ -174,10 +175,15 @@ class _Session:
             self._check_poses(surveyed, camera, options)
         if request.force:
             shutil.rmtree(request.output / CHECKPOINT, ignore_errors=True)
-        self.mapper = Mapper(options, camera, request.threads)
+        self._set_mapper(options, camera, origin)
+        self._prepare(surveyed, "", {})
+
+    def _set_mapper(self, options: MappingOptions, camera: Camera, origin: str) -> None:
+        """Start an empty map with a camera; `origin` says where its focal length comes from."""
+        self.mapper = Mapper(options, camera, self.request.threads)
         if self.mapper.calibration is not None:
             self.mapper.calibration.given = origin in (GIVEN, EXIF)
-        self._prepare(surveyed, "", {})
+            self.mapper.calibration.guessed = origin == GUESS
 
     def _check_poses(self, surveyed: Survey, camera: Camera, options: MappingOptions) -> None:
         pixel = pixel_size((camera.width, camera.height), options.max_size)
@@ -273,11 +279,12 @@ class _Session:
         self.note(f"{name} shows none of the first frames: they are mapped apart, to be merged")
         options, camera = base.options, base.camera
         surveyed = self._in_order(options, surveyed)
+        origin = ""
         if (camera.width, camera.height) != self.source.size():
-            camera, _ = self._guess_camera(surveyed)
+            camera, origin = self._guess_camera(surveyed)
             options = replace(options, calibrate=True)
         self.known = 0
-        self.mapper = Mapper(options, camera, self.request.threads)
+        self._set_mapper(options, camera, origin)
         self._prepare(surveyed, prefix, inputs)
 
     def finish(self) -> bool:
@@ -390,9 +397,14 @@ class _Session:
             asked = time.perf_counter()
             image = next(images, None)
             waited = time.perf_counter() - asked
-            if self.mapper.needs_restart(at_end=image is None):
+            if starts.needs_rivals(self.mapper, at_end=image is None):
+                if not self._compete(interrupted):
+                    self._save()
+                    return False
+                first, started = self.cursor, time.monotonic()
+            if starts.needs_restart(self.mapper, at_end=image is None):
                 # The wrong focal length has bent the first part of the map.
-                self.mapper = self.mapper.restart()
+                self.mapper = starts.restart(self.mapper)
                 self.note(self.mapper.history.events[-1])
                 self.cursor, first, started = 0, 0, time.monotonic()
                 images = self._images()
@@ -420,6 +432,18 @@ class _Session:
         self._save()
         return True
 
+    def _compete(self, interrupted: Callable[[], bool]) -> bool:
+        """Go on with the map of the frames so far that explains most; False if a signal comes."""
+        first = islice(self.source.images(), self.cursor)
+        images = tracked(first, self.progress, "try other focal lengths", self.cursor)
+        again = (self._with_features(image, again=True) for image in images)
+        best = starts.compete(self.mapper, again, interrupted)
+        if best is None:
+            return False
+        self.mapper = best
+        self.note(f"the focal length of {best.camera.focal_length:.0f} pixels explains most")
+        return True
+
     def _images(self, start: int = 0) -> Iterator[InputImage]:
         """The images; with several threads the features of the next are detected meanwhile."""
         images = self.source.images(start)
@@ -427,12 +451,12 @@ class _Session:
             images = map(self._with_features, images)
         return read_ahead(images, self.request.threads)
 
-    def _with_features(self, image: InputImage) -> InputImage:
-        mapper = self.mapper
-        known = image.name in mapper.features or image.name in mapper.history.records
+    def _with_features(self, image: InputImage, again: bool = False) -> InputImage:
+        known = image.name in self.mapper.history.records and not again
+        known = known or image.name in self.mapper.features
         if known or image.image is None or image.image.shape[::-1] != self.source.size():
             return image
-        return replace(image, features=mapper.extractor(image.image))
+        return replace(image, features=self.mapper.extractor(image.image))
 
     def _stage(self) -> str:
         """The name of the stage: a progress bar starts anew with each."""

@@ -34,8 +34,8 @@ _SAME_CAMERA = 0.01
 # A fisheye's image circle leaves out squares of this part of the longer side in each corner, where
 # no pixel is brighter than that.
 _CORNER, _BLACK = 16, 6
-# Origins of a focal length that is no guess.
-GIVEN, EXIF = "given", "from EXIF data"
+# Origins of a focal length.
+GIVEN, EXIF, GUESS = "given", "from EXIF data", "a guess"
 
 
 class FrameSource(ABC):
@@ -183,7 +183,7 @@ class FrameSource(ABC):
                 "none, --focal"
             )
         if focal is None:
-            focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), "a guess"
+            focal, origin = DEFAULT_FOCAL_RATIO * max(width, height), GUESS
         if not (np.isfinite(focal) and focal > 0):
             raise ValueError(f"--focal {focal}: give a positive number of pixels")
         return Camera(_GUESSED_MODEL, width, height, (focal, width / 2, height / 2, 0.0)), origin

@@ -41,7 +41,7 @@ _MAX_NAMED = 3
 _MAX_OFF, _MAX_SIGMAS = 0.05, 5.0
 # A frame is of another lens if it fits a focal length that is this share longer or shorter than
 # most frames fit, and so many standard deviations: its own, and that of most frames.
-_MAX_STRETCH, _STRETCH_SIGMAS, _MOST_SIGMAS = 0.04, 3.0, 3.5
+_MAX_STRETCH, _STRETCH_SIGMAS, _MOST_SIGMAS = 0.04, 3.0, 5.0
 # A given pose is wrong if it is this share of the longer side off in the image (median). A map is
 # not extended if that share of the new frames contradict their given poses.
 _MAX_OFFSET = 0.05
@@ -224,9 +224,12 @@ def warnings(mapper: Mapper) -> list[str]:
     out = []
     calibration, camera = mapper.calibration, mapper.camera
     if calibration is not None and not calibration.determined and not calibration.given:
+        span = [round(f) for f in sorted([camera.focal_length, *calibration.others])]
+        others = f", but {span[0]} to {span[-1]} fit as well" if calibration.others else ""
         out.append(
             f"the images do not determine the focal length, it stays at {camera.focal_length:.0f} "
-            "pixels: give the camera with --camera, or add images that turn and that come closer"
+            f"pixels{others}: give the camera with --camera or its focal length with --focal, or "
+            "add images that turn and that come closer"
         )
     if calibration is None and not mapper.options.fixed_poses:
         out += wrong_focal_lengths(mapper.structure)
