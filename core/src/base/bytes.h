@@ -15,9 +15,6 @@ T load(const void* from) {
   std::memcpy(&value, from, sizeof(value));
   return value;
 }
-template <typename T>
-void store(void* to, const T& value) {
-  std::memcpy(to, &value, sizeof(value));
-}
+void store(void* to, const auto& value) { std::memcpy(to, &value, sizeof(value)); }
 
 }  // namespace protomark

@@ -26,8 +26,7 @@ inline Range range_of(size_t n, size_t ranges, size_t i, size_t grain) {
 
 // Calls body(begin, end) for ranges that cover [0, n), on up to `threads` threads. All ranges but
 // the last have a multiple of `grain` elements.
-template <typename Body>
-void parallel_for(int threads, size_t n, size_t grain, const Body& body) {
+void parallel_for(int threads, size_t n, size_t grain, const auto& body) {
   if (threads == 1 && n > 0) return body(size_t{0}, n);
   // With several ranges per thread, others take over from a thread that is held up.
   const size_t ranges = std::min((n + grain - 1) / grain, 4 * static_cast<size_t>(threads));

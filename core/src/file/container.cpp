@@ -56,15 +56,16 @@ std::vector<std::byte> ContainerWriter::emit(const Put& put) const {
       table.push_back(entry);
       if (size != kUnknownSize) offset = align(offset + size);
     }
-    std::vector<Sink> sinks;
+    Writers writers;
     for (size_t i = first; i < table.size(); ++i) {
-      sinks.emplace_back([&put, &entry = table[i]](Bytes bytes) {
+      writers.emplace(group.parts[i - first].name, [&put, &entry = table[i]](Bytes bytes) {
         entry.crc = crc32(bytes, entry.crc);
         put(entry.offset + entry.size, bytes);
         entry.size += bytes.size();
       });
     }
-    group.produce(sinks);
+    group.produce(writers);
+    for (auto& [name, writer] : writers) writer.finish();
     for (size_t i = 0; i < group.parts.size(); ++i) {
       const auto& [name, size] = group.parts[i];
       const SectionEntry& entry = table[first + i];

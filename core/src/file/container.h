@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <map>
 
 #include "base/packed_numbers.h"
 #include "file/disk.h"
@@ -79,23 +80,23 @@ struct ContainerHead {
 // while the file is written.
 class ContainerWriter {
  public:
-  using Sink = protomark::Sink;
-  using Sinks = std::span<const Sink>;
+  // The writers of sections by name; that of a section which is left out takes nothing.
+  using Writers = std::map<std::string_view, ValueWriter>;
   struct Part {
     std::string name;
     size_t size;  // in bytes
   };
   static constexpr size_t kUnknownSize = SIZE_MAX;
-  using Produce = std::function<void(Sinks)>;
+  using Produce = std::function<void(Writers&)>;
 
   explicit ContainerWriter(FileKind kind) : kind_(kind) {}
 
   void add(std::string name, Bytes bytes) {
-    add({{std::move(name), bytes.size()}},
-        [owned = std::vector(bytes.begin(), bytes.end())](Sinks sinks) { sinks[0](owned); });
+    add({{std::move(name), bytes.size()}}, [owned = std::vector(bytes.begin(), bytes.end())](
+                                               Writers& to) { to.begin()->second.add_all(owned); });
   }
-  // Sections that are produced side by side, each time that the file is written: `produce` gets a
-  // sink for each. Only the size of the last one may be unknown.
+  // Sections that are produced side by side, each time that the file is written: `produce` gets
+  // their writers. Only the size of the last one may be unknown.
   void add(std::vector<Part> parts, Produce produce) {
     groups_.push_back({std::move(parts), std::move(produce)});
   }
@@ -136,16 +137,6 @@ class ContainerWriter {
 
   FileKind kind_;
   std::vector<Group> groups_;
-};
-
-// Gives the sinks of sections one after the other, and an empty one for a section that is left out.
-class SinkQueue {
- public:
-  explicit SinkQueue(ContainerWriter::Sinks sinks) : next_(sinks.begin()) {}
-  Sink next(bool present = true) { return present ? *next_++ : Sink(); }
-
- private:
-  ContainerWriter::Sinks::iterator next_;
 };
 
 // A checked view of the bytes of a file, which errors call `name`. All functions throw FileError.
@@ -191,12 +182,8 @@ class ContainerReader {
     for (const SectionEntry& entry : sections_) read(entry.name());
   }
   // Throw FileError about this file, two of them unless a condition holds.
-  template <typename... Parts>
-  [[noreturn]] void fail(const Parts&... what) const {
-    throw FileError(text(name_, ": ", what...));
-  }
-  template <typename... Parts>
-  void require(bool condition, const Parts&... what) const {
+  [[noreturn]] void fail(const auto&... what) const { throw FileError(text(name_, ": ", what...)); }
+  void require(bool condition, const auto&... what) const {
     if (!condition) fail(what...);
   }
   void require_size(bool condition, std::string_view section) const {

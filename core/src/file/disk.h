@@ -13,8 +13,7 @@ namespace protomark {
 
 std::string system_error();
 
-template <typename... Parts>
-[[noreturn]] void fail_file(const std::filesystem::path& path, const Parts&... what) {
+[[noreturn]] void fail_file(const std::filesystem::path& path, const auto&... what) {
   throw FileError(text(path.string(), ": ", what...));
 }
 

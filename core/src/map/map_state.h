@@ -101,8 +101,7 @@ class MapChange {
 
   // Calls write_one(i) for all i below n, in pieces after each of which all rows are in their
   // lists.
-  template <typename WriteOne>
-  void in_pieces(size_t n, const WriteOne& write_one) {
+  void in_pieces(size_t n, const auto& write_one) {
     for (size_t first = 0; first < n; first += kPiece) {
       const auto lock = write();
       for (size_t i = first; i < std::min(n, first + kPiece); ++i) write_one(i);

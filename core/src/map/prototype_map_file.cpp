@@ -61,12 +61,10 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
   if (ids) IdBlockWriter::add_to(parts, n);
 
-  file.add(std::move(parts), [=, &store](ContainerWriter::Sinks sinks) {
-    SinkQueue queue(sinks);
-    ValueWriter counts(queue.next());
-    PackedWriter spares(queue.next()), sums(queue.next()), appearances(queue.next(several));
-    ValueWriter positions_of(queue.next(positions));
-    IdBlockWriter ids_of{queue.next(ids), queue.next(ids)};
+  file.add(std::move(parts), [=, &store](ContainerWriter::Writers& to) {
+    ValueWriter &counts = to[section::kCounts], &spares = to[section::kSpareBits],
+                &sums = to[section::kSums], &appearances = to[section::kAppearances];
+    IdBlockWriter ids_of(to);
     const auto put_piece = [&](std::span<const LandmarkIndex> landmarks) {
       constexpr size_t kAhead = 16;
       const std::vector<Row> rows = store.sorted_rows(landmarks);
@@ -93,24 +91,16 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
       }
       for (const LandmarkIndex l : landmarks) {
         if (ids) ids_of.add(store.id(l));
-        if (positions) positions_of.add(store.position(l));
+        if (positions) to[section::kPositions].add(store.position(l));
       }
     };
     const auto put = [&](std::span<const LandmarkIndex> landmarks) {
-      constexpr size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
-      for (size_t first = 0, end = 0; first < landmarks.size(); first = end) {
-        for (size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
-          rows += store.row_count(landmarks[end]);
-        }
-        put_piece(landmarks.subspan(first, end - first));
+      constexpr size_t kAtOnce = 1 << 10;  // whose rows take little memory
+      for (size_t first = 0; first < landmarks.size(); first += kAtOnce) {
+        put_piece(landmarks.subspan(first, std::min(kAtOnce, landmarks.size() - first)));
       }
     };
     changed ? put(*changed) : store.visit_sorted_landmarks(put);
-    counts.finish();
-    spares.finish();
-    sums.finish();
-    appearances.finish();
-    positions_of.finish();
     ids_of.finish();
   });
 }

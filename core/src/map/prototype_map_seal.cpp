@@ -9,7 +9,7 @@
 namespace protomark {
 namespace {
 
-using Sinks = ContainerWriter::Sinks;
+using Writers = ContainerWriter::Writers;
 
 // Packs blocks of kPackedRows rows as search reads them.
 class BlockPacker {
@@ -95,12 +95,9 @@ class SealedLandmarks {
 // Writes rows, each list beginning a new block, and their owners if there is a writer for these.
 class RowWriter {
  public:
-  RowWriter(const BlockPacker& packer, size_t landmarks, Sink prototypes,
-            PackedWriter* owners = nullptr)
-      : packer_(packer),
-        landmarks_(landmarks),
-        prototypes_(std::move(prototypes)),
-        owners_(owners) {}
+  RowWriter(const BlockPacker& packer, size_t landmarks, ValueWriter& prototypes,
+            ValueWriter* owners = nullptr)
+      : packer_(packer), landmarks_(landmarks), prototypes_(prototypes), owners_(owners) {}
 
   void add(Row row, size_t owner = 0) {
     block_[filled_++] = row;
@@ -112,16 +109,12 @@ class RowWriter {
   void end_list() {
     while (filled_ != 0) add(kNoRow, landmarks_);
   }
-  void finish() {
-    end_list();
-    prototypes_.finish();
-  }
 
  private:
   const BlockPacker& packer_;
   size_t landmarks_;
-  ValueWriter prototypes_;
-  PackedWriter* owners_;
+  ValueWriter& prototypes_;
+  ValueWriter* owners_;
   std::array<Row, kPackedRows> block_{};
   size_t filled_ = 0;
 };
@@ -133,27 +126,24 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
   const size_t size = std::max<size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector) + 1);
   std::array<Row, kPackedRows> block;
-  const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(2, {});
-  PackedPrototypes piece = packer.view();
-  piece.data = packed.data();
-  for (size_t first = 0; first < store.row_end(); first += piece.rows) {
-    piece.rows = std::min(size, store.row_end() - first);
-    auto* to = reinterpret_cast<uint8_t*>(packed.data());
-    for (size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
-      for (size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
-      packer.pack(block.data(), to);
+  return answer(store.dim(), queries, 2, {}, [&](const auto& prepared, auto& nearest) {
+    PackedPrototypes piece = packer.view();
+    piece.data = packed.data();
+    for (size_t first = 0; first < store.row_end(); first += piece.rows) {
+      piece.rows = std::min(size, store.row_end() - first);
+      auto* to = reinterpret_cast<uint8_t*>(packed.data());
+      for (size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
+        for (size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
+        packer.pack(block.data(), to);
+      }
+      scan_all(piece, prepared, 1, nearest);
+      if (store.several()) {
+        piece.landmarks.of_row += piece.rows;
+      } else {
+        piece.landmarks.ids += piece.rows;
+      }
     }
-    PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, piece.rows});
-    if (store.several()) {
-      piece.landmarks.of_row += piece.rows;
-    } else {
-      piece.landmarks.ids += piece.rows;
-    }
-  }
-  Matches matches{{queries.rows, 2}, {queries.rows, 2}};
-  write_answer(nearest, prepared.norms(), {}, 0, matches);
-  return matches;
+  });
 }
 
 // Produces the sections of landmarks and rows in one pass over landmarks by id and, with an index,
@@ -179,44 +169,43 @@ class SealedContent {
     if (codec_) parts.push_back({section::kPositions, n * codec_->size()});
     if (nlist == 0) parts.push_back(prototypes);
     if (ids_are_stored_) IdBlockWriter::add_to(parts, n);
-    file.add(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
+    file.add(std::move(parts), [this](Writers& to) { put_landmarks(to); });
     if (nlist == 0) return;
     const size_t words = packed_words(store_.row_end(), owner_bits(n));
     file.add({prototypes, {section::kOwners, packed_bytes(words, 64)}},
-             [this](Sinks sinks) { put_lists(sinks); });
+             [this](Writers& to) { put_lists(to); });
     file.add({{section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(uint32_t)}},
-             [this](Sinks sinks) { sinks[0](std::as_bytes(std::span(owner_checksums_))); });
+             [this](Writers& to) {
+               to[section::kOwnerChecksums].add_all(std::as_bytes(std::span(owner_checksums_)));
+             });
     file.add(section::kCentroids, std::as_bytes(std::span(store_.quantizer().centroids().data)));
     std::vector<uint32_t> list_rows;
     for (uint32_t list = 0; list < nlist; ++list) {
       list_rows.push_back(static_cast<uint32_t>(store_.lists().rows(list)));
     }
     file.add(section::kListRows, std::as_bytes(std::span(list_rows)));
-    file.add({{section::kRecall, ContainerWriter::kUnknownSize}}, [this](Sinks sinks) {
+    file.add({{section::kRecall, ContainerWriter::kUnknownSize}}, [this](Writers& to) {
       const RecallTable table = measure_recall(
           store_, [this](int8_t* code) { packer_.quantize(code); },
           [this](Codes queries) { return search_packed(store_, packer_, queries); });
-      sinks[0](std::as_bytes(std::span(table)));
+      to[section::kRecall].add_all(std::as_bytes(std::span(table)));
     });
   }
 
  private:
   bool has_row_counts() const { return store_.prototype_count() != store_.landmark_count(); }
 
-  void put_landmarks(Sinks sinks) {
+  void put_landmarks(Writers& to) {
     const bool indexed = store_.quantizer().nlist() != 0;
-    SinkQueue queue(sinks);
-    ValueWriter row_counts(queue.next(has_row_counts()));
-    ValueWriter positions(queue.next(codec_.has_value()));
-    RowWriter prototypes(packer_, store_.landmark_count(), queue.next(!indexed));
-    IdBlockWriter ids{queue.next(ids_are_stored_), queue.next(ids_are_stored_)};
+    RowWriter prototypes(packer_, store_.landmark_count(), to[section::kPrototypes]);
+    IdBlockWriter ids(to);
     if (indexed && ids_are_stored_) landmarks_.emplace(store_);
     store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
       for (const LandmarkIndex l : landmarks) {
-        if (has_row_counts()) row_counts.add(static_cast<uint8_t>(store_.row_count(l)));
+        if (has_row_counts()) to[section::kRows].add(static_cast<uint8_t>(store_.row_count(l)));
         if (codec_) {
           codec_->encode(map_.position(&store_ == &map_ ? l : map_.at(store_.id(l))),
-                         positions.add_bytes(codec_->size()));
+                         to[section::kPositions].add_bytes(codec_->size()));
         }
         if (ids_are_stored_) ids.add(store_.id(l));
         if (landmarks_) landmarks_->add(l);
@@ -224,34 +213,28 @@ class SealedContent {
       if (indexed) return;
       for (const Row row : store_.sorted_rows(landmarks)) prototypes.add(row);
     });
-    row_counts.finish();
-    positions.finish();
-    prototypes.finish();
+    prototypes.end_list();
     ids.finish();
   }
 
-  void put_lists(Sinks sinks) {
+  void put_lists(Writers& to) {
     owner_checksums_.clear();
     // Comes in pieces of whole blocks.
-    PackedWriter owners([&](Bytes bytes) {
+    ValueWriter owners([&](Bytes bytes) {
       constexpr size_t kBlock = CheckedNumbers::kBlock * sizeof(uint64_t);
       for (size_t at = 0; at < bytes.size(); at += kBlock) {
         owner_checksums_.push_back(crc32(bytes.subspan(at, std::min(kBlock, bytes.size() - at))));
       }
-      sinks[1](bytes);
+      to[section::kOwners].add_all(bytes);
     });
-    RowWriter writer(packer_, store_.landmark_count(), sinks[0], &owners);
+    RowWriter writer(packer_, store_.landmark_count(), to[section::kPrototypes], &owners);
     for (uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
-      store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
-        for (const Row row : rows) {
-          const LandmarkIndex owner = store_.owner(row);
-          writer.add(row,
-                     landmarks_ ? (*landmarks_)[owner] : static_cast<size_t>(store_.id(owner)));
-        }
-      });
+      for (const Row row : store_.sorted_rows_of_list(list)) {
+        const LandmarkIndex owner = store_.owner(row);
+        writer.add(row, landmarks_ ? (*landmarks_)[owner] : static_cast<size_t>(store_.id(owner)));
+      }
       writer.end_list();
     }
-    writer.finish();
     owners.finish();
     landmarks_.reset();  // makes room for the test queries
   }

@@ -84,6 +84,34 @@ void PrototypeStore::close_gap(Row row) {
   resize(row_end());
 }
 
+void PrototypeStore::visit_sorted_landmarks(
+    const std::function<void(std::span<const LandmarkIndex>)>& visit) const {
+  constexpr size_t kPieces = 8, kMinPiece = 1 << 13;
+  const size_t n = landmark_count(), piece = std::max(kMinPiece, (n + kPieces - 1) / kPieces);
+  const size_t limit = piece + piece / 4;
+  const auto id_of = [&](LandmarkIndex landmark) { return id(landmark); };
+  std::vector<LandmarkIndex> landmarks;
+  landmarks.reserve(std::min(n, limit));
+  for (size_t seen = 0; seen < n; seen += landmarks.size()) {
+    // Takes the least ids above the last one of the piece before, which are up to `end` once there
+    // were too many.
+    const int64_t last = seen == 0 ? -1 : id(landmarks.back());
+    int64_t end = INT64_MAX;
+    landmarks.clear();
+    each_landmark([&](LandmarkIndex landmark) {
+      if (id(landmark) <= last || id(landmark) > end) return;
+      landmarks.push_back(landmark);
+      if (landmarks.size() < limit || limit >= n) return;
+      const auto middle = landmarks.begin() + static_cast<std::ptrdiff_t>(piece - 1);
+      std::ranges::nth_element(landmarks, middle, {}, id_of);
+      end = id(*middle);
+      landmarks.resize(piece);
+    });
+    std::ranges::sort(landmarks, {}, id_of);
+    visit(landmarks);
+  }
+}
+
 std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const size_t> n) const {
   std::vector<size_t> ascending(n.size());
   std::iota(ascending.begin(), ascending.end(), size_t{0});

@@ -164,27 +164,26 @@ class PrototypeStore : public RowTable {
   }
 
   // These come in no order.
-  template <typename Take>
-  void each_landmark(const Take& take) const {
+  void each_landmark(const auto& take) const {
     for (LandmarkIndex l{0}; l.value < ids_.size(); ++l.value) {
       if (id(l) >= 0) take(l);
     }
   }
-  template <typename Take>
-  void each_row(const Take& take) const {
+  void each_row(const auto& take) const {
     for (Row row{0}; row.value < row_end(); ++row.value) {
       if (is_row(row)) take(row);
     }
   }
-  // Visit all landmarks by ascending id, or the rows of a list by key, piece by piece (rows.h).
-  void visit_sorted_landmarks(const VisitPiece<LandmarkIndex>& visit) const {
-    const auto each = [&](const auto& take) { each_landmark(take); };
-    visit_sorted<LandmarkIndex>(
-        landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
-  }
-  void visit_sorted_rows(uint32_t list, const VisitPiece<Row>& visit) const {
-    const auto each = [&](const auto& take) { lists_.each_row(list, take); };
-    visit_sorted<Row>(lists_.rows(list), each, [&](Row row) { return key(row); }, visit);
+  // Calls visit for pieces of landmarks, which together hold all of them by ascending id. Takes 5
+  // bits per landmark.
+  void visit_sorted_landmarks(
+      const std::function<void(std::span<const LandmarkIndex>)>& visit) const;
+  std::vector<Row> sorted_rows_of_list(uint32_t list) const {
+    std::vector<Row> result;
+    result.reserve(lists_.rows(list));
+    lists_.each_row(list, [&](Row row) { result.push_back(row); });
+    std::ranges::sort(result, {}, [&](Row row) { return key(row); });
+    return result;
   }
   std::vector<LandmarkIndex> sorted_landmarks() const {
     std::vector<LandmarkIndex> result;
@@ -297,14 +296,12 @@ class PrototypeStore : public RowTable {
 
   // As RowTable::for_each_array, with the arrays of this class, without and with the packed one, in
   // which rows are interleaved.
-  template <typename Visit>
-  void for_each_plain_array(size_t landmarks, size_t rows, const Visit& visit) {
+  void for_each_plain_array(size_t landmarks, size_t rows, const auto& visit) {
     RowTable::for_each_array(landmarks, rows, visit);
     visit(rests_, rows * rest_bytes_, uint8_t{0});
     visit(counts_, rows, uint8_t{0});
   }
-  template <typename Visit>
-  void for_each_array(size_t landmarks, size_t rows, const Visit& visit) {
+  void for_each_array(size_t landmarks, size_t rows, const auto& visit) {
     for_each_plain_array(landmarks, rows, visit);
     visit(packed_, packed_size(rows, dim_) / sizeof(CodeVector), CodeVector{});
   }

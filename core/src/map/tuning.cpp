@@ -63,11 +63,7 @@ class Tuner {
     for (int round = 0; round < kRounds; ++round) {
       find_rivals();
       for (int pass = 0; pass < kPasses; ++pass) move();
-    }
-    for (size_t rank = 0; rank < rows_.size(); ++rank) {
-      Sum sum{};
-      for (size_t d = 0; d < dim_; ++d) sum[d] = int16_t{rounded(rank, d)};
-      tuned_.set(rows_[rank], sum, 1);
+      store_rounded();
     }
     if (indexed_) {
       tuned_.reassign(threads_);
@@ -91,11 +87,17 @@ class Tuner {
     for (const int8_t x : means_.data) {
       numbers_.push_back(static_cast<int16_t>(x * (1 << kFraction)));
     }
-    packed_.resize(packed_size(tuned_.row_end(), dim_) / sizeof(CodeVector));
   }
 
-  int8_t rounded(size_t rank, size_t d) const {
-    return rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
+  // Rounds all prototypes into the store, where they stay in their rows.
+  void store_rounded() {
+    for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      Sum sum{};
+      for (size_t d = 0; d < dim_; ++d) {
+        sum[d] = rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
+      }
+      tuned_.set(rows_[rank], sum, 1);
+    }
   }
 
   // Finds the own prototype of each query, the nearest one of its landmark, and the temperature.
@@ -142,14 +144,7 @@ class Tuner {
   // Finds the prototypes that each contested query could be mistaken for. Queries without any, most
   // of them, are contested no longer.
   void find_rivals() {
-    auto* packed = reinterpret_cast<int8_t*>(packed_.data());
-    for (size_t rank = 0; rank < rows_.size(); ++rank) {
-      for (size_t d = 0; d < dim_; ++d) {
-        packed[packed_index(rows_[rank].value, d, dim_)] = rounded(rank, d);
-      }
-    }
     PackedPrototypes view = tuned_.view();
-    view.data = packed_.data();
     view.landmarks = {};
     view.landmarks.ids = rank_of_row_.data();
     const SearchOptions options{.threads = threads_};
@@ -308,8 +303,6 @@ class Tuner {
   std::vector<uint32_t> counts_;  // observations
   std::vector<size_t> first_on_row_;
   std::vector<int64_t> rank_of_row_;  // -1 for padding
-
-  std::vector<CodeVector> packed_;  // by row
 
   std::vector<uint32_t> own_;  // the rank of each query's own prototype, or UINT32_MAX
   int64_t temperature_ = 1;

@@ -52,8 +52,7 @@ void refill(Codes codes, const std::vector<uint32_t>& list_of, const std::vector
 }
 
 // `assign(centroids)` returns the list of each code.
-template <typename Assign>
-Matrix<int8_t> k_means(Codes codes, size_t nlist, const Assign& assign) {
+Matrix<int8_t> k_means(Codes codes, size_t nlist, const auto& assign) {
   const size_t dim = codes.columns;
   Matrix<int8_t> centroids(nlist, dim);
   for (size_t c = 0; c < nlist; ++c) {

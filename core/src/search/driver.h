@@ -93,9 +93,8 @@ struct Division {
 };
 
 // Calls scan(queries, work, neighbours of these queries) for all ranges.
-template <typename Scan>
 void run_search(int threads, const Division& division, size_t work, Neighbours& nearest,
-                const Scan& scan) {
+                const auto& scan) {
   std::mutex mutex;
   const size_t tasks = division.query_ranges * division.work_ranges;
   run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](size_t i) {
@@ -113,9 +112,8 @@ void run_search(int threads, const Division& division, size_t work, Neighbours& 
 
 // Calls take(query, distance, row) for the rows of a chunk within limit_of(query), which `take` may
 // tighten. kernel(first, n, limits, &block, hits) scans for n queries from a block on.
-template <typename Kernel, typename LimitOf, typename Take>
-void each_hit(size_t n, size_t rows, size_t blocks, const Kernel& kernel, const LimitOf& limit_of,
-              const Take& take) {
+void each_hit(size_t n, size_t rows, size_t blocks, const auto& kernel, const auto& limit_of,
+              const auto& take) {
   kernels::Hit hits[kernels::kHitRoom];
   int32_t limits[kernels::kScanQueries];
   for (size_t first = 0; first < n; first += kernels::kScanQueries) {

@@ -5,9 +5,6 @@
 namespace protomark {
 namespace {
 
-// Queries that go through the lists together, so that their visits take little memory.
-constexpr size_t kQueries = 1 << 14;
-
 // Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
 // which, or a nearer one, limits the distance.
 constexpr size_t kMinStep = 16, kMaxSampled = 64;
@@ -74,8 +71,7 @@ class Selection {
   }
 
   // Compares all queries with centroids from `first` on, a multiple of 16.
-  template <typename LimitOf, typename Take>
-  void compare(size_t first, size_t n, const LimitOf& limit_of, const Take& take) {
+  void compare(size_t first, size_t n, const auto& limit_of, const auto& take) {
     const auto* codes = static_cast<const int8_t*>(centroids_.data);
     scan_.compare(codes + packed_size(first, centroids_.dim), n, limit_of,
                   [&](size_t q, int32_t distance, size_t i) { take(q, distance, first + i); });
@@ -199,13 +195,9 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
                      const PackedPrototypes& centroids, size_t nprobe, Codes queries, size_t k,
                      const SearchOptions& options) {
   if (nprobe >= lists.nlist()) return search_exact(prototypes, queries, k, options);
-  Matches matches = check_search(prototypes.dim, queries, k, options);
-  for (size_t begin = 0; begin < queries.rows; begin += kQueries) {
-    const size_t n = std::min(kQueries, queries.rows - begin);
-    const PreparedCodes prepared({queries.row(begin), n, queries.columns});
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
     const std::vector<uint32_t> nearest_to =
         nearest_lists(centroids, prepared, nprobe, options.threads);
-    Neighbours nearest = prepared.neighbours(k, options);
     // The nearest list goes first, as it leaves little for the others to find.
     for (const Range& range : {Range{0, 1}, Range{1, nprobe}}) {
       const std::vector<Visit> visits = sorted_visits(nearest_to, nprobe, range, lists.nlist());
@@ -215,9 +207,7 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
                                {prototypes, prepared, all, part});
                  });
     }
-    write_answer(nearest, prepared.norms(), options, begin, matches);
-  }
-  return matches;
+  });
 }
 
 Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
@@ -245,18 +235,15 @@ Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
     prototypes.landmarks.among = &among;
     return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
   }
-  Matches matches = check_search(prototypes.dim, queries, k, options);
-  const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(k, options);
-  PackedPiece piece;
-  for (size_t first = 0; first < some.size(); first += kPackedAtOnce) {
-    piece.pack(landmarks,
-               std::span(some).subspan(first, std::min(kPackedAtOnce, some.size() - first)),
-               prototypes);
-    scan_all(piece.view(), prepared, options.threads, nearest);
-  }
-  write_answer(nearest, prepared.norms(), options, 0, matches);
-  return matches;
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
+    PackedPiece piece;
+    for (size_t first = 0; first < some.size(); first += kPackedAtOnce) {
+      piece.pack(landmarks,
+                 std::span(some).subspan(first, std::min(kPackedAtOnce, some.size() - first)),
+                 prototypes);
+      scan_all(piece.view(), prepared, options.threads, nearest);
+    }
+  });
 }
 
 size_t nprobe_for(const RecallTable& table, double recall, size_t nlist) {

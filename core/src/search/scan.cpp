@@ -25,20 +25,27 @@ void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, 
 
 Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
                      const SearchOptions& options) {
-  Matches matches = check_search(prototypes.dim, queries, k, options);
-  const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(k, options);
-  scan_all(prototypes, prepared, options.threads, nearest);
-  write_answer(nearest, prepared.norms(), options, 0, matches);
-  return matches;
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
+    scan_all(prototypes, prepared, options.threads, nearest);
+  });
 }
 
-Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options) {
+Matches answer(size_t dim, Codes queries, size_t k, const SearchOptions& options,
+               const std::function<void(const PreparedCodes&, Neighbours&)>& find) {
+  constexpr size_t kAtOnce = 1 << 14;
   require(queries.columns == dim, "queries have ", queries.columns, " dimensions, prototypes ",
           dim);
   require(!options.ratio || (*options.ratio > 0 && *options.ratio <= 1),
           "ratio must be above 0 and at most 1");
-  return room_for_answer(queries.rows, k, options.max_distance);
+  Matches matches = room_for_answer(queries.rows, k, options.max_distance);
+  for (size_t first = 0; first < queries.rows; first += kAtOnce) {
+    const size_t n = std::min(kAtOnce, queries.rows - first);
+    const PreparedCodes prepared({queries.row(first), n, queries.columns});
+    Neighbours nearest = prepared.neighbours(k, options);
+    find(prepared, nearest);
+    write_answer(nearest, prepared.norms(), options, first, matches);
+  }
+  return matches;
 }
 
 }  // namespace protomark

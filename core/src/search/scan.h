@@ -104,8 +104,7 @@ class CodeScan {
 
   // Calls take(i, distance, row) for the rows of a packed chunk within limit_of(i) of the i-th
   // query. Distances are squared and lack the query's norm, which does not change their order.
-  template <typename LimitOf, typename Take>
-  void compare(const int8_t* packed, size_t rows, const LimitOf& limit_of, const Take& take) {
+  void compare(const int8_t* packed, size_t rows, const auto& limit_of, const auto& take) {
     const kernels::PackedCodes chunk = prepare(packed, rows);
     each_hit(
         n_, rows, chunk.blocks,
@@ -172,8 +171,7 @@ class PrototypeScan {
 
  private:
   // The i-th query that `scan_` compares is query_of(i).
-  template <typename QueryOf>
-  void compare(std::span<const uint32_t> blocks, size_t rows, const QueryOf& query_of) {
+  void compare(std::span<const uint32_t> blocks, size_t rows, const auto& query_of) {
     scan_.compare(
         read(blocks), rows, [&](size_t i) { return nearest_.limit(query_of(i)); },
         [&](size_t i, int32_t distance, size_t at) {
@@ -228,7 +226,10 @@ void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, 
 Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
                      const SearchOptions& options);
 
-// Returns room for the answer. Throws std::invalid_argument if the arguments do not fit.
-Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options);
+// Answers queries, so many at a time that the work on them takes little memory, by
+// find(prepared queries, their nearest so far). Throws std::invalid_argument if the arguments do
+// not fit prototypes of `dim` numbers.
+Matches answer(size_t dim, Codes queries, size_t k, const SearchOptions& options,
+               const std::function<void(const PreparedCodes&, Neighbours&)>& find);
 
 }  // namespace protomark
