@@ -44,8 +44,7 @@ struct MatchOptions {
 };
 
 // Finds the landmarks that the keypoints of a frame see: for each descriptor the nearest landmark,
-// if that is likely enough to be right. Throws std::invalid_argument as MatchCalibration::of, and
-// as search.
+// if that is likely enough to be right. Throws as MatchCalibration::of and as search.
 PROTOMARK_API MatchList match(const PrototypeMap& map, Descriptors descriptors,
                               const MatchOptions& options = {});
 PROTOMARK_API MatchList match(const SealedMap& map, Descriptors descriptors,

@@ -34,8 +34,7 @@ class PROTOMARK_API SealedMap {
   size_t words() const;
   // Whether prototypes were tuned against each other (SealOptions).
   bool tuned() const;
-  // Bytes that a landmark takes on average for its prototypes and their number, as SealOptions
-  // counts them; 0 for an empty map.
+  // Bytes per landmark as SealOptions counts them; 0 for an empty map.
   double bytes_per_landmark() const;
   // Bits per coordinate: 32, 16, or 0 if no landmark has a position.
   int position_bits() const;

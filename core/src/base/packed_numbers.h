@@ -1,5 +1,4 @@
-// Numbers of 0 to 63 bits, packed one after the other in 64-bit words, least significant bits
-// first.
+// Numbers of 0 to 63 bits, packed into 64-bit words, least significant bits first.
 #pragma once
 
 #include <algorithm>
@@ -33,8 +32,7 @@ inline uint64_t packed_number(const void* words, int bits, size_t i) {
 // Takes the bytes of a section in order.
 using Sink = std::function<void(Bytes)>;
 
-// Hands values and packed numbers to a sink in pieces of kPiece bytes or a little more, the last
-// one shorter.
+// Hands values and packed numbers to a sink in pieces of kPiece bytes or little more.
 class ValueWriter {
  public:
   static constexpr size_t kPiece = 1 << 15;

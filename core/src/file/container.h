@@ -76,8 +76,7 @@ struct ContainerHead {
   std::string identity() const { return sha256(bytes); }
 };
 
-// Collects the sections of a file, some of them in memory, others to be produced piece by piece
-// while the file is written.
+// Collects the sections of a file, in memory or to be produced while the file is written.
 class ContainerWriter {
  public:
   // The writers of sections by name; that of a section which is left out takes nothing.
@@ -113,8 +112,7 @@ class ContainerWriter {
   // Writes the file beside `path`, syncs it, renames it to `path` and syncs the folder. If that or
   // a producer fails, the old file stays; only if the folder cannot be synced is the new one there,
   // and a power cut may undo that. A process that is killed leaves `path`.<number> behind, which
-  // nobody reads. Calls `before` with the identity of the synced file before renaming it. Throws
-  // FileError.
+  // nobody reads. Calls `before` with the identity of the synced file. Throws FileError.
   void write(const std::filesystem::path& path,
              const std::function<void(const std::string&)>& before = {}) const {
     TemporaryFile file(path);

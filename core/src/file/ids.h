@@ -60,8 +60,7 @@ class IdBlockWriter {
 class LandmarkIds {
  public:
   LandmarkIds() = default;
-  // Checks everything but the gaps, which are mapped, and checked as they are read. `file` must
-  // outlive this. Throws FileError.
+  // Checks all but gaps, which are checked as they are read from `file`. Throws FileError.
   LandmarkIds(const ContainerReader& file, size_t n) : file_(&file), n_(n) {
     if (!file.has(section::kIdBlocks)) return;
     const size_t blocks = (n + kIdBlock - 1) / kIdBlock;

@@ -38,8 +38,7 @@ struct MapState {
   FairSharedMutex changing, searching;
 
   std::unique_ptr<Journal> journal;  // nullptr without a journal
-  // The map file whose journal this is or was; empty if it never had one. Constant once others have
-  // the map.
+  // The map file whose journal this is or was; empty if there never was one.
   std::filesystem::path journaled;
 
   // Returns how many lists to search for this recall, as measured on the map now, or earlier if
@@ -99,8 +98,7 @@ class MapChange {
   // Lets the change write: while the lock is held no search reads the map.
   std::unique_lock<FairSharedMutex> write() { return std::unique_lock(state_->searching); }
 
-  // Calls write_one(i) for all i below n, in pieces after each of which all rows are in their
-  // lists.
+  // Calls write_one(i) for all i below n, in pieces that leave all rows in their lists.
   void in_pieces(size_t n, const auto& write_one) {
     for (size_t first = 0; first < n; first += kPiece) {
       const auto lock = write();

@@ -1,5 +1,4 @@
-// Changes observations, landmarks, positions and metadata of a learning map, merges maps into one
-// and splits one into parts.
+// Changes of a learning map; merges maps into one and splits one into parts.
 #include <map>
 #include <unordered_map>
 

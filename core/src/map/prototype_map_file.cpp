@@ -116,8 +116,7 @@ size_t read_appearance_bits(const ContainerReader& file, size_t dim) {
 }
 
 // Reads the map file and its commits into an empty map, the newest first, so that an older one
-// counts only for landmarks that no later one names, and nothing has to be removed again. The time
-// is proportional to the bytes read.
+// counts only for landmarks that no later one names, and nothing has to be removed again.
 class Reading {
  public:
   explicit Reading(MapState& state) : state_(state), store_(state.store) {}

@@ -64,8 +64,7 @@ class BlockPacker {
   std::vector<int8_t> table_;
 };
 
-// Maps landmarks of a store to those of a sealed map, in little more than a byte per landmark: the
-// id tells the block of 256.
+// The ranks of landmarks by id, in little more than a byte each: the id tells the block of 256.
 class SealedLandmarks {
  public:
   explicit SealedLandmarks(const PrototypeStore& store)
@@ -119,8 +118,7 @@ class RowWriter {
   size_t filled_ = 0;
 };
 
-// Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
-// piece.
+// Finds the two nearest landmarks of each query among prototypes that are packed piece by piece.
 Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
   // A piece is small compared with the map.
   const size_t size = std::max<size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
@@ -146,8 +144,7 @@ Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Co
   });
 }
 
-// Produces the sections of landmarks and rows in one pass over landmarks by id and, with an index,
-// another one over its lists.
+// Produces sections in one pass over landmarks by id and, with an index, one over its lists.
 class SealedContent {
  public:
   // `store` has the prototypes, `map` everything else.

@@ -20,8 +20,8 @@ Eight eight(uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
 }
 
-// Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
-// odd count is rounded down.
+// Halves a sum of which `count` observations are left. A mean stays within 127, also if half of an
+// odd count was rounded down.
 int16_t half(int sum, int count) {
   return static_cast<int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
 }
@@ -66,8 +66,7 @@ void PrototypeStore::copy_row(Row from, Row to) {
   copy_packed(from, packed(), to.value);
 }
 
-// Moves the last row of a list to where one was removed, and the last of all blocks to a block that
-// this empties.
+// Moves the last row of the list to the gap, and the last of all blocks to a block that is empty.
 void PrototypeStore::close_gap(Row row) {
   vacate(row);
   const uint32_t list = lists_.list_of(row);
@@ -93,8 +92,7 @@ void PrototypeStore::visit_sorted_landmarks(
   std::vector<LandmarkIndex> landmarks;
   landmarks.reserve(std::min(n, limit));
   for (size_t seen = 0; seen < n; seen += landmarks.size()) {
-    // Takes the least ids above the last one of the piece before, which are up to `end` once there
-    // were too many.
+    // Takes the least ids above those of the piece before: up to `end` once there were too many.
     const int64_t last = seen == 0 ? -1 : id(landmarks.back());
     int64_t end = INT64_MAX;
     landmarks.clear();

@@ -34,8 +34,7 @@ struct Uncommitted {
 // its rounded prototype. Padding fills the last block of a list.
 //
 // A row keeps its rounded prototype p, which search reads, its count n, and what is left of its
-// sum, sum - n * p: numbers of -n / 2 to n / 2, which take 4 bits up to n = 15, and 8 bits above
-// that.
+// sum, sum - n * p: numbers of -n / 2 to n / 2, in 4 bits up to n = 15, else in 8.
 class PrototypeStore : public RowTable {
  public:
   // Names a row, whose index changes when others are removed.
@@ -59,8 +58,7 @@ class PrototypeStore : public RowTable {
   size_t landmark_count() const { return several_ ? ids_.size() : prototype_count_; }
   size_t prototype_count() const { return prototype_count_; }
   size_t row_end() const { return lists_.blocks() * kPackedRows; }  // with padding
-  // Bytes per row of few observations, without what arrays have room for, so that equal maps have
-  // the same.
+  // Bytes per row of few observations, the same in equal maps.
   size_t row_bytes() const {
     return rest_bytes_ + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
   }
@@ -131,8 +129,7 @@ class PrototypeStore : public RowTable {
   Key key(Row row) const { return {id(owner(row)), appearance(row)}; }
   int count(Row row) const { return counts_[row.value]; }
   Sum sum(Row row) const;
-  // Asks for what `sum` reads and `set` writes ahead. Inlined, as GCC drops calls of a function
-  // that does nothing but this.
+  // Fetches what `sum` and `set` access. Inlined, as GCC drops calls that do nothing but this.
   [[gnu::always_inline]] void prefetch(Row row) const {
     __builtin_prefetch(rest(row), 1);
     __builtin_prefetch(rest(row) + rest_bytes_ - 1, 1);
@@ -174,8 +171,7 @@ class PrototypeStore : public RowTable {
       if (is_row(row)) take(row);
     }
   }
-  // Calls visit for pieces of landmarks, which together hold all of them by ascending id. Takes 5
-  // bits per landmark.
+  // Visits all landmarks by ascending id, piece by piece, in 5 bits of memory per landmark.
   void visit_sorted_landmarks(
       const std::function<void(std::span<const LandmarkIndex>)>& visit) const;
   std::vector<Row> sorted_rows_of_list(uint32_t list) const {
@@ -196,8 +192,7 @@ class PrototypeStore : public RowTable {
   std::vector<Row> sorted_rows_at(std::span<const size_t> n) const;
 
   void find_rows(std::span<const Key> keys, std::span<Row> rows) const;
-  // Applies Eq. 2 for one code after the other. `rows` are those that find_rows found; where it
-  // found none, new ones are made.
+  // Applies Eq. 2 code by code, to rows that find_rows found and, where it found none, to new ones.
   void add(std::span<const Key> keys, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const Sum& sum, int count);
@@ -236,8 +231,7 @@ class PrototypeStore : public RowTable {
   Arrangement arrange(CoarseQuantizer quantizer, int threads) const;
   // Learns centroids from prototypes by id, so that they do not depend on the history of the map.
   CoarseQuantizer learn_quantizer(size_t nlist, int threads) const;
-  // Moves rows and takes the arrangement's centroids. After make_room_for it cannot run out of
-  // memory.
+  // Moves rows and takes the centroids. After make_room_for it cannot run out of memory.
   void rearrange(Arrangement arrangement);
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
     // One more block is for rows while they move.
@@ -294,8 +288,7 @@ class PrototypeStore : public RowTable {
   void close_gap(Row row);
   void permute(std::vector<Row>& to, Row spare);
 
-  // As RowTable::for_each_array, with the arrays of this class, without and with the packed one, in
-  // which rows are interleaved.
+  // Add the arrays of this class, without and with the packed one, in which rows are interleaved.
   void for_each_plain_array(size_t landmarks, size_t rows, const auto& visit) {
     RowTable::for_each_array(landmarks, rows, visit);
     visit(rests_, rows * rest_bytes_, uint8_t{0});

@@ -21,8 +21,7 @@ inline bool is_finite(const Position& p) {
   return std::ranges::all_of(p, [](double x) { return std::isfinite(x); });
 }
 
-// Returns the capacity for more elements. Arrays grow as with push_back, but before a change, which
-// therefore cannot fail half-way.
+// Returns the capacity for more elements, as push_back would. Arrays grow before a change.
 size_t capacity_for(const auto& v, size_t more) {
   const size_t size = v.size() + more;
   return size <= v.capacity() ? v.capacity() : std::max(2 * v.capacity(), size);
@@ -187,8 +186,7 @@ class RowTable {
     const bool placed = std::ranges::any_of(positions_, has_position);
     return sizeof(ids_[0]) + (placed ? sizeof(Position) : 0);
   }
-  // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
-  // and rows.
+  // Calls visit(array, size for so many landmarks and rows, padding) for each array.
   void for_each_array(size_t landmarks, size_t rows, const auto& visit) {
     if (!several_) landmarks = rows;
     visit(ids_, landmarks, int64_t{-1});

@@ -31,49 +31,7 @@ struct LandmarkSums {
   std::vector<uint8_t> counts;
 };
 
-// The merges of all landmarks, and how many of each landmark are made.
-class Merges {
- public:
-  // Makes those of least cost over the whole map, ties to the first landmark, until there are at
-  // most `limit` rows.
-  Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, size_t dim,
-         size_t limit)
-      : ends_(landmarks.size()), made_(landmarks.size()) {
-    size_t rows = store.prototype_count();
-    using Next = std::pair<double, size_t>;  // cost, index in landmarks
-    std::vector<Next> first;
-    for (size_t i = 0; i < landmarks.size(); ++i) {
-      const LandmarkSums of_landmark(store, landmarks[i], dim);
-      const auto merges = appearance_merges(of_landmark.sums, of_landmark.counts, dim);
-      merges_.insert(merges_.end(), merges.begin(), merges.end());
-      ends_[i] = merges_.size();
-      if (merges.size() >= kMaxRows) made_[i] = merges.size() + 1 - kMaxRows;
-      rows -= made_[i];
-      if (made_[i] < merges.size()) first.emplace_back(of(i)[made_[i]].cost, i);
-    }
-    std::priority_queue next(std::greater<>(), std::move(first));
-    for (; rows > limit && !next.empty(); --rows) {
-      const size_t i = next.top().second;
-      next.pop();
-      if (++made_[i] < of(i).size()) next.emplace(of(i)[made_[i]].cost, i);
-    }
-  }
-
-  std::span<const AppearanceMerge> made(size_t i) const { return of(i).first(made_[i]); }
-
- private:
-  std::span<const AppearanceMerge> of(size_t i) const {
-    const size_t begin = i == 0 ? 0 : ends_[i - 1];
-    return std::span(merges_).subspan(begin, ends_[i] - begin);
-  }
-
-  std::vector<AppearanceMerge> merges_;
-  std::vector<size_t> ends_;  // of each landmark's merges
-  std::vector<size_t> made_;
-};
-
-// Comparing all pairs of more rows would take seconds to minutes. A sealed map keeps far fewer per
-// landmark.
+// Comparing all pairs of more rows of a landmark would take seconds to minutes.
 constexpr size_t kMaxCompared = 2048;
 
 // The prototypes that remain, each with the later one of least merge cost as partner: the generic
@@ -184,8 +142,7 @@ struct Words {
   size_t count = 0;
 };
 
-// Returns the best words for up to `dim` numbers in so many bytes, none if they are too few for the
-// encoder's shortest codes.
+// Returns the best words for up to `dim` numbers; none if bytes are too few for the shortest codes.
 Words best_words(const Encoder& encoder, size_t dim, double bytes) {
   Words best;
   for (const Codebook& codebook : encoder.codebooks()) {
@@ -260,14 +217,39 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, siz
                                                 size_t limit) {
   if (store.prototype_count() <= limit && dim == store.dim()) return std::nullopt;
   const std::vector<LandmarkIndex> landmarks = store.sorted_landmarks();
-  const Merges merges(store, landmarks, dim, limit);
+  // Merges of all landmarks, the end of those of each, and the number of those that are made.
+  std::vector<AppearanceMerge> merges;
+  std::vector<size_t> ends, made;
+  const auto merges_of = [&](size_t i) {
+    const size_t begin = i == 0 ? 0 : ends[i - 1];
+    return std::span(merges).subspan(begin, ends[i] - begin);
+  };
+  // Makes those of least cost over the whole map, ties to the first landmark.
+  using Next = std::pair<double, size_t>;  // cost, index in landmarks
+  std::vector<Next> first;
+  size_t rows = store.prototype_count();
+  for (size_t i = 0; i < landmarks.size(); ++i) {
+    const LandmarkSums of_landmark(store, landmarks[i], dim);
+    const auto all = appearance_merges(of_landmark.sums, of_landmark.counts, dim);
+    merges.insert(merges.end(), all.begin(), all.end());
+    ends.push_back(merges.size());
+    made.push_back(all.size() >= kMaxRows ? all.size() + 1 - kMaxRows : 0);
+    rows -= made[i];
+    if (made[i] < all.size()) first.emplace_back(all[made[i]].cost, i);
+  }
+  std::priority_queue next(std::greater<>(), std::move(first));
+  for (; rows > limit && !next.empty(); --rows) {
+    const size_t i = next.top().second;
+    next.pop();
+    if (++made[i] < merges_of(i).size()) next.emplace(merges_of(i)[made[i]].cost, i);
+  }
   PrototypeStore result(dim, store.appearance_bits());
   result.reserve(landmarks.size(), std::min(limit, store.prototype_count()));
   for (size_t i = 0; i < landmarks.size(); ++i) {
     const LandmarkSums before(store, landmarks[i], dim);
     std::vector<int64_t> sums(before.sums.begin(), before.sums.end());
     std::vector<int64_t> counts(before.counts.begin(), before.counts.end());
-    for (const AppearanceMerge& m : merges.made(i)) {
+    for (const AppearanceMerge& m : merges_of(i).first(made[i])) {
       for (size_t d = 0; d < dim; ++d) sums[m.into * dim + d] += sums[m.source * dim + d];
       counts[m.into] += std::exchange(counts[m.source], 0);
     }

@@ -141,8 +141,8 @@ class Tuner {
   // Returns how many other observations the own prototype of a query has.
   uint32_t rest(size_t q) const { return counts_[own_[q]] - queries_.weights[q]; }
 
-  // Finds the prototypes that each contested query could be mistaken for. Queries without any, most
-  // of them, are contested no longer.
+  // Finds what each contested query could be mistaken for. Most queries are then contested no
+  // longer.
   void find_rivals() {
     PackedPrototypes view = tuned_.view();
     view.landmarks = {};

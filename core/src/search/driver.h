@@ -1,5 +1,4 @@
-// The driver of exact, inverted-list and Hamming search: keeps the nearest, divides the work among
-// threads, and writes the answer.
+// What all searches share: keeps the nearest, divides work among threads, writes the answer.
 #pragma once
 
 #include <mutex>
@@ -132,8 +131,7 @@ void each_hit(size_t n, size_t rows, size_t blocks, const auto& kernel, const au
   }
 }
 
-// Writes the neighbours to rows of `matches`, from `first` on. `norms`, if there are any, are added
-// to the distances of each query.
+// Writes neighbours to rows of `matches` from `first` on, adding the norms if there are any.
 inline void write_answer(const Neighbours& nearest, std::span<const int32_t> norms,
                          const SearchOptions& options, size_t first, Matches& matches) {
   const int32_t limit = options.max_distance.value_or(INT32_MAX);
@@ -152,8 +150,7 @@ inline void write_answer(const Neighbours& nearest, std::span<const int32_t> nor
   }
 }
 
-// Returns room for the answer of a search. Throws std::invalid_argument if k is 0 or max_distance
-// is negative.
+// Returns room for an answer. Throws std::invalid_argument for k = 0 or a negative max_distance.
 inline Matches room_for_answer(size_t queries, size_t k, std::optional<int32_t> max_distance) {
   require(k != 0, "k must be at least 1");
   require(!max_distance || *max_distance >= 0, "max_distance must not be negative");

@@ -1,5 +1,4 @@
-// Search in the inverted lists whose centroids are nearest to a query, as many as a recall takes,
-// or among some landmarks.
+// Search in as many inverted lists as a recall takes, or among some landmarks.
 #pragma once
 
 #include "search/list_blocks.h"
@@ -60,14 +59,12 @@ struct LandmarkRows {
 // Searches as search_lists does, but with options.among only the rows of these landmarks. They are
 // packed anew, a piece at a time, and searched as a small map, at a cost that follows their number;
 // or, where that is less work, all rows are compared and those of other landmarks are passed over.
-// With options.recall more lists are then searched than `nprobe`, as many as hold so many of these
-// rows.
+// With options.recall as many lists are then searched as hold so many of these rows.
 Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
                    const PackedPrototypes& centroids, const LandmarkRows& landmarks, size_t nprobe,
                    Codes queries, size_t k, const SearchOptions& options);
 
-// For each of some test queries, how many lists a search visits until it finds the nearest
-// landmark; ascending.
+// How many lists a search visits to find the nearest landmark of each test query; ascending.
 using RecallTable = std::vector<uint32_t>;
 
 inline constexpr size_t kTestQueries = 2048;  // at most

@@ -30,16 +30,14 @@ constexpr size_t word_index(size_t row, size_t word, size_t words) {
   return (row / kPackedRows * words + word) * kPackedRows + row % kPackedRows;
 }
 
-// Codes of 16 rows x 4 dimensions. Aligned, as a scan whose loads cross cache lines takes a quarter
-// longer.
+// Codes of 16 rows x 4 dimensions. Unaligned loads would make a scan a quarter slower.
 struct alignas(64) CodeVector {
   int8_t codes[4 * kPackedRows];
 };
 
 std::vector<CodeVector> pack_codes(Codes codes);
 
-// The landmark of each row: by at most one of the first two members; by none, row i is of landmark
-// i.
+// The landmark of each row: by one of the first two members, or else row i is of landmark i.
 struct RowLandmarks {
   const LandmarkIndex* of_row = nullptr;
   std::function<LandmarkIndex(Row)> look_up;
