@@ -64,60 +64,6 @@ class BlockPacker {
   std::vector<int8_t> table_;
 };
 
-// The ranks of landmarks by id, in little more than a byte each: the id tells the block of 256.
-class SealedLandmarks {
- public:
-  explicit SealedLandmarks(const PrototypeStore& store)
-      : store_(&store), in_block_(store.ids().size()) {}
-
-  // Landmarks come by ascending id.
-  void add(LandmarkIndex landmark) {
-    if (added_ % kBlock == 0) first_ids_.push_back(store_->id(landmark));
-    in_block_[landmark.value] = static_cast<uint8_t>(added_++ % kBlock);
-  }
-
-  size_t operator[](LandmarkIndex landmark) const {
-    const auto next = std::ranges::upper_bound(first_ids_, store_->id(landmark));
-    const auto block = static_cast<size_t>(next - first_ids_.begin()) - 1;
-    return block * kBlock + in_block_[landmark.value];
-  }
-
- private:
-  static constexpr size_t kBlock = 256;
-
-  const PrototypeStore* store_;
-  std::vector<uint8_t> in_block_;  // the index of a landmark in its block
-  std::vector<int64_t> first_ids_;
-  size_t added_ = 0;
-};
-
-// Writes rows, each list beginning a new block, and their owners if there is a writer for these.
-class RowWriter {
- public:
-  RowWriter(const BlockPacker& packer, size_t landmarks, ValueWriter& prototypes,
-            ValueWriter* owners = nullptr)
-      : packer_(packer), landmarks_(landmarks), prototypes_(prototypes), owners_(owners) {}
-
-  void add(Row row, size_t owner = 0) {
-    block_[filled_++] = row;
-    if (owners_ != nullptr) owners_->add(owner, owner_bits(landmarks_));
-    if (filled_ < kPackedRows) return;
-    packer_.pack(block_.data(), reinterpret_cast<uint8_t*>(prototypes_.add_bytes(packer_.size())));
-    filled_ = 0;
-  }
-  void end_list() {
-    while (filled_ != 0) add(kNoRow, landmarks_);
-  }
-
- private:
-  const BlockPacker& packer_;
-  size_t landmarks_;
-  ValueWriter& prototypes_;
-  ValueWriter* owners_;
-  std::array<Row, kPackedRows> block_{};
-  size_t filled_ = 0;
-};
-
 // Finds the two nearest landmarks of each query among prototypes that are packed piece by piece.
 Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
   // A piece is small compared with the map.
@@ -194,9 +140,11 @@ class SealedContent {
 
   void put_landmarks(Writers& to) {
     const bool indexed = store_.quantizer().nlist() != 0;
-    RowWriter prototypes(packer_, store_.landmark_count(), to[section::kPrototypes]);
+    std::vector<Row> rows;
     IdBlockWriter ids(to);
-    if (indexed && ids_are_stored_) landmarks_.emplace(store_);
+    if (indexed && ids_are_stored_) in_block_.resize(store_.ids().size());
+    first_ids_.clear();
+    size_t rank = 0;
     store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
       for (const LandmarkIndex l : landmarks) {
         if (has_row_counts()) to[section::kRows].add(static_cast<uint8_t>(store_.row_count(l)));
@@ -205,12 +153,17 @@ class SealedContent {
                          to[section::kPositions].add_bytes(codec_->size()));
         }
         if (ids_are_stored_) ids.add(store_.id(l));
-        if (landmarks_) landmarks_->add(l);
+        if (in_block_.empty()) continue;
+        if (rank % kRanks == 0) first_ids_.push_back(store_.id(l));
+        in_block_[l.value] = static_cast<uint8_t>(rank++ % kRanks);
       }
       if (indexed) return;
-      for (const Row row : store_.sorted_rows(landmarks)) prototypes.add(row);
+      const std::vector<Row> more = store_.sorted_rows(landmarks);
+      rows.insert(rows.end(), more.begin(), more.end());
+      put_blocks(rows, to);
     });
-    prototypes.end_list();
+    pad(rows);
+    put_blocks(rows, to);
     ids.finish();
   }
 
@@ -224,23 +177,49 @@ class SealedContent {
       }
       to[section::kOwners].add_all(bytes);
     });
-    RowWriter writer(packer_, store_.landmark_count(), to[section::kPrototypes], &owners);
+    const size_t n = store_.landmark_count();
     for (uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
-      for (const Row row : store_.sorted_rows_of_list(list)) {
-        const LandmarkIndex owner = store_.owner(row);
-        writer.add(row, landmarks_ ? (*landmarks_)[owner] : static_cast<size_t>(store_.id(owner)));
+      std::vector<Row> rows = store_.sorted_rows_of_list(list);
+      pad(rows);
+      for (const Row row : rows) {
+        owners.add(row == kNoRow ? n : rank_of(store_.owner(row)), owner_bits(n));
       }
-      writer.end_list();
+      put_blocks(rows, to);
     }
     owners.finish();
-    landmarks_.reset();  // makes room for the test queries
+    in_block_ = {};  // makes room for the test queries
+  }
+
+  static void pad(std::vector<Row>& rows) {
+    rows.resize(packed_blocks(rows.size()) * kPackedRows, kNoRow);
+  }
+  // Writes the rows of whole blocks, and removes them.
+  void put_blocks(std::vector<Row>& rows, Writers& to) const {
+    const size_t n = rows.size() / kPackedRows * kPackedRows;
+    for (size_t i = 0; i < n; i += kPackedRows) {
+      std::byte* block = to[section::kPrototypes].add_bytes(packer_.size());
+      packer_.pack(&rows[i], reinterpret_cast<uint8_t*>(block));
+    }
+    rows.erase(rows.begin(), rows.begin() + static_cast<std::ptrdiff_t>(n));
+  }
+  // Returns the rank of a landmark by id, which is its index in the sealed map.
+  size_t rank_of(LandmarkIndex landmark) const {
+    const int64_t id = store_.id(landmark);
+    if (!ids_are_stored_) return static_cast<size_t>(id);
+    const auto next = std::ranges::upper_bound(first_ids_, id);
+    const auto block = static_cast<size_t>(next - first_ids_.begin()) - 1;
+    return block * kRanks + in_block_[landmark.value];
   }
 
   const PrototypeStore &store_, &map_;
   const BlockPacker& packer_;
   const std::optional<PositionCodec>& codec_;
   bool ids_are_stored_;
-  std::optional<SealedLandmarks> landmarks_;  // with an index, if ids are stored
+  // With an index, if ids are stored: the first id of each block of landmarks by id, and for each
+  // landmark its rank in its block, which take little more than a byte.
+  static constexpr size_t kRanks = 256;
+  std::vector<int64_t> first_ids_;
+  std::vector<uint8_t> in_block_;
   std::vector<uint32_t> owner_checksums_;
 };
 

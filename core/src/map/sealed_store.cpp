@@ -34,106 +34,24 @@ struct LandmarkSums {
 // Comparing all pairs of more rows of a landmark would take seconds to minutes.
 constexpr size_t kMaxCompared = 2048;
 
-// The prototypes that remain, each with the later one of least merge cost as partner: the generic
-// algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering algorithms".
-class Clusters {
- public:
-  Clusters(std::span<const int16_t> sums, std::span<const uint8_t> counts, size_t dim)
-      : dim_(dim),
-        sums_(sums.begin(), sums.end()),
-        counts_(counts.begin(), counts.end()),
-        remaining_(counts.size()),
-        partner_(counts.size(), 0),
-        cost_(counts.size(), 0) {
-    std::iota(remaining_.begin(), remaining_.end(), size_t{0});
-    while (remaining_.size() > kMaxCompared) halve();
-    for (size_t at = 0; at + 1 < remaining_.size(); ++at) find_partner(at);
-  }
-
-  std::vector<AppearanceMerge> merge_all() {
-    while (remaining_.size() > 1) merge_best();
-    return std::move(merges_);
-  }
-
- private:
-  void merge_best() {
-    size_t best = 0;
-    for (size_t at = 1; at + 1 < remaining_.size(); ++at) {
-      if (cost_[remaining_[at]] < cost_[remaining_[best]]) best = at;
-    }
-    const size_t into = remaining_[best], source = partner_[into];
-    merge(into, source, cost_[into]);
-    std::erase(remaining_, source);
-    for (size_t at = 0; at + 1 < remaining_.size() && remaining_[at] < source; ++at) {
-      const size_t row = remaining_[at];
-      if (at == best || partner_[row] == into || partner_[row] == source) {
-        find_partner(at);
-      } else if (at < best) {
-        offer(row, into);
-      }
+// Returns |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)) for whole numbers. All but
+// the division is exact below 2^53, which no real landmark exceeds.
+double merge_cost(const double* a, double n, const double* b, double m, size_t dim) {
+  // Four sums, so that a compiler may use vectors without changing the order of additions.
+  double part[4] = {};
+  size_t d = 0;
+  for (; d + 4 <= dim; d += 4) {
+    for (size_t k = 0; k < 4; ++k) {
+      const double difference = m * a[d + k] - n * b[d + k];
+      part[k] += difference * difference;
     }
   }
-
-  void merge(size_t into, size_t source, double cost) {
-    merges_.push_back({cost, static_cast<uint16_t>(into), static_cast<uint16_t>(source)});
-    for (size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[source * dim_ + d];
-    counts_[into] += counts_[source];
+  for (; d < dim; ++d) {
+    const double difference = m * a[d] - n * b[d];
+    part[d % 4] += difference * difference;
   }
-
-  // Merges each second row into the one before it.
-  void halve() {
-    std::vector<size_t> halved;
-    for (size_t at = 0; at < remaining_.size(); at += 2) {
-      halved.push_back(remaining_[at]);
-      if (at + 1 < remaining_.size()) merge(remaining_[at], remaining_[at + 1], 0.0);
-    }
-    remaining_ = std::move(halved);
-  }
-
-  void find_partner(size_t at) {
-    const size_t row = remaining_[at];
-    partner_[row] = remaining_[at + 1];
-    cost_[row] = cost(row, partner_[row]);
-    for (size_t other = at + 2; other < remaining_.size(); ++other) offer(row, remaining_[other]);
-  }
-
-  void offer(size_t row, size_t other) {
-    const double c = cost(row, other);
-    if (c < cost_[row] || (c == cost_[row] && other < partner_[row])) {
-      cost_[row] = c;
-      partner_[row] = other;
-    }
-  }
-
-  // |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)). All but the division is exact
-  // below 2^53, which no real landmark exceeds.
-  double cost(size_t i, size_t j) const {
-    const double *a = &sums_[i * dim_], *b = &sums_[j * dim_];
-    const double n = counts_[i], m = counts_[j];
-    // Four sums, so that a compiler may use vectors without changing the order of additions.
-    double part[4] = {};
-    size_t d = 0;
-    for (; d + 4 <= dim_; d += 4) {
-      for (size_t k = 0; k < 4; ++k) {
-        const double difference = m * a[d + k] - n * b[d + k];
-        part[k] += difference * difference;
-      }
-    }
-    for (; d < dim_; ++d) {
-      const double difference = m * a[d] - n * b[d];
-      part[d % 4] += difference * difference;
-    }
-    return ((part[0] + part[1]) + (part[2] + part[3])) / (n * m * (n + m));
-  }
-
-  size_t dim_;
-  std::vector<AppearanceMerge> merges_;
-  std::vector<double> sums_;  // whole numbers
-  std::vector<double> counts_;
-  std::vector<size_t> remaining_;  // ascending
-  std::vector<size_t> partner_;    // of all but the last that remains
-  std::vector<double> cost_;       // of merging with the partner
-};
+  return ((part[0] + part[1]) + (part[2] + part[3])) / (n * m * (n + m));
+}
 
 struct Words {
   size_t numbers() const { return codebook == nullptr ? 0 : count * codebook->width; }
@@ -158,9 +76,62 @@ Words best_words(const Encoder& encoder, size_t dim, double bytes) {
 
 }  // namespace
 
+// The generic algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering
+// algorithms".
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
                                                std::span<const uint8_t> counts, size_t dim) {
-  return Clusters(sums, counts, dim).merge_all();
+  std::vector<double> sum(sums.begin(), sums.end()), count(counts.begin(), counts.end());
+  std::vector<AppearanceMerge> merges;
+  const auto merge = [&](size_t into, size_t source, double cost) {
+    merges.push_back({cost, static_cast<uint16_t>(into), static_cast<uint16_t>(source)});
+    for (size_t d = 0; d < dim; ++d) sum[into * dim + d] += sum[source * dim + d];
+    count[into] += count[source];
+  };
+  std::vector<size_t> remaining(counts.size());  // ascending
+  std::iota(remaining.begin(), remaining.end(), size_t{0});
+  // Merges each second row into the one before it.
+  while (remaining.size() > kMaxCompared) {
+    std::vector<size_t> halved;
+    for (size_t at = 0; at < remaining.size(); at += 2) {
+      halved.push_back(remaining[at]);
+      if (at + 1 < remaining.size()) merge(remaining[at], remaining[at + 1], 0.0);
+    }
+    remaining = std::move(halved);
+  }
+  // Of all but the last that remains, the later row of least cost, and that cost.
+  std::vector<size_t> partner(counts.size(), 0);
+  std::vector<double> least(counts.size(), 0);
+  const auto offer = [&](size_t row, size_t other) {
+    const double cost =
+        merge_cost(&sum[row * dim], count[row], &sum[other * dim], count[other], dim);
+    if (std::pair(cost, other) < std::pair(least[row], partner[row])) {
+      least[row] = cost;
+      partner[row] = other;
+    }
+  };
+  const auto find_partner = [&](size_t at) {
+    least[remaining[at]] = std::numeric_limits<double>::infinity();
+    for (size_t i = at + 1; i < remaining.size(); ++i) offer(remaining[at], remaining[i]);
+  };
+  for (size_t at = 0; at + 1 < remaining.size(); ++at) find_partner(at);
+  while (remaining.size() > 1) {
+    size_t best = 0;
+    for (size_t at = 1; at + 1 < remaining.size(); ++at) {
+      if (least[remaining[at]] < least[remaining[best]]) best = at;
+    }
+    const size_t into = remaining[best], source = partner[into];
+    merge(into, source, least[into]);
+    std::erase(remaining, source);
+    for (size_t at = 0; at + 1 < remaining.size() && remaining[at] < source; ++at) {
+      const size_t row = remaining[at];
+      if (at == best || partner[row] == into || partner[row] == source) {
+        find_partner(at);
+      } else if (at < best) {
+        offer(row, into);
+      }
+    }
+  }
+  return merges;
 }
 
 size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes) {

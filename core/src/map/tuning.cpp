@@ -1,6 +1,8 @@
 // Compiled without contraction of products and sums (core/CMakeLists.txt).
 #include "map/sealed_store.h"
 
+#include <numeric>
+
 #include "base/parallel.h"
 #include "search/inverted_lists.h"
 
@@ -167,13 +169,9 @@ class Tuner {
       }
     }
     firsts_.push_back(forces_.size());
-    // The forces on each row, by query.
-    first_on_row_.assign(rows_.size() + 1, 0);
-    for (const Force& force : forces_) ++first_on_row_[force.rank + 1];
-    for (size_t i = 0; i < rows_.size(); ++i) first_on_row_[i + 1] += first_on_row_[i];
     on_row_.resize(forces_.size());
-    std::vector<size_t> next(first_on_row_.begin(), first_on_row_.end() - 1);
-    for (size_t f = 0; f < forces_.size(); ++f) on_row_[next[forces_[f].rank]++] = f;
+    std::iota(on_row_.begin(), on_row_.end(), size_t{0});
+    std::ranges::stable_sort(on_row_, {}, [&](size_t f) { return forces_[f].rank; });
     weights_.resize(forces_.size());
   }
 
@@ -229,7 +227,9 @@ class Tuner {
       std::vector<int64_t> sums(dim_);
       std::vector<int32_t> part(dim_);
       for (size_t rank = begin; rank < end; ++rank) {
-        if (first_on_row_[rank] == first_on_row_[rank + 1]) continue;
+        const auto on_row =
+            std::ranges::equal_range(on_row_, rank, {}, [&](size_t f) { return forces_[f].rank; });
+        if (on_row.empty()) continue;
         std::ranges::fill(sums, 0);
         std::ranges::fill(part, 0);
         int64_t total = 0, in_part = 0;
@@ -237,8 +237,8 @@ class Tuner {
           for (size_t d = 0; d < dim_; ++d) sums[d] += std::exchange(part[d], 0);
           in_part = 0;
         };
-        for (size_t i = first_on_row_[rank]; i < first_on_row_[rank + 1]; ++i) {
-          const int32_t weight = weights_[on_row_[i]];
+        for (const size_t f : on_row) {
+          const int32_t weight = weights_[f];
           if (weight == 0) continue;
           total += weight;
           in_part += std::abs(weight);
@@ -246,7 +246,7 @@ class Tuner {
             flush();
             in_part = std::abs(weight);
           }
-          const int8_t* code = queries_.codes.row(contested_[forces_[on_row_[i]].query]);
+          const int8_t* code = queries_.codes.row(contested_[forces_[f].query]);
           for (size_t d = 0; d < dim_; ++d) part[d] += weight * code[d];
         }
         flush();
@@ -299,9 +299,8 @@ class Tuner {
   // By rank.
   std::vector<Row> rows_;
   Matrix<int8_t> means_;
-  std::vector<int16_t> numbers_;  // prototypes, with kFraction bits behind the point
-  std::vector<uint32_t> counts_;  // observations
-  std::vector<size_t> first_on_row_;
+  std::vector<int16_t> numbers_;      // prototypes, with kFraction bits behind the point
+  std::vector<uint32_t> counts_;      // observations
   std::vector<int64_t> rank_of_row_;  // -1 for padding
 
   std::vector<uint32_t> own_;  // the rank of each query's own prototype, or UINT32_MAX
@@ -311,7 +310,7 @@ class Tuner {
   std::vector<size_t> firsts_;       // the first force of each, and the end
   std::vector<Force> forces_;        // of each query on its own prototype, then on its rivals
   std::vector<int32_t> weights_;     // of each force, in kUnit
-  std::vector<size_t> on_row_;       // forces by the rank that they are on
+  std::vector<size_t> on_row_;       // forces by the rank that they are on, then by query
 };
 
 }  // namespace

@@ -5,83 +5,58 @@
 namespace protomark {
 namespace {
 
-// Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
-// which, or a nearer one, limits the distance.
-constexpr size_t kMinStep = 16, kMaxSampled = 64;
 // Queries that are compared with centroids together.
 constexpr size_t kBatch = 256;
 
-// The centroids that a query has found: distance in the upper bits, index in the lower ones, so
-// that ties go to the smaller index.
-using Found = std::vector<int64_t>;
-
 // Selects the lists nearest to a batch of queries, on one thread. (Neighbours are for a few; these
 // may be hundreds.)
-class Selection {
- public:
-  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch)
-      : centroids_(centroids),
-        scan_(queries, batch),
-        limits_(batch.size(), kNoLimit),
-        found_(batch.size()) {}
-
-  void nearest(size_t nprobe, uint32_t* to) {
-    guess_limits(nprobe);
-    const auto limit_of = [&](size_t q) { return limits_[q]; };
-    const auto take = [&](size_t q, int32_t distance, size_t list) {
-      found_[q].push_back(int64_t{distance} * (int64_t{1} << 32) + static_cast<int64_t>(list));
-    };
-    const size_t chunk = scan_.chunk_rows();
-    for (size_t row = 0; row < centroids_.rows; row += chunk) {
-      compare(row, std::min(chunk, centroids_.rows - row), limit_of, take);
-    }
-    for (uint32_t q = 0; q < limits_.size(); ++q) {
-      if (found_[q].size() < nprobe) {
-        found_[q].clear();
-        scan_.select({&q, 1});
-        compare(
-            0, centroids_.rows, [](size_t) { return kNoLimit; },
-            [&](size_t, int32_t distance, size_t list) { take(q, distance, list); });
-      }
-      select(found_[q], nprobe, to + q * nprobe);
-    }
+void select_lists(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch,
+                  size_t nprobe, uint32_t* to) {
+  CodeScan scan(queries, batch);
+  // Compares queries with centroids from `first` on, a multiple of 16.
+  const auto compare = [&](size_t first, size_t n, const auto& limit_of, const auto& take) {
+    const auto* codes = static_cast<const int8_t*>(centroids.data);
+    scan.compare(codes + packed_size(first, centroids.dim), std::min(n, centroids.rows - first),
+                 limit_of,
+                 [&](size_t q, int32_t distance, size_t i) { take(q, distance, first + i); });
+  };
+  // Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
+  // which, or a nearer one, is a limit that probably leaves a few more than `nprobe` centroids.
+  constexpr size_t kMinStep = 16, kMaxSampled = 64;
+  const size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
+  Neighbours sample(nprobe * 3 / 2 / step + 5, std::vector(batch.size(), kNoLimit));
+  for (size_t row = 0; row < centroids.rows; row += step * kPackedRows) {
+    compare(
+        row, kPackedRows, [&](size_t q) { return sample.limit(q); },
+        [&](size_t q, int32_t distance, size_t list) {
+          sample.offer(q, distance, static_cast<int64_t>(list), false);
+        });
   }
-
- private:
-  // Sets limits that probably leave a few more than `nprobe` centroids.
-  void guess_limits(size_t nprobe) {
-    const size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
-    Neighbours sample(nprobe * 3 / 2 / step + 5, limits_);
-    for (size_t row = 0; row < centroids_.rows; row += step * kPackedRows) {
+  // What each query finds: distance in the upper bits, index in the lower ones, so that ties go to
+  // the smaller index.
+  std::vector<std::vector<int64_t>> all_found(batch.size());
+  const auto take = [&](size_t q, int32_t distance, size_t list) {
+    all_found[q].push_back(int64_t{distance} * (int64_t{1} << 32) + static_cast<int64_t>(list));
+  };
+  const size_t chunk = scan.chunk_rows();
+  for (size_t row = 0; row < centroids.rows; row += chunk) {
+    compare(row, chunk, [&](size_t q) { return sample.limit(q); }, take);
+  }
+  for (uint32_t q = 0; q < all_found.size(); ++q) {
+    std::vector<int64_t>& found = all_found[q];
+    if (found.size() < nprobe) {
+      found.clear();
+      scan.select({&q, 1});
       compare(
-          row, std::min(kPackedRows, centroids_.rows - row),
-          [&](size_t q) { return sample.limit(q); },
-          [&](size_t q, int32_t distance, size_t list) {
-            sample.offer(q, distance, static_cast<int64_t>(list), false);
-          });
+          0, centroids.rows, [](size_t) { return kNoLimit; },
+          [&](size_t, int32_t distance, size_t list) { take(q, distance, list); });
     }
-    for (size_t q = 0; q < limits_.size(); ++q) limits_[q] = sample.limit(q);
-  }
-
-  static void select(Found& found, size_t nprobe, uint32_t* to) {
     const auto end = found.begin() + static_cast<std::ptrdiff_t>(nprobe);
     std::nth_element(found.begin(), end - 1, found.end());
     std::iter_swap(found.begin(), std::min_element(found.begin(), end));
-    for (size_t i = 0; i < nprobe; ++i) to[i] = static_cast<uint32_t>(found[i]);
+    for (auto f = found.begin(); f != end; ++f) *to++ = static_cast<uint32_t>(*f);
   }
-
-  // Compares all queries with centroids from `first` on, a multiple of 16.
-  void compare(size_t first, size_t n, const auto& limit_of, const auto& take) {
-    const auto* codes = static_cast<const int8_t*>(centroids_.data);
-    scan_.compare(codes + packed_size(first, centroids_.dim), n, limit_of,
-                  [&](size_t q, int32_t distance, size_t i) { take(q, distance, first + i); });
-  }
-
-  const PackedPrototypes& centroids_;
-  CodeScan scan_;
-  std::vector<int32_t> limits_;
-  std::vector<Found> found_;
-};
+}
 
 struct Visit {
   uint32_t list;
@@ -184,8 +159,8 @@ std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const Pre
   std::vector<uint32_t> result(queries.queries() * nprobe);
   parallel_for(threads, queries.queries(), 16, [&](size_t first, size_t last) {
     for (size_t q = first; q < last; q += kBatch) {
-      Selection batch(centroids, queries, {q, std::min(last, q + kBatch)});
-      batch.nearest(nprobe, &result[q * nprobe]);
+      select_lists(centroids, queries, {q, std::min(last, q + kBatch)}, nprobe,
+                   &result[q * nprobe]);
     }
   });
   return result;

@@ -35,7 +35,16 @@ struct alignas(64) CodeVector {
   int8_t codes[4 * kPackedRows];
 };
 
-std::vector<CodeVector> pack_codes(Codes codes);
+inline std::vector<CodeVector> pack_codes(Codes codes) {
+  std::vector<CodeVector> result(packed_size(codes.rows, codes.columns) / sizeof(CodeVector));
+  auto* to = reinterpret_cast<int8_t*>(result.data());
+  for (size_t row = 0; row < codes.rows; ++row) {
+    for (size_t d = 0; d < codes.columns; ++d) {
+      to[packed_index(row, d, codes.columns)] = codes.row(row)[d];
+    }
+  }
+  return result;
+}
 
 // The landmark of each row: by one of the first two members, or else row i is of landmark i.
 struct RowLandmarks {

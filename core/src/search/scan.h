@@ -15,6 +15,8 @@ inline int32_t squared_norm(const uint8_t* code, size_t dim) {
   return sum;
 }
 
+static_assert(kPackedRows == kernels::kCodeRows);
+
 // Above all distances without norms, whose magnitude is below 2^24.
 inline constexpr int32_t kNoLimit = 1 << 25;
 
@@ -219,17 +221,41 @@ class PrototypeScan {
   std::vector<CodeVector> room_;
 };
 
-void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
-              Neighbours& nearest);
-
-// Searches all prototypes (protomark/search.h), whatever options.recall and options.nprobe say.
-Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
-                     const SearchOptions& options);
+inline void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
+                     Neighbours& nearest) {
+  run_search(threads, Division::of_rows(threads, queries.queries(), prototypes.rows),
+             prototypes.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
+               PrototypeScan(prototypes, queries, some, part).scan(rows);
+             });
+}
 
 // Answers queries, so many at a time that the work on them takes little memory, by
 // find(prepared queries, their nearest so far). Throws std::invalid_argument if the arguments do
 // not fit prototypes of `dim` numbers.
 Matches answer(size_t dim, Codes queries, size_t k, const SearchOptions& options,
-               const std::function<void(const PreparedCodes&, Neighbours&)>& find);
+               const auto& find) {
+  constexpr size_t kAtOnce = 1 << 14;
+  require(queries.columns == dim, "queries have ", queries.columns, " dimensions, prototypes ",
+          dim);
+  require(!options.ratio || (*options.ratio > 0 && *options.ratio <= 1),
+          "ratio must be above 0 and at most 1");
+  Matches matches = room_for_answer(queries.rows, k, options.max_distance);
+  for (size_t first = 0; first < queries.rows; first += kAtOnce) {
+    const size_t n = std::min(kAtOnce, queries.rows - first);
+    const PreparedCodes prepared({queries.row(first), n, queries.columns});
+    Neighbours nearest = prepared.neighbours(k, options);
+    find(prepared, nearest);
+    write_answer(nearest, prepared.norms(), options, first, matches);
+  }
+  return matches;
+}
+
+// Searches all prototypes (protomark/search.h), whatever options.recall and options.nprobe say.
+inline Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
+                            const SearchOptions& options) {
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
+    scan_all(prototypes, prepared, options.threads, nearest);
+  });
+}
 
 }  // namespace protomark
