@@ -41,8 +41,7 @@ class PROTOMARK_API SealedMap {
   // With 16 bits, how far a position may be from that of the learning map along each axis. With 32
   // bits, coordinates relative to the middle of the map are rounded to floats.
   std::optional<Position> position_error() const;
-  // Returns the ids of all landmarks in ascending order. Throws FileError if those of a broken file
-  // do not ascend, which only this call checks.
+  // Returns all ids in ascending order. Throws FileError if a broken file has them in another one.
   std::vector<int64_t> ids() const;
 
   // Number of inverted lists; 0 means no index.

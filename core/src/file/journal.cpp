@@ -168,8 +168,7 @@ std::filesystem::path journal_path(const std::filesystem::path& map) {
 
 JournaledFile::JournaledFile(const std::filesystem::path& map) {
   const auto path = journal_path(map);
-  // The map may be compacted while the two are read, even to an equal file. Not every file system
-  // gives a file the same inode each time.
+  // The map may be compacted meanwhile, even to an equal file; not all inodes are stable.
   for (int tries = 0;; ++tries) {
     const auto open = FileDescriptor::open_to_read(map);
     mapped_ = std::make_unique<MappedFile>(open, map);

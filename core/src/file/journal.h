@@ -80,8 +80,7 @@ class JournaledFile {
 // A journal to which one map, of all processes, writes. Functions throw FileError.
 class Journal {
  public:
-  // Locks the journal of a map file, which it makes if there is none. The error for a locked
-  // journal names the process that holds the lock.
+  // Locks the journal of a map file, or makes one. Errors name the process that holds the lock.
   explicit Journal(const std::filesystem::path& map);
   Journal(const Journal&) = delete;
   Journal& operator=(const Journal&) = delete;
@@ -119,8 +118,7 @@ class Journal {
   ChainLink last_{};
 };
 
-// Writes a file, replacing any other, unless a map has the journal of that or the journal holds
-// commits, which would be lost. Throws FileError.
+// Writes a file. Throws FileError if a map has its journal, or that holds commits.
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path);
 
 }  // namespace protomark

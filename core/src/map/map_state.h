@@ -26,7 +26,6 @@ struct MeasuredRecall {
 //                  source of a merge, measuring
 //   searching      a change, alone, while it writes a piece; shared, searches and short questions
 //   recall_mutex   whoever reads or replaces `recall_table`
-// So a search waits only for a piece of a change.
 struct MapState {
   MapState(std::shared_ptr<const Encoder> its_encoder, size_t dim, size_t appearance_bits)
       : encoder(std::move(its_encoder)), store(dim, appearance_bits) {}
@@ -84,8 +83,7 @@ using ExactSearch = std::function<Matches(Codes)>;
 RecallTable measure_recall(const PrototypeStore& store, const std::function<void(int8_t*)>& stored,
                            const ExactSearch& search);
 
-// A change of a map: while it exists no other one begins, and all that read the map for long wait.
-// Searches go on between its pieces.
+// A change of a map, beside which only searches go on, between its pieces.
 class MapChange {
  public:
   // Observations or landmarks that are changed at a time.

@@ -22,8 +22,7 @@ int spare_bits(const int16_t* eight, int bits) {
   return std::min(3, bits - 1 - static_cast<int>(std::bit_width(magnitudes)));
 }
 
-// Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
-// must not change until the file is written.
+// Adds sections of all landmarks of a store, or of these by id. It must not change until written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
   const size_t dim = store.dim();

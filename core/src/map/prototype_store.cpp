@@ -20,8 +20,7 @@ Eight eight(uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
 }
 
-// Halves a sum of which `count` observations are left. A mean stays within 127, also if half of an
-// odd count was rounded down.
+// Halves a sum of which `count` observations, rounded down, are left; the mean stays within 127.
 int16_t half(int sum, int count) {
   return static_cast<int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
 }

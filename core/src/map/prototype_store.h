@@ -138,8 +138,7 @@ class PrototypeStore : public RowTable {
       __builtin_prefetch(packed() + packed_index(row.value, d, dim_), 1);
     }
   }
-  // Replaces the sum and count of a row; its rounded prototype follows. If memory runs out nothing
-  // has changed, and for a new row it does not.
+  // Replaces the sum and count of a row. If memory runs out nothing has changed.
   void set(Row row, const Sum& sum, int count);
   void rounded(Row row, int8_t* to) const {
     for (size_t d = 0; d < dim_; d += 4) {
@@ -196,8 +195,7 @@ class PrototypeStore : public RowTable {
   void add(std::span<const Key> keys, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const Sum& sum, int count);
-  // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
-  // which keeps its position if it has one.
+  // Merges a landmark of a store, perhaps this one, into one with an id, existing or new.
   void merge(int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
     LandmarkIndex into = find(id);
     const std::vector<Row> rows = into == kNoLandmark ? std::vector<Row>() : sorted_rows(into);

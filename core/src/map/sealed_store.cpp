@@ -76,8 +76,7 @@ Words best_words(const Encoder& encoder, size_t dim, double bytes) {
 
 }  // namespace
 
-// The generic algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering
-// algorithms".
+// Muellner's generic algorithm ("Modern hierarchical, agglomerative clustering algorithms", 2011).
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
                                                std::span<const uint8_t> counts, size_t dim) {
   std::vector<double> sum(sums.begin(), sums.end()), count(counts.begin(), counts.end());

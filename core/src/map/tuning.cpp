@@ -143,8 +143,7 @@ class Tuner {
   // Returns how many other observations the own prototype of a query has.
   uint32_t rest(size_t q) const { return counts_[own_[q]] - queries_.weights[q]; }
 
-  // Finds what each contested query could be mistaken for. Most queries are then contested no
-  // longer.
+  // Finds what contested queries could be mistaken for; those without rivals are so no longer.
   void find_rivals() {
     PackedPrototypes view = tuned_.view();
     view.landmarks = {};

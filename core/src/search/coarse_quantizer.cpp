@@ -152,8 +152,7 @@ size_t CoarseQuantizer::default_nlist(size_t prototypes, size_t dim, size_t row_
   const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
   const double sealed =
       (n * (kBytes - static_cast<double>(std::bit_width(prototypes)) / 8) - table) / (9.5 * k + 4);
-  // A learning map keeps for each list its centroid three times, 16 bytes, and half a block of rows
-  // and of the 12 bytes of a block.
+  // A learning map keeps for each list its centroid three times, 16 bytes, and half a block.
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
   const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
   const double nlist = std::min({4 * std::sqrt(n), sealed, learning});

@@ -8,8 +8,7 @@ namespace {
 // Queries that are compared with centroids together.
 constexpr size_t kBatch = 256;
 
-// Selects the lists nearest to a batch of queries, on one thread. (Neighbours are for a few; these
-// may be hundreds.)
+// Selects the lists nearest to each query, on one thread. (Neighbours are for fewer.)
 void select_lists(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch,
                   size_t nprobe, uint32_t* to) {
   CodeScan scan(queries, batch);
@@ -32,8 +31,7 @@ void select_lists(const PackedPrototypes& centroids, const PreparedCodes& querie
           sample.offer(q, distance, static_cast<int64_t>(list), false);
         });
   }
-  // What each query finds: distance in the upper bits, index in the lower ones, so that ties go to
-  // the smaller index.
+  // Distances in the upper bits, indices in the lower ones, so that ties go to smaller indices.
   std::vector<std::vector<int64_t>> all_found(batch.size());
   const auto take = [&](size_t q, int32_t distance, size_t list) {
     all_found[q].push_back(int64_t{distance} * (int64_t{1} << 32) + static_cast<int64_t>(list));
@@ -92,8 +90,7 @@ void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, Prot
   }
 }
 
-// Landmarks that are packed at a time: so many that the work on each query is small beside that on
-// rows, so few that they stay in the cache.
+// Landmarks that are packed at a time: many beside the work per query, few enough for the cache.
 constexpr size_t kPackedAtOnce = 1 << 14;
 // The time to read a row, and to pack one from anywhere, in comparisons of a row and a query.
 constexpr double kReading = 40, kPacking = 900;

@@ -43,8 +43,7 @@ std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const Pre
                                     size_t nprobe, int threads);
 
 // Searches as search_exact does, but only in the `nprobe` lists (at least 1) nearest to each query,
-// ties to the smaller list; in all prototypes if there are no more lists than that. Prototype i of
-// `centroids` is the centroid of list i.
+// ties to the smaller list; in all prototypes if there are no more. `centroids` are those of lists.
 Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
                      const PackedPrototypes& centroids, size_t nprobe, Codes queries, size_t k,
                      const SearchOptions& options);

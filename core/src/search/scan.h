@@ -181,8 +181,7 @@ class PrototypeScan {
           offer(query_of(i), distance, row_at(row));
         });
   }
-  // Returns the codes of these blocks, one after the other, valid until the next call. Words are
-  // decoded into the cache, once for all queries.
+  // Returns the codes of these blocks, until the next call; decodes words once for all queries.
   const int8_t* read(std::span<const uint32_t> blocks) {
     const auto& [data, rows, dim, width, table, landmarks] = prototypes_;
     const size_t stored_bytes = packed_size(kPackedRows, dim, width);
@@ -229,9 +228,8 @@ inline void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& qu
              });
 }
 
-// Answers queries, so many at a time that the work on them takes little memory, by
-// find(prepared queries, their nearest so far). Throws std::invalid_argument if the arguments do
-// not fit prototypes of `dim` numbers.
+// Answers queries, some at a time, by find(prepared queries, their nearest so far). Throws
+// std::invalid_argument if the arguments do not fit prototypes of `dim` numbers.
 Matches answer(size_t dim, Codes queries, size_t k, const SearchOptions& options,
                const auto& find) {
   constexpr size_t kAtOnce = 1 << 14;
