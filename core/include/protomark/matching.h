@@ -11,7 +11,7 @@ namespace protomark {
 // The probability that the nearest landmark of a keypoint is the right one:
 //   P = 1 / (1 + exp(-(w0 + w1 d^2 + w2 (s^2 - d^2))))
 // d and s are the distances to the nearest and the second nearest landmark, 2 d without a second.
-// `protomark calibrate` fits the weights for each encoder and length, with mean or tuned prototypes.
+// `protomark calibrate` fits the weights for each encoder and length, mean or tuned prototypes.
 struct PROTOMARK_API MatchCalibration {
   std::array<double, 3> weights{};  // w0, w1, w2
 

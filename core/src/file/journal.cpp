@@ -171,14 +171,14 @@ JournaledFile::JournaledFile(const std::filesystem::path& map) {
   // The map may be compacted meanwhile, even to an equal file; not all inodes are stable.
   for (int tries = 0;; ++tries) {
     const auto open = FileDescriptor::open_to_read(map);
-    mapped_ = std::make_unique<MappedFile>(open, map);
-    file_.emplace(mapped_->bytes(), map.string());
-    const auto journal = FileDescriptor::open_to_read(path);
-    if (!journal && errno != ENOENT && errno != ENAMETOOLONG) fail_read(path);
-    bytes_ = journal ? read_journal(journal, path) : std::vector<std::byte>();
-    if (identity_of(map) == file_->identity() && (open.is_at(map) || tries >= kTries)) break;
+    mapped = std::make_unique<MappedFile>(open, map);
+    file.emplace(mapped->bytes(), map.string());
+    const auto at_path = FileDescriptor::open_to_read(path);
+    if (!at_path && errno != ENOENT && errno != ENAMETOOLONG) fail_read(path);
+    bytes = at_path ? read_journal(at_path, path) : std::vector<std::byte>();
+    if (identity_of(map) == file->identity() && (open.is_at(map) || tries >= kTries)) break;
   }
-  journal_ = JournalContent(bytes_, path.string());
+  journal = JournalContent(bytes, path.string());
 }
 
 JournalContent::JournalContent(Bytes bytes, std::string name)

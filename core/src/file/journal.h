@@ -63,18 +63,13 @@ class JournalContent {
 };
 
 // A map file and its journal that fit each other even if another map commits or compacts meanwhile.
-class JournaledFile {
- public:
+struct JournaledFile {
   explicit JournaledFile(const std::filesystem::path& map);
 
-  const ContainerReader& file() const { return *file_; }
-  const JournalContent& journal() const { return journal_; }
-
- private:
-  std::unique_ptr<const MappedFile> mapped_;
-  std::optional<ContainerReader> file_;
-  std::vector<std::byte> bytes_;
-  JournalContent journal_;
+  std::unique_ptr<const MappedFile> mapped;
+  std::optional<ContainerReader> file;
+  std::vector<std::byte> bytes;
+  JournalContent journal;
 };
 
 // A journal to which one map, of all processes, writes. Functions throw FileError.

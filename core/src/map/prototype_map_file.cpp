@@ -317,7 +317,7 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
 PrototypeMap PrototypeMap::load(const std::filesystem::path& path, bool journal) {
   if (journal) return PrototypeMap(read_with_journal(path));
   const JournaledFile both(path);
-  return PrototypeMap(read_map(both.file(), both.journal()));
+  return PrototypeMap(read_map(*both.file, both.journal));
 }
 
 bool PrototypeMap::has_journal() const {

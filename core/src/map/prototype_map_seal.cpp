@@ -96,11 +96,7 @@ class SealedContent {
   // `store` has the prototypes, `map` everything else.
   SealedContent(const PrototypeStore& store, const PrototypeStore& map, const BlockPacker& packer,
                 const std::optional<PositionCodec>& codec)
-      : store_(store), map_(map), packer_(packer), codec_(codec) {
-    int64_t largest = -1;
-    for (const int64_t id : store.ids()) largest = std::max(largest, id);
-    ids_are_stored_ = IdBlockWriter::needed(store.landmark_count(), largest);
-  }
+      : store_(store), map_(map), packer_(packer), codec_(codec) {}
 
   // The file must be written while this exists.
   void add_to(ContainerWriter& file) {
@@ -214,7 +210,9 @@ class SealedContent {
   const PrototypeStore &store_, &map_;
   const BlockPacker& packer_;
   const std::optional<PositionCodec>& codec_;
-  bool ids_are_stored_;
+  const bool ids_are_stored_ =
+      !store_.ids().empty() &&
+      IdBlockWriter::needed(store_.landmark_count(), *std::ranges::max_element(store_.ids()));
   // With an index, if ids are stored: the first id of each block of landmarks by id, and for each
   // landmark its rank in its block, which take little more than a byte.
   static constexpr size_t kRanks = 256;

@@ -107,9 +107,7 @@ class PrototypeStore : public RowTable {
     close_gap(row);
   }
   void erase(int64_t id) {
-    const LandmarkIndex landmark = at(id);
-    while (next_row(first_row(landmark)) != kNoRow) erase_row(first_row(landmark));
-    erase_row(first_row(landmark));
+    for (size_t left = row_count(at(id)); left > 0; --left) erase_row(first_row(at(id)));
   }
 
   uint32_t observations(LandmarkIndex landmark) const {

@@ -190,7 +190,7 @@ SealedMap::SealedMap(const std::filesystem::path& path) {
   content_ = std::make_unique<const Content>(bytes, path.string(), std::move(mapped));
   // Refuses a map file that replaced one with commits.
   const JournaledFile both(path);
-  both.journal().commits(both.file().identity());
+  both.journal.commits(both.file->identity());
 }
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
   require(reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment == 0,

@@ -90,64 +90,32 @@ void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, Prot
   }
 }
 
-// Landmarks that are packed at a time: many beside the work per query, few enough for the cache.
-constexpr size_t kPackedAtOnce = 1 << 14;
 // The time to read a row, and to pack one from anywhere, in comparisons of a row and a query.
 constexpr double kReading = 40, kPacking = 900;
 
-// Rows that were packed anew.
-class PackedPiece {
- public:
-  void pack(const LandmarkRows& landmarks, std::span<const LandmarkIndex> some,
-            const PackedPrototypes& from) {
-    rows_.clear();
-    owners_.clear();
-    ids_.clear();
-    for (const LandmarkIndex landmark : some) {
-      landmarks.append(landmark, rows_);
-      owners_.resize(rows_.size(), landmark_at(ids_.size()));
-      const int64_t* ids = from.landmarks.ids;
-      ids_.push_back(ids != nullptr ? ids[landmark.value] : int64_t{landmark.value});
-    }
-    // What a row has in one place: 4 numbers or a word.
-    from.width == 0 ? copy_rows<4>(from) : copy_rows<1>(from);
-    view_ = {packed_.data(), rows_.size(), from.dim, from.width, from.table, {}};
-    view_.landmarks.of_row = owners_.data();
-    view_.landmarks.ids = ids_.data();
-  }
-
-  const PackedPrototypes& view() const { return view_; }
-
- private:
-  template <size_t kBytes>
-  void copy_rows(const PackedPrototypes& from) {
-    constexpr size_t kAhead = 8;
-    const size_t block = packed_size(kPackedRows, from.dim, from.width);
-    packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector) + 1);
+// Packs some rows anew, of which `kBytes` bytes are in one place: 4 numbers or a word.
+template <size_t kBytes>
+void pack_rows(const PackedPrototypes& from, std::span<const Row> rows,
+               std::vector<CodeVector>& packed) {
+  constexpr size_t kAhead = 8;
+  const size_t block = packed_size(kPackedRows, from.dim, from.width);
+  packed.resize(packed_blocks(rows.size()) * block / sizeof(CodeVector) + 1);
+  const auto start = [&](size_t row) {
+    return row / kPackedRows * block + row % kPackedRows * kBytes;
+  };
+  for (size_t i = 0; i < rows.size(); ++i) {
     const auto* source = static_cast<const std::byte*>(from.data);
-    auto* to = reinterpret_cast<std::byte*>(packed_.data());
-    const auto start = [&](size_t row) {
-      return row / kPackedRows * block + row % kPackedRows * kBytes;
-    };
-    for (size_t i = 0; i < rows_.size(); ++i) {
-      if (i + kAhead < rows_.size()) {
-        const std::byte* next = source + start(rows_[i + kAhead].value);
-        for (size_t at = 0; at < block; at += sizeof(CodeVector)) __builtin_prefetch(next + at);
-      }
-      const std::byte* row = source + start(rows_[i].value);
-      std::byte* packed = to + start(i);
-      for (size_t at = 0; at < block; at += kPackedRows * kBytes) {
-        std::memcpy(packed + at, row + at, kBytes);
-      }
+    if (i + kAhead < rows.size()) {
+      const std::byte* next = source + start(rows[i + kAhead].value);
+      for (size_t at = 0; at < block; at += sizeof(CodeVector)) __builtin_prefetch(next + at);
+    }
+    const std::byte* row = source + start(rows[i].value);
+    std::byte* to = reinterpret_cast<std::byte*>(packed.data()) + start(i);
+    for (size_t at = 0; at < block; at += kPackedRows * kBytes) {
+      std::memcpy(to + at, row + at, kBytes);
     }
   }
-
-  std::vector<Row> rows_;
-  std::vector<LandmarkIndex> owners_;
-  std::vector<int64_t> ids_;
-  std::vector<CodeVector> packed_;
-  PackedPrototypes view_;
-};
+}
 
 }  // namespace
 
@@ -208,12 +176,31 @@ Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
     return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
   }
   return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
-    PackedPiece piece;
-    for (size_t first = 0; first < some.size(); first += kPackedAtOnce) {
-      piece.pack(landmarks,
-                 std::span(some).subspan(first, std::min(kPackedAtOnce, some.size() - first)),
-                 prototypes);
-      scan_all(piece.view(), prepared, options.threads, nearest);
+    // Landmarks are packed some at a time: many beside the work per query, few enough for the
+    // cache.
+    constexpr size_t kAtOnce = 1 << 14;
+    std::vector<CodeVector> packed;
+    std::vector<Row> rows;
+    std::vector<LandmarkIndex> owners;
+    std::vector<int64_t> ids;
+    for (size_t first = 0; first < some.size(); first += kAtOnce) {
+      rows.clear();
+      owners.clear();
+      ids.clear();
+      for (size_t i = first; i < std::min(some.size(), first + kAtOnce); ++i) {
+        landmarks.append(some[i], rows);
+        owners.resize(rows.size(), landmark_at(ids.size()));
+        const int64_t* all_ids = prototypes.landmarks.ids;
+        ids.push_back(all_ids != nullptr ? all_ids[some[i].value] : int64_t{some[i].value});
+      }
+      (prototypes.width == 0 ? pack_rows<4> : pack_rows<1>)(prototypes, rows, packed);
+      PackedPrototypes piece = prototypes;
+      piece.data = packed.data();
+      piece.rows = rows.size();
+      piece.landmarks = {};
+      piece.landmarks.of_row = owners.data();
+      piece.landmarks.ids = ids.data();
+      scan_all(piece, prepared, options.threads, nearest);
     }
   });
 }
