@@ -1,7 +1,7 @@
 // Packed numbers of every width.
 #include "base/packed_numbers.h"
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "check.h"
 #include "random.h"
 

@@ -1,4 +1,4 @@
-#include "base/checksums.h"
+#include "base/bytes.h"
 
 #include <bit>
 

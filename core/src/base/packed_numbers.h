@@ -7,7 +7,7 @@
 #include <memory>
 #include <utility>
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "base/text.h"
 
 namespace protomark {
