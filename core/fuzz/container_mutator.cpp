@@ -6,7 +6,7 @@
 #include <random>
 #include <vector>
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "base/packed_numbers.h"
 #include "file/container.h"
 #include "file/sections.h"

@@ -1,7 +1,7 @@
 // Packed numbers of every width.
 #include "base/packed_numbers.h"
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "check.h"
 #include "random.h"
 
@@ -14,7 +14,7 @@ int main() {
     const auto limit = static_cast<std::int64_t>((std::uint64_t{1} << bits) - 1);
     const auto values = random.integers<std::uint64_t>(kNumbers, 0, limit);
     std::vector<std::uint64_t> words;
-    PackedWriter writer([&](std::span<const std::byte> bytes) {
+    ValueWriter writer([&](std::span<const std::byte> bytes) {
       const std::size_t before = words.size();
       words.resize(before + bytes.size() / 8);
       if (!bytes.empty()) std::memcpy(&words[before], bytes.data(), bytes.size());

@@ -2,7 +2,7 @@
 #include <string>
 #include <vector>
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "check.h"
 
 namespace {

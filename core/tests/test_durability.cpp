@@ -50,22 +50,19 @@ void pieces(const fs::path& path) {
   whole.add("first", bytes.first(100));
   whole.add("second", bytes);
   whole.add("last", bytes);
-  pieced.add({{"none", 0}, {"values", bytes.size()}}, [&](ContainerWriter::Sinks sinks) {
-    ValueWriter none(sinks[0]), writer(sinks[1]);
+  pieced.add({{"none", 0}, {"values", bytes.size()}}, [&](ContainerWriter::Writers& to) {
     for (std::size_t i = 0; i < values.size(); i += 3) {
-      writer.add(std::array{values[i], values[i + 1], values[i + 2]});
+      to["values"].add(std::array{values[i], values[i + 1], values[i + 2]});
     }
-    none.finish();
-    writer.finish();
   });
   // Produced side by side, in any order.
   pieced.add({{"first", 100}, {"second", bytes.size()}, {"last", ContainerWriter::kUnknownSize}},
-             [&](ContainerWriter::Sinks sinks) {
-               sinks[2](bytes.first(7));
-               sinks[1](bytes.first(1000));
-               sinks[0](bytes.first(100));
-               sinks[2](bytes.subspan(7));
-               sinks[1](bytes.subspan(1000));
+             [&](ContainerWriter::Writers& to) {
+               to["last"].add_all(bytes.first(7));
+               to["second"].add_all(bytes.first(1000));
+               to["first"].add_all(bytes.first(100));
+               to["last"].add_all(bytes.subspan(7));
+               to["second"].add_all(bytes.subspan(1000));
              });
   CHECK(pieced.serialize() == whole.serialize());
   pieced.write(path);
@@ -74,12 +71,12 @@ void pieces(const fs::path& path) {
 
   // If a producer throws, the old file stays.
   pieced.add({{"broken", 1}},
-             [](ContainerWriter::Sinks) { throw std::invalid_argument("no such value"); });
+             [](ContainerWriter::Writers&) { throw std::invalid_argument("no such value"); });
   CHECK(check::throws<std::invalid_argument>([&] { pieced.write(path); }, "no such value"));
   CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
   for (const std::size_t size : {3u, 5u}) {
     ContainerWriter other(FileKind::encoder);
-    other.add({{"four", size}}, [](auto sinks) { sinks[0](std::vector<std::byte>(4)); });
+    other.add({{"four", size}}, [](auto& to) { to["four"].add_all(std::vector<std::byte>(4)); });
     CHECK(check::throws<std::logic_error>([&] { other.write(path); }, "has 4 bytes, not"));
     CHECK(read(path) == old_bytes && files(path.parent_path()) == 1);
   }

@@ -4,7 +4,7 @@
 #include <cstring>
 #include <new>
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "file/container.h"
 #include "file/sections.h"
 #include "journal_files.h"

@@ -24,8 +24,8 @@ std::vector<std::byte> file_of(const Ids& ids) {
   if (!IdBlockWriter::needed(ids.size(), ids.empty() ? -1 : ids.back())) return file.serialize();
   std::vector<ContainerWriter::Part> parts;
   IdBlockWriter::add_to(parts, ids.size());
-  file.add(std::move(parts), [&](ContainerWriter::Sinks sinks) {
-    IdBlockWriter to(sinks[0], sinks[1]);
+  file.add(std::move(parts), [&](ContainerWriter::Writers& writers) {
+    IdBlockWriter to(writers);
     for (const std::int64_t id : ids) to.add(id);
     to.finish();
   });

@@ -29,8 +29,7 @@ Eigen::Map<const RowMajor<T>> as_eigen(const Matrix<T>& matrix) {
   return as_eigen(matrix.view());
 }
 
-// Copies points to positions: the columns of a matrix of 3 x n, or the rows of one of n x 3. The
-// type must say which of the two it is.
+// Copies points to positions: the columns of a matrix of 3 x n, or the rows of one of n x 3.
 template <typename Points>
 std::vector<Position> to_positions(const Eigen::MatrixBase<Points>& points) {
   constexpr bool columns = Points::RowsAtCompileTime == 3;

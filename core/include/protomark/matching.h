@@ -10,9 +10,8 @@ namespace protomark {
 
 // The probability that the nearest landmark of a keypoint is the right one:
 //   P = 1 / (1 + exp(-(w0 + w1 d^2 + w2 (s^2 - d^2))))
-// d and s are the distances to the nearest and the second nearest landmark; without a second, s is
-// 2 d. `protomark calibrate` fits the weights to data for each encoder and length of its codes,
-// with mean prototypes and with tuned ones.
+// d and s are the distances to the nearest and the second nearest landmark, 2 d without a second.
+// `protomark calibrate` fits the weights for each encoder and length, mean or tuned prototypes.
 struct PROTOMARK_API MatchCalibration {
   std::array<double, 3> weights{};  // w0, w1, w2
 
@@ -44,8 +43,7 @@ struct MatchOptions {
 };
 
 // Finds the landmarks that the keypoints of a frame see: for each descriptor the nearest landmark,
-// if that is likely enough to be right. Throws std::invalid_argument as MatchCalibration::of, and
-// as search.
+// if that is likely enough to be right. Throws as MatchCalibration::of and as search.
 PROTOMARK_API MatchList match(const PrototypeMap& map, Descriptors descriptors,
                               const MatchOptions& options = {});
 PROTOMARK_API MatchList match(const SealedMap& map, Descriptors descriptors,

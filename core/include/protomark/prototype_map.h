@@ -14,8 +14,7 @@ struct MapPart;
 struct MapState;
 
 struct IndexOptions {
-  // Number of inverted lists, 1 to 65536 and at most one per prototype; by default a number that
-  // fits the map.
+  // Inverted lists, 1 to 65536 and at most one per prototype; by default as many as fit the map.
   std::optional<size_t> nlist = std::nullopt;
   // Moves prototypes within the map instead of copying it.
   bool in_place = false;
@@ -74,8 +73,7 @@ class PROTOMARK_API PrototypeMap {
   // Returns the ids of all landmarks in ascending order.
   std::vector<int64_t> ids() const;
 
-  // Adds observations: descriptor i (n x bytes) is of landmark ids[i], which is new if the map does
-  // not hold it. Ids are not negative.
+  // Adds observations: descriptor i (n x bytes) is of landmark ids[i], 0 or above, existing or new.
   void add(std::span<const int64_t> ids, Descriptors descriptors, int threads = 1);
   // Undoes `add`. A landmark without observations leaves the map. Throws UnknownLandmark, and
   // std::invalid_argument if these observations cannot have been added.
@@ -94,9 +92,8 @@ class PROTOMARK_API PrototypeMap {
   // observations had been added here. Landmark source[i] of the other map becomes landmark into[i]
   // of this one, existing or new; all others keep their ids. If several become one, they are merged
   // by ascending id in the other map, positions as in merge_landmarks. This map takes over metadata
-  // under names that it lacks, and the earlier "created". Throws UnknownLandmark for a source that
-  // the other map does not hold, and std::invalid_argument if maps differ, a source is named twice
-  // or an id is negative.
+  // under names that it lacks, and the earlier "created". Throws UnknownLandmark for a source, and
+  // std::invalid_argument if maps differ, a source is named twice or an id is negative.
   void merge_map(const PrototypeMap& other, std::span<const int64_t> into = {},
                  std::span<const int64_t> source = {});
 
@@ -207,8 +204,7 @@ class PROTOMARK_API PrototypeMap {
 
 // The landmarks of one cube of space.
 struct MapPart {
-  // Coordinate i of each position is in [cell[i], cell[i] + 1) * cell_size. nullopt: no landmark
-  // has a position.
+  // Coordinate i of each position is in [cell[i], cell[i] + 1) * cell_size. nullopt: no positions.
   std::optional<std::array<int64_t, 3>> cell;
   PrototypeMap map;
 };

@@ -34,16 +34,14 @@ class PROTOMARK_API SealedMap {
   size_t words() const;
   // Whether prototypes were tuned against each other (SealOptions).
   bool tuned() const;
-  // Bytes that a landmark takes on average for its prototypes and their number, as SealOptions
-  // counts them; 0 for an empty map.
+  // Bytes per landmark as SealOptions counts them; 0 for an empty map.
   double bytes_per_landmark() const;
   // Bits per coordinate: 32, 16, or 0 if no landmark has a position.
   int position_bits() const;
   // With 16 bits, how far a position may be from that of the learning map along each axis. With 32
   // bits, coordinates relative to the middle of the map are rounded to floats.
   std::optional<Position> position_error() const;
-  // Returns the ids of all landmarks in ascending order. Throws FileError if those of a broken file
-  // do not ascend, which only this call checks.
+  // Returns all ids in ascending order. Throws FileError if a broken file has them in another one.
   std::vector<int64_t> ids() const;
 
   // Number of inverted lists; 0 means no index.

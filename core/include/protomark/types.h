@@ -65,8 +65,8 @@ struct Matrix {
   std::vector<T> data;
 };
 
-// One descriptor per row, as OpenCV gives them: bit i of a descriptor is bit i % 8 (least
-// significant first) of byte i / 8. Those of vectors are their bytes, or the bytes of their floats.
+// One descriptor per row, as OpenCV gives them: bit i is bit i % 8 (lowest first) of byte i / 8.
+// Those of vectors are their bytes, or the bytes of their floats.
 using Descriptors = MatrixView<const uint8_t>;
 // One code per row, each number -127 to 127.
 using Codes = MatrixView<const int8_t>;
@@ -91,8 +91,7 @@ inline constexpr size_t kMaxMetadata = 256;          // names
 inline constexpr size_t kMaxMetadataName = 128;      // bytes, at least 1
 inline constexpr size_t kMaxMetadataText = 1 << 16;  // bytes
 
-// Throws std::invalid_argument if metadata exceed these limits or are not UTF-8, or if "created" is
-// not such a time.
+// Throws std::invalid_argument beyond these limits, for bad UTF-8 and for a bad "created".
 PROTOMARK_API void check_metadata(const Metadata& metadata);
 
 struct MapSummary {
@@ -104,8 +103,7 @@ struct MapSummary {
   std::optional<std::array<Position, 2>> extent;
 };
 
-// Thrown if a file cannot be read or written, or is broken. (Wrong arguments throw
-// std::invalid_argument.)
+// Thrown if a file cannot be read or written, or is broken.
 struct PROTOMARK_API FileError : std::runtime_error {
   using std::runtime_error::runtime_error;
 };

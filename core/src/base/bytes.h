@@ -1,4 +1,4 @@
-// Plain values at any address.
+// Plain values at any address, and checksums of bytes.
 #pragma once
 
 #include <cstring>
@@ -15,9 +15,12 @@ T load(const void* from) {
   std::memcpy(&value, from, sizeof(value));
   return value;
 }
-template <typename T>
-void store(void* to, const T& value) {
-  std::memcpy(to, &value, sizeof(value));
-}
+void store(void* to, const auto& value) { std::memcpy(to, &value, sizeof(value)); }
+
+// Returns the CRC-32 (IEEE 802.3, as in zlib) of bytes that follow others whose CRC-32 is `crc`.
+uint32_t crc32(Bytes bytes, uint32_t crc = 0);
+
+// Returns the SHA-256 (FIPS 180-4) as 64 lower-case hexadecimal digits.
+std::string sha256(Bytes bytes);
 
 }  // namespace protomark

@@ -1,4 +1,4 @@
-#include "base/checksums.h"
+#include "base/bytes.h"
 
 #include <bit>
 
@@ -8,8 +8,7 @@ namespace {
 constexpr size_t kSlices = 8;
 using Tables = std::array<std::array<uint32_t, 256>, kSlices>;
 
-// Table t holds the CRC of each byte when t zero bytes follow it ("slicing by 8", Kounavis and
-// Berry 2008).
+// Table t has the CRC of each byte with t zero bytes behind it ("slicing by 8", Kounavis 2008).
 constexpr Tables make_tables() {
   Tables tables{};
   for (uint32_t i = 0; i < 256; ++i) {

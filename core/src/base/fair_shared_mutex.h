@@ -7,8 +7,7 @@
 
 namespace protomark {
 
-// glibc's std::shared_mutex admits new readers while others hold it, so that a writer would wait
-// for ever if a few threads search all the time.
+// A writer would wait for glibc's std::shared_mutex for ever while a few threads search in turns.
 class FairSharedMutex {
  public:
   void lock() {

@@ -65,8 +65,7 @@ class IdIndex {
   // Removes an id that is in the table and still in `ids`.
   void erase(const Ids& ids, int64_t id) {
     size_t hole = slot_of(ids, id);
-    // Each entry that follows without a break moves back if the hole is no further from its home
-    // than the slot that it is in.
+    // Each entry up to the next gap moves back unless the hole is before its home.
     for (size_t s = next(hole); slots_[s] != kNoLandmark; s = next(s)) {
       const size_t from = home(ids[slots_[s].value]);
       if (((s - from) & mask()) >= ((s - hole) & mask())) {

@@ -12,8 +12,7 @@
 
 namespace protomark {
 
-// Memory begins at a cache line, and much of it lies in huge pages, which spares most reads a
-// page-table walk.
+// Begins at a cache line, and in huge pages if it is large, so that few reads walk page tables.
 template <typename T>
 struct LargePageAllocator {
   using value_type = T;
@@ -97,8 +96,7 @@ class Slots {
 
   size_t size_;
   std::vector<LargeVector<int8_t>> chunks_;
-  // The first of the slots that were given back, each of which begins with the next one; and how
-  // many were ever taken.
+  // The first slot that was given back, which begins with the next one; how many were ever taken.
   uint32_t free_ = kNone, used_ = 0;
 };
 

@@ -1,5 +1,4 @@
-// Numbers of 0 to 63 bits, packed one after the other in 64-bit words, least significant bits
-// first.
+// Numbers of 0 to 63 bits, packed into 64-bit words, least significant bits first.
 #pragma once
 
 #include <algorithm>
@@ -8,7 +7,7 @@
 #include <memory>
 #include <utility>
 
-#include "base/checksums.h"
+#include "base/bytes.h"
 #include "base/text.h"
 
 namespace protomark {
@@ -33,58 +32,51 @@ inline uint64_t packed_number(const void* words, int bits, size_t i) {
 // Takes the bytes of a section in order.
 using Sink = std::function<void(Bytes)>;
 
-// Hands values to a sink in pieces of kPiece bytes or a little more, the last one shorter.
+// Hands values and packed numbers to a sink in pieces of kPiece bytes or little more.
 class ValueWriter {
  public:
   static constexpr size_t kPiece = 1 << 15;
 
-  explicit ValueWriter(Sink sink) : sink_(std::move(sink)) {}
+  explicit ValueWriter(Sink sink = {}) : sink_(std::move(sink)) {}
 
-  template <typename T>
-  void add(const T& value) {
-    store(add_bytes(sizeof(T)), value);
-  }
+  void add(const auto& value) { store(add_bytes(sizeof(value)), value); }
   // Returns room for n more bytes, to be written before the next call.
   std::byte* add_bytes(size_t n) {
-    if (bytes_.size() >= kPiece) finish();
+    if (bytes_.size() >= kPiece) flush();
     bytes_.resize(bytes_.size() + n);
     return &bytes_[bytes_.size() - n];
   }
-  void finish() {
-    if (!bytes_.empty()) sink_(bytes_);
-    bytes_.clear();
+  void add_all(Bytes bytes) {
+    flush();
+    sink_(bytes);
   }
-
- private:
-  Sink sink_;
-  std::vector<std::byte> bytes_;
-};
-
-class PackedWriter {
- public:
-  explicit PackedWriter(Sink sink) : words_(std::move(sink)) {}
-
-  // A number of 64 bits begins at a whole word.
+  // Adds a packed number; one of 64 bits begins at a whole word.
   void add(uint64_t value, int bits) {
     const auto width = static_cast<unsigned>(bits);
     word_ |= value << filled_;
     filled_ += width;
     if (filled_ < 64) return;
     filled_ -= 64;
-    words_.add(std::exchange(word_, 0));
+    add(std::exchange(word_, 0));
     if (filled_ > 0) word_ = value >> (width - filled_);
   }
   void align() {
-    if (filled_ > 0) words_.add(std::exchange(word_, 0));
+    if (filled_ > 0) add(std::exchange(word_, 0));
     filled_ = 0;
   }
   void finish() {
     align();
-    words_.finish();
+    flush();
   }
 
  private:
-  ValueWriter words_;
+  void flush() {
+    if (!bytes_.empty()) sink_(bytes_);
+    bytes_.clear();
+  }
+
+  Sink sink_;
+  std::vector<std::byte> bytes_;
   uint64_t word_ = 0;
   unsigned filled_ = 0;  // bits of word_
 };

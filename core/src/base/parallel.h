@@ -24,10 +24,8 @@ inline Range range_of(size_t n, size_t ranges, size_t i, size_t grain) {
   return {std::min(n, grains * i / ranges * grain), std::min(n, grains * (i + 1) / ranges * grain)};
 }
 
-// Calls body(begin, end) for ranges that cover [0, n), on up to `threads` threads. All ranges but
-// the last have a multiple of `grain` elements.
-template <typename Body>
-void parallel_for(int threads, size_t n, size_t grain, const Body& body) {
+// Calls body(begin, end) for ranges of [0, n), all but the last of a multiple of `grain` elements.
+void parallel_for(int threads, size_t n, size_t grain, const auto& body) {
   if (threads == 1 && n > 0) return body(size_t{0}, n);
   // With several ranges per thread, others take over from a thread that is held up.
   const size_t ranges = std::min((n + grain - 1) / grain, 4 * static_cast<size_t>(threads));

@@ -8,20 +8,15 @@
 namespace protomark {
 
 // Joins values into one text.
-template <typename... Parts>
-std::string text(const Parts&... parts) {
+std::string text(const auto&... parts) {
   std::ostringstream out;
   (out << ... << parts);
   return out.str();
 }
 
 // Throw std::invalid_argument with the text of these parts, `require` unless a condition holds.
-template <typename... Parts>
-[[noreturn]] void invalid(const Parts&... parts) {
-  throw std::invalid_argument(text(parts...));
-}
-template <typename... Parts>
-void require(bool condition, const Parts&... parts) {
+[[noreturn]] void invalid(const auto&... parts) { throw std::invalid_argument(text(parts...)); }
+void require(bool condition, const auto&... parts) {
   if (!condition) invalid(parts...);
 }
 

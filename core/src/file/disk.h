@@ -13,8 +13,7 @@ namespace protomark {
 
 std::string system_error();
 
-template <typename... Parts>
-[[noreturn]] void fail_file(const std::filesystem::path& path, const Parts&... what) {
+[[noreturn]] void fail_file(const std::filesystem::path& path, const auto&... what) {
   throw FileError(text(path.string(), ": ", what...));
 }
 
@@ -44,8 +43,7 @@ class FileDescriptor {
 
   // Reads up to n bytes from the beginning. Returns nullopt, with errno set, on failure.
   std::optional<std::vector<std::byte>> read(size_t n) const;
-  // Writes all bytes from an offset on. Returns false, with errno set, on failure, also at a limit
-  // on file sizes, which raises no signal.
+  // Writes all bytes from an offset on. Returns false, with errno set, on failure; never a signal.
   bool write(size_t offset, Bytes bytes) const;
   // Whether the file still has this name.
   bool is_at(const std::filesystem::path& path) const;

@@ -22,7 +22,8 @@ inline constexpr size_t kIdBlock = 128;  // landmarks; the last block may have f
 // Writes the sections `idblocks` and `idgaps` from ascending ids.
 class IdBlockWriter {
  public:
-  IdBlockWriter(Sink blocks, Sink gaps) : blocks_(std::move(blocks)), gaps_(std::move(gaps)) {}
+  explicit IdBlockWriter(ContainerWriter::Writers& to)
+      : blocks_(to[section::kIdBlocks]), gaps_(to[section::kIdGaps]) {}
 
   void add(int64_t id) {
     ids_.push_back(id);
@@ -30,8 +31,6 @@ class IdBlockWriter {
   }
   void finish() {
     if (!ids_.empty()) end_block();
-    blocks_.finish();
-    gaps_.finish();
   }
 
   // Whether ids have to be stored: 0 to n - 1 have not.
@@ -46,15 +45,14 @@ class IdBlockWriter {
   void end_block() {
     const auto gap = [&](size_t j) { return static_cast<uint64_t>(ids_[j] - ids_.front()) - j; };
     const auto bits = static_cast<int>(std::bit_width(gap(ids_.size() - 1)));
-    blocks_.add(static_cast<uint64_t>(ids_.front()), 64);
-    blocks_.add(words_ * 64 + static_cast<uint64_t>(bits), 64);
+    blocks_.add(IdBlock{ids_.front(), words_ * 64 + static_cast<uint64_t>(bits)});
     for (size_t j = 0; j < ids_.size(); ++j) gaps_.add(gap(j), bits);
     gaps_.align();
     words_ += packed_words(ids_.size(), bits);
     ids_.clear();
   }
 
-  PackedWriter blocks_, gaps_;
+  ValueWriter &blocks_, &gaps_;
   std::vector<int64_t> ids_;  // of the block
   size_t words_ = 0;          // of all gaps
 };
@@ -62,8 +60,7 @@ class IdBlockWriter {
 class LandmarkIds {
  public:
   LandmarkIds() = default;
-  // Checks everything but the gaps, which are mapped, and checked as they are read. `file` must
-  // outlive this. Throws FileError.
+  // Checks all but gaps, which are checked as they are read from `file`. Throws FileError.
   LandmarkIds(const ContainerReader& file, size_t n) : file_(&file), n_(n) {
     if (!file.has(section::kIdBlocks)) return;
     const size_t blocks = (n + kIdBlock - 1) / kIdBlock;

@@ -23,8 +23,7 @@ std::optional<ContainerHead> intact_head(Bytes bytes) {
 }
 
 // Returns the container that bytes begin with; nullopt if its header is broken or it is cut off.
-// Throws FileError if it is unreadable all the same, such as one of a later version, which no power
-// cut leaves.
+// Throws FileError for what no power cut leaves, such as one of a later version.
 std::optional<ContainerReader> container_at(Bytes bytes, const std::string& name) {
   const auto head = intact_head(bytes);
   if (!head || head->header.file_size > bytes.size()) return std::nullopt;
@@ -113,8 +112,7 @@ std::string holder(const FileDescriptor& file) {
 
 uint32_t checksum_of(Bytes container) { return ContainerHead::parse(container)->header.crc; }
 
-// Returns the bytes of an open journal, which its writer may cut off meanwhile. Throws FileError if
-// it is not a journal.
+// Reads an open journal, which its writer may cut off meanwhile. Throws FileError for another file.
 std::vector<std::byte> read_journal(const FileDescriptor& file, const std::filesystem::path& path) {
   struct stat status;
   if (::fstat(file.get(), &status) != 0) fail_read(path);
@@ -170,18 +168,17 @@ std::filesystem::path journal_path(const std::filesystem::path& map) {
 
 JournaledFile::JournaledFile(const std::filesystem::path& map) {
   const auto path = journal_path(map);
-  // The map may be compacted while the two are read, even to an equal file. Not every file system
-  // gives a file the same inode each time.
+  // The map may be compacted meanwhile, even to an equal file; not all inodes are stable.
   for (int tries = 0;; ++tries) {
     const auto open = FileDescriptor::open_to_read(map);
-    mapped_ = std::make_unique<MappedFile>(open, map);
-    file_.emplace(mapped_->bytes(), map.string());
-    const auto journal = FileDescriptor::open_to_read(path);
-    if (!journal && errno != ENOENT && errno != ENAMETOOLONG) fail_read(path);
-    bytes_ = journal ? read_journal(journal, path) : std::vector<std::byte>();
-    if (identity_of(map) == file_->identity() && (open.is_at(map) || tries >= kTries)) break;
+    mapped = std::make_unique<MappedFile>(open, map);
+    file.emplace(mapped->bytes(), map.string());
+    const auto at_path = FileDescriptor::open_to_read(path);
+    if (!at_path && errno != ENOENT && errno != ENAMETOOLONG) fail_read(path);
+    bytes = at_path ? read_journal(at_path, path) : std::vector<std::byte>();
+    if (identity_of(map) == file->identity() && (open.is_at(map) || tries >= kTries)) break;
   }
-  journal_ = JournalContent(bytes_, path.string());
+  journal = JournalContent(bytes, path.string());
 }
 
 JournalContent::JournalContent(Bytes bytes, std::string name)
@@ -266,7 +263,6 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   base_ = identity;
   end_ = content.end();
   last_ = content.last();
-  tail_ = content.end() != content.size();
   if (content.commits(identity).empty() && !content.is_new(identity)) end_ = 0;
   // A process that compacted may have been killed before this: the name of the new map file must be
   // durable before the commits that it has are dropped.
@@ -278,18 +274,10 @@ void Journal::resume(const JournalContent& content, const std::string& identity)
   }
 }
 
-bool Journal::cut(size_t size) {
-  if (tail_ && ::ftruncate(file_.get(), static_cast<off_t>(size)) != 0) return false;
-  tail_ = false;
-  return true;
-}
-
 // Empties the file and syncs it before writing a header, so that no older record follows that.
 void Journal::begin() {
-  tail_ = true;
   if (!cut(0)) fail_write(path_);
   end_ = 0;
-  tail_ = true;
   ContainerWriter file(FileKind::journal);
   file.add(section::kBase, std::as_bytes(std::span(base_)));
   const auto first = file.serialize();
@@ -298,7 +286,6 @@ void Journal::begin() {
   }
   end_ = first.size();
   last_ = {0, checksum_of(first), 0};
-  tail_ = false;
 }
 
 void Journal::check_owner() const {
@@ -327,14 +314,12 @@ void Journal::append(Bytes record) {
   }
   base_ = now;
   if (!cut(end_)) fail_write(path_);
-  tail_ = true;
   if (!file_.write(end_, record) || ::fsync(file_.get()) != 0) {
     const int error = errno;
     cut(end_);  // or before the next one
     errno = error;
     fail_write(path_);
   }
-  tail_ = false;
   end_ += record.size();
   last_ = {last_.record + 1, checksum_of(record), 0};
 }
@@ -351,7 +336,7 @@ void Journal::restart(const std::string& identity) noexcept {
     base_ = identity;
     begin();
   } catch (const std::exception&) {
-    tail_ = true;  // as after a power cut at this moment
+    return;  // as after a power cut at this moment
   }
 }
 

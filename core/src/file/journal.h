@@ -3,6 +3,8 @@
 // that the map was folded into a new map file; each names the checksum of the one before it.
 #pragma once
 
+#include <unistd.h>
+
 #include <memory>
 
 #include "file/container.h"
@@ -28,12 +30,10 @@ class JournalContent {
 
   JournalContent() = default;
   // Reads all records but a torn last one, which a killed process or a power cut leaves. The bytes
-  // stay the caller's. Throws FileError if another record follows a torn one, and for anything else
-  // that no writer leaves.
+  // stay the caller's. Throws FileError for what no writer leaves, as a torn record before others.
   JournalContent(Bytes bytes, std::string name);
 
-  // Returns the commits to apply to a map file of this identity, in order. Throws FileError if they
-  // belong to another file.
+  // Returns the commits to a map file of this identity. Throws FileError if they are to another.
   std::span<const Commit> commits(const std::string& identity) const;
 
   const std::string& name() const { return name_; }
@@ -62,27 +62,20 @@ class JournalContent {
   std::vector<Base> bases_;
 };
 
-// A map file and its journal, read without a lock, that fit each other even if a map commits and
-// compacts meanwhile.
-class JournaledFile {
- public:
+// A map file and its journal that fit each other even if another map commits or compacts meanwhile.
+struct JournaledFile {
   explicit JournaledFile(const std::filesystem::path& map);
 
-  const ContainerReader& file() const { return *file_; }
-  const JournalContent& journal() const { return journal_; }
-
- private:
-  std::unique_ptr<const MappedFile> mapped_;
-  std::optional<ContainerReader> file_;
-  std::vector<std::byte> bytes_;
-  JournalContent journal_;
+  std::unique_ptr<const MappedFile> mapped;
+  std::optional<ContainerReader> file;
+  std::vector<std::byte> bytes;
+  JournalContent journal;
 };
 
 // A journal to which one map, of all processes, writes. Functions throw FileError.
 class Journal {
  public:
-  // Locks the journal of a map file, which it makes if there is none. The error for a locked
-  // journal names the process that holds the lock.
+  // Locks the journal of a map file, or makes one. Errors name the process that holds the lock.
   explicit Journal(const std::filesystem::path& map);
   Journal(const Journal&) = delete;
   Journal& operator=(const Journal&) = delete;
@@ -107,7 +100,8 @@ class Journal {
  private:
   void check_owner() const;
   void begin();
-  bool cut(size_t size);
+  // Cuts off what an interrupted write may have left behind the end.
+  bool cut(size_t size) { return ::ftruncate(file_.get(), static_cast<off_t>(size)) == 0; }
 
   std::filesystem::path map_, path_;
   FileDescriptor file_;  // locked while it is open, also in a forked child
@@ -117,11 +111,9 @@ class Journal {
   std::string folded_;  // and of the one that may have replaced it
   size_t end_ = 0;
   ChainLink last_{};
-  bool tail_ = false;  // bytes may follow the end
 };
 
-// Writes a file, replacing any other, unless a map has the journal of that or the journal holds
-// commits, which would be lost. Throws FileError.
+// Writes a file. Throws FileError if a map has its journal, or that holds commits.
 void write_guarded(const ContainerWriter& file, const std::filesystem::path& path);
 
 }  // namespace protomark

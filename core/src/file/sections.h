@@ -96,12 +96,8 @@ T read_value(const ContainerReader& file, const char* name) {
 
 class SectionWriter {
  public:
-  template <typename T>
-  void value(const T& v) {
-    values(&v, 1);
-  }
-  template <typename T>
-  void values(const T* v, size_t n) {
+  void value(const auto& v) { values(&v, 1); }
+  void values(const auto* v, size_t n) {
     const Bytes bytes = std::as_bytes(std::span(v, n));
     bytes_.insert(bytes_.end(), bytes.begin(), bytes.end());
   }
@@ -115,8 +111,7 @@ class SectionWriter {
   std::vector<std::byte> bytes_;
 };
 
-template <typename T>
-void add_value(ContainerWriter& file, const char* name, const T& value) {
+void add_value(ContainerWriter& file, const char* name, const auto& value) {
   file.add(name, std::as_bytes(std::span(&value, 1)));
 }
 

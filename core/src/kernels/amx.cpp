@@ -29,9 +29,8 @@ constexpr size_t kTileDim = 64;  // dimensions of a full tile
 // Blocks compared at a time: four independent products hide the latency of a tile product.
 constexpr size_t kStep = 4;
 
-// Packed blocks and queries are tiles without further packing. Tiles 0 to 3 hold the results of
-// four blocks, 4 and 5 queries, 6 and 7 a block; the first of each pair is for 64 dimensions, the
-// second for the rest.
+// Packed blocks and queries are tiles as they are. Tiles 0 to 3 hold the results of four blocks, 4
+// and 5 queries, 6 and 7 a block: the first of each pair 64 dimensions, the second the rest.
 TileConfig configuration(size_t queries, size_t dim) {
   TileConfig config;
   for (int tile = 0; tile < 4; ++tile) config.set(tile, queries, 4 * kCodeRows);
@@ -47,8 +46,7 @@ TileConfig configuration(size_t queries, size_t dim) {
   return config;
 }
 
-// Adds the products of queries in tile `a` and of four blocks, in tile `b`, from dimension d on,
-// to tiles 0 to 3.
+// Adds the products, from dimension d on, of queries (tile a) and four blocks (b) to tiles 0 to 3.
 #define PROTOMARK_ADD_PRODUCTS(a, b)          \
   TILE_LOAD(a, queries.codes + d, rows.dim);  \
   TILE_LOAD(b, codes[0] + d * kCodeRows, 64); \

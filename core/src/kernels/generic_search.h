@@ -162,8 +162,7 @@ PROTOMARK_TILE size_t scan_tile(const CodeTile<S>& t, size_t query, Hit* hits) {
 }
 
 // Calls take<Queries>(query) for all n queries, kTileQueries at a time.
-template <typename Take>
-void each_tile(size_t n, const Take& take) {
+void each_tile(size_t n, const auto& take) {
   size_t q = 0;
   for (; q + kTileQueries <= n; q += kTileQueries) take.template operator()<kTileQueries>(q);
   static_assert(kTileQueries == 4);

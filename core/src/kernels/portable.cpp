@@ -24,8 +24,7 @@ struct Portable : ByPairs<Portable, 16> {
   using Step = uint8_t[4];
   static constexpr int kDenseBatch = 1;
   static constexpr int kDenseGroups = 1;
-  // For shifts of any size. Rounds half up; s * multiplier is below 2^62, so adding 2^61 at most
-  // cannot overflow.
+  // For shifts of any size. s * multiplier is below 2^62, so adding 2^61 at most cannot overflow.
   template <typename Sum>
   static void activate(const Activation& a, const Sum* sums, size_t n, uint8_t* next,
                        size_t stride) {

@@ -1,5 +1,4 @@
-// Vectors of GCC and Clang, which have the arithmetic of their elements. Everything has internal
-// linkage: see kernels.h.
+// Vectors of GCC and Clang, with the arithmetic of their elements. Linkage: see kernels.h.
 #pragma once
 
 #include <cstddef>

@@ -159,15 +159,15 @@ std::vector<std::pair<std::string, size_t>> file_sections(const std::filesystem:
 
 void verify_file(const std::filesystem::path& path) {
   const JournaledFile both(path);
-  both.file().verify();
-  both.journal().commits(both.file().identity());
+  both.file->verify();
+  both.journal.commits(both.file->identity());
 }
 
 std::optional<FileJournal> file_journal(const std::filesystem::path& path) {
   const JournaledFile both(path);
-  const JournalContent& journal = both.journal();
+  const JournalContent& journal = both.journal;
   if (journal.size() == 0) return std::nullopt;
-  return FileJournal{journal.commits(both.file().identity()).size(), journal.size(),
+  return FileJournal{journal.commits(both.file->identity()).size(), journal.size(),
                      journal.size() - journal.end()};
 }
 

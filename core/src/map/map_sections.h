@@ -17,8 +17,7 @@ MapShape read_shape(const ContainerReader& file, const Encoder& encoder);
 std::shared_ptr<const Encoder> read_encoder(const ContainerReader& file);
 void add_metadata(ContainerWriter& file, const Metadata& metadata);
 Metadata read_metadata(const ContainerReader& file);
-// Returns the metadata of a map after merging another one into it (PrototypeMap::merge_map). Throws
-// std::invalid_argument if there are too many.
+// Merges metadata as PrototypeMap::merge_map does. Throws std::invalid_argument for too many.
 Metadata merged(const Metadata& into, const Metadata& other);
 // Returns the centroids of inverted lists (nlist x dim); none without an index.
 Matrix<int8_t> read_centroids(const ContainerReader& file, size_t dim);

@@ -26,7 +26,6 @@ struct MeasuredRecall {
 //                  source of a merge, measuring
 //   searching      a change, alone, while it writes a piece; shared, searches and short questions
 //   recall_mutex   whoever reads or replaces `recall_table`
-// So a search waits only for a piece of a change.
 struct MapState {
   MapState(std::shared_ptr<const Encoder> its_encoder, size_t dim, size_t appearance_bits)
       : encoder(std::move(its_encoder)), store(dim, appearance_bits) {}
@@ -38,8 +37,7 @@ struct MapState {
   FairSharedMutex changing, searching;
 
   std::unique_ptr<Journal> journal;  // nullptr without a journal
-  // The map file whose journal this is or was; empty if it never had one. Constant once others have
-  // the map.
+  // The map file whose journal this is or was; empty if there never was one.
   std::filesystem::path journaled;
 
   // Returns how many lists to search for this recall, as measured on the map now, or earlier if
@@ -85,8 +83,7 @@ using ExactSearch = std::function<Matches(Codes)>;
 RecallTable measure_recall(const PrototypeStore& store, const std::function<void(int8_t*)>& stored,
                            const ExactSearch& search);
 
-// A change of a map: while it exists no other one begins, and all that read the map for long wait.
-// Searches go on between its pieces.
+// A change of a map, beside which only searches go on, between its pieces.
 class MapChange {
  public:
   // Observations or landmarks that are changed at a time.
@@ -99,10 +96,8 @@ class MapChange {
   // Lets the change write: while the lock is held no search reads the map.
   std::unique_lock<FairSharedMutex> write() { return std::unique_lock(state_->searching); }
 
-  // Calls write_one(i) for all i below n, in pieces after each of which all rows are in their
-  // lists.
-  template <typename WriteOne>
-  void in_pieces(size_t n, const WriteOne& write_one) {
+  // Calls write_one(i) for all i below n, in pieces that leave all rows in their lists.
+  void in_pieces(size_t n, const auto& write_one) {
     for (size_t first = 0; first < n; first += kPiece) {
       const auto lock = write();
       for (size_t i = first; i < std::min(n, first + kPiece); ++i) write_one(i);

@@ -44,8 +44,7 @@ std::optional<MatchCalibration> read_note(const std::string& note, size_t dim) {
   return found;
 }
 
-template <typename Map>
-MatchList match_with(const Map& map, bool tuned, Descriptors descriptors,
+MatchList match_with(const auto& map, bool tuned, Descriptors descriptors,
                      const MatchOptions& options) {
   require(options.min_probability >= 0 && options.min_probability <= 1,
           "min_probability must be 0 to 1, not ", options.min_probability);

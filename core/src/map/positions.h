@@ -23,8 +23,7 @@ inline void add_to_summary(MapSummary& summary, const Position& position) {
 class PositionCodec {
  public:
   PositionCodec() = default;
-  // For positions between these lowest and highest coordinates. Throws std::invalid_argument if
-  // they are too far apart for floats.
+  // For positions in this box. Throws std::invalid_argument if it is too large for floats.
   PositionCodec(const std::array<Position, 2>& extent, int bits) : bits_(bits) {
     for (size_t i = 0; i < 3; ++i) {
       const double low = extent[0][i], high = extent[1][i], middle = low / 2 + high / 2;

@@ -21,8 +21,7 @@ void write_mean(const PrototypeStore& store, std::span<const Row> rows, float* m
   }
 }
 
-template <typename ValueOf>
-auto values_of(MapState& state, std::span<const int64_t> ids, const ValueOf& value_of) {
+auto values_of(MapState& state, std::span<const int64_t> ids, const auto& value_of) {
   const std::shared_lock lock(state.searching);
   std::vector<decltype(value_of(LandmarkIndex{}))> result;
   for (const int64_t id : ids) result.push_back(value_of(state.store.at(id)));

@@ -1,5 +1,4 @@
-// Changes observations, landmarks, positions and metadata of a learning map, merges maps into one
-// and splits one into parts.
+// Changes of a learning map; merges maps into one and splits one into parts.
 #include <map>
 #include <unordered_map>
 
@@ -306,16 +305,14 @@ std::vector<PrototypeMap> PrototypeMap::split_by_id(std::span<const int64_t> bou
   const std::vector<LandmarkIndex> landmarks = state_->store.sorted_landmarks();
   std::vector<PrototypeMap> parts;
   parts.reserve(boundaries.size() + 1);
-  auto first = landmarks.begin();
-  for (size_t i = 0; i <= boundaries.size(); ++i) {
-    const auto end =
-        i == boundaries.size()
-            ? landmarks.end()
-            : std::ranges::lower_bound(first, landmarks.end(), boundaries[i], {},
-                                       [&](LandmarkIndex l) { return state_->store.id(l); });
-    parts.push_back(state_->part({first, end}));
-    first = end;
+  std::span<const LandmarkIndex> rest = landmarks;
+  for (const int64_t boundary : boundaries) {
+    const auto end = std::ranges::lower_bound(rest, boundary, {},
+                                              [&](LandmarkIndex l) { return state_->store.id(l); });
+    parts.push_back(state_->part({rest.begin(), end}));
+    rest = {end, rest.end()};
   }
+  parts.push_back(state_->part(rest));
   return parts;
 }
 

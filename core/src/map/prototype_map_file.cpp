@@ -1,4 +1,6 @@
 // Writes and reads the file of a learning map, and its journal.
+#include <ranges>
+
 #include "file/ids.h"
 #include "map/map_sections.h"
 #include "map/map_state.h"
@@ -20,8 +22,7 @@ int spare_bits(const int16_t* eight, int bits) {
   return std::min(3, bits - 1 - static_cast<int>(std::bit_width(magnitudes)));
 }
 
-// Adds the sections of all landmarks of a store, or of these in ascending order of ids. The store
-// must not change until the file is written.
+// Adds sections of all landmarks of a store, or of these by id. It must not change until written.
 void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
                    const std::optional<std::vector<LandmarkIndex>>& changed = {}) {
   const size_t dim = store.dim();
@@ -61,12 +62,10 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
   if (positions) parts.push_back({section::kPositions, n * sizeof(Position)});
   if (ids) IdBlockWriter::add_to(parts, n);
 
-  file.add(std::move(parts), [=, &store](ContainerWriter::Sinks sinks) {
-    SinkQueue queue(sinks);
-    ValueWriter counts(queue.next());
-    PackedWriter spares(queue.next()), sums(queue.next()), appearances(queue.next(several));
-    ValueWriter positions_of(queue.next(positions));
-    IdBlockWriter ids_of{queue.next(ids), queue.next(ids)};
+  file.add(std::move(parts), [=, &store](ContainerWriter::Writers& to) {
+    ValueWriter &counts = to[section::kCounts], &spares = to[section::kSpareBits],
+                &sums = to[section::kSums], &appearances = to[section::kAppearances];
+    IdBlockWriter ids_of(to);
     const auto put_piece = [&](std::span<const LandmarkIndex> landmarks) {
       constexpr size_t kAhead = 16;
       const std::vector<Row> rows = store.sorted_rows(landmarks);
@@ -93,24 +92,16 @@ void add_landmarks(ContainerWriter& file, const PrototypeStore& store,
       }
       for (const LandmarkIndex l : landmarks) {
         if (ids) ids_of.add(store.id(l));
-        if (positions) positions_of.add(store.position(l));
+        if (positions) to[section::kPositions].add(store.position(l));
       }
     };
     const auto put = [&](std::span<const LandmarkIndex> landmarks) {
-      constexpr size_t kRows = 1 << 13;  // at a time, and the rest of a landmark
-      for (size_t first = 0, end = 0; first < landmarks.size(); first = end) {
-        for (size_t rows = 0; end < landmarks.size() && rows < kRows; ++end) {
-          rows += store.row_count(landmarks[end]);
-        }
-        put_piece(landmarks.subspan(first, end - first));
+      constexpr size_t kAtOnce = 1 << 10;  // whose rows take little memory
+      for (size_t first = 0; first < landmarks.size(); first += kAtOnce) {
+        put_piece(landmarks.subspan(first, std::min(kAtOnce, landmarks.size() - first)));
       }
     };
     changed ? put(*changed) : store.visit_sorted_landmarks(put);
-    counts.finish();
-    spares.finish();
-    sums.finish();
-    appearances.finish();
-    positions_of.finish();
     ids_of.finish();
   });
 }
@@ -125,132 +116,84 @@ size_t read_appearance_bits(const ContainerReader& file, size_t dim) {
   return bits;
 }
 
-// Reads the map file and its commits into an empty map, the newest first, so that an older one
-// counts only for landmarks that no later one names, and nothing has to be removed again. The time
-// is proportional to the bytes read.
-class Reading {
- public:
-  explicit Reading(MapState& state) : state_(state), store_(state.store) {}
-
-  void read_commit(const ContainerReader& commit) {
-    const MapShape shape = read_shape(commit, *state_.encoder);
-    commit.require(shape.dim == store_.dim() &&
-                       read_appearance_bits(commit, shape.dim) == store_.appearance_bits(),
-                   "its dimension or appearance bits are not the map's");
-    auto ids = read_landmarks(commit, shape.landmarks);
-    if (commit.has(section::kRemoved)) {
-      const auto removed = read_section<int64_t>(commit, section::kRemoved);
-      check_ids(commit, removed);
-      ids.insert(ids.end(), removed.begin(), removed.end());
-    }
-    for (const int64_t id : ids) read_.insert(id);
-    if (commit.has(section::kCentroids)) {
-      // Empty if the index was dropped.
-      auto centroids = commit.map(section::kCentroids).empty() ? Matrix<int8_t>()
-                                                               : read_centroids(commit, shape.dim);
-      if (!centroids_) centroids_ = std::move(centroids);
-    }
-    if (commit.has(section::kMetadata)) {
-      auto metadata = read_metadata(commit);
-      if (!metadata_) metadata_ = std::move(metadata);
+// Checks all landmarks of a file, takes those that no later commit names, and returns their ids.
+std::vector<int64_t> read_landmarks(const ContainerReader& file, size_t n, const IdSet& named,
+                                    PrototypeStore& store) {
+  const size_t dim = store.dim();
+  const auto bits = static_cast<int>(store.appearance_bits());
+  const bool several = store.several();
+  const size_t m = several ? file.map(section::kCounts).size() : n;
+  file.require(m <= UINT32_MAX, "it claims more prototypes than a map can hold");
+  file.require_size(m >= n, section::kCounts);
+  const auto counts = read_section<uint8_t>(file, section::kCounts, m);
+  file.require(std::ranges::find(counts, 0) == counts.end(), "it has an impossible prototype");
+  const size_t spares_size = m * ((dim + 7) / 8) * kSpareBits;
+  PackedReader spares(file, section::kSpareBits, spares_size);
+  size_t sums_size = 0;
+  for (PackedReader in = spares; const int count : counts) {
+    for (size_t d = 0; d < dim; d += 8) {
+      sums_size += 8 * (static_cast<size_t>(sum_bits(count)) - in.next(kSpareBits));
     }
   }
-
-  void read_map(const ContainerReader& file) {
-    auto metadata = read_metadata(file);
-    auto centroids = read_centroids(file, store_.dim());
-    read_landmarks(file, read_shape(file, *state_.encoder).landmarks);
-    state_.metadata = std::move(metadata_ ? *metadata_ : metadata);
-    if (centroids_) centroids = std::move(*centroids_);
-    if (centroids.rows == 0) return;
-    MapChange(state_).set_quantizer(CoarseQuantizer(std::move(centroids)), 1, true);
+  PackedReader sums(file, section::kSums, sums_size);
+  std::optional<PackedReader> appearances;
+  if (several) {
+    appearances.emplace(file, section::kAppearances, m * static_cast<size_t>(bits + 1));
+  }
+  if (file.has(section::kIdGaps)) file.read(section::kIdGaps);  // checks what is only mapped
+  auto ids = LandmarkIds(file, n).all();
+  std::vector<Position> positions;
+  if (file.has(section::kPositions)) {
+    positions = read_section<Position>(file, section::kPositions, n);
   }
 
- private:
-  // Checks all landmarks of a file, takes those that no later commit names, and returns their ids.
-  std::vector<int64_t> read_landmarks(const ContainerReader& file, size_t n) {
-    const size_t dim = store_.dim();
-    const auto bits = static_cast<int>(store_.appearance_bits());
-    const bool several = store_.several();
-    const size_t m = several ? file.map(section::kCounts).size() : n;
-    file.require(m <= UINT32_MAX, "it claims more prototypes than a map can hold");
-    file.require_size(m >= n, section::kCounts);
-    const auto counts = read_section<uint8_t>(file, section::kCounts, m);
-    file.require(std::ranges::find(counts, 0) == counts.end(), "it has an impossible prototype");
-    const size_t spares_size = m * ((dim + 7) / 8) * kSpareBits;
-    PackedReader spares(file, section::kSpareBits, spares_size);
-    size_t sums_size = 0;
-    for (PackedReader in = spares; const int count : counts) {
+  // Not for each of many small commits, which would move all rows each time.
+  if (m > store.prototype_count()) {
+    store.reserve(store.landmark_count() + n, store.prototype_count() + m);
+  }
+  std::vector<LandmarkIndex> landmarks;  // if there are positions
+  landmarks.reserve(positions.size());
+  size_t row = 0;
+  for (size_t i = 0; i < n; ++i) {
+    const bool is_newest = named.empty() || !named.contains(ids[i]);
+    LandmarkIndex landmark = kNoLandmark;
+    int32_t before = -1;  // the appearance of the row before
+    for (bool last = false; !last; ++row) {
+      file.require(row != m, "it has a landmark without prototypes");
+      const int count = counts[row];
+      Sum sum{};
+      bool possible = true;
       for (size_t d = 0; d < dim; d += 8) {
-        sums_size += 8 * (static_cast<size_t>(sum_bits(count)) - in.next(kSpareBits));
-      }
-    }
-    PackedReader sums(file, section::kSums, sums_size);
-    std::optional<PackedReader> appearances;
-    if (several) {
-      appearances.emplace(file, section::kAppearances, m * static_cast<size_t>(bits + 1));
-    }
-    if (file.has(section::kIdGaps)) file.read(section::kIdGaps);  // checks what is only mapped
-    auto ids = LandmarkIds(file, n).all();
-    std::vector<Position> positions;
-    if (file.has(section::kPositions)) {
-      positions = read_section<Position>(file, section::kPositions, n);
-    }
-
-    // Not for each of many small commits, which would move all rows each time.
-    if (m > store_.prototype_count()) {
-      store_.reserve(store_.landmark_count() + n, store_.prototype_count() + m);
-    }
-    std::vector<LandmarkIndex> landmarks;  // if there are positions
-    landmarks.reserve(positions.size());
-    size_t row = 0;
-    for (size_t i = 0; i < n; ++i) {
-      const bool is_newest = read_.empty() || !read_.contains(ids[i]);
-      LandmarkIndex landmark = kNoLandmark;
-      int32_t before = -1;  // the appearance of the row before
-      for (bool last = false; !last; ++row) {
-        file.require(row != m, "it has a landmark without prototypes");
-        const int count = counts[row];
-        Sum sum{};
-        bool possible = true;
-        for (size_t d = 0; d < dim; d += 8) {
-          const int width = sum_bits(count) - static_cast<int>(spares.next(kSpareBits));
-          const int sign = 1 << (width - 1);
-          for (size_t j = d; j < d + 8; ++j) {
-            const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
-            possible = possible && std::abs(number) <= (j < dim ? 127 * count : 0);
-            sum[j] = static_cast<int16_t>(number);
-          }
+        const int width = sum_bits(count) - static_cast<int>(spares.next(kSpareBits));
+        const int sign = 1 << (width - 1);
+        for (size_t j = d; j < d + 8; ++j) {
+          const int number = (static_cast<int>(sums.next(width)) ^ sign) - sign;
+          possible = possible && std::abs(number) <= (j < dim ? 127 * count : 0);
+          sum[j] = static_cast<int16_t>(number);
         }
-        file.require(possible, "landmark ", ids[i], " has an impossible prototype");
-        const auto marked = several ? static_cast<int32_t>(appearances->next(bits + 1)) : 1;
-        const int32_t appearance = marked & ((1 << bits) - 1);
-        last = marked >> bits != 0;
-        file.require(appearance > before, "the appearances of landmark ", ids[i], " do not ascend");
-        before = appearance;
-        if (!is_newest) continue;
-        const Row to = store_.create_row(ids[i], landmark, static_cast<uint16_t>(appearance));
-        store_.set(to, sum, count);
       }
-      if (positions.empty()) continue;
-      landmarks.push_back(landmark);
-      file.require(is_finite(positions[i]) || !has_position(positions[i]), "landmark ", ids[i],
-                   " has no finite position");
+      file.require(possible, "landmark ", ids[i], " has an impossible prototype");
+      const auto marked = several ? static_cast<int32_t>(appearances->next(bits + 1)) : 1;
+      const int32_t appearance = marked & ((1 << bits) - 1);
+      last = marked >> bits != 0;
+      file.require(appearance > before, "the appearances of landmark ", ids[i], " do not ascend");
+      before = appearance;
+      if (!is_newest) continue;
+      const Row to = store.create_row(ids[i], landmark, static_cast<uint16_t>(appearance));
+      store.set(to, sum, count);
     }
-    file.require(row == m, "it has prototypes of no landmark");
-    // After the landmarks, so that room for positions is made once.
-    for (size_t i = 0; i < positions.size(); ++i) {
-      if (landmarks[i] != kNoLandmark) store_.set_position(landmarks[i], positions[i]);
-    }
-    return ids;
+    if (positions.empty()) continue;
+    landmarks.push_back(landmark);
+    file.require(is_finite(positions[i]) || !has_position(positions[i]), "landmark ", ids[i],
+                 " has no finite position");
   }
-
-  MapState& state_;
-  PrototypeStore& store_;
-  IdSet read_;  // landmarks that later commits name
-  std::optional<Metadata> metadata_;
-  std::optional<Matrix<int8_t>> centroids_;
-};
+  file.require(row == m, "it has prototypes of no landmark");
+  // After the landmarks, so that room for positions is made once.
+  for (size_t i = 0; i < positions.size(); ++i) {
+    if (landmarks[i] != kNoLandmark) store.set_position(landmarks[i], positions[i]);
+  }
+  return ids;
+}
 
 std::unique_ptr<MapState> read_with_journal(const std::filesystem::path& path) {
   // Before a journal is made, the file must be a learning map.
@@ -313,15 +256,44 @@ std::vector<std::byte> serialize(ContainerWriter& record, const MapState& state,
 std::unique_ptr<MapState> read_map(const ContainerReader& file, const JournalContent& journal) {
   file.expect(FileKind::learning_map);
   auto encoder = read_encoder(file);
-  const size_t dim = read_shape(file, *encoder).dim;
-  auto state = std::make_unique<MapState>(std::move(encoder), dim, read_appearance_bits(file, dim));
-  Reading reading(*state);
-  const auto commits = journal.commits(file.identity());
-  for (auto commit = commits.rbegin(); commit != commits.rend(); ++commit) {
-    const std::string name = text(journal.name(), ": record at byte ", commit->offset);
-    reading.read_commit(ContainerReader(commit->bytes, name));
+  const size_t dim = read_shape(file, *encoder).dim, bits = read_appearance_bits(file, dim);
+  auto state = std::make_unique<MapState>(std::move(encoder), dim, bits);
+  IdSet named;  // by commits that were read
+  std::optional<Metadata> metadata;
+  std::optional<Matrix<int8_t>> centroids;
+  const auto read = [&](const ContainerReader& from) {
+    const MapShape shape = read_shape(from, *state->encoder);
+    from.require(shape.dim == dim && read_appearance_bits(from, dim) == bits,
+                 "its dimension or appearance bits are not the map's");
+    const bool is_commit = from.kind() == FileKind::commit;
+    auto ids = read_landmarks(from, shape.landmarks, named, state->store);
+    if (is_commit && from.has(section::kRemoved)) {
+      const auto removed = read_section<int64_t>(from, section::kRemoved);
+      check_ids(from, removed);
+      ids.insert(ids.end(), removed.begin(), removed.end());
+    }
+    if (is_commit) std::ranges::for_each(ids, [&](int64_t id) { named.insert(id); });
+    if (from.has(section::kCentroids)) {
+      // Empty if a commit dropped the index.
+      const bool dropped = is_commit && from.map(section::kCentroids).empty();
+      auto read_here = dropped ? Matrix<int8_t>() : read_centroids(from, dim);
+      if (!centroids) centroids = std::move(read_here);
+    }
+    if (from.has(section::kMetadata)) {
+      auto read_here = read_metadata(from);
+      if (!metadata) metadata = std::move(read_here);
+    }
+  };
+  // The newest first, so that an older one counts only for landmarks that no later one names, and
+  // nothing has to be removed again.
+  for (const auto& [bytes, offset] : journal.commits(file.identity()) | std::views::reverse) {
+    read(ContainerReader(bytes, text(journal.name(), ": record at byte ", offset)));
   }
-  reading.read_map(file);
+  read(file);
+  if (metadata) state->metadata = *std::move(metadata);
+  if (centroids && centroids->rows != 0) {
+    MapChange(*state).set_quantizer(CoarseQuantizer(*std::move(centroids)), 1, true);
+  }
   return state;
 }
 
@@ -345,7 +317,7 @@ PrototypeMap PrototypeMap::parse(std::span<const std::byte> bytes, const std::st
 PrototypeMap PrototypeMap::load(const std::filesystem::path& path, bool journal) {
   if (journal) return PrototypeMap(read_with_journal(path));
   const JournaledFile both(path);
-  return PrototypeMap(read_map(both.file(), both.journal()));
+  return PrototypeMap(read_map(*both.file, both.journal));
 }
 
 bool PrototypeMap::has_journal() const {

@@ -9,7 +9,7 @@
 namespace protomark {
 namespace {
 
-using Sinks = ContainerWriter::Sinks;
+using Writers = ContainerWriter::Writers;
 
 // Packs blocks of kPackedRows rows as search reads them.
 class BlockPacker {
@@ -64,110 +64,39 @@ class BlockPacker {
   std::vector<int8_t> table_;
 };
 
-// Maps landmarks of a store to those of a sealed map, in little more than a byte per landmark: the
-// id tells the block of 256.
-class SealedLandmarks {
- public:
-  explicit SealedLandmarks(const PrototypeStore& store)
-      : store_(&store), in_block_(store.ids().size()) {}
-
-  // Landmarks come by ascending id.
-  void add(LandmarkIndex landmark) {
-    if (added_ % kBlock == 0) first_ids_.push_back(store_->id(landmark));
-    in_block_[landmark.value] = static_cast<uint8_t>(added_++ % kBlock);
-  }
-
-  size_t operator[](LandmarkIndex landmark) const {
-    const auto next = std::ranges::upper_bound(first_ids_, store_->id(landmark));
-    const auto block = static_cast<size_t>(next - first_ids_.begin()) - 1;
-    return block * kBlock + in_block_[landmark.value];
-  }
-
- private:
-  static constexpr size_t kBlock = 256;
-
-  const PrototypeStore* store_;
-  std::vector<uint8_t> in_block_;  // the index of a landmark in its block
-  std::vector<int64_t> first_ids_;
-  size_t added_ = 0;
-};
-
-// Writes rows, each list beginning a new block, and their owners if there is a writer for these.
-class RowWriter {
- public:
-  RowWriter(const BlockPacker& packer, size_t landmarks, Sink prototypes,
-            PackedWriter* owners = nullptr)
-      : packer_(packer),
-        landmarks_(landmarks),
-        prototypes_(std::move(prototypes)),
-        owners_(owners) {}
-
-  void add(Row row, size_t owner = 0) {
-    block_[filled_++] = row;
-    if (owners_ != nullptr) owners_->add(owner, owner_bits(landmarks_));
-    if (filled_ < kPackedRows) return;
-    packer_.pack(block_.data(), reinterpret_cast<uint8_t*>(prototypes_.add_bytes(packer_.size())));
-    filled_ = 0;
-  }
-  void end_list() {
-    while (filled_ != 0) add(kNoRow, landmarks_);
-  }
-  void finish() {
-    end_list();
-    prototypes_.finish();
-  }
-
- private:
-  const BlockPacker& packer_;
-  size_t landmarks_;
-  ValueWriter prototypes_;
-  PackedWriter* owners_;
-  std::array<Row, kPackedRows> block_{};
-  size_t filled_ = 0;
-};
-
-// Finds the two nearest landmarks of each query among packed prototypes, which it packs piece by
-// piece.
+// Finds the two nearest landmarks of each query among prototypes that are packed piece by piece.
 Matches search_packed(const PrototypeStore& store, const BlockPacker& packer, Codes queries) {
   // A piece is small compared with the map.
   const size_t size = std::max<size_t>(1 << 12, store.prototype_count() / 64 / 16 * 16);
   std::vector<CodeVector> packed(size * packer.size() / kPackedRows / sizeof(CodeVector) + 1);
   std::array<Row, kPackedRows> block;
-  const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(2, {});
-  PackedPrototypes piece = packer.view();
-  piece.data = packed.data();
-  for (size_t first = 0; first < store.row_end(); first += piece.rows) {
-    piece.rows = std::min(size, store.row_end() - first);
-    auto* to = reinterpret_cast<uint8_t*>(packed.data());
-    for (size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
-      for (size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
-      packer.pack(block.data(), to);
+  return answer(store.dim(), queries, 2, {}, [&](const auto& prepared, auto& nearest) {
+    PackedPrototypes piece = packer.view();
+    piece.data = packed.data();
+    for (size_t first = 0; first < store.row_end(); first += piece.rows) {
+      piece.rows = std::min(size, store.row_end() - first);
+      auto* to = reinterpret_cast<uint8_t*>(packed.data());
+      for (size_t i = 0; i < piece.rows; i += kPackedRows, to += packer.size()) {
+        for (size_t j = 0; j < kPackedRows; ++j) block[j] = row_at(first + i + j);
+        packer.pack(block.data(), to);
+      }
+      scan_all(piece, prepared, 1, nearest);
+      if (store.several()) {
+        piece.landmarks.of_row += piece.rows;
+      } else {
+        piece.landmarks.ids += piece.rows;
+      }
     }
-    PrototypeScan(piece, prepared, {0, queries.rows}, nearest).scan({0, piece.rows});
-    if (store.several()) {
-      piece.landmarks.of_row += piece.rows;
-    } else {
-      piece.landmarks.ids += piece.rows;
-    }
-  }
-  Matches matches{{queries.rows, 2}, {queries.rows, 2}};
-  write_answer(nearest, prepared.norms(), {}, 0, matches);
-  return matches;
+  });
 }
 
-// Produces the sections of landmarks and rows in one pass over landmarks by id and, with an index,
-// another one over its lists.
+// Produces sections in one pass over landmarks by id and, with an index, one over its lists.
 class SealedContent {
  public:
   // `store` has the prototypes, `map` everything else.
   SealedContent(const PrototypeStore& store, const PrototypeStore& map, const BlockPacker& packer,
                 const std::optional<PositionCodec>& codec)
-      : store_(store), map_(map), packer_(packer), codec_(codec) {
-    int64_t largest = -1;
-    for (const int64_t id : store.ids()) largest = std::max(largest, id);
-    ids_are_stored_ = IdBlockWriter::needed(store.landmark_count(), largest);
-  }
+      : store_(store), map_(map), packer_(packer), codec_(codec) {}
 
   // The file must be written while this exists.
   void add_to(ContainerWriter& file) {
@@ -179,88 +108,116 @@ class SealedContent {
     if (codec_) parts.push_back({section::kPositions, n * codec_->size()});
     if (nlist == 0) parts.push_back(prototypes);
     if (ids_are_stored_) IdBlockWriter::add_to(parts, n);
-    file.add(std::move(parts), [this](Sinks sinks) { put_landmarks(sinks); });
+    file.add(std::move(parts), [this](Writers& to) { put_landmarks(to); });
     if (nlist == 0) return;
     const size_t words = packed_words(store_.row_end(), owner_bits(n));
     file.add({prototypes, {section::kOwners, packed_bytes(words, 64)}},
-             [this](Sinks sinks) { put_lists(sinks); });
+             [this](Writers& to) { put_lists(to); });
     file.add({{section::kOwnerChecksums, CheckedNumbers::blocks(words) * sizeof(uint32_t)}},
-             [this](Sinks sinks) { sinks[0](std::as_bytes(std::span(owner_checksums_))); });
+             [this](Writers& to) {
+               to[section::kOwnerChecksums].add_all(std::as_bytes(std::span(owner_checksums_)));
+             });
     file.add(section::kCentroids, std::as_bytes(std::span(store_.quantizer().centroids().data)));
     std::vector<uint32_t> list_rows;
     for (uint32_t list = 0; list < nlist; ++list) {
       list_rows.push_back(static_cast<uint32_t>(store_.lists().rows(list)));
     }
     file.add(section::kListRows, std::as_bytes(std::span(list_rows)));
-    file.add({{section::kRecall, ContainerWriter::kUnknownSize}}, [this](Sinks sinks) {
+    file.add({{section::kRecall, ContainerWriter::kUnknownSize}}, [this](Writers& to) {
       const RecallTable table = measure_recall(
           store_, [this](int8_t* code) { packer_.quantize(code); },
           [this](Codes queries) { return search_packed(store_, packer_, queries); });
-      sinks[0](std::as_bytes(std::span(table)));
+      to[section::kRecall].add_all(std::as_bytes(std::span(table)));
     });
   }
 
  private:
   bool has_row_counts() const { return store_.prototype_count() != store_.landmark_count(); }
 
-  void put_landmarks(Sinks sinks) {
+  void put_landmarks(Writers& to) {
     const bool indexed = store_.quantizer().nlist() != 0;
-    SinkQueue queue(sinks);
-    ValueWriter row_counts(queue.next(has_row_counts()));
-    ValueWriter positions(queue.next(codec_.has_value()));
-    RowWriter prototypes(packer_, store_.landmark_count(), queue.next(!indexed));
-    IdBlockWriter ids{queue.next(ids_are_stored_), queue.next(ids_are_stored_)};
-    if (indexed && ids_are_stored_) landmarks_.emplace(store_);
+    std::vector<Row> rows;
+    IdBlockWriter ids(to);
+    if (indexed && ids_are_stored_) in_block_.resize(store_.ids().size());
+    first_ids_.clear();
+    size_t rank = 0;
     store_.visit_sorted_landmarks([&](std::span<const LandmarkIndex> landmarks) {
       for (const LandmarkIndex l : landmarks) {
-        if (has_row_counts()) row_counts.add(static_cast<uint8_t>(store_.row_count(l)));
+        if (has_row_counts()) to[section::kRows].add(static_cast<uint8_t>(store_.row_count(l)));
         if (codec_) {
           codec_->encode(map_.position(&store_ == &map_ ? l : map_.at(store_.id(l))),
-                         positions.add_bytes(codec_->size()));
+                         to[section::kPositions].add_bytes(codec_->size()));
         }
         if (ids_are_stored_) ids.add(store_.id(l));
-        if (landmarks_) landmarks_->add(l);
+        if (in_block_.empty()) continue;
+        if (rank % kRanks == 0) first_ids_.push_back(store_.id(l));
+        in_block_[l.value] = static_cast<uint8_t>(rank++ % kRanks);
       }
       if (indexed) return;
-      for (const Row row : store_.sorted_rows(landmarks)) prototypes.add(row);
+      const std::vector<Row> more = store_.sorted_rows(landmarks);
+      rows.insert(rows.end(), more.begin(), more.end());
+      put_blocks(rows, to);
     });
-    row_counts.finish();
-    positions.finish();
-    prototypes.finish();
+    pad(rows);
+    put_blocks(rows, to);
     ids.finish();
   }
 
-  void put_lists(Sinks sinks) {
+  void put_lists(Writers& to) {
     owner_checksums_.clear();
     // Comes in pieces of whole blocks.
-    PackedWriter owners([&](Bytes bytes) {
+    ValueWriter owners([&](Bytes bytes) {
       constexpr size_t kBlock = CheckedNumbers::kBlock * sizeof(uint64_t);
       for (size_t at = 0; at < bytes.size(); at += kBlock) {
         owner_checksums_.push_back(crc32(bytes.subspan(at, std::min(kBlock, bytes.size() - at))));
       }
-      sinks[1](bytes);
+      to[section::kOwners].add_all(bytes);
     });
-    RowWriter writer(packer_, store_.landmark_count(), sinks[0], &owners);
+    const size_t n = store_.landmark_count();
     for (uint32_t list = 0; list < store_.quantizer().nlist(); ++list) {
-      store_.visit_sorted_rows(list, [&](std::span<const Row> rows) {
-        for (const Row row : rows) {
-          const LandmarkIndex owner = store_.owner(row);
-          writer.add(row,
-                     landmarks_ ? (*landmarks_)[owner] : static_cast<size_t>(store_.id(owner)));
-        }
-      });
-      writer.end_list();
+      std::vector<Row> rows = store_.sorted_rows_of_list(list);
+      pad(rows);
+      for (const Row row : rows) {
+        owners.add(row == kNoRow ? n : rank_of(store_.owner(row)), owner_bits(n));
+      }
+      put_blocks(rows, to);
     }
-    writer.finish();
     owners.finish();
-    landmarks_.reset();  // makes room for the test queries
+    in_block_ = {};  // makes room for the test queries
+  }
+
+  static void pad(std::vector<Row>& rows) {
+    rows.resize(packed_blocks(rows.size()) * kPackedRows, kNoRow);
+  }
+  // Writes the rows of whole blocks, and removes them.
+  void put_blocks(std::vector<Row>& rows, Writers& to) const {
+    const size_t n = rows.size() / kPackedRows * kPackedRows;
+    for (size_t i = 0; i < n; i += kPackedRows) {
+      std::byte* block = to[section::kPrototypes].add_bytes(packer_.size());
+      packer_.pack(&rows[i], reinterpret_cast<uint8_t*>(block));
+    }
+    rows.erase(rows.begin(), rows.begin() + static_cast<std::ptrdiff_t>(n));
+  }
+  // Returns the rank of a landmark by id, which is its index in the sealed map.
+  size_t rank_of(LandmarkIndex landmark) const {
+    const int64_t id = store_.id(landmark);
+    if (!ids_are_stored_) return static_cast<size_t>(id);
+    const auto next = std::ranges::upper_bound(first_ids_, id);
+    const auto block = static_cast<size_t>(next - first_ids_.begin()) - 1;
+    return block * kRanks + in_block_[landmark.value];
   }
 
   const PrototypeStore &store_, &map_;
   const BlockPacker& packer_;
   const std::optional<PositionCodec>& codec_;
-  bool ids_are_stored_;
-  std::optional<SealedLandmarks> landmarks_;  // with an index, if ids are stored
+  const bool ids_are_stored_ =
+      !store_.ids().empty() &&
+      IdBlockWriter::needed(store_.landmark_count(), *std::ranges::max_element(store_.ids()));
+  // With an index, if ids are stored: the first id of each block of landmarks by id, and for each
+  // landmark its rank in its block, which take little more than a byte.
+  static constexpr size_t kRanks = 256;
+  std::vector<int64_t> first_ids_;
+  std::vector<uint8_t> in_block_;
   std::vector<uint32_t> owner_checksums_;
 };
 

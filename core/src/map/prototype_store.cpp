@@ -20,8 +20,7 @@ Eight eight(uint64_t bytes) {
   return __builtin_convertvector(std::bit_cast<EightBytes>(bytes), Eight);
 }
 
-// Halves a sum of which `count` observations are left. A mean of 127 stays one, although half of an
-// odd count is rounded down.
+// Halves a sum of which `count` observations, rounded down, are left; the mean stays within 127.
 int16_t half(int sum, int count) {
   return static_cast<int16_t>(std::clamp(sum / 2, -127 * count, 127 * count));
 }
@@ -66,8 +65,7 @@ void PrototypeStore::copy_row(Row from, Row to) {
   copy_packed(from, packed(), to.value);
 }
 
-// Moves the last row of a list to where one was removed, and the last of all blocks to a block that
-// this empties.
+// Moves the last row of the list to the gap, and the last of all blocks to a block that is empty.
 void PrototypeStore::close_gap(Row row) {
   vacate(row);
   const uint32_t list = lists_.list_of(row);
@@ -82,6 +80,33 @@ void PrototypeStore::close_gap(Row row) {
     if (is_row(from)) relocate(from, row_at(emptied * kPackedRows + i));
   }
   resize(row_end());
+}
+
+void PrototypeStore::visit_sorted_landmarks(
+    const std::function<void(std::span<const LandmarkIndex>)>& visit) const {
+  constexpr size_t kPieces = 8, kMinPiece = 1 << 13;
+  const size_t n = landmark_count(), piece = std::max(kMinPiece, (n + kPieces - 1) / kPieces);
+  const size_t limit = piece + piece / 4;
+  const auto id_of = [&](LandmarkIndex landmark) { return id(landmark); };
+  std::vector<LandmarkIndex> landmarks;
+  landmarks.reserve(std::min(n, limit));
+  for (size_t seen = 0; seen < n; seen += landmarks.size()) {
+    // Takes the least ids above those of the piece before: up to `end` once there were too many.
+    const int64_t last = seen == 0 ? -1 : id(landmarks.back());
+    int64_t end = INT64_MAX;
+    landmarks.clear();
+    each_landmark([&](LandmarkIndex landmark) {
+      if (id(landmark) <= last || id(landmark) > end) return;
+      landmarks.push_back(landmark);
+      if (landmarks.size() < limit || limit >= n) return;
+      const auto middle = landmarks.begin() + static_cast<std::ptrdiff_t>(piece - 1);
+      std::ranges::nth_element(landmarks, middle, {}, id_of);
+      end = id(*middle);
+      landmarks.resize(piece);
+    });
+    std::ranges::sort(landmarks, {}, id_of);
+    visit(landmarks);
+  }
 }
 
 std::vector<Row> PrototypeStore::sorted_rows_at(std::span<const size_t> n) const {

@@ -34,8 +34,7 @@ struct Uncommitted {
 // its rounded prototype. Padding fills the last block of a list.
 //
 // A row keeps its rounded prototype p, which search reads, its count n, and what is left of its
-// sum, sum - n * p: numbers of -n / 2 to n / 2, which take 4 bits up to n = 15, and 8 bits above
-// that.
+// sum, sum - n * p: numbers of -n / 2 to n / 2, in 4 bits up to n = 15, else in 8.
 class PrototypeStore : public RowTable {
  public:
   // Names a row, whose index changes when others are removed.
@@ -59,8 +58,7 @@ class PrototypeStore : public RowTable {
   size_t landmark_count() const { return several_ ? ids_.size() : prototype_count_; }
   size_t prototype_count() const { return prototype_count_; }
   size_t row_end() const { return lists_.blocks() * kPackedRows; }  // with padding
-  // Bytes per row of few observations, without what arrays have room for, so that equal maps have
-  // the same.
+  // Bytes per row of few observations, the same in equal maps.
   size_t row_bytes() const {
     return rest_bytes_ + packed_dim(dim_) + sizeof(counts_[0]) + RowTable::row_bytes();
   }
@@ -109,9 +107,7 @@ class PrototypeStore : public RowTable {
     close_gap(row);
   }
   void erase(int64_t id) {
-    const LandmarkIndex landmark = at(id);
-    while (next_row(first_row(landmark)) != kNoRow) erase_row(first_row(landmark));
-    erase_row(first_row(landmark));
+    for (size_t left = row_count(at(id)); left > 0; --left) erase_row(first_row(at(id)));
   }
 
   uint32_t observations(LandmarkIndex landmark) const {
@@ -131,8 +127,7 @@ class PrototypeStore : public RowTable {
   Key key(Row row) const { return {id(owner(row)), appearance(row)}; }
   int count(Row row) const { return counts_[row.value]; }
   Sum sum(Row row) const;
-  // Asks for what `sum` reads and `set` writes ahead. Inlined, as GCC drops calls of a function
-  // that does nothing but this.
+  // Fetches what `sum` and `set` access. Inlined, as GCC drops calls that do nothing but this.
   [[gnu::always_inline]] void prefetch(Row row) const {
     __builtin_prefetch(rest(row), 1);
     __builtin_prefetch(rest(row) + rest_bytes_ - 1, 1);
@@ -141,8 +136,7 @@ class PrototypeStore : public RowTable {
       __builtin_prefetch(packed() + packed_index(row.value, d, dim_), 1);
     }
   }
-  // Replaces the sum and count of a row; its rounded prototype follows. If memory runs out nothing
-  // has changed, and for a new row it does not.
+  // Replaces the sum and count of a row. If memory runs out nothing has changed.
   void set(Row row, const Sum& sum, int count);
   void rounded(Row row, int8_t* to) const {
     for (size_t d = 0; d < dim_; d += 4) {
@@ -164,27 +158,25 @@ class PrototypeStore : public RowTable {
   }
 
   // These come in no order.
-  template <typename Take>
-  void each_landmark(const Take& take) const {
+  void each_landmark(const auto& take) const {
     for (LandmarkIndex l{0}; l.value < ids_.size(); ++l.value) {
       if (id(l) >= 0) take(l);
     }
   }
-  template <typename Take>
-  void each_row(const Take& take) const {
+  void each_row(const auto& take) const {
     for (Row row{0}; row.value < row_end(); ++row.value) {
       if (is_row(row)) take(row);
     }
   }
-  // Visit all landmarks by ascending id, or the rows of a list by key, piece by piece (rows.h).
-  void visit_sorted_landmarks(const VisitPiece<LandmarkIndex>& visit) const {
-    const auto each = [&](const auto& take) { each_landmark(take); };
-    visit_sorted<LandmarkIndex>(
-        landmark_count(), each, [&](LandmarkIndex landmark) { return id(landmark); }, visit);
-  }
-  void visit_sorted_rows(uint32_t list, const VisitPiece<Row>& visit) const {
-    const auto each = [&](const auto& take) { lists_.each_row(list, take); };
-    visit_sorted<Row>(lists_.rows(list), each, [&](Row row) { return key(row); }, visit);
+  // Visits all landmarks by ascending id, piece by piece, in 5 bits of memory per landmark.
+  void visit_sorted_landmarks(
+      const std::function<void(std::span<const LandmarkIndex>)>& visit) const;
+  std::vector<Row> sorted_rows_of_list(uint32_t list) const {
+    std::vector<Row> result;
+    result.reserve(lists_.rows(list));
+    lists_.each_row(list, [&](Row row) { result.push_back(row); });
+    std::ranges::sort(result, {}, [&](Row row) { return key(row); });
+    return result;
   }
   std::vector<LandmarkIndex> sorted_landmarks() const {
     std::vector<LandmarkIndex> result;
@@ -197,13 +189,11 @@ class PrototypeStore : public RowTable {
   std::vector<Row> sorted_rows_at(std::span<const size_t> n) const;
 
   void find_rows(std::span<const Key> keys, std::span<Row> rows) const;
-  // Applies Eq. 2 for one code after the other. `rows` are those that find_rows found; where it
-  // found none, new ones are made.
+  // Applies Eq. 2 code by code, to rows that find_rows found and, where it found none, to new ones.
   void add(std::span<const Key> keys, Codes codes, std::span<const Row> rows);
   // Adds another sum and count, and halves the result if the count is too large.
   void merge(Row row, const Sum& sum, int count);
-  // Merges a landmark of a store, which may be this one, into the one with an id, existing or new,
-  // which keeps its position if it has one.
+  // Merges a landmark of a store, perhaps this one, into one with an id, existing or new.
   void merge(int64_t id, const PrototypeStore& from, LandmarkIndex landmark) {
     LandmarkIndex into = find(id);
     const std::vector<Row> rows = into == kNoLandmark ? std::vector<Row>() : sorted_rows(into);
@@ -237,8 +227,7 @@ class PrototypeStore : public RowTable {
   Arrangement arrange(CoarseQuantizer quantizer, int threads) const;
   // Learns centroids from prototypes by id, so that they do not depend on the history of the map.
   CoarseQuantizer learn_quantizer(size_t nlist, int threads) const;
-  // Moves rows and takes the arrangement's centroids. After make_room_for it cannot run out of
-  // memory.
+  // Moves rows and takes the centroids. After make_room_for it cannot run out of memory.
   void rearrange(Arrangement arrangement);
   void make_room_for(const Arrangement& arrangement, FairSharedMutex& searching) {
     // One more block is for rows while they move.
@@ -295,16 +284,13 @@ class PrototypeStore : public RowTable {
   void close_gap(Row row);
   void permute(std::vector<Row>& to, Row spare);
 
-  // As RowTable::for_each_array, with the arrays of this class, without and with the packed one, in
-  // which rows are interleaved.
-  template <typename Visit>
-  void for_each_plain_array(size_t landmarks, size_t rows, const Visit& visit) {
+  // Add the arrays of this class, without and with the packed one, in which rows are interleaved.
+  void for_each_plain_array(size_t landmarks, size_t rows, const auto& visit) {
     RowTable::for_each_array(landmarks, rows, visit);
     visit(rests_, rows * rest_bytes_, uint8_t{0});
     visit(counts_, rows, uint8_t{0});
   }
-  template <typename Visit>
-  void for_each_array(size_t landmarks, size_t rows, const Visit& visit) {
+  void for_each_array(size_t landmarks, size_t rows, const auto& visit) {
     for_each_plain_array(landmarks, rows, visit);
     visit(packed_, packed_size(rows, dim_) / sizeof(CodeVector), CodeVector{});
   }

@@ -21,10 +21,8 @@ inline bool is_finite(const Position& p) {
   return std::ranges::all_of(p, [](double x) { return std::isfinite(x); });
 }
 
-// Returns the capacity for more elements. Arrays grow as with push_back, but before a change, which
-// therefore cannot fail half-way.
-template <typename Vector>
-size_t capacity_for(const Vector& v, size_t more) {
+// Returns the capacity for more elements, as push_back would. Arrays grow before a change.
+size_t capacity_for(const auto& v, size_t more) {
   const size_t size = v.size() + more;
   return size <= v.capacity() ? v.capacity() : std::max(2 * v.capacity(), size);
 }
@@ -72,8 +70,7 @@ class RowTable {
     return several_ ? first_rows_[landmark.value] : Row{landmark.value};
   }
   Row next_row(Row row) const { return several_ ? next_rows_[row.value] : kNoRow; }
-  template <typename Take>
-  void each_row_of(LandmarkIndex landmark, const Take& take) const {
+  void each_row_of(LandmarkIndex landmark, const auto& take) const {
     for (Row row = first_row(landmark); row != kNoRow; row = next_row(row)) take(row);
   }
   // Steps from a row to that of an appearance, or to kNoRow, but over at most `limit` others.
@@ -189,10 +186,8 @@ class RowTable {
     const bool placed = std::ranges::any_of(positions_, has_position);
     return sizeof(ids_[0]) + (placed ? sizeof(Position) : 0);
   }
-  // Calls visit(array, size, padding) for each array, with its size for these numbers of landmarks
-  // and rows.
-  template <typename Visit>
-  void for_each_array(size_t landmarks, size_t rows, const Visit& visit) {
+  // Calls visit(array, size for so many landmarks and rows, padding) for each array.
+  void for_each_array(size_t landmarks, size_t rows, const auto& visit) {
     if (!several_) landmarks = rows;
     visit(ids_, landmarks, int64_t{-1});
     if (!positions_.empty()) visit(positions_, landmarks, kNoPosition);

@@ -55,9 +55,6 @@ struct SealedMap::Content {
       file.require(row_counts[i] != 0, "it has a landmark without prototypes");
       if (i % kFirstRowStep == 0) first_rows.push_back(static_cast<uint32_t>(prototype_count));
       prototype_count += row_counts[i];
-      while (steps.size() * kRowStep < prototype_count) {
-        steps.push_back(static_cast<uint32_t>(i / kFirstRowStep));
-      }
     }
     file.require(prototype_count <= UINT32_MAX, "it claims more prototypes than a map can hold");
   }
@@ -91,14 +88,12 @@ struct SealedMap::Content {
   }
 
   size_t words() const { return prototypes.width == 0 ? 0 : shape.dim / prototypes.width; }
-  // Returns the landmark of a row if that is not the row's own index. Throws FileError if the
-  // owners are broken.
+  // Returns the landmark of a row where indices differ. Throws FileError if owners are broken.
   LandmarkIndex owner(Row row) const {
     if (owners != nullptr) return landmark_at((*owners)[row.value]);
-    size_t step = steps[row.value / kRowStep];
-    while (step + 1 < first_rows.size() && first_rows[step + 1] <= row.value) ++step;
-    size_t landmark = step * kFirstRowStep;
-    for (size_t end = first_rows[step] + row_counts[landmark]; end <= row.value;) {
+    const auto after = std::ranges::upper_bound(first_rows, row.value);
+    auto landmark = static_cast<size_t>(after - first_rows.begin() - 1) * kFirstRowStep;
+    for (size_t end = *(after - 1) + row_counts[landmark]; end <= row.value;) {
       end += row_counts[++landmark];
     }
     return landmark_at(landmark);
@@ -164,7 +159,6 @@ struct SealedMap::Content {
   }
 
   static constexpr size_t kFirstRowStep = 16;  // landmarks
-  static constexpr size_t kRowStep = 64;
 
   std::unique_ptr<MappedFile> mapped;  // nullptr if the caller keeps the bytes
   ContainerReader file;
@@ -174,7 +168,6 @@ struct SealedMap::Content {
   size_t prototype_count = 0;
   std::span<const uint8_t> row_counts;  // empty if each landmark has one row
   std::vector<uint32_t> first_rows;     // of every kFirstRowStep-th landmark
-  std::vector<uint32_t> steps;          // of every kRowStep-th row, the last of these at or before
   PackedPrototypes prototypes;
   std::vector<int8_t> table;  // of a codebook, if there are words
   // With an index.
@@ -197,7 +190,7 @@ SealedMap::SealedMap(const std::filesystem::path& path) {
   content_ = std::make_unique<const Content>(bytes, path.string(), std::move(mapped));
   // Refuses a map file that replaced one with commits.
   const JournaledFile both(path);
-  both.journal().commits(both.file().identity());
+  both.journal.commits(both.file->identity());
 }
 SealedMap::SealedMap(std::span<const std::byte> bytes, const std::string& name) {
   require(reinterpret_cast<std::uintptr_t>(bytes.data()) % kSectionAlignment == 0,

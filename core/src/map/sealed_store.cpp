@@ -31,151 +31,27 @@ struct LandmarkSums {
   std::vector<uint8_t> counts;
 };
 
-// The merges of all landmarks, and how many of each landmark are made.
-class Merges {
- public:
-  // Makes those of least cost over the whole map, ties to the first landmark, until there are at
-  // most `limit` rows.
-  Merges(const PrototypeStore& store, std::span<const LandmarkIndex> landmarks, size_t dim,
-         size_t limit)
-      : ends_(landmarks.size()), made_(landmarks.size()) {
-    size_t rows = store.prototype_count();
-    using Next = std::pair<double, size_t>;  // cost, index in landmarks
-    std::vector<Next> first;
-    for (size_t i = 0; i < landmarks.size(); ++i) {
-      const LandmarkSums of_landmark(store, landmarks[i], dim);
-      const auto merges = appearance_merges(of_landmark.sums, of_landmark.counts, dim);
-      merges_.insert(merges_.end(), merges.begin(), merges.end());
-      ends_[i] = merges_.size();
-      if (merges.size() >= kMaxRows) made_[i] = merges.size() + 1 - kMaxRows;
-      rows -= made_[i];
-      if (made_[i] < merges.size()) first.emplace_back(of(i)[made_[i]].cost, i);
-    }
-    std::priority_queue next(std::greater<>(), std::move(first));
-    for (; rows > limit && !next.empty(); --rows) {
-      const size_t i = next.top().second;
-      next.pop();
-      if (++made_[i] < of(i).size()) next.emplace(of(i)[made_[i]].cost, i);
-    }
-  }
-
-  std::span<const AppearanceMerge> made(size_t i) const { return of(i).first(made_[i]); }
-
- private:
-  std::span<const AppearanceMerge> of(size_t i) const {
-    const size_t begin = i == 0 ? 0 : ends_[i - 1];
-    return std::span(merges_).subspan(begin, ends_[i] - begin);
-  }
-
-  std::vector<AppearanceMerge> merges_;
-  std::vector<size_t> ends_;  // of each landmark's merges
-  std::vector<size_t> made_;
-};
-
-// Comparing all pairs of more rows would take seconds to minutes. A sealed map keeps far fewer per
-// landmark.
+// Comparing all pairs of more rows of a landmark would take seconds to minutes.
 constexpr size_t kMaxCompared = 2048;
 
-// The prototypes that remain, each with the later one of least merge cost as partner: the generic
-// algorithm of Muellner 2011, "Modern hierarchical, agglomerative clustering algorithms".
-class Clusters {
- public:
-  Clusters(std::span<const int16_t> sums, std::span<const uint8_t> counts, size_t dim)
-      : dim_(dim),
-        sums_(sums.begin(), sums.end()),
-        counts_(counts.begin(), counts.end()),
-        remaining_(counts.size()),
-        partner_(counts.size(), 0),
-        cost_(counts.size(), 0) {
-    std::iota(remaining_.begin(), remaining_.end(), size_t{0});
-    while (remaining_.size() > kMaxCompared) halve();
-    for (size_t at = 0; at + 1 < remaining_.size(); ++at) find_partner(at);
-  }
-
-  std::vector<AppearanceMerge> merge_all() {
-    while (remaining_.size() > 1) merge_best();
-    return std::move(merges_);
-  }
-
- private:
-  void merge_best() {
-    size_t best = 0;
-    for (size_t at = 1; at + 1 < remaining_.size(); ++at) {
-      if (cost_[remaining_[at]] < cost_[remaining_[best]]) best = at;
-    }
-    const size_t into = remaining_[best], source = partner_[into];
-    merge(into, source, cost_[into]);
-    std::erase(remaining_, source);
-    for (size_t at = 0; at + 1 < remaining_.size() && remaining_[at] < source; ++at) {
-      const size_t row = remaining_[at];
-      if (at == best || partner_[row] == into || partner_[row] == source) {
-        find_partner(at);
-      } else if (at < best) {
-        offer(row, into);
-      }
+// Returns |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)) for whole numbers. All but
+// the division is exact below 2^53, which no real landmark exceeds.
+double merge_cost(const double* a, double n, const double* b, double m, size_t dim) {
+  // Four sums, so that a compiler may use vectors without changing the order of additions.
+  double part[4] = {};
+  size_t d = 0;
+  for (; d + 4 <= dim; d += 4) {
+    for (size_t k = 0; k < 4; ++k) {
+      const double difference = m * a[d + k] - n * b[d + k];
+      part[k] += difference * difference;
     }
   }
-
-  void merge(size_t into, size_t source, double cost) {
-    merges_.push_back({cost, static_cast<uint16_t>(into), static_cast<uint16_t>(source)});
-    for (size_t d = 0; d < dim_; ++d) sums_[into * dim_ + d] += sums_[source * dim_ + d];
-    counts_[into] += counts_[source];
+  for (; d < dim; ++d) {
+    const double difference = m * a[d] - n * b[d];
+    part[d % 4] += difference * difference;
   }
-
-  // Merges each second row into the one before it.
-  void halve() {
-    std::vector<size_t> halved;
-    for (size_t at = 0; at < remaining_.size(); at += 2) {
-      halved.push_back(remaining_[at]);
-      if (at + 1 < remaining_.size()) merge(remaining_[at], remaining_[at + 1], 0.0);
-    }
-    remaining_ = std::move(halved);
-  }
-
-  void find_partner(size_t at) {
-    const size_t row = remaining_[at];
-    partner_[row] = remaining_[at + 1];
-    cost_[row] = cost(row, partner_[row]);
-    for (size_t other = at + 2; other < remaining_.size(); ++other) offer(row, remaining_[other]);
-  }
-
-  void offer(size_t row, size_t other) {
-    const double c = cost(row, other);
-    if (c < cost_[row] || (c == cost_[row] && other < partner_[row])) {
-      cost_[row] = c;
-      partner_[row] = other;
-    }
-  }
-
-  // |a/n - b/m|^2 n m / (n + m) = |m a - n b|^2 / (n m (n + m)). All but the division is exact
-  // below 2^53, which no real landmark exceeds.
-  double cost(size_t i, size_t j) const {
-    const double *a = &sums_[i * dim_], *b = &sums_[j * dim_];
-    const double n = counts_[i], m = counts_[j];
-    // Four sums, so that a compiler may use vectors without changing the order of additions.
-    double part[4] = {};
-    size_t d = 0;
-    for (; d + 4 <= dim_; d += 4) {
-      for (size_t k = 0; k < 4; ++k) {
-        const double difference = m * a[d + k] - n * b[d + k];
-        part[k] += difference * difference;
-      }
-    }
-    for (; d < dim_; ++d) {
-      const double difference = m * a[d] - n * b[d];
-      part[d % 4] += difference * difference;
-    }
-    return ((part[0] + part[1]) + (part[2] + part[3])) / (n * m * (n + m));
-  }
-
-  size_t dim_;
-  std::vector<AppearanceMerge> merges_;
-  std::vector<double> sums_;  // whole numbers
-  std::vector<double> counts_;
-  std::vector<size_t> remaining_;  // ascending
-  std::vector<size_t> partner_;    // of all but the last that remains
-  std::vector<double> cost_;       // of merging with the partner
-};
+  return ((part[0] + part[1]) + (part[2] + part[3])) / (n * m * (n + m));
+}
 
 struct Words {
   size_t numbers() const { return codebook == nullptr ? 0 : count * codebook->width; }
@@ -184,8 +60,7 @@ struct Words {
   size_t count = 0;
 };
 
-// Returns the best words for up to `dim` numbers in so many bytes, none if they are too few for the
-// encoder's shortest codes.
+// Returns the best words for up to `dim` numbers; none if bytes are too few for the shortest codes.
 Words best_words(const Encoder& encoder, size_t dim, double bytes) {
   Words best;
   for (const Codebook& codebook : encoder.codebooks()) {
@@ -201,9 +76,61 @@ Words best_words(const Encoder& encoder, size_t dim, double bytes) {
 
 }  // namespace
 
+// Muellner's generic algorithm ("Modern hierarchical, agglomerative clustering algorithms", 2011).
 std::vector<AppearanceMerge> appearance_merges(std::span<const int16_t> sums,
                                                std::span<const uint8_t> counts, size_t dim) {
-  return Clusters(sums, counts, dim).merge_all();
+  std::vector<double> sum(sums.begin(), sums.end()), count(counts.begin(), counts.end());
+  std::vector<AppearanceMerge> merges;
+  const auto merge = [&](size_t into, size_t source, double cost) {
+    merges.push_back({cost, static_cast<uint16_t>(into), static_cast<uint16_t>(source)});
+    for (size_t d = 0; d < dim; ++d) sum[into * dim + d] += sum[source * dim + d];
+    count[into] += count[source];
+  };
+  std::vector<size_t> remaining(counts.size());  // ascending
+  std::iota(remaining.begin(), remaining.end(), size_t{0});
+  // Merges each second row into the one before it.
+  while (remaining.size() > kMaxCompared) {
+    std::vector<size_t> halved;
+    for (size_t at = 0; at < remaining.size(); at += 2) {
+      halved.push_back(remaining[at]);
+      if (at + 1 < remaining.size()) merge(remaining[at], remaining[at + 1], 0.0);
+    }
+    remaining = std::move(halved);
+  }
+  // Of all but the last that remains, the later row of least cost, and that cost.
+  std::vector<size_t> partner(counts.size(), 0);
+  std::vector<double> least(counts.size(), 0);
+  const auto offer = [&](size_t row, size_t other) {
+    const double cost =
+        merge_cost(&sum[row * dim], count[row], &sum[other * dim], count[other], dim);
+    if (std::pair(cost, other) < std::pair(least[row], partner[row])) {
+      least[row] = cost;
+      partner[row] = other;
+    }
+  };
+  const auto find_partner = [&](size_t at) {
+    least[remaining[at]] = std::numeric_limits<double>::infinity();
+    for (size_t i = at + 1; i < remaining.size(); ++i) offer(remaining[at], remaining[i]);
+  };
+  for (size_t at = 0; at + 1 < remaining.size(); ++at) find_partner(at);
+  while (remaining.size() > 1) {
+    size_t best = 0;
+    for (size_t at = 1; at + 1 < remaining.size(); ++at) {
+      if (least[remaining[at]] < least[remaining[best]]) best = at;
+    }
+    const size_t into = remaining[best], source = partner[into];
+    merge(into, source, least[into]);
+    std::erase(remaining, source);
+    for (size_t at = 0; at + 1 < remaining.size() && remaining[at] < source; ++at) {
+      const size_t row = remaining[at];
+      if (at == best || partner[row] == into || partner[row] == source) {
+        find_partner(at);
+      } else if (at < best) {
+        offer(row, into);
+      }
+    }
+  }
+  return merges;
 }
 
 size_t sealed_bytes(size_t landmarks, size_t rows, size_t row_bytes) {
@@ -260,14 +187,39 @@ std::optional<PrototypeStore> merge_appearances(const PrototypeStore& store, siz
                                                 size_t limit) {
   if (store.prototype_count() <= limit && dim == store.dim()) return std::nullopt;
   const std::vector<LandmarkIndex> landmarks = store.sorted_landmarks();
-  const Merges merges(store, landmarks, dim, limit);
+  // Merges of all landmarks, the end of those of each, and the number of those that are made.
+  std::vector<AppearanceMerge> merges;
+  std::vector<size_t> ends, made;
+  const auto merges_of = [&](size_t i) {
+    const size_t begin = i == 0 ? 0 : ends[i - 1];
+    return std::span(merges).subspan(begin, ends[i] - begin);
+  };
+  // Makes those of least cost over the whole map, ties to the first landmark.
+  using Next = std::pair<double, size_t>;  // cost, index in landmarks
+  std::vector<Next> first;
+  size_t rows = store.prototype_count();
+  for (size_t i = 0; i < landmarks.size(); ++i) {
+    const LandmarkSums of_landmark(store, landmarks[i], dim);
+    const auto all = appearance_merges(of_landmark.sums, of_landmark.counts, dim);
+    merges.insert(merges.end(), all.begin(), all.end());
+    ends.push_back(merges.size());
+    made.push_back(all.size() >= kMaxRows ? all.size() + 1 - kMaxRows : 0);
+    rows -= made[i];
+    if (made[i] < all.size()) first.emplace_back(all[made[i]].cost, i);
+  }
+  std::priority_queue next(std::greater<>(), std::move(first));
+  for (; rows > limit && !next.empty(); --rows) {
+    const size_t i = next.top().second;
+    next.pop();
+    if (++made[i] < merges_of(i).size()) next.emplace(merges_of(i)[made[i]].cost, i);
+  }
   PrototypeStore result(dim, store.appearance_bits());
   result.reserve(landmarks.size(), std::min(limit, store.prototype_count()));
   for (size_t i = 0; i < landmarks.size(); ++i) {
     const LandmarkSums before(store, landmarks[i], dim);
     std::vector<int64_t> sums(before.sums.begin(), before.sums.end());
     std::vector<int64_t> counts(before.counts.begin(), before.counts.end());
-    for (const AppearanceMerge& m : merges.made(i)) {
+    for (const AppearanceMerge& m : merges_of(i).first(made[i])) {
       for (size_t d = 0; d < dim; ++d) sums[m.into * dim + d] += sums[m.source * dim + d];
       counts[m.into] += std::exchange(counts[m.source], 0);
     }

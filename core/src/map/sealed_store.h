@@ -13,8 +13,8 @@ struct SealFormat {
 };
 
 // Chooses the format for a number of bytes per landmark (SealOptions); `observed` says whether
-// observations will tune the prototypes. Throws std::invalid_argument, which names the smallest
-// possible number, if that is too small.
+// observations will tune the prototypes. Throws std::invalid_argument, with the smallest possible
+// number, for less.
 SealFormat seal_format(const PrototypeStore& store, const Encoder& encoder,
                        std::optional<double> bytes_per_landmark, bool observed);
 

@@ -1,6 +1,8 @@
 // Compiled without contraction of products and sums (core/CMakeLists.txt).
 #include "map/sealed_store.h"
 
+#include <numeric>
+
 #include "base/parallel.h"
 #include "search/inverted_lists.h"
 
@@ -63,11 +65,7 @@ class Tuner {
     for (int round = 0; round < kRounds; ++round) {
       find_rivals();
       for (int pass = 0; pass < kPasses; ++pass) move();
-    }
-    for (size_t rank = 0; rank < rows_.size(); ++rank) {
-      Sum sum{};
-      for (size_t d = 0; d < dim_; ++d) sum[d] = int16_t{rounded(rank, d)};
-      tuned_.set(rows_[rank], sum, 1);
+      store_rounded();
     }
     if (indexed_) {
       tuned_.reassign(threads_);
@@ -91,11 +89,17 @@ class Tuner {
     for (const int8_t x : means_.data) {
       numbers_.push_back(static_cast<int16_t>(x * (1 << kFraction)));
     }
-    packed_.resize(packed_size(tuned_.row_end(), dim_) / sizeof(CodeVector));
   }
 
-  int8_t rounded(size_t rank, size_t d) const {
-    return rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
+  // Rounds all prototypes into the store, where they stay in their rows.
+  void store_rounded() {
+    for (size_t rank = 0; rank < rows_.size(); ++rank) {
+      Sum sum{};
+      for (size_t d = 0; d < dim_; ++d) {
+        sum[d] = rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
+      }
+      tuned_.set(rows_[rank], sum, 1);
+    }
   }
 
   // Finds the own prototype of each query, the nearest one of its landmark, and the temperature.
@@ -139,17 +143,9 @@ class Tuner {
   // Returns how many other observations the own prototype of a query has.
   uint32_t rest(size_t q) const { return counts_[own_[q]] - queries_.weights[q]; }
 
-  // Finds the prototypes that each contested query could be mistaken for. Queries without any, most
-  // of them, are contested no longer.
+  // Finds what contested queries could be mistaken for; those without rivals are so no longer.
   void find_rivals() {
-    auto* packed = reinterpret_cast<int8_t*>(packed_.data());
-    for (size_t rank = 0; rank < rows_.size(); ++rank) {
-      for (size_t d = 0; d < dim_; ++d) {
-        packed[packed_index(rows_[rank].value, d, dim_)] = rounded(rank, d);
-      }
-    }
     PackedPrototypes view = tuned_.view();
-    view.data = packed_.data();
     view.landmarks = {};
     view.landmarks.ids = rank_of_row_.data();
     const SearchOptions options{.threads = threads_};
@@ -172,13 +168,9 @@ class Tuner {
       }
     }
     firsts_.push_back(forces_.size());
-    // The forces on each row, by query.
-    first_on_row_.assign(rows_.size() + 1, 0);
-    for (const Force& force : forces_) ++first_on_row_[force.rank + 1];
-    for (size_t i = 0; i < rows_.size(); ++i) first_on_row_[i + 1] += first_on_row_[i];
     on_row_.resize(forces_.size());
-    std::vector<size_t> next(first_on_row_.begin(), first_on_row_.end() - 1);
-    for (size_t f = 0; f < forces_.size(); ++f) on_row_[next[forces_[f].rank]++] = f;
+    std::iota(on_row_.begin(), on_row_.end(), size_t{0});
+    std::ranges::stable_sort(on_row_, {}, [&](size_t f) { return forces_[f].rank; });
     weights_.resize(forces_.size());
   }
 
@@ -234,7 +226,9 @@ class Tuner {
       std::vector<int64_t> sums(dim_);
       std::vector<int32_t> part(dim_);
       for (size_t rank = begin; rank < end; ++rank) {
-        if (first_on_row_[rank] == first_on_row_[rank + 1]) continue;
+        const auto on_row =
+            std::ranges::equal_range(on_row_, rank, {}, [&](size_t f) { return forces_[f].rank; });
+        if (on_row.empty()) continue;
         std::ranges::fill(sums, 0);
         std::ranges::fill(part, 0);
         int64_t total = 0, in_part = 0;
@@ -242,8 +236,8 @@ class Tuner {
           for (size_t d = 0; d < dim_; ++d) sums[d] += std::exchange(part[d], 0);
           in_part = 0;
         };
-        for (size_t i = first_on_row_[rank]; i < first_on_row_[rank + 1]; ++i) {
-          const int32_t weight = weights_[on_row_[i]];
+        for (const size_t f : on_row) {
+          const int32_t weight = weights_[f];
           if (weight == 0) continue;
           total += weight;
           in_part += std::abs(weight);
@@ -251,7 +245,7 @@ class Tuner {
             flush();
             in_part = std::abs(weight);
           }
-          const int8_t* code = queries_.codes.row(contested_[forces_[on_row_[i]].query]);
+          const int8_t* code = queries_.codes.row(contested_[forces_[f].query]);
           for (size_t d = 0; d < dim_; ++d) part[d] += weight * code[d];
         }
         flush();
@@ -304,12 +298,9 @@ class Tuner {
   // By rank.
   std::vector<Row> rows_;
   Matrix<int8_t> means_;
-  std::vector<int16_t> numbers_;  // prototypes, with kFraction bits behind the point
-  std::vector<uint32_t> counts_;  // observations
-  std::vector<size_t> first_on_row_;
+  std::vector<int16_t> numbers_;      // prototypes, with kFraction bits behind the point
+  std::vector<uint32_t> counts_;      // observations
   std::vector<int64_t> rank_of_row_;  // -1 for padding
-
-  std::vector<CodeVector> packed_;  // by row
 
   std::vector<uint32_t> own_;  // the rank of each query's own prototype, or UINT32_MAX
   int64_t temperature_ = 1;
@@ -318,7 +309,7 @@ class Tuner {
   std::vector<size_t> firsts_;       // the first force of each, and the end
   std::vector<Force> forces_;        // of each query on its own prototype, then on its rivals
   std::vector<int32_t> weights_;     // of each force, in kUnit
-  std::vector<size_t> on_row_;       // forces by the rank that they are on
+  std::vector<size_t> on_row_;       // forces by the rank that they are on, then by query
 };
 
 }  // namespace

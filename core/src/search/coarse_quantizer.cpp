@@ -2,9 +2,10 @@
 
 #include <bit>
 #include <cmath>
+#include <numeric>
 #include <queue>
 #include <set>
-#include <utility>
+#include <tuple>
 
 #include "base/quantize.h"
 #include "search/inverted_lists.h"
@@ -24,36 +25,27 @@ std::vector<uint32_t> ids_of(const Matches& nearest) {
 void refill(Codes codes, const std::vector<uint32_t>& list_of, const std::vector<uint32_t>& counts,
             Matrix<int8_t>& centroids) {
   const size_t nlist = counts.size();
-  std::vector<uint32_t> first(nlist + 1, 0), members(codes.rows);
-  for (size_t c = 0; c < nlist; ++c) first[c + 1] = first[c] + counts[c];
-  std::vector<uint32_t> next(first.begin(), first.end() - 1);
+  std::vector<uint32_t> first(nlist), members(codes.rows);
+  std::exclusive_scan(counts.begin(), counts.end(), first.begin(), 0u);
+  std::vector<uint32_t> next = first;
   for (uint32_t i = 0; i < codes.rows; ++i) members[next[list_of[i]]++] = i;
-  struct Large {
-    size_t share;  // codes per centroid that the list has got
-    size_t list;
-    size_t parts;
-    bool operator<(const Large& other) const {
-      return std::pair(share, other.list) < std::pair(other.share, list);
-    }
-  };
-  std::priority_queue<Large> largest;
-  for (size_t c = 0; c < nlist; ++c) largest.push({counts[c], c, 1});
+  // Codes per centroid that a list has got, lists from last to first, and its centroids.
+  std::priority_queue<std::tuple<uint32_t, size_t, uint32_t>> largest;
+  for (size_t c = 0; c < nlist; ++c) largest.emplace(counts[c], nlist - 1 - c, 1);
   for (size_t c = 0; c < nlist; ++c) {
     if (counts[c] != 0) continue;
-    Large from = largest.top();
+    const auto [share, from_last, parts] = largest.top();
     largest.pop();
+    const size_t list = nlist - 1 - from_last;
     // Another code each time, spread over the list.
-    const size_t at = first[from.list] + counts[from.list] / (from.parts + 1);
+    const size_t at = first[list] + counts[list] / (parts + 1);
     std::copy_n(codes.row(members[at]), codes.columns, centroids.row(c));
-    ++from.parts;
-    from.share = counts[from.list] / from.parts;
-    largest.push(from);
+    largest.emplace(counts[list] / (parts + 1), from_last, parts + 1);
   }
 }
 
 // `assign(centroids)` returns the list of each code.
-template <typename Assign>
-Matrix<int8_t> k_means(Codes codes, size_t nlist, const Assign& assign) {
+Matrix<int8_t> k_means(Codes codes, size_t nlist, const auto& assign) {
   const size_t dim = codes.columns;
   Matrix<int8_t> centroids(nlist, dim);
   for (size_t c = 0; c < nlist; ++c) {
@@ -160,8 +152,7 @@ size_t CoarseQuantizer::default_nlist(size_t prototypes, size_t dim, size_t row_
   const double table = static_cast<double>(std::min(prototypes, kTestQueries)) * sizeof(float);
   const double sealed =
       (n * (kBytes - static_cast<double>(std::bit_width(prototypes)) / 8) - table) / (9.5 * k + 4);
-  // A learning map keeps for each list its centroid three times, 16 bytes, and half a block of rows
-  // and of the 12 bytes of a block.
+  // A learning map keeps for each list its centroid three times, 16 bytes, and half a block.
   const double half_block = static_cast<double>(kPackedRows * row_bytes) / 2 + 6;
   const double learning = (n * kBytes - table) / (half_block + 3 * k + 16);
   const double nlist = std::min({4 * std::sqrt(n), sealed, learning});

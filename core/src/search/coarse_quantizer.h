@@ -47,8 +47,7 @@ class CoarseQuantizer {
   std::vector<uint32_t> group_blocks_;  // first block of each group, and the end
 };
 
-// The new rows of prototypes if lists follow each other, each beginning a new block, with
-// prototypes in their present order.
+// The new rows of prototypes if lists follow each other, each beginning a new block.
 struct ListOrder {
   // `lists` has the list of each row as its value, or kNoRow for padding.
   ListOrder(std::vector<Row> lists, size_t nlist);

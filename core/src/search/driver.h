@@ -1,5 +1,4 @@
-// The driver of exact, inverted-list and Hamming search: keeps the nearest, divides the work among
-// threads, and writes the answer.
+// What all searches share: keeps the nearest, divides work among threads, writes the answer.
 #pragma once
 
 #include <mutex>
@@ -93,9 +92,8 @@ struct Division {
 };
 
 // Calls scan(queries, work, neighbours of these queries) for all ranges.
-template <typename Scan>
 void run_search(int threads, const Division& division, size_t work, Neighbours& nearest,
-                const Scan& scan) {
+                const auto& scan) {
   std::mutex mutex;
   const size_t tasks = division.query_ranges * division.work_ranges;
   run_tasks(threads, nearest.queries() == 0 ? 0 : tasks, [&](size_t i) {
@@ -113,9 +111,8 @@ void run_search(int threads, const Division& division, size_t work, Neighbours& 
 
 // Calls take(query, distance, row) for the rows of a chunk within limit_of(query), which `take` may
 // tighten. kernel(first, n, limits, &block, hits) scans for n queries from a block on.
-template <typename Kernel, typename LimitOf, typename Take>
-void each_hit(size_t n, size_t rows, size_t blocks, const Kernel& kernel, const LimitOf& limit_of,
-              const Take& take) {
+void each_hit(size_t n, size_t rows, size_t blocks, const auto& kernel, const auto& limit_of,
+              const auto& take) {
   kernels::Hit hits[kernels::kHitRoom];
   int32_t limits[kernels::kScanQueries];
   for (size_t first = 0; first < n; first += kernels::kScanQueries) {
@@ -134,8 +131,7 @@ void each_hit(size_t n, size_t rows, size_t blocks, const Kernel& kernel, const 
   }
 }
 
-// Writes the neighbours to rows of `matches`, from `first` on. `norms`, if there are any, are added
-// to the distances of each query.
+// Writes neighbours to rows of `matches` from `first` on, adding the norms if there are any.
 inline void write_answer(const Neighbours& nearest, std::span<const int32_t> norms,
                          const SearchOptions& options, size_t first, Matches& matches) {
   const int32_t limit = options.max_distance.value_or(INT32_MAX);
@@ -154,8 +150,7 @@ inline void write_answer(const Neighbours& nearest, std::span<const int32_t> nor
   }
 }
 
-// Returns room for the answer of a search. Throws std::invalid_argument if k is 0 or max_distance
-// is negative.
+// Returns room for an answer. Throws std::invalid_argument for k = 0 or a negative max_distance.
 inline Matches room_for_answer(size_t queries, size_t k, std::optional<int32_t> max_distance) {
   require(k != 0, "k must be at least 1");
   require(!max_distance || *max_distance >= 0, "max_distance must not be negative");

@@ -5,87 +5,56 @@
 namespace protomark {
 namespace {
 
-// Queries that go through the lists together, so that their visits take little memory.
-constexpr size_t kQueries = 1 << 14;
-
-// Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
-// which, or a nearer one, limits the distance.
-constexpr size_t kMinStep = 16, kMaxSampled = 64;
 // Queries that are compared with centroids together.
 constexpr size_t kBatch = 256;
 
-// The centroids that a query has found: distance in the upper bits, index in the lower ones, so
-// that ties go to the smaller index.
-using Found = std::vector<int64_t>;
-
-// Selects the lists nearest to a batch of queries, on one thread. (Neighbours are for a few; these
-// may be hundreds.)
-class Selection {
- public:
-  Selection(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch)
-      : centroids_(centroids),
-        scan_(queries, batch),
-        limits_(batch.size(), kNoLimit),
-        found_(batch.size()) {}
-
-  void nearest(size_t nprobe, uint32_t* to) {
-    guess_limits(nprobe);
-    const auto limit_of = [&](size_t q) { return limits_[q]; };
-    const auto take = [&](size_t q, int32_t distance, size_t list) {
-      found_[q].push_back(int64_t{distance} * (int64_t{1} << 32) + static_cast<int64_t>(list));
-    };
-    const size_t chunk = scan_.chunk_rows();
-    for (size_t row = 0; row < centroids_.rows; row += chunk) {
-      compare(row, std::min(chunk, centroids_.rows - row), limit_of, take);
-    }
-    for (uint32_t q = 0; q < limits_.size(); ++q) {
-      if (found_[q].size() < nprobe) {
-        found_[q].clear();
-        scan_.select({&q, 1});
-        compare(
-            0, centroids_.rows, [](size_t) { return kNoLimit; },
-            [&](size_t, int32_t distance, size_t list) { take(q, distance, list); });
-      }
-      select(found_[q], nprobe, to + q * nprobe);
-    }
+// Selects the lists nearest to each query, on one thread. (Neighbours are for fewer.)
+void select_lists(const PackedPrototypes& centroids, const PreparedCodes& queries, Range batch,
+                  size_t nprobe, uint32_t* to) {
+  CodeScan scan(queries, batch);
+  // Compares queries with centroids from `first` on, a multiple of 16.
+  const auto compare = [&](size_t first, size_t n, const auto& limit_of, const auto& take) {
+    const auto* codes = static_cast<const int8_t*>(centroids.data);
+    scan.compare(codes + packed_size(first, centroids.dim), std::min(n, centroids.rows - first),
+                 limit_of,
+                 [&](size_t q, int32_t distance, size_t i) { take(q, distance, first + i); });
+  };
+  // Every kMinStep-th block of centroids, or fewer, are a sample, the kMaxSampled-th nearest of
+  // which, or a nearer one, is a limit that probably leaves a few more than `nprobe` centroids.
+  constexpr size_t kMinStep = 16, kMaxSampled = 64;
+  const size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
+  Neighbours sample(nprobe * 3 / 2 / step + 5, std::vector(batch.size(), kNoLimit));
+  for (size_t row = 0; row < centroids.rows; row += step * kPackedRows) {
+    compare(
+        row, kPackedRows, [&](size_t q) { return sample.limit(q); },
+        [&](size_t q, int32_t distance, size_t list) {
+          sample.offer(q, distance, static_cast<int64_t>(list), false);
+        });
   }
-
- private:
-  // Sets limits that probably leave a few more than `nprobe` centroids.
-  void guess_limits(size_t nprobe) {
-    const size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
-    Neighbours sample(nprobe * 3 / 2 / step + 5, limits_);
-    for (size_t row = 0; row < centroids_.rows; row += step * kPackedRows) {
+  // Distances in the upper bits, indices in the lower ones, so that ties go to smaller indices.
+  std::vector<std::vector<int64_t>> all_found(batch.size());
+  const auto take = [&](size_t q, int32_t distance, size_t list) {
+    all_found[q].push_back(int64_t{distance} * (int64_t{1} << 32) + static_cast<int64_t>(list));
+  };
+  const size_t chunk = scan.chunk_rows();
+  for (size_t row = 0; row < centroids.rows; row += chunk) {
+    compare(row, chunk, [&](size_t q) { return sample.limit(q); }, take);
+  }
+  for (uint32_t q = 0; q < all_found.size(); ++q) {
+    std::vector<int64_t>& found = all_found[q];
+    if (found.size() < nprobe) {
+      found.clear();
+      scan.select({&q, 1});
       compare(
-          row, std::min(kPackedRows, centroids_.rows - row),
-          [&](size_t q) { return sample.limit(q); },
-          [&](size_t q, int32_t distance, size_t list) {
-            sample.offer(q, distance, static_cast<int64_t>(list), false);
-          });
+          0, centroids.rows, [](size_t) { return kNoLimit; },
+          [&](size_t, int32_t distance, size_t list) { take(q, distance, list); });
     }
-    for (size_t q = 0; q < limits_.size(); ++q) limits_[q] = sample.limit(q);
-  }
-
-  static void select(Found& found, size_t nprobe, uint32_t* to) {
     const auto end = found.begin() + static_cast<std::ptrdiff_t>(nprobe);
     std::nth_element(found.begin(), end - 1, found.end());
     std::iter_swap(found.begin(), std::min_element(found.begin(), end));
-    for (size_t i = 0; i < nprobe; ++i) to[i] = static_cast<uint32_t>(found[i]);
+    for (auto f = found.begin(); f != end; ++f) *to++ = static_cast<uint32_t>(*f);
   }
-
-  // Compares all queries with centroids from `first` on, a multiple of 16.
-  template <typename LimitOf, typename Take>
-  void compare(size_t first, size_t n, const LimitOf& limit_of, const Take& take) {
-    const auto* codes = static_cast<const int8_t*>(centroids_.data);
-    scan_.compare(codes + packed_size(first, centroids_.dim), n, limit_of,
-                  [&](size_t q, int32_t distance, size_t i) { take(q, distance, first + i); });
-  }
-
-  const PackedPrototypes& centroids_;
-  CodeScan scan_;
-  std::vector<int32_t> limits_;
-  std::vector<Found> found_;
-};
+}
 
 struct Visit {
   uint32_t list;
@@ -121,65 +90,32 @@ void scan_visits(const InvertedLists& lists, std::span<const Visit> visits, Prot
   }
 }
 
-// Landmarks that are packed at a time: so many that the work on each query is small beside that on
-// rows, so few that they stay in the cache.
-constexpr size_t kPackedAtOnce = 1 << 14;
 // The time to read a row, and to pack one from anywhere, in comparisons of a row and a query.
 constexpr double kReading = 40, kPacking = 900;
 
-// Rows that were packed anew.
-class PackedPiece {
- public:
-  void pack(const LandmarkRows& landmarks, std::span<const LandmarkIndex> some,
-            const PackedPrototypes& from) {
-    rows_.clear();
-    owners_.clear();
-    ids_.clear();
-    for (const LandmarkIndex landmark : some) {
-      landmarks.append(landmark, rows_);
-      owners_.resize(rows_.size(), landmark_at(ids_.size()));
-      const int64_t* ids = from.landmarks.ids;
-      ids_.push_back(ids != nullptr ? ids[landmark.value] : int64_t{landmark.value});
-    }
-    // What a row has in one place: 4 numbers or a word.
-    from.width == 0 ? copy_rows<4>(from) : copy_rows<1>(from);
-    view_ = {packed_.data(), rows_.size(), from.dim, from.width, from.table, {}};
-    view_.landmarks.of_row = owners_.data();
-    view_.landmarks.ids = ids_.data();
-  }
-
-  const PackedPrototypes& view() const { return view_; }
-
- private:
-  template <size_t kBytes>
-  void copy_rows(const PackedPrototypes& from) {
-    constexpr size_t kAhead = 8;
-    const size_t block = packed_size(kPackedRows, from.dim, from.width);
-    packed_.resize(packed_blocks(rows_.size()) * block / sizeof(CodeVector) + 1);
+// Packs some rows anew, of which `kBytes` bytes are in one place: 4 numbers or a word.
+template <size_t kBytes>
+void pack_rows(const PackedPrototypes& from, std::span<const Row> rows,
+               std::vector<CodeVector>& packed) {
+  constexpr size_t kAhead = 8;
+  const size_t block = packed_size(kPackedRows, from.dim, from.width);
+  packed.resize(packed_blocks(rows.size()) * block / sizeof(CodeVector) + 1);
+  const auto start = [&](size_t row) {
+    return row / kPackedRows * block + row % kPackedRows * kBytes;
+  };
+  for (size_t i = 0; i < rows.size(); ++i) {
     const auto* source = static_cast<const std::byte*>(from.data);
-    auto* to = reinterpret_cast<std::byte*>(packed_.data());
-    const auto start = [&](size_t row) {
-      return row / kPackedRows * block + row % kPackedRows * kBytes;
-    };
-    for (size_t i = 0; i < rows_.size(); ++i) {
-      if (i + kAhead < rows_.size()) {
-        const std::byte* next = source + start(rows_[i + kAhead].value);
-        for (size_t at = 0; at < block; at += sizeof(CodeVector)) __builtin_prefetch(next + at);
-      }
-      const std::byte* row = source + start(rows_[i].value);
-      std::byte* packed = to + start(i);
-      for (size_t at = 0; at < block; at += kPackedRows * kBytes) {
-        std::memcpy(packed + at, row + at, kBytes);
-      }
+    if (i + kAhead < rows.size()) {
+      const std::byte* next = source + start(rows[i + kAhead].value);
+      for (size_t at = 0; at < block; at += sizeof(CodeVector)) __builtin_prefetch(next + at);
+    }
+    const std::byte* row = source + start(rows[i].value);
+    std::byte* to = reinterpret_cast<std::byte*>(packed.data()) + start(i);
+    for (size_t at = 0; at < block; at += kPackedRows * kBytes) {
+      std::memcpy(to + at, row + at, kBytes);
     }
   }
-
-  std::vector<Row> rows_;
-  std::vector<LandmarkIndex> owners_;
-  std::vector<int64_t> ids_;
-  std::vector<CodeVector> packed_;
-  PackedPrototypes view_;
-};
+}
 
 }  // namespace
 
@@ -188,8 +124,8 @@ std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const Pre
   std::vector<uint32_t> result(queries.queries() * nprobe);
   parallel_for(threads, queries.queries(), 16, [&](size_t first, size_t last) {
     for (size_t q = first; q < last; q += kBatch) {
-      Selection batch(centroids, queries, {q, std::min(last, q + kBatch)});
-      batch.nearest(nprobe, &result[q * nprobe]);
+      select_lists(centroids, queries, {q, std::min(last, q + kBatch)}, nprobe,
+                   &result[q * nprobe]);
     }
   });
   return result;
@@ -199,13 +135,9 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
                      const PackedPrototypes& centroids, size_t nprobe, Codes queries, size_t k,
                      const SearchOptions& options) {
   if (nprobe >= lists.nlist()) return search_exact(prototypes, queries, k, options);
-  Matches matches = check_search(prototypes.dim, queries, k, options);
-  for (size_t begin = 0; begin < queries.rows; begin += kQueries) {
-    const size_t n = std::min(kQueries, queries.rows - begin);
-    const PreparedCodes prepared({queries.row(begin), n, queries.columns});
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
     const std::vector<uint32_t> nearest_to =
         nearest_lists(centroids, prepared, nprobe, options.threads);
-    Neighbours nearest = prepared.neighbours(k, options);
     // The nearest list goes first, as it leaves little for the others to find.
     for (const Range& range : {Range{0, 1}, Range{1, nprobe}}) {
       const std::vector<Visit> visits = sorted_visits(nearest_to, nprobe, range, lists.nlist());
@@ -215,9 +147,7 @@ Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& li
                                {prototypes, prepared, all, part});
                  });
     }
-    write_answer(nearest, prepared.norms(), options, begin, matches);
-  }
-  return matches;
+  });
 }
 
 Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
@@ -245,18 +175,34 @@ Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
     prototypes.landmarks.among = &among;
     return search_lists(prototypes, lists, centroids, nprobe, queries, k, options);
   }
-  Matches matches = check_search(prototypes.dim, queries, k, options);
-  const PreparedCodes prepared(queries);
-  Neighbours nearest = prepared.neighbours(k, options);
-  PackedPiece piece;
-  for (size_t first = 0; first < some.size(); first += kPackedAtOnce) {
-    piece.pack(landmarks,
-               std::span(some).subspan(first, std::min(kPackedAtOnce, some.size() - first)),
-               prototypes);
-    scan_all(piece.view(), prepared, options.threads, nearest);
-  }
-  write_answer(nearest, prepared.norms(), options, 0, matches);
-  return matches;
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
+    // Landmarks are packed some at a time: many beside the work per query, few enough for the
+    // cache.
+    constexpr size_t kAtOnce = 1 << 14;
+    std::vector<CodeVector> packed;
+    std::vector<Row> rows;
+    std::vector<LandmarkIndex> owners;
+    std::vector<int64_t> ids;
+    for (size_t first = 0; first < some.size(); first += kAtOnce) {
+      rows.clear();
+      owners.clear();
+      ids.clear();
+      for (size_t i = first; i < std::min(some.size(), first + kAtOnce); ++i) {
+        landmarks.append(some[i], rows);
+        owners.resize(rows.size(), landmark_at(ids.size()));
+        const int64_t* all_ids = prototypes.landmarks.ids;
+        ids.push_back(all_ids != nullptr ? all_ids[some[i].value] : int64_t{some[i].value});
+      }
+      (prototypes.width == 0 ? pack_rows<4> : pack_rows<1>)(prototypes, rows, packed);
+      PackedPrototypes piece = prototypes;
+      piece.data = packed.data();
+      piece.rows = rows.size();
+      piece.landmarks = {};
+      piece.landmarks.of_row = owners.data();
+      piece.landmarks.ids = ids.data();
+      scan_all(piece, prepared, options.threads, nearest);
+    }
+  });
 }
 
 size_t nprobe_for(const RecallTable& table, double recall, size_t nlist) {

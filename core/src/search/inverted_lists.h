@@ -1,5 +1,4 @@
-// Search in the inverted lists whose centroids are nearest to a query, as many as a recall takes,
-// or among some landmarks.
+// Search in as many inverted lists as a recall takes, or among some landmarks.
 #pragma once
 
 #include "search/list_blocks.h"
@@ -44,8 +43,7 @@ std::vector<uint32_t> nearest_lists(const PackedPrototypes& centroids, const Pre
                                     size_t nprobe, int threads);
 
 // Searches as search_exact does, but only in the `nprobe` lists (at least 1) nearest to each query,
-// ties to the smaller list; in all prototypes if there are no more lists than that. Prototype i of
-// `centroids` is the centroid of list i.
+// ties to the smaller list; in all prototypes if there are no more. `centroids` are those of lists.
 Matches search_lists(const PackedPrototypes& prototypes, const InvertedLists& lists,
                      const PackedPrototypes& centroids, size_t nprobe, Codes queries, size_t k,
                      const SearchOptions& options);
@@ -60,14 +58,12 @@ struct LandmarkRows {
 // Searches as search_lists does, but with options.among only the rows of these landmarks. They are
 // packed anew, a piece at a time, and searched as a small map, at a cost that follows their number;
 // or, where that is less work, all rows are compared and those of other landmarks are passed over.
-// With options.recall more lists are then searched than `nprobe`, as many as hold so many of these
-// rows.
+// With options.recall as many lists are then searched as hold so many of these rows.
 Matches search_map(PackedPrototypes prototypes, const InvertedLists& lists,
                    const PackedPrototypes& centroids, const LandmarkRows& landmarks, size_t nprobe,
                    Codes queries, size_t k, const SearchOptions& options);
 
-// For each of some test queries, how many lists a search visits until it finds the nearest
-// landmark; ascending.
+// How many lists a search visits to find the nearest landmark of each test query; ascending.
 using RecallTable = std::vector<uint32_t>;
 
 inline constexpr size_t kTestQueries = 2048;  // at most

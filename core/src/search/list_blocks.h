@@ -21,8 +21,7 @@ class ListBlocks {
     const List& l = lists_[list];
     return {static_cast<uint32_t>(l.last * kPackedRows + (l.rows - 1) % kPackedRows)};
   }
-  template <typename Take>
-  void each_row(uint32_t list, const Take& take) const {
+  void each_row(uint32_t list, const auto& take) const {
     if (lists_[list].rows == 0) return;
     size_t in_block = (lists_[list].rows - 1) % kPackedRows + 1;
     for (uint32_t b = lists_[list].last; b != kNone; b = blocks_[b].previous) {

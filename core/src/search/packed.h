@@ -30,16 +30,23 @@ constexpr size_t word_index(size_t row, size_t word, size_t words) {
   return (row / kPackedRows * words + word) * kPackedRows + row % kPackedRows;
 }
 
-// Codes of 16 rows x 4 dimensions. Aligned, as a scan whose loads cross cache lines takes a quarter
-// longer.
+// Codes of 16 rows x 4 dimensions. Unaligned loads would make a scan a quarter slower.
 struct alignas(64) CodeVector {
   int8_t codes[4 * kPackedRows];
 };
 
-std::vector<CodeVector> pack_codes(Codes codes);
+inline std::vector<CodeVector> pack_codes(Codes codes) {
+  std::vector<CodeVector> result(packed_size(codes.rows, codes.columns) / sizeof(CodeVector));
+  auto* to = reinterpret_cast<int8_t*>(result.data());
+  for (size_t row = 0; row < codes.rows; ++row) {
+    for (size_t d = 0; d < codes.columns; ++d) {
+      to[packed_index(row, d, codes.columns)] = codes.row(row)[d];
+    }
+  }
+  return result;
+}
 
-// The landmark of each row: by at most one of the first two members; by none, row i is of landmark
-// i.
+// The landmark of each row: by one of the first two members, or else row i is of landmark i.
 struct RowLandmarks {
   const LandmarkIndex* of_row = nullptr;
   std::function<LandmarkIndex(Row)> look_up;

@@ -15,6 +15,8 @@ inline int32_t squared_norm(const uint8_t* code, size_t dim) {
   return sum;
 }
 
+static_assert(kPackedRows == kernels::kCodeRows);
+
 // Above all distances without norms, whose magnitude is below 2^24.
 inline constexpr int32_t kNoLimit = 1 << 25;
 
@@ -104,8 +106,7 @@ class CodeScan {
 
   // Calls take(i, distance, row) for the rows of a packed chunk within limit_of(i) of the i-th
   // query. Distances are squared and lack the query's norm, which does not change their order.
-  template <typename LimitOf, typename Take>
-  void compare(const int8_t* packed, size_t rows, const LimitOf& limit_of, const Take& take) {
+  void compare(const int8_t* packed, size_t rows, const auto& limit_of, const auto& take) {
     const kernels::PackedCodes chunk = prepare(packed, rows);
     each_hit(
         n_, rows, chunk.blocks,
@@ -172,8 +173,7 @@ class PrototypeScan {
 
  private:
   // The i-th query that `scan_` compares is query_of(i).
-  template <typename QueryOf>
-  void compare(std::span<const uint32_t> blocks, size_t rows, const QueryOf& query_of) {
+  void compare(std::span<const uint32_t> blocks, size_t rows, const auto& query_of) {
     scan_.compare(
         read(blocks), rows, [&](size_t i) { return nearest_.limit(query_of(i)); },
         [&](size_t i, int32_t distance, size_t at) {
@@ -181,8 +181,7 @@ class PrototypeScan {
           offer(query_of(i), distance, row_at(row));
         });
   }
-  // Returns the codes of these blocks, one after the other, valid until the next call. Words are
-  // decoded into the cache, once for all queries.
+  // Returns the codes of these blocks, until the next call; decodes words once for all queries.
   const int8_t* read(std::span<const uint32_t> blocks) {
     const auto& [data, rows, dim, width, table, landmarks] = prototypes_;
     const size_t stored_bytes = packed_size(kPackedRows, dim, width);
@@ -221,14 +220,40 @@ class PrototypeScan {
   std::vector<CodeVector> room_;
 };
 
-void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
-              Neighbours& nearest);
+inline void scan_all(const PackedPrototypes& prototypes, const PreparedCodes& queries, int threads,
+                     Neighbours& nearest) {
+  run_search(threads, Division::of_rows(threads, queries.queries(), prototypes.rows),
+             prototypes.rows, nearest, [&](Range some, Range rows, Neighbours& part) {
+               PrototypeScan(prototypes, queries, some, part).scan(rows);
+             });
+}
+
+// Answers queries, some at a time, by find(prepared queries, their nearest so far). Throws
+// std::invalid_argument if the arguments do not fit prototypes of `dim` numbers.
+Matches answer(size_t dim, Codes queries, size_t k, const SearchOptions& options,
+               const auto& find) {
+  constexpr size_t kAtOnce = 1 << 14;
+  require(queries.columns == dim, "queries have ", queries.columns, " dimensions, prototypes ",
+          dim);
+  require(!options.ratio || (*options.ratio > 0 && *options.ratio <= 1),
+          "ratio must be above 0 and at most 1");
+  Matches matches = room_for_answer(queries.rows, k, options.max_distance);
+  for (size_t first = 0; first < queries.rows; first += kAtOnce) {
+    const size_t n = std::min(kAtOnce, queries.rows - first);
+    const PreparedCodes prepared({queries.row(first), n, queries.columns});
+    Neighbours nearest = prepared.neighbours(k, options);
+    find(prepared, nearest);
+    write_answer(nearest, prepared.norms(), options, first, matches);
+  }
+  return matches;
+}
 
 // Searches all prototypes (protomark/search.h), whatever options.recall and options.nprobe say.
-Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
-                     const SearchOptions& options);
-
-// Returns room for the answer. Throws std::invalid_argument if the arguments do not fit.
-Matches check_search(size_t dim, Codes queries, size_t k, const SearchOptions& options);
+inline Matches search_exact(const PackedPrototypes& prototypes, Codes queries, size_t k,
+                            const SearchOptions& options) {
+  return answer(prototypes.dim, queries, k, options, [&](const auto& prepared, auto& nearest) {
+    scan_all(prototypes, prepared, options.threads, nearest);
+  });
+}
 
 }  // namespace protomark
