@@ -209,10 +209,10 @@ def test_iterative_quantisation_rotates_principal_components_to_their_signs(
 
 
 def test_sizes_in_bytes() -> None:
-    names = [c.name for c in choose_methods(method_choices(bits=488), ["pq", "itq", "lsh"])]
-    assert names[:4] == ["pq-8", "pq-16", "pq-32", "pq-64"]
+    names = [c.name for c in choose_methods(method_choices(width=488), ["pq", "itq", "lsh"])]
+    assert names[:5] == ["pq-4", "pq-8", "pq-16", "pq-32", "pq-64"]
     # 512 signs need 512 components.
-    assert names[4:7] == ["itq-8", "itq-16", "itq-32"]
-    assert names[7:] == ["lsh-8", "lsh-16", "lsh-32", "lsh-64"]
+    assert names[5:9] == ["itq-4", "itq-8", "itq-16", "itq-32"]
+    assert names[9:] == ["lsh-4", "lsh-8", "lsh-16", "lsh-32", "lsh-64"]
     default = [c.name for c in choose_methods(method_choices(), [])]
     assert default[-3:] == ["pq-32", "itq-32", "lsh-32"]

@@ -91,7 +91,7 @@ class Support:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Mean and covariances of the numbers of descriptors, from which linear projections are learned."""
+    """Mean and covariances of descriptors' numbers, from which linear projections are learned."""
 
     # Far fewer rows than this estimate a quarter of a million numbers well.
     MAX_ROWS: ClassVar = 100_000
@@ -111,7 +111,7 @@ class Moments:
         chosen[drawn[:count]] = True
         rows = np.flatnonzero(np.repeat(chosen, support.counts))
         # A piece sums fewer than 2^24 products of 0 and 1, which is exact in float32.
-        dtype = np.float32 if support.kind == "bits" else np.float64
+        dtype: Any = np.float32 if support.kind == "bits" else np.float64
         sums = support.sums[chosen].astype(dtype)
         counts = support.counts[chosen]
         second = np.zeros((support.width, support.width))
