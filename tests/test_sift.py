@@ -71,7 +71,7 @@ def test_a_map_of_a_database(scene: Path, built: Path) -> None:
     found = tracks_from_database(scene / "database.db", scene / "points", "sift")
     reconstruction = pycolmap.Reconstruction(scene / "points")
     assert len(found.landmark_ids) == len(reconstruction.points3D)
-    features = read_features(scene / "database.db", "sift", 128)
+    features = read_features(scene / "database.db", "sift")
     point = reconstruction.points3D[sorted(reconstruction.points3D)[7]]
     rows = [
         features[reconstruction.images[e.image_id].name].descriptors[e.point2D_idx]
@@ -177,7 +177,7 @@ def test_both_extractors_see_the_same(scene: Path) -> None:
     image = read_gray(scene / "images" / "img3.png")
     opencv = Extractor("sift", 2000)(image)
     colmap = Extractor("sift", 600, detector={"name": "COLMAP"})(image)
-    stored = read_features(scene / "database.db", "sift", 128)["img3.png"]
+    stored = read_features(scene / "database.db", "sift")["img3.png"]
     for features in (opencv, colmap, stored):
         assert is_rooted(features.descriptors)[0]
         assert features.descriptors.any(1).all()
