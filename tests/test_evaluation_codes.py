@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from conftest import random_descriptors
 from protomark.baselines import hashing, quantization
 from protomark.baselines.hashing import SignMap, iterative_quantization, random_hyperplanes
-from protomark.baselines.linear import real_mean, principal_components
+from protomark.baselines.linear import principal_components, real_mean
 from protomark.baselines.quantization import k_means, nearest_words, product_quantized_mean
 from protomark.baselines.support import Support
 from protomark.evaluation.methods import choose_methods, method_choices
@@ -165,10 +165,10 @@ def test_iterative_quantisation_rotates_principal_components_to_their_signs(
 
 
 def test_sizes_in_bytes() -> None:
-    names = [c.name for c in choose_methods(method_choices(bits=488), ["pq", "itq", "lsh"])]
-    assert names[:4] == ["pq-8", "pq-16", "pq-32", "pq-64"]
+    names = [c.name for c in choose_methods(method_choices(width=488), ["pq", "itq", "lsh"])]
+    assert names[:5] == ["pq-4", "pq-8", "pq-16", "pq-32", "pq-64"]
     # 512 signs need 512 components.
-    assert names[4:7] == ["itq-8", "itq-16", "itq-32"]
-    assert names[7:] == ["lsh-8", "lsh-16", "lsh-32", "lsh-64"]
+    assert names[5:9] == ["itq-4", "itq-8", "itq-16", "itq-32"]
+    assert names[9:] == ["lsh-4", "lsh-8", "lsh-16", "lsh-32", "lsh-64"]
     default = [c.name for c in choose_methods(method_choices(), [])]
     assert default[-3:] == ["pq-32", "itq-32", "lsh-32"]

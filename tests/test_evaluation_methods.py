@@ -27,9 +27,9 @@ from protomark.baselines.binary import (
 from protomark.baselines.linear import (
     RIDGE,
     linear_discriminants,
-    real_mean,
     principal_components,
     projected_mean,
+    real_mean,
 )
 from protomark.baselines.support import Moments, Support
 from protomark.evaluation.methods import choose_methods, method_choices, prototype_map

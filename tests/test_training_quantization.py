@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import protomark as pm
-from conftest import reference_encode
+from conftest import descriptors_for, reference_encode
 from protomark import models
 from protomark.training.network import (
     BITS,
@@ -84,9 +84,10 @@ def test_the_core_encodes_the_same_bytes(bits, dim, hidden, tmp_path):
 @pytest.mark.parametrize("name", models.names())
 def test_encoders_that_ship_encode_as_their_layers_say(name):
     encoder = pm.Encoder.load(name)
-    descriptors = random_descriptors(3000, encoder.bits)
+    descriptors = descriptors_for(encoder, 3000)
     np.testing.assert_array_equal(
-        encoder.encode(descriptors), reference_encode(encoder.layers, descriptors)
+        encoder.encode(descriptors),
+        reference_encode(encoder.layers, descriptors, encoder.input, encoder.input_scale),
     )
 
 

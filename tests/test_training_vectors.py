@@ -123,7 +123,7 @@ def test_tracks_of_vectors_come_back_from_their_file(kind, tmp_path):
 )
 def test_tracks_refuse_broken_vectors(kind, change, words):
     x = change(vectors(40, "uint8" if kind == "uint8" else "float32"))
-    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=".") as caught:
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=r".") as caught:
         replace(small_tracks(), descriptors=x, input=kind).check()
     assert words in str(caught.value)
 
@@ -145,9 +145,7 @@ def test_methods_of_vectors_by_their_definition(seed, spread):
     order = np.argsort(nearest, axis=1, kind="stable")[:, :2]
     found, distances = unaggregated(support).match(queries)
     np.testing.assert_array_equal(found, ids[order])
-    np.testing.assert_array_equal(
-        np.rint(distances**2), np.take_along_axis(nearest, order, axis=1)
-    )
+    np.testing.assert_array_equal(np.rint(distances**2), np.take_along_axis(nearest, order, axis=1))
     for i in ids:
         own = x[landmarks == i].astype(int)
         each = np.sort(np.square(own[:, None] - own[None]).sum(2), axis=1)

@@ -25,6 +25,7 @@ from protomark.evaluation.results import (
     save_precision_plot,
     summary_markdown,
 )
+from protomark.features.descriptors import DESCRIPTORS
 from protomark.files import write_text
 from protomark.plot import SERIES, Curve, draw_curves, new_figure, save_figure
 from protomark_bench.report import ReportTable, load_json, number
@@ -44,6 +45,7 @@ COLUMNS = {
     "unaggregated": "all",
     "medoid": "medoid",
     "majority": "majority",
+    "clusters": "clusters",
     **{f"pca-{dim}": f"PCA {dim}" for dim in (16, 32, 64)},
     "pq-32": "PQ 32 B",
     "itq-32": "ITQ 32 B",
@@ -99,7 +101,7 @@ def joined(results: Sequence[SequenceResult]) -> list[SequenceResult]:
         ValueError: two files measured a sequence on other queries.
     """
     families = [choice.family for choice in method_choices()]
-    families += ["protomark", "protomark-sealed", "protomark-appearances", "protomark-untuned"]
+    families += ["clusters", "protomark", "protomark-sealed", "protomark-appearances", "protomark-untuned"]
     whole: dict[tuple[str, str, str], SequenceResult] = {}
     for result in results:
         first = whole.setdefault((result.descriptor, result.sequence, result.split), result)
@@ -162,9 +164,9 @@ def descriptors_text(results: Sequence[SequenceResult], plot: Path) -> str:
 
     The means are over the sequences that were measured with every descriptor. What each measures is
     the same images, at most 2,000 keypoints of the detector that goes with it, and the landmarks
-    that it could triangulate.
+    that it could triangulate. SIFT's tracks are made otherwise.
     """
-    groups = group_by_descriptor(results)
+    groups = group_by_descriptor([r for r in results if DESCRIPTORS[r.descriptor].input == "bits"])
     common = set.intersection(*({r.sequence for r in same} for same in groups.values()))
     names = ["unaggregated", "medoid", *(f"sealed-{size}" for size in SIZES)]
     rows, curves = [], []

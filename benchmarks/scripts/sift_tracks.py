@@ -1,6 +1,6 @@
 """Makes tracks of SIFT's keypoints and matches, so that labels do not favour a binary descriptor.
 
-python benchmarks/scripts/sift_tracks.py OUTPUT SEQUENCE... [--descriptors freak,orb] [--every N]
+python benchmarks/scripts/sift_tracks.py OUTPUT SEQUENCE... [--descriptors sift,orb] [--every N]
 
 COLMAP triangulates its matches under the given poses. All descriptors describe the same keypoints,
 at SIFT's size and angle. OUTPUT/NAME.db keeps keypoints and matches, which a later run takes up.
@@ -88,8 +88,10 @@ def main() -> None:
         features, (labels, positions) = triangulate(sequence.images, model, database)
         of_image = np.split(labels, np.cumsum([len(f) for f in features])[:-1])
         for name in args.descriptors.split(","):
-            extractor, paths = Extractor(name), [sequence.images / n for n in model.names]
-            parts = [describe(extractor, *one) for one in zip(paths, features, strict=True)]
+            parts = [(f, np.arange(len(f))) for f in features]
+            if name != "sift":
+                extractor, paths = Extractor(name), [sequence.images / n for n in model.names]
+                parts = [describe(extractor, *one) for one in zip(paths, features, strict=True)]
             label = np.concatenate([of_image[i][rows] for i, (_, rows) in enumerate(parts)])
             count = np.bincount(label[label >= 0], minlength=len(positions))
             keep, number = count >= 3, np.full(len(positions) + 1, -1)

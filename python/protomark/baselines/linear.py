@@ -165,9 +165,7 @@ def projected_mean(support: Support, projection: Projection, *, rounded: bool) -
         )
     step = float(np.abs(means).max()) / 127 or 1.0
     stored = np.rint(means / step).astype(np.int8)
-    return EuclideanMap(
-        stored, support.ids, dim + 1, support.kind, projection.matrix, offset, step
-    )
+    return EuclideanMap(stored, support.ids, dim + 1, support.kind, projection.matrix, offset, step)
 
 
 def real_mean(support: Support) -> EuclideanMap:

@@ -91,7 +91,7 @@ class Support:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Mean and covariances of the numbers of descriptors, from which linear projections are learned."""
+    """Mean and covariances of descriptors' numbers, from which linear projections are learned."""
 
     # Far fewer rows than this estimate a quarter of a million numbers well.
     MAX_ROWS: ClassVar = 100_000

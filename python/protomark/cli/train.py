@@ -59,8 +59,9 @@ def train(
 ) -> None:
     """Train an encoder on tracks (needs PyTorch).
 
-    Reads tracks of any binary descriptor of 64 to 1024 bits. Writes the model (.pme), its card
-    (.md) and a picture of the training (.png) that is redrawn at each validation.
+    Reads tracks of any binary descriptor of 64 to 1024 bits, or vector of 16 to 1024 numbers.
+    Writes the model (.pme), its card (.md) and a picture of the training (.png) that is redrawn at
+    each validation.
 
     protomark train tracks/*.freak.safetensors -o my-freak.pme
 

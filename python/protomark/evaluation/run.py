@@ -104,9 +104,7 @@ def learn_moments(paths: Sequence[Path], like: Tracks) -> Moments:
         landmarks.append(index[repeated] + offset)
         descriptors.append(tracks.descriptors[rows[repeated]])
         offset += len(tracks.landmark_ids)
-    return Support(
-        np.concatenate(landmarks), np.concatenate(descriptors), kind=like.input
-    ).moments
+    return Support(np.concatenate(landmarks), np.concatenate(descriptors), kind=like.input).moments
 
 
 def evaluate(

@@ -8,7 +8,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-
 # Bits in bytes, lowest first, or vectors of numbers of this type.
 InputKind = Literal["bits", "uint8", "float32"]
 # Numbers that a vector may have.
