@@ -271,7 +271,7 @@ def extractor_rows(
 
 
 def main() -> None:
-    """Prints the tables of docs/results/sift.md."""
+    """Prints the tables of docs/results/colmap.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", type=Path)
     parser.add_argument("sequences", type=Path, nargs="+")
