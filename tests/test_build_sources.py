@@ -16,7 +16,7 @@ from protomark.geometry.colmap import ColmapModel
 from protomark.maps.origin import joint_origin, map_detector, source_rows
 from protomark.maps.places import map_places, places_text
 from protomark.maps.sources import find_sources, read_places
-from protomark.tracks.database import read_features
+from protomark.tracks.database import read_features, tracks_from_database
 from protomark.tracks.file import Tracks
 from protomark.tracks.matching import View, match
 from protomark.tracks.triangulation import triangulate
@@ -31,7 +31,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toy3")
     toy = sample.load()
     database = unpacked(DATABASES[0], folder)
-    features = read_features(database, "orb", 32)
+    features = read_features(database, "orb")
     rows = [toy.keyframe_names.index(name) for name in features]
     poses = toy.cam_from_world[rows]
     posed = ColmapModel(
@@ -61,7 +61,9 @@ def test_databases_by_columns_and_not_by_type(packed: Path, model: Path, tmp_pat
     """COLMAP 4 calls the ORB descriptors of an older database SIFT when it opens that."""
     database = unpacked(packed, tmp_path)
     found = read_places([database, model])
-    assert (found.descriptor, len(found.keypoints)) == ("orb", 900)
+    assert found.descriptor == "orb"
+    assert len(tracks_from_database(database, model, "orb").keypoints) == 900
+    assert (found.landmark_of_keypoint >= 0).all()
     assert len(found.landmark_ids) > 50
     (facts,) = found.info["sources"]
     assert facts["program"] == "COLMAP"

@@ -116,7 +116,7 @@ def database(tmp_path: Path) -> Path:
 
 
 def read_database(path: Path) -> None:
-    for name, features in read_features(path, "orb", 32).items():
+    for name, features in read_features(path, "orb").items():
         assert isinstance(name, str)
         assert len(features.descriptors) == len(features.keypoints) == len(features.sizes)
         for values in (features.keypoints, features.sizes, features.angles):

@@ -22,8 +22,10 @@ from protomark.features.images import read_gray
 from protomark.features.sift import is_rooted, root_sift
 from protomark.geometry.colmap import pycolmap, read_model
 from protomark.geometry.pose import pose_error
+from protomark.geometry.similarity import fit_similarity
 from protomark.maps.origin import map_detector
 from protomark.tracks.database import read_features, stored_descriptor, tracks_from_database
+from protomark.tracks.file import Tracks
 from sift_scene import sift_encoder, write_sift_scene
 
 SHARED = Path(os.environ.get("PROTOMARK_SHARED", Path(__file__).parents[2] / "shared")) / "data"
@@ -71,7 +73,7 @@ def test_a_map_of_a_database(scene: Path, built: Path) -> None:
     found = tracks_from_database(scene / "database.db", scene / "points", "sift")
     reconstruction = pycolmap.Reconstruction(scene / "points")
     assert len(found.landmark_ids) == len(reconstruction.points3D)
-    features = read_features(scene / "database.db", "sift", 128)
+    features = read_features(scene / "database.db", "sift")
     point = reconstruction.points3D[sorted(reconstruction.points3D)[7]]
     rows = [
         features[reconstruction.images[e.image_id].name].descriptors[e.point2D_idx]
@@ -177,7 +179,7 @@ def test_both_extractors_see_the_same(scene: Path) -> None:
     image = read_gray(scene / "images" / "img3.png")
     opencv = Extractor("sift", 2000)(image)
     colmap = Extractor("sift", 600, detector={"name": "COLMAP"})(image)
-    stored = read_features(scene / "database.db", "sift", 128)["img3.png"]
+    stored = read_features(scene / "database.db", "sift")["img3.png"]
     for features in (opencv, colmap, stored):
         assert is_rooted(features.descriptors)[0]
         assert features.descriptors.any(1).all()
@@ -247,3 +249,25 @@ def test_real_images_tell_the_norm(sequence: str) -> None:
     rooted = Extractor("sift", 1000)(read_gray(path)).descriptors
     assert is_rooted(rooted) == (True, True)
     assert is_rooted(without_root(rooted)) == (False, True)
+
+
+def test_tracks_of_images(scene: Path, tmp_path: Path) -> None:
+    done = protomark("tracks", scene, "-d", "sift", "-o", tmp_path, "--max-keypoints", "400")
+    assert done.returncode == 0, done.stderr
+    found = Tracks.load(tmp_path / "plane.sift.safetensors")
+    assert (found.descriptor, found.input) == ("sift", "uint8")
+    assert len(found.landmark_ids) > 100
+    # The scene is the plane z = 0, two units away.
+    assert float(np.median(np.abs(found.landmark_positions[:, 2]))) < 0.005
+
+
+def test_mapping_by_sift(scene: Path, tmp_path: Path) -> None:
+    done = protomark(
+        *("map", scene / "images", "-o", tmp_path / "map", "-d", "sift", "--max-keypoints", "600"),
+        *("--encoder", scene / "sift.pme", "--camera", "PINHOLE:300,300,160,120"),
+    )
+    assert done.returncode == 0, done.stderr + done.stdout
+    mapped, true = read_model(tmp_path / "map" / "sparse"), read_model(scene / "sparse")
+    assert mapped.names == true.names
+    moved = fit_similarity(mapped.centers, true.centers)(mapped.centers)
+    assert np.abs(moved - true.centers).max() < 0.02

@@ -16,6 +16,7 @@ import pickle
 import shutil
 import sqlite3
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
+from protomark.features.extractor import Extractor, described_keypoints
+from protomark.features.images import read_gray
 from protomark.geometry.camera import Camera
 from protomark.geometry.colmap import ColmapModel, new_reconstruction, pycolmap, quiet, read_model
-from protomark.geometry.pose import pose_error
+from protomark.geometry.pose import pose_error, transform
 from protomark.maps.build import build_map
 from protomark.maps.info import matching_bytes
-from protomark.maps.origin import tracks_metadata
+from protomark.maps.origin import map_detector, tracks_metadata
 from protomark.maps.seal import SealRequest, observed, seal_map
 from protomark.maps.selection import Views
 from protomark.maps.sources import read_places
@@ -37,6 +40,7 @@ from protomark.tracks.extract import SequenceFolder, find_sequence
 from protomark_bench.report import ReportTable
 
 Pose = NDArray[np.float64] | None
+RIGHT = 4.0  # pixels between a keypoint and the projection of its nearest landmark
 
 
 @dataclass(frozen=True)
@@ -234,8 +238,40 @@ def rows_of(
     return rows
 
 
+def extractor_rows(
+    name: str, scene: Path, sequence: SequenceFolder, every: int
+) -> Iterator[list[str]]:
+    """How COLMAP's and OpenCV's SIFT do in the map, one row for each limit on keypoints."""
+    model = read_model(sequence.model)
+    localizer = pm.Localizer(scene)
+    most = described_keypoints(map_detector(localizer.scene))
+    queries = range(1, len(model.names), 2)[::every]
+    for program, limit in (("COLMAP", most), ("OpenCV", most), ("COLMAP", 2000), ("OpenCV", 2000)):
+        extractor = Extractor("sift", limit, detector={"name": program})
+        figures = []
+        for i in queries:
+            camera, pose = model.cameras[int(model.camera_ids[i])], model.cam_from_world[i]
+            image = read_gray(sequence.images / model.names[i])
+            begin = time.process_time()
+            features = extractor(image)
+            seconds = time.process_time() - begin
+            ids = localizer.scene.search(features.descriptors, k=1)[0][:, 0]
+            pixels = camera.project(transform(pose, localizer.scene.positions(ids)))
+            right = np.linalg.norm(pixels - features.keypoints, axis=1) <= RIGHT
+            found = localizer.localize_features(features.keypoints, features.descriptors, camera)
+            error = (np.inf, np.inf)
+            if found.cam_from_world is not None:
+                error = pose_error(found.cam_from_world, pose)
+            figures.append((len(features), right.sum(), *error, 1000 * seconds))
+        count, right, distance, degrees, milliseconds = np.median(figures, axis=0)
+        yield [
+            *(name, program, f"{count:,.0f}", f"{right:,.0f}", f"{right / count:.3f}"),
+            *(f"{distance:.4g}, {degrees:.3g}°", f"{milliseconds:,.0f}"),
+        ]
+
+
 def main() -> None:
-    """Prints the table of docs/results/localization.md."""
+    """Prints the tables of docs/results/colmap.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", type=Path)
     parser.add_argument("sequences", type=Path, nargs="+")
@@ -245,12 +281,17 @@ def main() -> None:
     args = parser.parse_args()
     encoder = pm.Encoder.load(args.encoder)
     options: dict[str, Any] = {"max_keypoints": args.max_keypoints} if args.max_keypoints else {}
-    rows = []
+    rows: list[list[str]] = []
+    by_extractor: list[list[str]] = []
     for sequence in map(find_sequence, args.sequences):
         folder = args.output / sequence.name
         rows += rows_of(sequence.name, folder, sequence, encoder, args.every, options)
+        scene = folder / "scene.sealed.pmk"
+        by_extractor += extractor_rows(sequence.name, scene, sequence, args.every)
     heads = ["sequence", "program", "descriptors", "file", "found", "median error"]
     print(ReportTable([*heads, "milliseconds", "total"], rows).markdown())
+    heads = ["sequence", "extractor", "keypoints", "right", "precision", "median error"]
+    print(ReportTable([*heads, "milliseconds"], by_extractor).markdown())
 
 
 if __name__ == "__main__":

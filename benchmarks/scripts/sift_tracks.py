@@ -44,7 +44,7 @@ def triangulate(images: Path, model: ColmapModel, database: Path) -> tuple[list[
     with quiet(), tempfile.TemporaryDirectory() as folder:
         pycolmap.extract_features(database, images, model.names, single, reader, extraction)
         match(database, matching_options=matching, verification_options=verification)
-        features = read_features(database, "sift", 128)
+        features = read_features(database, "sift")
         if list(features) != model.names:
             raise SystemExit(f"{database} has other images, or another order of them: remove it")
         points = [f.keypoints for f in features.values()]

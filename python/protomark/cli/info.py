@@ -79,7 +79,7 @@ def _map_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         "bytes",
         f"{facts['bytes']:,}: {sections['encoder']:,} for the encoder, {each:,.1f} per landmark",
     )
-    yield "encoder", f"{encoder['name']}, for {encoder['descriptor']} of {encoder['bits']} bits"
+    yield "encoder", f"{encoder['name']}, for {encoder['descriptor']} of {_length(encoder)}"
     lists = facts["nlist"]
     yield "index", f"{lists:,} inverted lists" if lists else "none: every search is exact"
     posed = facts["landmarks_with_position"]
@@ -126,9 +126,15 @@ def _metadata_rows(metadata: dict[str, str]) -> Iterator[tuple[str, str]]:
             yield f"metadata: {name}", text
 
 
+def _length(facts: dict[str, Any]) -> str:
+    """Length of the descriptors of an encoder or of tracks."""
+    bits: int = facts["bits"]
+    return f"{bits} bits" if facts["input"] == "bits" else f"{bits // 8} bytes"
+
+
 def _encoder_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "name", facts["name"]
-    yield "descriptor", f"{facts['descriptor']}, {facts['bits']} bits"
+    yield "descriptor", f"{facts['descriptor']}, {_length(facts)}"
     yield "numbers", f"{', '.join(map(str, facts['dims']))} per prototype"
     yield "trained on", facts["data"]
     yield "licence", facts["licence"]
@@ -138,7 +144,7 @@ def _encoder_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _track_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     from protomark.report import track_rows
 
-    yield "descriptor", f"{facts['descriptor']}, {facts['bits']} bits"
+    yield "descriptor", f"{facts['descriptor']}, {_length(facts)}"
     yield "keypoints", f"{facts['keypoints']:,} in {facts['keyframes']:,} keyframes"
     yield from track_rows(facts)
     yield "bytes", f"{facts['bytes']:,}"

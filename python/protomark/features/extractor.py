@@ -127,7 +127,7 @@ class Extractor(threading.local):
             self._detect = [_good_features(settings, 5 * max_keypoints).detect]
         else:
             self._detect = [orb(fastThreshold=t).detect for t in (20, 7)]
-        self._compute = {
+        describe: dict[str, Callable[[], Any]] = {
             "freak": lambda: _opencv("FREAK_create")(),
             "orb": lambda: orb(fastThreshold=20),
             "brisk": lambda: _opencv("BRISK_create")(),
@@ -136,7 +136,8 @@ class Extractor(threading.local):
             "beblid": lambda: _opencv("BEBLID_create")(1.0, _opencv("BEBLID_SIZE_512_BITS")),
             "sift": lambda: OpenCvSift(_SIFT_THRESHOLDS[0]),
             "teblid": lambda: _opencv("TEBLID_create")(1.0, _opencv("TEBLID_SIZE_256_BITS")),
-        }[self.kind.name]().compute
+        }
+        self._compute = describe[self.kind.name]().compute
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """The features of a (height, width) uint8 image in its pixels, the strongest first.

@@ -53,7 +53,7 @@ class OpenCvSift:
         """Keypoints of a (height, width) image, the largest first.
 
         Their size is their response, as large ones are found again more often than contrasting
-        ones (docs/results/sift.md).
+        ones (docs/results/colmap.md).
         """
         found = sorted(self._sift.detect(image, None), key=lambda k: -k.size)
         for keypoint in found:

@@ -71,6 +71,7 @@ def _encoder_facts(encoder: pm.Encoder) -> dict[str, Any]:
     return {
         "name": encoder.name,
         "descriptor": encoder.descriptor,
+        "input": encoder.input,
         "bits": encoder.bits,
         "dims": encoder.dims,
         "word_widths": [codebook.shape[2] for codebook in encoder.codebooks],

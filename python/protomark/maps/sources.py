@@ -155,7 +155,9 @@ def _read(source: Source, descriptor: str | None, threads: int, progress: Progre
     if source.kind == "database":
         assert source.model is not None
         chosen = plain or stored_descriptor(source.path)
-        return tracks_from_database(source.path, source.model, chosen, source.name)
+        return tracks_from_database(
+            source.path, source.model, chosen, source.name, observed_only=True
+        )
     if source.kind == "images":
         assert source.model is not None
         folder = SequenceFolder(source.name, source.path, source.model)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.features.descriptors import DESCRIPTORS, descriptor_kind
+from protomark.features.descriptors import DESCRIPTORS, DescriptorKind, descriptor_kind
 from protomark.features.extractor import Features
 from protomark.features.sift import is_rooted, root_sift
 from protomark.files import hash_files
@@ -18,7 +21,7 @@ from protomark.tracks.sqlite import has_tables, open_database
 _MAX_PIXEL = 1e9  # a product of two such numbers is still a float32
 # Pixels between a keypoint of model and database, as some programs count from another corner.
 _MAX_SHIFT = 1.0
-_SAMPLE = 100  # so many images tell whether SIFT is RootSIFT
+_SAMPLE = 300  # keypoints of as many images tell whether SIFT is RootSIFT
 
 
 def provenance(database: Path, model: Path, descriptor: str) -> dict[str, Any]:
@@ -69,7 +72,11 @@ def stored_descriptor(database: Path) -> str:
 
 
 def tracks_from_database(
-    database: Path, model_path: Path, descriptor: str, name: str = ""
+    database: Path,
+    model_path: Path,
+    descriptor: str,
+    name: str = "",
+    observed_only: bool = False,  # leave out keypoints of no landmark, most of a database's bytes
 ) -> Tracks:
     """Tracks with the descriptors of a database, and the landmarks of a model made from it.
 
@@ -93,33 +100,34 @@ def tracks_from_database(
             f"{model_path}: the model has no points, so the database's descriptors have no "
             "landmarks: run `protomark tracks` without --database to make them from the images"
         )
-    by_name = read_features(database, kind.name, kind.bytes)
     ids = {point_id: row for row, point_id in enumerate(sorted(reconstruction.points3D))}
     positions = np.array([reconstruction.points3D[i].xyz for i in sorted(ids)], np.float64)
-    features, labels = [], []
-    for image_id, image_name in zip(model.image_ids, model.names, strict=True):
-        image = reconstruction.images[int(image_id)]
-        if image_name not in by_name:
+    image_ids = dict(zip(model.names, model.image_ids.tolist(), strict=True))
+    sift = _SiftKeypoints() if kind.name == "sift" else None
+    found: dict[str, tuple[Features, NDArray[np.int64]]] = {}
+    for image_name, features in _each_image(database, kind):
+        if image_name not in image_ids:
+            continue
+        image = reconstruction.images[image_ids[image_name]]
+        if len(features) != image.num_points2D():
             raise ValueError(
-                f"{database}: image {image_name} of the model is not in the database: give the "
-                "database of this model"
-            )
-        found = by_name[image_name]
-        if len(found) != image.num_points2D():
-            raise ValueError(
-                f"{database}: image {image_name} has {len(found)} keypoints, but "
+                f"{database}: image {image_name} has {len(features)} keypoints, but "
                 f"{image.num_points2D()} in the model: give the database of this model"
             )
         try:
-            labels.append(_labels(image, reconstruction.points3D, ids, found.keypoints))
+            label = _labels(image, reconstruction.points3D, ids, features.keypoints)
         except ValueError as error:
             raise ValueError(f"{database}: image {image_name}: {error}") from None
-        features.append(found)
-    del by_name
-    facts: dict[str, Any] = {}
-    if kind.name == "sift":
-        facts = _to_root_sift(database, features, labels)
-    label = np.concatenate(labels)
+        keep = sift.usable(features) if sift else np.ones(len(features), bool)
+        keep &= (label >= 0) | (not observed_only)
+        found[image_name] = features.where(keep), label[keep]
+    if lacking := [one for one in model.names if one not in found]:
+        raise ValueError(
+            f"{database}: image {lacking[0]} of the model is not in the database: give the "
+            "database of this model"
+        )
+    every = [found[one][0] for one in model.names]
+    label = np.concatenate([found[one][1] for one in model.names])
     count = np.bincount(label[label >= 0], minlength=len(positions))
     keep = np.flatnonzero(count >= 2)
     number = np.full(len(positions) + 1, -1, np.int64)
@@ -130,13 +138,59 @@ def tracks_from_database(
     source = {"program": "COLMAP", "version": version, "digest": made_from["input"]}
     info = {
         "sequence": name,
-        "source": source | facts.pop("source", {}),
-        **facts,
+        "source": source,
         **made_from,
         "images_without_pose": model.unposed,
         "poses_refined": False,
     }
-    return Tracks.from_features(kind.name, model, features, number[label], positions[keep], info)
+    if sift:
+        try:
+            sift.take_root(every, info)
+        except ValueError as error:
+            raise ValueError(
+                f"{database} has {error}: name the folder of the images in its place, which are "
+                "described anew"
+            ) from None
+    return Tracks.from_features(kind.name, model, every, number[label], positions[keep], info)
+
+
+class _SiftKeypoints:
+    """What the SIFT keypoints of a database tell of how they were made."""
+
+    def __init__(self) -> None:
+        self._empty, self._most, self._upright = 0, 0, True
+        self._sample: list[NDArray[np.uint8]] = []
+
+    def usable(self, features: Features) -> NDArray[np.bool_]:
+        """Which keypoints (n,) of an image have a descriptor that is not zero."""
+        full = np.asarray(features.descriptors.any(1))
+        self._empty += int((~full).sum())
+        self._most = max(self._most, len(features))
+        self._upright &= not (features.angles % 360).any()
+        if len(self._sample) < _SAMPLE:
+            self._sample.append(features.descriptors[full][:: -(-len(features) // _SAMPLE) or 1])
+        return full
+
+    def take_root(self, images: list[Features], info: dict[str, Any]) -> None:
+        """Make the descriptors of images RootSIFT, and tell `info` of them.
+
+        Raises:
+            ValueError: they are not SIFT.
+        """
+        sample = np.concatenate([np.zeros((0, 128), np.uint8), *self._sample])
+        if not len(sample):
+            raise ValueError("no descriptors of the model's images")
+        rooted, certain = is_rooted(sample)
+        if not rooted:
+            for features in images:
+                features.descriptors = root_sift(features.descriptors)
+        if not (rooted and certain):
+            info["source"]["note"] = "taken for RootSIFT" if rooted else "SIFT, whose root is taken"
+        if self._empty:
+            info["source"]["dropped"] = {"keypoints whose descriptor is zero": self._empty}
+        info["detector"] = {"name": "COLMAP", "max_keypoints": self._most}
+        if self._upright:
+            info["detector"]["upright"] = True
 
 
 def _labels(
@@ -169,74 +223,49 @@ def _labels(
     return label
 
 
-def _to_root_sift(
-    database: Path, features: list[Features], labels: list[NDArray[np.int64]]
-) -> dict[str, Any]:
-    """Make the descriptors of all images RootSIFT, in place; returns what `info` says of it."""
-    empty = 0
-    for i, found in enumerate(features):
-        full = np.asarray(found.descriptors.any(1))
-        if not full.all():
-            empty += int((~full).sum())
-            features[i], labels[i] = found.where(full), labels[i][full]
-    sample = [f.descriptors for f in features[:: -(-len(features) // _SAMPLE)] if len(f)]
-    if not sample:
-        raise ValueError(f"{database}: no keypoint of the model's images has a descriptor")
-    try:
-        rooted, certain = is_rooted(np.concatenate(sample))
-    except ValueError as error:
-        raise ValueError(
-            f"{database} has {error}: name the folder of the images in its place, which are "
-            "described anew"
-        ) from None
-    if not rooted:
-        for found in features:
-            found.descriptors = root_sift(found.descriptors)
-    upright = all(not (found.angles % 360).any() for found in features)
-    source: dict[str, Any] = {}
-    if not (rooted and certain):
-        source["note"] = "taken for RootSIFT" if rooted else "SIFT, whose root is taken"
-    if empty:
-        source["dropped"] = {"keypoints whose descriptor is zero": empty}
-    detector: dict[str, Any] = {"name": "COLMAP", "max_keypoints": max(map(len, features))}
-    return {"source": source, "detector": detector | ({"upright": True} if upright else {})}
-
-
-def read_features(database: Path, descriptor: str, width: int) -> dict[str, Features]:
+def read_features(database: Path, descriptor: str) -> dict[str, Features]:
     """Keypoints and descriptors by image name."""
-    images: dict[str, Features] = {}
+    return dict(_each_image(database, descriptor_kind(descriptor)))
+
+
+def _each_image(database: Path, kind: DescriptorKind) -> Iterator[tuple[str, Features]]:
+    """Names and features of the images, one at a time, as descriptors are most of a database."""
+    broken = f"{database}: not a COLMAP database, or a broken one"
     with open_database(database, "a COLMAP database") as tables:
-        names = dict(tables.rows_by_id("images", "name", "image_id"))
+        names = {i: name for i, (name,) in tables.rows_by_id("images", "name", "image_id")}
+        counts = Counter(names.values())
+        if len(counts) < len(names):
+            raise ValueError(f"{database}: two images have the name {counts.most_common(1)[0][0]}")
         keypoints = dict(tables.rows_by_id("keypoints", "rows, cols, data", "image_id"))
-        descriptors = dict(tables.rows_by_id("descriptors", "rows, cols, data", "image_id"))
-    empty = (None, None, None)
-    for image_id, (name,) in names.items():
-        kr, kc, kd = keypoints.pop(image_id, empty)
-        dr, dc, dd = descriptors.pop(image_id, empty)
-        kr, kc, kd = kr or 0, kc or 2, kd or b""
-        dr, dc, dd = dr or 0, dc or width, dd or b""
-        numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
-        if not (numbers_fit and isinstance(name, str) and type(kd) is type(dd) is bytes):
-            raise ValueError(f"{database}: not a COLMAP database, or a broken one")
-        if name in images:
-            raise ValueError(f"{database}: two images have the name {name}")
-        if dr and dc != width:
-            guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
-            raise ValueError(
-                f"{database}: image {name} has descriptors of {dc} bytes, but {descriptor} has "
-                f"{width}: name the right descriptor with -d"
-                + (f" ({' or '.join(guess)})" if guess else "")
-            )
-        if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
-            raise ValueError(
-                f"{database}: the {kr} keypoints and {dr} descriptors of image {name} do not fit "
-                "together: extract its features anew"
-            )
-        points = np.frombuffer(kd, "<f4").reshape(kr, kc)
-        if not (np.abs(points) < _MAX_PIXEL).all():
-            raise ValueError(f"{database}: image {name} has keypoints far outside of any image")
-        images[name] = _features(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
-    return images
+        described = tables.rows_by_id("descriptors", "rows, cols, data", "image_id")
+        # Images without descriptors come last.
+        for image_id, row in chain(described, ((i, (None,) * 3) for i in list(names))):
+            if image_id not in names:
+                continue
+            name = names.pop(image_id)
+            kr, kc, kd = keypoints.pop(image_id, (None,) * 3)
+            dr, dc, dd = row
+            kr, kc, kd = kr or 0, kc or 2, kd or b""
+            dr, dc, dd = dr or 0, dc or kind.bytes, dd or b""
+            numbers_fit = all(isinstance(number, int) for number in (kr, kc, dr, dc))
+            if not (numbers_fit and isinstance(name, str) and type(kd) is type(dd) is bytes):
+                raise ValueError(broken)
+            if dr and dc != kind.bytes:
+                guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
+                raise ValueError(
+                    f"{database}: image {name} has descriptors of {dc} bytes, but {kind.name} has "
+                    f"{kind.bytes}: name the right descriptor with -d"
+                    + (f" ({' or '.join(guess)})" if guess else "")
+                )
+            if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
+                raise ValueError(
+                    f"{database}: the {kr} keypoints and {dr} descriptors of image {name} do not "
+                    "fit together: extract its features anew"
+                )
+            points = np.frombuffer(kd, "<f4").reshape(kr, kc)
+            if not (np.abs(points) < _MAX_PIXEL).all():
+                raise ValueError(f"{database}: image {name} has keypoints far outside of any image")
+            yield name, _features(points, np.frombuffer(dd, np.uint8).reshape(dr, dc))
 
 
 def _features(k: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Features:

@@ -283,9 +283,9 @@ class _Matching:
 
     def _make_views(self) -> list[View]:
         poses = map(turned, self.model.cam_from_world, self.turns)
-        parts = (self.features, self.rays, poses, self.focal)
+        parts = zip(self.features, self.rays, poses, self.focal, strict=True)
         kind = self.options.kind
-        return [View(f.descriptors, *rest, kind=kind) for f, *rest in zip(*parts, strict=True)]
+        return [View(f.descriptors, rays, pose, focal, kind) for f, rays, pose, focal in parts]
 
     def _match(self, chosen: list[tuple[int, int]], stage: str) -> None:
         def one(pair: tuple[int, int]) -> VerifiedMatches:

@@ -34,6 +34,7 @@ def summarise(tracks: Tracks) -> dict[str, Any]:
     return {
         "sequence": tracks.info.get("sequence", ""),
         "descriptor": tracks.descriptor,
+        "input": tracks.input,
         "bits": tracks.bits,
         "keyframes": len(tracks.keyframe_names),
         "keypoints": len(tracks.keypoints),

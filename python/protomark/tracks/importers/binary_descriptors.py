@@ -36,7 +36,8 @@ def refusal(path: Path, program: str, found: Iterable[str]) -> ValueError:
         found: the descriptors that it has.
     """
     listed = " and ".join(sorted(found)) or "no"
-    names = ", ".join(name.upper() for name in DESCRIPTORS)
+    binary = [name.upper() for name, kind in DESCRIPTORS.items() if kind.input == "bits"]
+    names = ", ".join(binary)
     return ValueError(
         f"{path}: this data set of {program} has {listed} descriptors, but Protomark takes binary "
         f"ones ({names}): describe its images anew with `protomark build images/ sparse/`, where "

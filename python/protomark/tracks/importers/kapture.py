@@ -303,7 +303,8 @@ def write_kapture(tracks: Tracks, folder: Path) -> None:
             model / "observations.txt": list(_observation_lines(tracks, kind)),
             model / "keypoints" / kind / "keypoints.txt": [f"{kind}, float32, {3 + oriented}"],
             model / "descriptors" / kind / "descriptors.txt": [
-                f"{kind}, uint8, {tracks.bits // 8}, {kind}, Hamming"
+                f"{kind}, {tracks.descriptors.dtype}, {tracks.descriptors.shape[1]}, {kind}, "
+                + ("Hamming" if tracks.input == "bits" else "L2")
             ],
         }
         for path, lines in files.items():
