@@ -43,7 +43,8 @@ test-python: .venv-test/installed .venv-test/bench
 
 # Distributed builds on a Ray cluster of this machine.
 test-ray: .venv-ray/installed
-	OMP_NUM_THREADS=1 .venv-ray/bin/python -m pytest tests/test_distributed_ray.py
+	OMP_NUM_THREADS=1 .venv-ray/bin/python -m pytest tests/test_distributed_ray.py \
+	  'tests/test_docs.py::test_blocks_run[city.md]'
 
 test-cpp: .venv-test/installed
 	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \
@@ -183,9 +184,12 @@ clean:
 	.venv-test/bin/pip install --quiet --no-deps ./benchmarks
 	touch $@
 
-.venv-ray/installed: $(SOURCES)
+# Ray beside what the other tests have.
+.venv-ray/installed: .venv-test/installed
 	test -x .venv-ray/bin/python || $(PYTHON) -m venv .venv-ray
-	.venv-ray/bin/pip install --quiet -c constraints.txt '.[ray]' hypothesis pytest
+	ls -d $(abspath .venv-test)/lib/python3*/site-packages > \
+	  $$(ls -d .venv-ray/lib/python3*/site-packages)/tests.pth
+	.venv-ray/bin/pip install --quiet -c constraints.txt fsspec ray
 	touch $@
 
 .venv-sanitize/tools:

@@ -57,21 +57,33 @@ class Folder:
         return shown(self.url)
 
     @contextmanager
-    def new_file(self, name: str) -> Iterator[Path]:
-        """Yield a path on this machine to write a file to, which appears when the block ends.
+    def workspace(self, name: str) -> Iterator[Path]:
+        """Yield a folder of this machine for files to `publish`.
 
-        In a folder of this machine that is its place already: what writes there must do so whole
-        or not at all.
+        On a shared disk it is `name` in this folder.
         """
         if self.local is not None:
-            (self.local / name).parent.mkdir(parents=True, exist_ok=True)
+            (self.local / name).mkdir(parents=True, exist_ok=True)
             yield self.local / name
             return
         with tempfile.TemporaryDirectory(prefix="protomark-") as folder:
-            path = Path(folder) / Path(name).name
-            yield path
+            yield Path(folder)
+
+    def publish(self, path: Path, name: str) -> None:
+        """Move a file from the workspace to its place, where it appears as a whole."""
+        if self.local is not None:
+            path.replace(self.local / name)
+        else:
             fs, target = self._target(name)
             fs.put_file(str(path), target)
+
+    def fetch(self, name: str, folder: Path) -> Path:
+        """A file as one of this machine, in `folder` if it has to be copied."""
+        if self.local is not None:
+            return self.local / name
+        fs, root = file_system(self.url)
+        fs.get_file(f"{root}/{name}", str(folder / Path(name).name))
+        return folder / Path(name).name
 
     def write(self, name: str, content: bytes) -> None:
         """Write a small file, whole or not at all."""

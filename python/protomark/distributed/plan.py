@@ -65,7 +65,6 @@ class ShardPlan:
     segments: tuple[Segment, ...]
     metadata: dict[str, str]
     recipe: str  # SHA-256 of all that its bytes depend on
-    name: str
 
 
 def data_bytes(memory: int) -> int:

@@ -7,8 +7,9 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from protomark.distributed.tracks_file import BLOCK, TracksFile
 from protomark.extras import optional
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.maps import sources
+from protomark.maps.open import open_learning_map
 from protomark.maps.seal import SealRequest, seal_map
-from protomark.maps.shards import Shard, ShardFile, describe_file, describe_shard
+from protomark.maps.shards import Shard, describe_file, describe_shard
 
 # Parts that a shard's task asks for at a time.
 _FETCHED = 8
@@ -59,8 +61,9 @@ def open_source(
             kept = f"{WORK}/{digest}.safetensors"
             if output.size(kept) is None:
                 (tracks,) = sources.read_sources([source], descriptor)
-                with output.new_file(kept) as path:
-                    tracks.save(path)
+                with output.workspace(WORK) as folder:
+                    tracks.save(folder / f"{digest}.new.safetensors")
+                    output.publish(folder / f"{digest}.new.safetensors", kept)
             url = output.url_of(kept)
     file = TracksFile(url)
     count = file.rows("landmark_ids")
@@ -211,7 +214,6 @@ class Input:
 
 
 def write_shard(
-    name: str,
     recipe: str,
     inputs: Sequence[Input],
     metadata: dict[str, str],
@@ -219,9 +221,13 @@ def write_shard(
     dim: int,
     appearance_bits: int,
     seal: bool,
+    cell_size: float | None,
     output: Folder,
-) -> tuple[Shard, Work]:
-    """Sum the codes of a shard's landmarks, source by source and piece by piece, and write it."""
+) -> tuple[list[Shard], Work]:
+    """Sum the codes of a shard's landmarks, source by source and piece by piece, and write it.
+
+    With `cell_size` the shard is divided by space, and parts are written for `join_cell`.
+    """
     began = time.perf_counter()
     scene = pm.PrototypeMap(_encoder(encoder), dim, appearance_bits)
     total = 0
@@ -242,20 +248,53 @@ def write_shard(
         if not np.isfinite(positions).all():
             raise ValueError(f"{one.source.shown}: landmark_positions contains NaN or infinity")
         scene.set_positions(known[kept] + one.source.shift, positions)
-    shard = None
-    if len(scene):
+    shards: list[Shard] = []
+    with output.workspace(WORK) as folder:
+        if not len(scene):
+            pass
+        elif cell_size is not None:
+            for cell, part in scene.split_by_space(cell_size).items():
+                name = "nowhere" if cell is None else "_".join(map(str, cell))
+                path = folder / f"{recipe}.{name}.pmk"
+                part.save(path)
+                file = replace(describe_file(path), name=f"{WORK}/{path.name}")
+                output.publish(path, file.name)
+                shards.append(describe_shard(name, part, file))
+        else:
+            scene.metadata = metadata
+            path = folder / f"{recipe}.pmk"
+            shards.append(_saved(str(scene.ids[0]), scene, path, seal, output))
+    output.write(f"{WORK}/{recipe}.json", json.dumps([asdict(one) for one in shards]).encode())
+    return shards, Work(total, time.perf_counter() - began, 0, _attempts())
+
+
+def join_cell(
+    cell: str, names: Sequence[str], metadata: dict[str, str], seal: bool, output: Folder
+) -> tuple[Shard, Work]:
+    """Join the parts of a cube of space, which have no landmark in common."""
+    began = time.perf_counter()
+    with output.workspace(WORK) as folder:
+        scene = open_learning_map(output.fetch(names[0], folder))
+        for name in names[1:]:
+            scene.merge_map(open_learning_map(output.fetch(name, folder)))
         scene.metadata = metadata
-        files: dict[str, ShardFile] = {}
-        with output.new_file(f"{name}.pmk") as path:
-            scene.save(path)
-            files["learning"] = describe_file(path)
-        if seal:
-            with output.new_file(f"{name}.sealed.pmk") as path:
-                seal_map(scene, path, SealRequest())
-                files["sealed"] = describe_file(path)
-        shard = describe_shard(name, scene, **files)
-    output.write(f"{WORK}/{recipe}.json", json.dumps(shard and asdict(shard)).encode())
-    return shard, Work(total, time.perf_counter() - began, 0, _attempts())
+        shard = _saved(cell, scene, folder / f"{cell}.new.pmk", seal, output)
+    return shard, Work(0, time.perf_counter() - began, 0, _attempts())
+
+
+def _saved(label: str, scene: pm.PrototypeMap, path: Path, seal: bool, output: Folder) -> Shard:
+    """Write the files of a shard, named by its place and what is in it."""
+    scene.save(path)
+    learning, sealed = describe_file(path), None
+    name = f"shard-{label}-{learning.identity[:8]}"
+    if seal:
+        sealed_to = path.with_suffix(".sealed.pmk")
+        seal_map(scene, sealed_to, SealRequest())
+        sealed = replace(describe_file(sealed_to), name=f"{name}.sealed.pmk")
+        output.publish(sealed_to, sealed.name)
+    learning = replace(learning, name=f"{name}.pmk")
+    output.publish(path, learning.name)
+    return describe_shard(name, scene, learning, sealed)
 
 
 def _fetched(parts: Sequence[Any]) -> Iterator[Part]:
