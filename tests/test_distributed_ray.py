@@ -287,6 +287,29 @@ def one_process_bytes(paths: list[Path], folder: Path) -> bytes:
     return (folder / "one.pmk").read_bytes()
 
 
+def test_cubes_of_space(
+    cluster: Any, sessions: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Are those of the map of one process, split."""
+    folder = tmp_path / "city"
+    built(sessions[2:], folder, cell_size=50.0)
+    one = one_process(sessions[2:], tmp_path / "one.pmk")
+    parts = one.split_by_space(50.0)
+    shards = pm.ShardedMap(folder).shards
+    assert len(shards) == len(parts) > 20
+    found = [shard.name for shard in shards]
+    for cell, part in parts.items():
+        label = "_".join(map(str, cell or ()))
+        (name,) = [name for name in found if name.startswith(f"shard-{label}-")]
+        part.save(tmp_path / "part.pmk")
+        assert (folder / f"{name}.pmk").read_bytes() == (tmp_path / "part.pmk").read_bytes()
+    with pytest.raises(ValueError, match="several places with coordinates of their own"):
+        built(sessions, folder, cell_size=50.0)
+    monkeypatch.setattr(plan, "PROTOTYPE_BYTES", 100_000)
+    with pytest.raises(ValueError, match=r"cube \S+ has [\d,]+ prototypes, more than the"):
+        built(sessions[2:], folder, cell_size=5000.0)
+
+
 def test_sealed_shards_and_object_storage(
     cluster: Any, sessions: list[Path], tmp_path: Path
 ) -> None:

@@ -180,6 +180,8 @@ def test_blocks_run(
     quick = QUICK
     if page.name.startswith("from-"):
         pytest.importorskip("pycolmap")
+    if page.name == "city.md":
+        pytest.importorskip("ray")
     if page.name == MAPPED:
         pytest.importorskip("pycolmap")
         from mapping_scene import walk, write_images

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 
 import protomark as pm
 from conftest import balanced_encoder, random_descriptors
+from protomark import sample
+from protomark.maps.build import build_map
 from protomark.maps.neighbours import merged
 from protomark.maps.shards import Manifest
 from protomark.maps.split import split_file
@@ -231,3 +233,30 @@ def test_any_cut_gives_the_same_answers(one: Path, data: st.DataObject) -> None:
     parts = [whole.part(ids) for i in range(5) if len(ids := whole.ids[np.array(label) == i])]
     k = data.draw(st.integers(1, 5))
     same(merged([part.search(QUERIES, k) for part in parts], k), whole.search(QUERIES, k))
+
+
+def test_poses_and_matches_are_those_of_one_map(tmp_path: Path) -> None:
+    """On the sample, with a frame that the map has not seen, with and without a prior."""
+    pytest.importorskip("poselib")
+    pytest.importorskip("pycolmap")
+    toy = sample.load()
+    rows = toy.keypoints_of(40)
+    others = toy.where(toy.keyframe_of_keypoint != 40)
+    scene = build_map(others, pm.Encoder.load("freak"))
+    scene.save(tmp_path / "one.pmk")
+    split_file(tmp_path / "one.pmk", tmp_path / "city", cell_size=4.0)
+    city = pm.ShardedMap(tmp_path / "city")
+    assert len(city.shards) > 5
+    descriptors, camera = toy.descriptors[rows], next(iter(toy.cameras.values()))
+    found, right = pm.match(city, descriptors), pm.match(scene, descriptors)
+    for name in ("keypoints", "landmarks", "probabilities"):
+        assert np.array_equal(getattr(found, name), getattr(right, name))
+    for prior in (None, pm.PosePrior(toy.cam_from_world[40], 0.5, 5.0)):
+        poses = [
+            pm.Localizer(one).localize_features(toy.keypoints[rows], descriptors, camera, prior)
+            for one in (scene, city, tmp_path / "city")
+        ]
+        for pose in poses:
+            assert pose.cam_from_world is not None
+            assert np.array_equal(pose.cam_from_world, poses[0].cam_from_world)
+            assert pose.confidence == poses[0].confidence

@@ -156,6 +156,20 @@ def meanwhile(action: Callable[[], None], every: float) -> Iterator[None]:
         thread.join()
 
 
+def cpu_seconds() -> float:
+    """CPU time of this process and of all that it started, ended ones included."""
+    rows = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            fields = (path / "stat").read_text().rpartition(")")[2].split()
+            rows[int(path.name)] = int(fields[1]), sum(map(int, fields[11:15]))
+    mine, grown = {os.getpid()}, True
+    while grown:
+        more = {process for process, (parent, _) in rows.items() if parent in mine} - mine
+        mine, grown = mine | more, bool(more)
+    return sum(rows[process][1] for process in mine) / os.sysconf("SC_CLK_TCK")
+
+
 def memory(folder: Path, megabytes: float, times: float, seal: bool) -> dict[str, Any]:
     """Peak memory of workers whose input is `times` what each may take."""
     source = folder / "large.freak.safetensors"
@@ -200,19 +214,22 @@ def overhead(folder: Path, count: int) -> dict[str, Any]:
     for i in range(4):
         sources.append(folder / f"session{i}.freak.safetensors")
         write_session(sources[-1], count // 4, i)
-    began = time.perf_counter()
+    began, before = time.perf_counter(), cpu_seconds()
     seen = read_places(sources)
     scene = build_map(seen, pm.Encoder.load("freak"), min_observations=1)
     scene.metadata = tracks_metadata(seen) | METADATA
     scene.save(folder / "one.pmk")
     found: dict[str, Any] = {"observations": count, "one process": time.perf_counter() - began}
+    found["CPU seconds of one process"] = cpu_seconds() - before
     del seen, scene
     contents = []
     for cpus in ([1], [2], [1, 1], [1, 1, 1, 1]):
         with cluster_of(cpus, 300_000_000):
             build(sources[:1], folder / "warm", memory=400, metadata=METADATA, seal=False)
+            before = cpu_seconds()
             facts = build(sources, folder / "city", memory=400, metadata=METADATA, seal=False)
-        found[f"workers by node: {cpus}"] = facts["run"]
+            used = cpu_seconds() - before
+        found[f"workers by node: {cpus}"] = {**facts["run"], "CPU seconds": used}
         contents.append({p.name: p.read_bytes() for p in (folder / "city").iterdir()})
     found["same bytes"] = all(one == contents[0] for one in contents)
     return found

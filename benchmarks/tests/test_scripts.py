@@ -67,3 +67,15 @@ def test_table_of_tracks() -> None:
     (row,) = tracks_table.table([Path(sample.path())]).rows
     assert row[:2] == ["freak", "toy"]
     assert len(row) == len(tracks_table.HEADS)
+
+
+def test_service_speed_on_the_sample(tmp_path: Path) -> None:
+    pytest.importorskip("fastapi_offline")
+    import service_speed
+
+    path = tmp_path / "sample.pmk"
+    requests = service_speed.sample_requests(path)[::20]
+    with service_speed.served(path, ["--threads", "1"]) as address:
+        (*closed, rate) = service_speed.measure(address, requests, 0.5, [4.0])
+    assert [row[0] for row in closed] == ["1 client", "2 clients", "4 clients"]
+    assert rate[-1] == "2 of 2"

@@ -67,6 +67,13 @@ def build(
         float | None,
         typer.Option(help="MB of memory of a worker of the cluster, by default 1000."),
     ] = None,
+    cell_size: Annotated[
+        float | None,
+        typer.Option(
+            help="Shards by space, cubes with edges of this length in the unit of the positions, "
+            "instead of by id; only of one place."
+        ),
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option("--resume", help="Take over what the build had finished before it was cut."),
@@ -121,6 +128,7 @@ def build(
                 min_observations=min_observations,
                 metadata=texts,
                 seal=not no_seal,
+                cell_size=cell_size,
                 resume=resume,
                 add=add,
                 progress=progress,
@@ -128,9 +136,14 @@ def build(
         write_json(json_file, facts)
         show(facts)
         return
-    if memory is not None or resume or add:
-        told = "--memory" if memory is not None else "--resume" if resume else "--add"
-        raise ValueError(f"{told} is for shards: add --ray local")
+    of_shards = {
+        "--memory": memory is not None,
+        "--cell-size": cell_size is not None,
+        "--resume": resume,
+        "--add": add,
+    }
+    for option in (option for option, given in of_shards.items() if given):
+        raise ValueError(f"{option} is for shards: add --ray local")
     paths, target = [Path(source) for source in sources], Path(output)
     sealed = None if no_seal else sealed_path(target)
     check_outputs(json_file, inputs=[*paths, encoder], maps=[target, sealed])

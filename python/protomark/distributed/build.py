@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -32,6 +33,7 @@ def build(
     min_observations: int | None = None,
     metadata: Mapping[str, str] | None = None,
     seal: bool = True,
+    cell_size: float | None = None,
     resume: bool = False,
     add: bool = False,
     progress: Progress = silent,
@@ -55,6 +57,8 @@ def build(
         min_observations: see `protomark.maps.sources.read_places`.
         metadata: further metadata of the map.
         seal: whether to seal each shard.
+        cell_size: edge of the cubes of space of which each becomes a shard, in the unit of the
+            positions; only of sources that are one place. None: shards are ranges of ids.
         resume: take over the shards that a build with the same arguments finished before it was
             cut.
         add: the sources are further places of the map in the folder, whose shards stay.
@@ -77,6 +81,8 @@ def build(
         raise ValueError(
             f"--memory {memory:g}: a worker needs {plan.MIN_MEMORY / 1e6:g} MB or more"
         )
+    if cell_size is not None and not 0 < cell_size < math.inf:
+        raise ValueError(f"--cell-size {cell_size:g} is not above 0")
     folder = Folder(str(output))
     request = Request(
         folder,
@@ -84,6 +90,7 @@ def build(
         min_observations,
         dict(metadata or {}),
         seal,
+        cell_size,
         int(memory * 1e6),
         resume,
         add,

@@ -77,6 +77,14 @@ class Folder:
             fs, target = self._target(name)
             fs.put_file(str(path), target)
 
+    def fetch(self, name: str, folder: Path) -> Path:
+        """A file as one of this machine, in `folder` if it has to be copied."""
+        if self.local is not None:
+            return self.local / name
+        fs, root = file_system(self.url)
+        fs.get_file(f"{root}/{name}", str(folder / Path(name).name))
+        return folder / Path(name).name
+
     def write(self, name: str, content: bytes) -> None:
         """Write a small file, whole or not at all."""
         if self.local is not None:

@@ -22,12 +22,13 @@ from protomark.distributed.cluster import Tasks
 from protomark.distributed.folder import Folder
 from protomark.distributed.plan import Segment, ShardPlan, Source
 from protomark.features.upright import SUFFIX
-from protomark.files import MANIFEST
+from protomark.files import MANIFEST, natural_key
 from protomark.geometry.camera import Camera
 from protomark.maps import sources as places
 from protomark.maps.build import check_encoder, chosen_appearance_bits, chosen_dim
 from protomark.maps.info import describe_shards
 from protomark.maps.origin import OF_SOURCES, sources_metadata
+from protomark.maps.places import KEY as PLACES
 from protomark.maps.shards import Manifest, Shard, encoder_facts, shard_from
 from protomark.progress import Progress
 from protomark.tracks.file import shipped_encoder
@@ -43,6 +44,7 @@ class Request:
     min_observations: int | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
     seal: bool = True
+    cell_size: float | None = None
     memory: int = plan.MIN_MEMORY
     resume: bool = False
     add: bool = False
@@ -124,6 +126,11 @@ class Job:
             )
         self._number(sources)
         costs = self._count(sources)
+        if request.cell_size is not None and (self.base or PLACES in _metadata(sources)):
+            raise ValueError(
+                "--cell-size cuts one world, but these are several places with coordinates of "
+                "their own: leave it out, or `protomark merge` the maps of the places first"
+            )
         plans = self._plan(sources, plan.cut_segments(costs, request.memory), texts)
         shards, reused = self._write(sources, plans)
         if not shards:
@@ -278,6 +285,7 @@ class Job:
                 [
                     common,
                     self.request.seal,
+                    self.request.cell_size,
                     metadata,
                     [
                         (one.digest, segment.start, segment.stop, one.shift, one.limit)
@@ -288,18 +296,18 @@ class Job:
             plans.append(ShardPlan(tuple(segments), metadata, recipe))
         return plans
 
-    def _finished(self, plans: Sequence[ShardPlan]) -> dict[str, Shard | None]:
+    def _finished(self, plans: Sequence[ShardPlan]) -> dict[str, list[Shard]]:
         """The shards that an earlier build wrote, by their recipes."""
-        found: dict[str, Shard | None] = {}
+        found: dict[str, list[Shard]] = {}
         output = self.request.output
         for one in plans if self.request.resume else ():
             content = output.read(f"{tasks.WORK}/{one.recipe}.json")
             if content is None:
                 continue
-            facts = json.loads(content)
-            shard = shard_from(facts) if facts else None
-            if shard is None or all(output.size(f.name) == f.bytes for f in shard.files):
-                found[one.recipe] = shard
+            shards = [shard_from(facts) for facts in json.loads(content)]
+            files = [file for shard in shards for file in shard.files]
+            if all(output.size(file.name) == file.bytes for file in files):
+                found[one.recipe] = shards
         return found
 
     def _write(
@@ -330,12 +338,13 @@ class Job:
                     partial(finished, shard.recipe),
                     tasks.write_shard,
                     *(shard.recipe, [other.input(s) for other, s in inputs]),
-                    *(shard.metadata, *common, self.bits, request.seal, request.output),
+                    *(shard.metadata, *common, self.bits),
+                    *(request.seal, request.cell_size, request.output),
                 )
                 for other, _ in inputs:
                     other.hand_over()
 
-        def finished(recipe: str, result: tuple[Shard | None, tasks.Work]) -> None:
+        def finished(recipe: str, result: tuple[list[Shard], tasks.Work]) -> None:
             written[recipe] = result[0]
             self._note(result[1])
 
@@ -355,8 +364,37 @@ class Job:
             self.progress("build", done, total)
             self.running.wait()
             done += 1
-        shards = [written[one.recipe] for one in plans]
-        return [shard for shard in shards if shard is not None], reused
+        shards = [shard for one in plans for shard in written[one.recipe]]
+        if request.cell_size is not None:
+            shards = self._join_cells(shards, plans[0].metadata)
+        return shards, reused
+
+    def _join_cells(self, parts: Sequence[Shard], metadata: dict[str, str]) -> list[Shard]:
+        """Write a shard for each cube of space, of the parts that lie in it."""
+        cells: dict[str, list[Shard]] = {}
+        for part in parts:
+            cells.setdefault(part.name, []).append(part)
+        request, joined = self.request, dict[str, Shard]()
+
+        def finished(cell: str, result: tuple[Shard, tasks.Work]) -> None:
+            joined[cell] = result[0]
+            self._note(result[1])
+
+        room = plan.data_bytes(request.memory) // plan.PROTOTYPE_BYTES
+        for cell, own in cells.items():
+            if (count := sum(part.prototypes for part in own)) > room:
+                raise ValueError(
+                    f"cube {cell} has {count:,} prototypes, more than the {room:,} that --memory "
+                    f"{request.memory / 1e6:g} holds: give a smaller --cell-size or more memory"
+                )
+            names = [file.name for part in own for file in part.files]
+            self.running.start(
+                partial(finished, cell),
+                tasks.join_cell,
+                *(cell, names, metadata, request.seal, request.output),
+            )
+        self._drain("join cubes", len(cells))
+        return [joined[cell] for cell in sorted(joined, key=natural_key)]
 
     def _note(self, work: tasks.Work) -> None:
         self.work["seconds"] += work.seconds
@@ -408,7 +446,7 @@ class Job:
         output.write(MANIFEST, manifest.text().encode())
         kept = {file.name for shard in manifest.shards for file in shard.files}
         for name in output.names():
-            if re.fullmatch(r"shard-\d+-[0-9a-f]{8}(\.sealed)?\.pmk", name) and name not in kept:
+            if re.fullmatch(r"shard-[\w-]+-[0-9a-f]{8}(\.sealed)?\.pmk", name) and name not in kept:
                 output.remove(name)
         output.remove(tasks.WORK)
 

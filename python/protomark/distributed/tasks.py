@@ -22,6 +22,7 @@ from protomark.distributed.tracks_file import BLOCK, TracksFile
 from protomark.extras import optional
 from protomark.features.upright import SUFFIX, upright_descriptors
 from protomark.maps import sources
+from protomark.maps.open import open_learning_map
 from protomark.maps.seal import SealRequest, seal_map
 from protomark.maps.shards import Shard, describe_file, describe_shard
 
@@ -221,9 +222,13 @@ def write_shard(
     dim: int,
     appearance_bits: int,
     seal: bool,
+    cell_size: float | None,
     output: Folder,
-) -> tuple[Shard, Work]:
-    """Sum the codes of a shard's landmarks, source by source and piece by piece, and write it."""
+) -> tuple[list[Shard], Work]:
+    """Sum the codes of a shard's landmarks, source by source and piece by piece, and write it.
+
+    With `cell_size` the shard is divided by space, and parts are written for `join_cell`.
+    """
     began = time.perf_counter()
     scene = pm.PrototypeMap(_encoder(encoder), dim, appearance_bits)
     total = 0
@@ -244,20 +249,45 @@ def write_shard(
         if not np.isfinite(positions).all():
             raise ValueError(f"{one.source.shown}: landmark_positions contains NaN or infinity")
         scene.set_positions(known[kept] + one.source.shift, positions)
-    shard: Shard | None = None
-    if len(scene):
+    shards: list[Shard] = []
+    with output.workspace(WORK) as folder:
+        if not len(scene):
+            pass
+        elif cell_size is not None:
+            for cell, part in scene.split_by_space(cell_size).items():
+                name = "nowhere" if cell is None else "_".join(map(str, cell))
+                path = folder / f"{recipe}.{name}.pmk"
+                part.save(path)
+                file = replace(describe_file(path), name=f"{WORK}/{path.name}")
+                output.publish(path, file.name)
+                shards.append(describe_shard(name, part, file))
+        else:
+            scene.metadata = metadata
+            path = folder / f"{recipe}.pmk"
+            shards.append(_saved(str(scene.ids[0]), scene, path, seal, output))
+    output.write(f"{WORK}/{recipe}.json", json.dumps([asdict(one) for one in shards]).encode())
+    return shards, Work(total, time.perf_counter() - began, 0, _attempts())
+
+
+def join_cell(
+    cell: str, names: Sequence[str], metadata: dict[str, str], seal: bool, output: Folder
+) -> tuple[Shard, Work]:
+    """Join the parts of a cube of space, which have no landmark in common."""
+    began = time.perf_counter()
+    with output.workspace(WORK) as folder:
+        scene = open_learning_map(output.fetch(names[0], folder))
+        for name in names[1:]:
+            scene.merge_map(open_learning_map(output.fetch(name, folder)))
         scene.metadata = metadata
-        with output.workspace(WORK) as folder:
-            shard = _saved(scene, folder / f"{recipe}.pmk", seal, output)
-    output.write(f"{WORK}/{recipe}.json", json.dumps(shard and asdict(shard)).encode())
-    return shard, Work(total, time.perf_counter() - began, 0, _attempts())
+        shard = _saved(cell, scene, folder / f"{cell}.new.pmk", seal, output)
+    return shard, Work(0, time.perf_counter() - began, 0, _attempts())
 
 
-def _saved(scene: pm.PrototypeMap, path: Path, seal: bool, output: Folder) -> Shard:
-    """Write the files of a shard, named by its first id and what is in it."""
+def _saved(label: str, scene: pm.PrototypeMap, path: Path, seal: bool, output: Folder) -> Shard:
+    """Write the files of a shard, named by its place and what is in it."""
     scene.save(path)
     learning, sealed = describe_file(path), None
-    name = f"shard-{scene.ids[0]}-{learning.identity[:8]}"
+    name = f"shard-{label}-{learning.identity[:8]}"
     if seal:
         sealed_to = path.with_suffix(".sealed.pmk")
         seal_map(scene, sealed_to, SealRequest())

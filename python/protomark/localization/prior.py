@@ -12,6 +12,8 @@ from protomark.geometry.pose import camera_centers
 
 # Number of points along each border of the image, as distortion bends the borders.
 _BORDER = 33
+# Positions that are looked at together, as each takes some hundred bytes meanwhile.
+_PART = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,14 @@ def visible(prior: PosePrior, camera: Camera, positions: NDArray[np.float64]) ->
     Returns:
         (n,) bool, False for NaN.
     """
-    normals = _field_of_view(camera)
+    normals, parts = _field_of_view(camera), range(0, len(positions), _PART)
+    found = [_visible(prior, normals, positions[i : i + _PART]) for i in parts]
+    return np.concatenate([*found, np.zeros(0, bool)])
+
+
+def _visible(
+    prior: PosePrior, normals: NDArray[np.float64], positions: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     offset = positions - camera_centers(prior.cam_from_world)
     distance = np.linalg.norm(offset, axis=1)
     finite = np.isfinite(distance)

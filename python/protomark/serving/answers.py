@@ -10,27 +10,27 @@ from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.solve import Localization
 from protomark.serving.messages import Answer, CameraMessage, MatchesMessage, Pose
 from protomark.serving.metrics import log
-from protomark.serving.reading import Limits, Query, Refusal, Upload, feature_camera, parse
+from protomark.serving.reading import FrameRequest, Limits, Refusal, Upload, feature_camera, parse
 
 
-def localize_query(localizer: Localizer, query: Query) -> Localization:
+def localize_request(localizer: Localizer, asked: FrameRequest) -> Localization:
     """The pose of an image or of features, as `protomark localize` finds it."""
-    if query.image is None:
-        camera = feature_camera(query.camera, localizer.cameras.cameras)
+    if asked.image is None:
+        camera = feature_camera(asked.camera, localizer.cameras.cameras)
         return localizer.localize_features(
-            query.keypoints,
-            query.descriptors,
+            asked.keypoints,
+            asked.descriptors,
             camera,
-            query.prior,
-            focal_length=query.focal_length,
+            asked.prior,
+            focal_length=asked.focal_length,
         )
-    height, width = query.image.shape
-    focal_length = query.focal_length
-    found = query.camera or localizer.map_camera(width, height)
+    height, width = asked.image.shape
+    focal_length = asked.focal_length
+    found = asked.camera or localizer.map_camera(width, height)
     if found is None:
-        found, focal_length = query.exif(), "rough"
+        found, focal_length = asked.exif(), "rough"
     return localizer.localize(
-        query.image, found or ESTIMATE, query.prior, focal_length=focal_length
+        asked.image, found or ESTIMATE, asked.prior, focal_length=focal_length
     )
 
 
@@ -41,11 +41,11 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
         Refusal: it cannot be answered.
     """
     began = time.perf_counter()
-    query = parse(upload, limits, localizer.scene.encoder.bits // 8)
+    asked = parse(upload, limits, localizer.scene.encoder.bits // 8)
     decoded = time.perf_counter() - began
     try:
-        found = localize_query(localizer, query)
-        details = _details(localizer, found) if query.details else None
+        found = localize_request(localizer, asked)
+        details = _details(localizer, found) if asked.details else None
     except KeyError:  # a shard has gone between the pose and its details
         raise Refusal(503, "the map is changing: try again in 1 s", 1) from None
     except OSError as error:  # FileError, too
@@ -70,7 +70,7 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
         camera=CameraMessage(**found.camera.as_dict()),
         place=found.place,
         reason=found.reason,
-        warnings=_doubts(query.camera, found.camera),
+        warnings=_doubts(asked.camera, found.camera),
         seconds=stages,
         details=details,
     )

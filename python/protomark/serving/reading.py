@@ -67,7 +67,7 @@ class Upload:
 
 
 @dataclass(frozen=True)
-class Query:
+class FrameRequest:
     """What to localize: an image, or keypoints and descriptors."""
 
     camera: Camera | None
@@ -174,8 +174,8 @@ def sentence_of(errors: Any) -> str:
     return f"{where}: {first['msg'][0].lower()}{first['msg'][1:]}: see /docs for what requests hold"
 
 
-def parse(upload: Upload, limits: Limits, descriptor_bytes: int) -> Query:
-    """The query of a request.
+def parse(upload: Upload, limits: Limits, descriptor_bytes: int) -> FrameRequest:
+    """What a request asks for.
 
     Args:
         upload: the request.
@@ -183,7 +183,7 @@ def parse(upload: Upload, limits: Limits, descriptor_bytes: int) -> Query:
         descriptor_bytes: bytes of a descriptor of the map's encoder.
 
     Raises:
-        Refusal: the request holds no query, or one beyond the limits.
+        Refusal: the request asks for nothing, or for more than the limits allow.
     """
     try:
         if upload.is_json:
@@ -193,17 +193,17 @@ def parse(upload: Upload, limits: Limits, descriptor_bytes: int) -> Query:
         prior = None
         if settings.prior is not None:
             prior = _prior(_numbers(settings.prior), settings.prior_distance, settings)
-        query = Query(camera, prior, settings.focal_length, settings.details)
+        asked = FrameRequest(camera, prior, settings.focal_length, settings.details)
         if _is_safetensors(upload.data):
-            return _with_features(query, *_load_safetensors(upload.data), descriptor_bytes)
+            return _with_features(asked, *_load_safetensors(upload.data), descriptor_bytes)
         check_pixels(upload.data, limits)
         image = decode_gray(np.frombuffer(upload.data, np.uint8), "the image")
-        return replace(query, image=image, exif=lambda: _camera_from_exif(upload.data))
+        return replace(asked, image=image, exif=lambda: _camera_from_exif(upload.data))
     except ValueError as error:
         raise Refusal(422, str(error)) from None
 
 
-def _parse_json(upload: Upload, descriptor_bytes: int) -> Query:
+def _parse_json(upload: Upload, descriptor_bytes: int) -> FrameRequest:
     given = upload.settings.model_fields_set
     if given:
         raise ValueError(f"{min(given)} is in the URL, but the body is JSON: put it there")
@@ -228,9 +228,9 @@ def _parse_json(upload: Upload, descriptor_bytes: int) -> Query:
             f"descriptors: {descriptors.size} bytes are not {descriptor_bytes} for each of "
             f"{len(keypoints)} keypoints, as the map's encoder takes them"
         )
-    query = Query(camera, prior, message.focal_length, message.details)
+    asked = FrameRequest(camera, prior, message.focal_length, message.details)
     rows = descriptors.reshape(-1, descriptor_bytes)
-    return _with_features(query, keypoints, rows, descriptor_bytes)
+    return _with_features(asked, keypoints, rows, descriptor_bytes)
 
 
 def _numbers(text: str) -> NDArray[np.float64]:
@@ -265,8 +265,8 @@ def _load_safetensors(data: bytes) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _with_features(
-    query: Query, keypoints: NDArray[Any], descriptors: NDArray[Any], descriptor_bytes: int
-) -> Query:
+    asked: FrameRequest, keypoints: NDArray[Any], descriptors: NDArray[Any], descriptor_bytes: int
+) -> FrameRequest:
     if keypoints.ndim != 2 or keypoints.shape[1] != 2 or keypoints.dtype.kind != "f":
         raise ValueError(
             f"keypoints: {keypoints.shape} {keypoints.dtype} is not (n, 2) of a float type"
@@ -282,12 +282,12 @@ def _with_features(
         )
     if not np.isfinite(keypoints).all():
         raise ValueError("keypoints: some are not finite numbers")
-    if query.camera is not None and not query.camera.width:
+    if asked.camera is not None and not asked.camera.width:
         raise ValueError(
-            f"camera {query.camera.model} has no size, which features need: write MODEL WIDTH "
+            f"camera {asked.camera.model} has no size, which features need: write MODEL WIDTH "
             "HEIGHT PARAMETERS"
         )
-    return replace(query, keypoints=keypoints.astype(np.float64), descriptors=descriptors)
+    return replace(asked, keypoints=keypoints.astype(np.float64), descriptors=descriptors)
 
 
 def check_pixels(data: bytes, limits: Limits) -> None:

@@ -69,7 +69,7 @@ def make_app(localizer: Localizer, limits: Limits, view: TopView) -> FastAPI:
     async def answer(request: Request, settings: Settings) -> Answer:
         deadline = time.monotonic() + limits.seconds
         try:
-            with workers.place():
+            with workers.slot():
                 upload = await receive_upload(request, settings, limits)
                 work = partial(answer_of, localizer, upload, limits)
                 return await workers.run(work, request, deadline)

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 from starlette.requests import Request
@@ -35,7 +35,7 @@ class Workers:
         self._limits = limits
         self._threads = ThreadPoolExecutor(limits.threads, "localize")
         self._seconds = 0.1  # running mean per request
-        self.in_progress = 0  # requests that have a place, and what runs although it was given up
+        self.in_progress = 0  # requests that have a slot, and what runs although it was given up
 
     @property
     def waiting(self) -> int:
@@ -43,11 +43,11 @@ class Workers:
         return max(0, self.in_progress - self._limits.threads)
 
     @contextmanager
-    def place(self) -> Iterator[None]:
-        """Hold a place for a request from before its body is read until it is answered.
+    def slot(self) -> Iterator[None]:
+        """Hold a slot for a request from before its body is read until it is answered.
 
         Raises:
-            Refusal: no place is free.
+            Refusal: no slot is free.
         """
         if self.in_progress >= self._limits.threads + self._limits.waiting:
             raise self._busy(f"{self.waiting} requests wait already")
@@ -110,12 +110,13 @@ class Workers:
             self._seconds += _LATEST * (time.monotonic() - began - self._seconds)
 
     def _let_end(self, job: Future[T]) -> None:
-        """Count a place as taken until a thread ends what nobody waits for."""
+        """Count a slot as taken until a thread ends what nobody waits for."""
         loop = asyncio.get_running_loop()
         self.in_progress += 1
 
         def ended(_: Future[T]) -> None:
-            loop.call_soon_threadsafe(self._free)
+            with suppress(RuntimeError):  # the loop has ended before
+                loop.call_soon_threadsafe(self._free)
 
         job.add_done_callback(ended)
 
