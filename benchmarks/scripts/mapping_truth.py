@@ -1,11 +1,12 @@
 """Maps sequences with and without their camera, by Protomark and by COLMAP, beside the truth.
 
-    python benchmarks/scripts/mapping_truth.py SEQUENCE[:FRAMES] ... [--no-colmap]
+    python benchmarks/scripts/mapping_truth.py SEQUENCE[:SLICE] ... [--no-colmap]
 
-SEQUENCE is a folder with images/ and a COLMAP model of the true poses in true/ or sparse/. Prints a
-Markdown row for each run: frames registered, root mean square distance of the camera centres after
-the best similarity, and CPU seconds of one thread. COLMAP has SIFT and its defaults, as in
-`protomark evaluate-mapping`.
+SEQUENCE is a folder with images/ and a COLMAP model of the true poses in true/ or sparse/;
+kitchen:120 takes its first 120 images, kitti07:64: all from the 65th on. Prints a Markdown row for
+each run: frames registered, root mean square distance of the camera centres after the best
+similarity, and CPU seconds of one thread. COLMAP has SIFT and its defaults, as in `protomark
+evaluate-mapping`.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def main() -> None:
     print("| " + " | ".join(HEADS) + " |\n|" + " --- |" * len(HEADS), flush=True)
     systems = (protomark,) if "--no-colmap" in sys.argv else (protomark, colmap)
     for name in (a for a in sys.argv[1:] if not a.startswith("--")):
-        folder, _, count = name.partition(":")
+        folder, *bounds = name.split(":")
         path = Path(folder)
         true = read_model(find_model(path / "true" if (path / "true").is_dir() else path))
         centers = {n: c.tolist() for n, c in zip(true.names, true.centers, strict=True)}
@@ -94,7 +95,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as temporary:
             images = Path(temporary) / "images"
             images.mkdir()
-            names = sorted(p.name for p in (path / "images").iterdir())[: int(count or 0) or None]
+            chosen = slice(*(int(b) if b else None for b in bounds or [""]))
+            names = sorted(p.name for p in (path / "images").iterdir())[chosen]
             for image in names:
                 (images / image).symlink_to((path / "images" / image).resolve())
             extent = float(np.linalg.norm(np.ptp([centers[n] for n in names], axis=0)))

@@ -111,7 +111,7 @@ def free_focal_lengths(structure: Structure) -> dict[int, tuple[float, float]]:
 def other_factors(structure: Structure) -> list[float]:
     """Factors of the calibrated focal lengths that fit the images as well; the map stays."""
     whole = _whole(structure, True, _SAMPLED)
-    if whole is None:
+    if whole is None or not whole[1].refined.any():
         return []
     _, bundle = whole
 
