@@ -23,7 +23,8 @@ void select_lists(const PackedPrototypes& centroids, const PreparedCodes& querie
   // which, or a nearer one, is a limit that probably leaves a few more than `nprobe` centroids.
   constexpr size_t kMinStep = 16, kMaxSampled = 64;
   const size_t step = std::max(kMinStep, nprobe * 3 / 2 / kMaxSampled);
-  Neighbours sample(nprobe * 3 / 2 / step + 5, std::vector(batch.size(), kNoLimit));
+  std::vector<int32_t> limits(batch.size(), kNoLimit);
+  Neighbours sample(nprobe * 3 / 2 / step + 5, limits);
   for (size_t row = 0; row < centroids.rows; row += step * kPackedRows) {
     compare(
         row, kPackedRows, [&](size_t q) { return sample.limit(q); },
@@ -31,6 +32,7 @@ void select_lists(const PackedPrototypes& centroids, const PreparedCodes& querie
           sample.offer(q, distance, static_cast<int64_t>(list), false);
         });
   }
+  for (size_t q = 0; q < limits.size(); ++q) limits[q] = sample.limit(q);
   // Distances in the upper bits, indices in the lower ones, so that ties go to smaller indices.
   std::vector<std::vector<int64_t>> all_found(batch.size());
   const auto take = [&](size_t q, int32_t distance, size_t list) {
@@ -38,7 +40,7 @@ void select_lists(const PackedPrototypes& centroids, const PreparedCodes& querie
   };
   const size_t chunk = scan.chunk_rows();
   for (size_t row = 0; row < centroids.rows; row += chunk) {
-    compare(row, chunk, [&](size_t q) { return sample.limit(q); }, take);
+    compare(row, chunk, [&](size_t q) { return limits[q]; }, take);
   }
   for (uint32_t q = 0; q < all_found.size(); ++q) {
     std::vector<int64_t>& found = all_found[q];
