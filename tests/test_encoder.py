@@ -370,5 +370,5 @@ def test_vectors_that_are_refused(input: str, tmp_path: Path) -> None:
 
 
 def test_unknown_encoder_is_named() -> None:
-    with pytest.raises(FileNotFoundError, match="sift: neither a model file nor a bundled"):
-        pm.Encoder.load("sift")
+    with pytest.raises(FileNotFoundError, match="surf: neither a model file nor a bundled"):
+        pm.Encoder.load("surf")

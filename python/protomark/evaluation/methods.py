@@ -40,8 +40,8 @@ from protomark.maps.info import matching_bytes
 SEALED_BYTES = (9, 17, 25, 33, 65)
 # Signs that tell appearances apart in the learning maps that are sealed, as `protomark map` has.
 APPEARANCE_BITS = 5
-# Of projected means, which are compared as int8 by default; 10 floats are what maplab keeps.
-PROJECTED_DIMS = (8, 10, 16, 32, 64)
+PROJECTED_DIMS = (8, 16, 32, 64)
+MAPLAB_DIM = 10  # discriminants that maplab keeps, as floats
 # Bytes of codes of the mean, and those that are compared by default: one that takes little time.
 CODE_BYTES = (4, 8, 16, 32, 64)
 DEFAULT_CODE_BYTES = 32
@@ -130,7 +130,8 @@ def method_choices(
     listed = [choice for choice in listed if choice.name != other]
     for rounded in (True, False):
         for family, label in (("pca", "PCA mean"), ("discriminant", "Discriminant")):
-            for dim in PROJECTED_DIMS:
+            kept = () if rounded or family == "pca" else (MAPLAB_DIM,)
+            for dim in (*PROJECTED_DIMS, *kept):
                 build = _projected(family, dim, discriminant_from, rounded)
                 tail, mark = ("", "") if rounded else ("-float", ", float")
                 listed.append(
@@ -139,7 +140,7 @@ def method_choices(
                         f"{label}, {dim}{mark}",
                         family + tail,
                         build,
-                        default=rounded and dim != 10,
+                        default=rounded,
                     )
                 )
     for family, label, build_code in (
