@@ -15,6 +15,7 @@ from protomark.tracks.file import Tracks
 from protomark.tracks.joining import shifted_ids
 
 SOURCES, DETECTOR = "sources", "detector"
+LIMIT = "max_keypoints"  # of a detector
 _COUNTED = ("keyframes", "landmarks", "observations")
 
 
@@ -30,9 +31,8 @@ def tracks_metadata(tracks: Tracks) -> dict[str, str]:
     }
     if places := places_text(tracks.info["sources"]):
         texts[PLACES] = places
-    detectors = {json.dumps(one, sort_keys=True) for one in tracks.info["detectors"]}
-    if len(detectors) == 1 and detectors != {"{}"}:
-        texts[DETECTOR] = detectors.pop()
+    if detector := _joint_detector(tracks.info["detectors"]):
+        texts[DETECTOR] = json.dumps(detector, sort_keys=True)
     return texts
 
 
@@ -59,8 +59,18 @@ def joint_origin(
     if sources:
         texts[SOURCES] = _sources_text([s for i, s in enumerate(sources) if s not in sources[:i]])
     if target.get(DETECTOR) != source.get(DETECTOR):
-        texts[DETECTOR] = "{}"
+        detectors = [_detector(one) for one in (target, source)]
+        texts[DETECTOR] = json.dumps(_joint_detector(detectors), sort_keys=True)
     return texts
+
+
+def _joint_detector(detectors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The detector that all are but for the number of keypoints, whose largest counts; or none."""
+    plain = [{k: v for k, v in one.items() if k != LIMIT} for one in detectors]
+    if any(one != plain[0] for one in plain):
+        return {}
+    limits = [n for one in detectors if isinstance(n := one.get(LIMIT), int)]
+    return plain[0] | ({LIMIT: max(limits)} if limits else {})
 
 
 def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
@@ -78,7 +88,11 @@ def map_detector(scene: pm.PrototypeMap | pm.SealedMap) -> dict[str, Any]:
 
     Empty if nobody stored it, or if its sources had several.
     """
-    found = _parsed(scene.metadata.get(DETECTOR, "{}"))
+    return _detector(scene.metadata)
+
+
+def _detector(metadata: Mapping[str, str]) -> dict[str, Any]:
+    found = _parsed(metadata.get(DETECTOR, "{}"))
     return found if isinstance(found, dict) else {}
 
 
