@@ -273,9 +273,9 @@ def test_model_file_of_vectors(input: str, tmp_path: Path) -> None:
     ("width", "kind", "message"),
     [
         (64, {"input": "int8"}, "input must be bits, uint8 or float32, not 'int8'"),
-        (64, {"input_scale": 1.0}, "input_scale is for float32 alone"),
-        (64, {"input": "uint8", "input_scale": 1.0}, "input_scale is for float32 alone"),
-        (64, {"input": "float32"}, "input_scale must be positive for float32, not 0"),
+        (64, {"input_scale": 1.0}, "and 0 for others, not 1"),
+        (64, {"input": "uint8", "input_scale": 1.0}, "and 0 for others, not 1"),
+        (64, {"input": "float32"}, "input_scale must be positive for float32 .*, not 0"),
         (64, {"input": "float32", "input_scale": -1.0}, "must be positive"),
         (64, {"input": "float32", "input_scale": float("nan")}, "must be positive"),
         (64, {"input": "float32", "input_scale": float("inf")}, "must be positive"),

@@ -101,7 +101,8 @@ def joined(results: Sequence[SequenceResult]) -> list[SequenceResult]:
         ValueError: two files measured a sequence on other queries.
     """
     families = [choice.family for choice in method_choices()]
-    families += ["clusters", "protomark", "protomark-sealed", "protomark-appearances", "protomark-untuned"]
+    families += ["clusters", "protomark"]
+    families += [f"protomark-{kind}" for kind in ("sealed", "appearances", "untuned")]
     whole: dict[tuple[str, str, str], SequenceResult] = {}
     for result in results:
         first = whole.setdefault((result.descriptor, result.sequence, result.split), result)

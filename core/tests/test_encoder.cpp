@@ -122,7 +122,7 @@ void refuse_vectors(test::Random& random) {
                                                "has 16 to 1024 numbers"));
   }
   CHECK(check::throws<std::invalid_argument>(
-      [&] { network(12, {64, 12}, 34, {InputKind::uint8, 1.0f}); }, "for float32 alone"));
+      [&] { network(12, {64, 12}, 34, {InputKind::uint8, 1.0f}); }, "and 0 for others, not 1"));
 }
 
 void read_and_write() {

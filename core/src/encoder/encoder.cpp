@@ -70,19 +70,13 @@ void check_codebooks(const std::vector<Codebook>& codebooks, size_t dim) {
 }
 
 void check_input(const EncoderInput& input, size_t inputs) {
-  if (input.kind == InputKind::bits) {
-    require(inputs >= kMinBits && inputs <= kMaxInputs && inputs % 8 == 0,
-            "encoder: a descriptor has 64 to 1024 bits, a multiple of 8, not ", inputs);
-  } else {
-    require(inputs >= kMinNumbers && inputs <= kMaxInputs,
-            "encoder: a descriptor has 16 to 1024 numbers, not ", inputs);
-  }
-  if (input.kind == InputKind::float32) {
-    require(input.scale > 0 && std::isfinite(input.scale),
-            "encoder: input_scale must be positive for float32, not ", input.scale);
-  } else {
-    require(input.scale == 0, "encoder: input_scale is for float32 alone");
-  }
+  const bool bits = input.kind == InputKind::bits, floats = input.kind == InputKind::float32;
+  const size_t least = bits ? kMinBits : kMinNumbers;
+  require(inputs >= least && inputs <= kMaxInputs && (!bits || inputs % 8 == 0),
+          "encoder: a descriptor has ", least, " to ", kMaxInputs,
+          bits ? " bits, a multiple of 8" : " numbers", ", not ", inputs);
+  require(floats ? input.scale > 0 && std::isfinite(input.scale) : input.scale == 0,
+          "encoder: input_scale must be positive for float32 and 0 for others, not ", input.scale);
 }
 
 // Returns what is wrong with a vector, or nullptr.
@@ -106,6 +100,7 @@ const char* fault_of(const EncoderInput& input, const uint8_t* row, size_t bytes
 // Writes vectors as the first layer takes them: `inputs` bytes, zeros up to `padded`.
 void write_bytes(const EncoderInput& input, Descriptors descriptors, size_t inputs, size_t padded,
                  MatrixView<uint8_t> x) {
+  const float scale = input.scale;
   for (size_t i = 0; i < descriptors.rows; ++i) {
     const uint8_t* row = descriptors.row(i);
     uint8_t* to = x.row(i);
@@ -117,9 +112,12 @@ void write_bytes(const EncoderInput& input, Descriptors descriptors, size_t inpu
     for (size_t j = 0; j < inputs; ++j) {
       float f;
       std::memcpy(&f, row + j * sizeof f, sizeof f);
-      // Between 2^23 and 2^24 floats are integers: the sum is rounded as rint() would.
-      const float sum = std::min(std::max(f * input.scale, -127.0f), 127.0f) + 0x1.8p23f;
-      to[j] = static_cast<uint8_t>(std::bit_cast<uint32_t>(sum) + 128);
+      // Clamped by its bits, which compilers vectorise, and rounded by a sum: between 2^23 and 2^24
+      // floats are integers.
+      const auto product = std::bit_cast<int32_t>(f * scale);
+      const int32_t most = std::min(product & INT32_MAX, std::bit_cast<int32_t>(127.0f));
+      const auto clamped = std::bit_cast<float>(most | (product & INT32_MIN));
+      to[j] = static_cast<uint8_t>(std::bit_cast<uint32_t>(clamped + 0x1.8p23f) + 128);
     }
   }
 }
@@ -233,11 +231,11 @@ void Encoder::check(Descriptors descriptors, int threads) const {
   std::atomic<size_t> bad = descriptors.rows;  // the first of them
   parallel_for(threads, descriptors.rows, kGrain, [&](size_t i, size_t end) {
     while (i < end && fault(i) == nullptr) ++i;
-    for (size_t known = bad; i < end && i < known && !bad.compare_exchange_weak(known, i);) {
-    }
+    size_t known = bad;
+    while (i < end && i < known && !bad.compare_exchange_weak(known, i)) continue;
   });
-  require(bad == descriptors.rows, "descriptors: row ", bad, " ",
-          bad == descriptors.rows ? "" : fault(bad), ": leave such rows out");
+  if (bad == descriptors.rows) return;
+  invalid("descriptors: row ", bad, " ", fault(bad), ": leave such rows out");
 }
 
 void Encoder::encode(Descriptors descriptors, MatrixView<int8_t> codes, int threads) const {

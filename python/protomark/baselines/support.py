@@ -111,7 +111,7 @@ class Moments:
         chosen[drawn[:count]] = True
         rows = np.flatnonzero(np.repeat(chosen, support.counts))
         # A piece sums fewer than 2^24 products of 0 and 1, which is exact in float32.
-        dtype = np.float32 if support.kind == "bits" else np.float64
+        dtype: Any = np.float32 if support.kind == "bits" else np.float64
         sums = support.sums[chosen].astype(dtype)
         counts = support.counts[chosen]
         second = np.zeros((support.width, support.width))

@@ -233,7 +233,7 @@ class Tracks:
         has_texts = isinstance(self.info, dict) and _is_text(
             json.dumps(self.info, ensure_ascii=False)
         )
-        empty = [] if self.input == "bits" else np.flatnonzero(~self.descriptors.any(axis=1))
+        empty = np.flatnonzero(~self.descriptors.any(axis=1) & (self.input != "bits"))
         for wrong, problem in (
             (sizes["b"] < 1, "descriptors have no bytes"),
             (
