@@ -193,6 +193,9 @@ def test_merged_maps_have_both_origins() -> None:
     assert texts["detector"] == "{}"
     assert joint_origin(first, first)["sources"] == first["sources"]
     assert joint_origin({}, {}) == {}
+    databases = [{"detector": json.dumps({"name": "COLMAP", "max_keypoints": n})} for n in (5, 9)]
+    joint = joint_origin(*databases)["detector"]
+    assert json.loads(joint) == {"name": "COLMAP", "max_keypoints": 9}
 
 
 def test_places_of_a_map() -> None:

@@ -18,6 +18,7 @@ from protomark.tracks.joining import shifted_ids
 SOURCES, DETECTOR = "sources", "detector"
 # What `sources_metadata` says; all else is the user's.
 OF_SOURCES = (KEY, SOURCES, PLACES, DETECTOR)
+LIMIT = "max_keypoints"  # of a detector
 _COUNTED = ("keyframes", "landmarks", "observations")
 
 
@@ -40,9 +41,8 @@ def sources_metadata(
     texts = {KEY: cameras_text(cameras), SOURCES: _sources_text(sources)}
     if places := places_text(sources):
         texts[PLACES] = places
-    found = {json.dumps(one, sort_keys=True) for one in detectors}
-    if len(found) == 1 and found != {"{}"}:
-        texts[DETECTOR] = found.pop()
+    if detector := _joint_detector(detectors):
+        texts[DETECTOR] = json.dumps(detector, sort_keys=True)
     return texts
 
 
@@ -69,8 +69,18 @@ def joint_origin(
     if sources:
         texts[SOURCES] = _sources_text([s for i, s in enumerate(sources) if s not in sources[:i]])
     if target.get(DETECTOR) != source.get(DETECTOR):
-        texts[DETECTOR] = "{}"
+        detectors = [_detector(one) for one in (target, source)]
+        texts[DETECTOR] = json.dumps(_joint_detector(detectors), sort_keys=True)
     return texts
+
+
+def _joint_detector(detectors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The detector that all are but for the number of keypoints, whose largest counts; or none."""
+    plain = [{k: v for k, v in one.items() if k != LIMIT} for one in detectors]
+    if any(one != plain[0] for one in plain):
+        return {}
+    limits = [n for one in detectors if isinstance(n := one.get(LIMIT), int)]
+    return plain[0] | ({LIMIT: max(limits)} if limits else {})
 
 
 def _sources_text(sources: Sequence[Mapping[str, Any]]) -> str:
@@ -88,7 +98,11 @@ def map_detector(scene: pm.PrototypeMap | pm.SealedMap | pm.ShardedMap) -> dict[
 
     Empty if nobody stored it, or if its sources had several.
     """
-    found = _parsed(scene.metadata.get(DETECTOR, "{}"))
+    return _detector(scene.metadata)
+
+
+def _detector(metadata: Mapping[str, str]) -> dict[str, Any]:
+    found = _parsed(metadata.get(DETECTOR, "{}"))
     return found if isinstance(found, dict) else {}
 
 
