@@ -43,8 +43,8 @@ test-python: .venv-test/installed .venv-test/bench
 
 # Distributed builds and replicas on a Ray cluster of this machine.
 test-ray: .venv-ray/installed
-	OMP_NUM_THREADS=1 .venv-ray/bin/python -m pytest tests/test_distributed_ray.py tests/test_serving_shards.py \
-	  'tests/test_docs.py::test_blocks_run[city.md]'
+	OMP_NUM_THREADS=1 .venv-ray/bin/python -m pytest tests/test_distributed_ray.py \
+	  tests/test_serving_shards.py 'tests/test_docs.py::test_blocks_run[city.md]'
 
 test-cpp: .venv-test/installed
 	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \
