@@ -16,7 +16,7 @@ help:
 	@echo "make demo      run the main job on the sample that ships"
 	@echo "make bench     measure speed beside peers (BENCH_OPTIONS='--scale quick')"
 	@echo "make test      run the tests (C++ and Python)"
-	@echo "make test-ray  run the tests of builds on a Ray cluster"
+	@echo "make test-ray  run the tests of builds and replicas on a Ray cluster"
 	@echo "make test-cpp-bridges  run the C++ tests and examples that need OpenCV and Eigen"
 	@echo "make test-arm  run the C++ tests for 64-bit ARM under qemu-user"
 	@echo "make sanitize  run the tests of the core under sanitizers (memory, undefined behaviour, threads)"
@@ -41,10 +41,10 @@ test: test-cpp test-python
 test-python: .venv-test/installed .venv-test/bench
 	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n $(JOBS) --dist loadfile
 
-# Distributed builds on a Ray cluster of this machine.
+# Distributed builds and replicas on a Ray cluster of this machine.
 test-ray: .venv-ray/installed
 	OMP_NUM_THREADS=1 .venv-ray/bin/python -m pytest tests/test_distributed_ray.py \
-	  'tests/test_docs.py::test_blocks_run[city.md]'
+	  tests/test_serving_shards.py 'tests/test_docs.py::test_blocks_run[city.md]'
 
 test-cpp: .venv-test/installed
 	$(call cmake,.venv-test) -S core -B build/core -DPROTOMARK_BUILD_TESTS=ON \
@@ -189,7 +189,7 @@ clean:
 	test -x .venv-ray/bin/python || $(PYTHON) -m venv .venv-ray
 	ls -d $(abspath .venv-test)/lib/python3*/site-packages > \
 	  $$(ls -d .venv-ray/lib/python3*/site-packages)/tests.pth
-	.venv-ray/bin/pip install --quiet -c constraints.txt fsspec ray
+	.venv-ray/bin/pip install --quiet -c constraints.txt fsspec 'ray[serve]'
 	touch $@
 
 .venv-sanitize/tools:

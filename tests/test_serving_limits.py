@@ -70,7 +70,16 @@ def test_late_answers_keep_their_slot_until_their_thread_is_free() -> None:
         began: list[float] = []
         with pytest.raises(Gone):
             await ran(workers, began.append, 10, patience=0.05)
+        # Nobody waits for what will come too late.
+        slow = Workers(Limits(seconds=0.3, threads=1, waiting=9))
+        await ran(slow, lambda _: time.sleep(0.25), 10)
+        running = [asyncio.ensure_future(ran(slow, lambda _: free.wait(), 10)) for _ in range(3)]
+        await asyncio.sleep(0.05)
+        with pytest.raises(Refusal, match=r"busy \(2 requests wait already\)"):
+            await ran(slow, lambda _: None, 10)
         free.set()
+        await asyncio.gather(*running)
+        slow.close()
         assert await ran(workers, lambda waited: waited, 10) < 5
         assert (workers.in_progress, began) == (0, [])
 

@@ -70,7 +70,7 @@ def make_map(path: Path, synthetic: SyntheticLandmarks, encoder: pm.Encoder, cou
 
 
 def frame(
-    scene: pm.PrototypeMap | pm.SealedMap,
+    scene: pm.PrototypeMap | pm.SealedMap | pm.ShardedMap,
     synthetic: SyntheticLandmarks,
     place: int,
     rng: np.random.Generator,

@@ -27,6 +27,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -161,7 +162,7 @@ class Load:
         self.seconds.append(time.perf_counter() - began)
         self.failed += reply.status != 200
         at = answer.get("center")
-        self.right += at is not None and np.linalg.norm(at - request.center) < _RIGHT
+        self.right += at is not None and bool(np.linalg.norm(at - request.center) < _RIGHT)
 
     def in_threads(self, count: int, work: Callable[[http.client.HTTPConnection], None]) -> float:
         """Run `work` in threads, each with a connection; seconds until all have ended."""
@@ -215,14 +216,14 @@ def measure(
 ) -> list[list[str]]:
     """A row for each load."""
     Load(address, requests).closed(2, 3)  # warms up
-    loads: list[tuple[str, Callable[[Load], float]]] = [
-        (f"{n} client{'s' * (n > 1)}", lambda load, n=n: load.closed(n, seconds)) for n in CLIENTS
+    loads: list[tuple[str, Callable[..., float]]] = [
+        *((f"{n} client{'s' * (n > 1)}", partial(Load.closed, clients=n)) for n in CLIENTS),
+        *((f"{rate:g} a second", partial(Load.at_rate, rate=rate)) for rate in rates),
     ]
-    loads += [(f"{r:g} a second", lambda load, r=r: load.at_rate(r, seconds)) for r in rates]
     rows = []
     for name, run in loads:
         load, before = Load(address, requests), cpu_seconds(address)
-        took = run(load)
+        took = run(load, seconds=seconds)
         count = len(load.seconds)
         p50, p99 = 1000 * np.quantile(load.seconds, (0.5, 0.99))
         cpu = 1000 * (cpu_seconds(address) - before) / count

@@ -164,6 +164,10 @@ class ShardedMap:
         """The ids of all landmarks in ascending order, (n,) int64; opens all shards."""
         return np.sort(np.concatenate([part.ids for part in self._view.parts]))
 
+    def every(self, step: int) -> Ids:
+        """Every so many-th id of each shard; opens all, and holds all ids of one at a time."""
+        return self._ask(lambda view: np.concatenate([part.map.ids[::step] for part in view.parts]))
+
     def summary(self) -> dict[str, Any]:
         """The map at a glance, as `PrototypeMap.summary` has it, from the manifest."""
         shards = self.shards

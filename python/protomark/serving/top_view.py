@@ -32,10 +32,10 @@ def top_view(
         places: its places; none if it is one.
         poses: (n, 3, 4) the keyframes of a map of one place; None: unknown.
     """
-    ids = scene.ids
+    step = 1 + len(scene) // MAX_LANDMARKS
+    ids = scene.every(step) if isinstance(scene, ShardedMap) else scene.ids[::step]
     parts = [(p.name, ids[p.holds(ids)]) for p in places] or [("", ids)]
-    step = 1 + len(ids) // MAX_LANDMARKS
-    return [_view(name, scene.positions(part[::step]), poses) for name, part in parts]
+    return [_view(name, scene.positions(part), poses) for name, part in parts]
 
 
 def _view(

@@ -49,7 +49,8 @@ class Workers:
         Raises:
             Refusal: no slot is free.
         """
-        if self.in_progress >= self._limits.threads + self._limits.waiting:
+        full = self.in_progress >= self._limits.threads + self._limits.waiting
+        if full or (self.waiting and self._expected() > self._limits.seconds):
             raise self._busy(f"{self.waiting} requests wait already")
         self.in_progress += 1
         try:
@@ -123,8 +124,12 @@ class Workers:
     def _free(self) -> None:
         self.in_progress -= 1
 
+    def _expected(self) -> float:
+        """Seconds until all requests in progress are answered, about."""
+        return self._seconds * self.in_progress / self._limits.threads
+
     def _busy(self, cause: str) -> Refusal:
-        seconds = max(1, math.ceil(self._seconds * self.in_progress / self._limits.threads))
+        seconds = max(1, math.ceil(self._expected()))
         sentence = f"the server is busy ({cause}): try again in {seconds} s"
         return Refusal(503, sentence, retry_after=seconds)
 
