@@ -240,9 +240,9 @@ def faults(folder: Path, count: int, every: float) -> dict[str, Any]:
     source = folder / "session.freak.safetensors"
     write_session(source, count)
     options: dict[str, Any] = {"memory": 250, "metadata": METADATA, "seal": False}
-    killed: list[str] = []
+    killed, removed = list[str](), list[Any]()
     with cluster_of([1, 1], 200_000_000) as cluster:
-        build([source], folder / "calm", **options)
+        calm = build([source], folder / "calm", **options)["run"]
 
         def kill() -> None:
             if workers := [w for w in workers_of(cluster) if w[1] != "ray::IDLE"]:
@@ -254,11 +254,14 @@ def faults(folder: Path, count: int, every: float) -> dict[str, Any]:
         with meanwhile(kill, every):
             worker = build([source], folder / "killed", **options)["run"]
         gone = threading.Timer(
-            worker["seconds"] / 4,
-            lambda: cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False),
+            calm["seconds"] / 3,
+            lambda: removed.append(
+                cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
+            ),
         )
         gone.start()
         node = build([source], folder / "removed", **options)["run"]
+        assert removed, "the build was done before a node was removed"
         gone.join()
     same = [
         {p.name: p.read_bytes() for p in (folder / name).iterdir()}
@@ -266,6 +269,7 @@ def faults(folder: Path, count: int, every: float) -> dict[str, Any]:
     ]
     return {
         "observations": count,
+        "without faults": calm,
         "killed": len(killed),
         "with kills": worker,
         "with a node removed": node,
