@@ -65,7 +65,8 @@ struct Matrix {
   std::vector<T> data;
 };
 
-// One descriptor per row, as OpenCV gives them: bit i is bit i % 8 (lowest first) of byte i / 8.
+// One descriptor per row, as OpenCV gives them: bit i of a descriptor is bit i % 8 (least
+// significant first) of byte i / 8.
 using Descriptors = MatrixView<const uint8_t>;
 // One code per row, each number -127 to 127.
 using Codes = MatrixView<const int8_t>;
