@@ -37,7 +37,7 @@ struct MapState {
   FairSharedMutex changing, searching;
 
   std::unique_ptr<Journal> journal;  // nullptr without a journal
-  // The map file whose journal this is or was; empty if there never was one.
+  // The map file whose journal this is or was, if any. Constant once others have the map.
   std::filesystem::path journaled;
 
   // Returns how many lists to search for this recall, as measured on the map now, or earlier if

@@ -136,7 +136,7 @@ class PrototypeStore : public RowTable {
       __builtin_prefetch(packed() + packed_index(row.value, d, dim_), 1);
     }
   }
-  // Replaces the sum and count of a row. If memory runs out nothing has changed.
+  // Replaces the sum and count of a row. If memory runs out, never for a new row, nothing changes.
   void set(Row row, const Sum& sum, int count);
   void rounded(Row row, int8_t* to) const {
     for (size_t d = 0; d < dim_; d += 4) {
