@@ -101,8 +101,8 @@ def write_session(path: Path, count: int, seed: int = 0) -> None:
             total = header[name]["shape"][0]
             for start in range(0, total, block):
                 stop = min(start + block, total)
-                rows = make.get(name, lambda a, b: np.ones(b - a))(start, stop)
-                file.write(np.ascontiguousarray(rows, dtype).tobytes())
+                values = make[name](start, stop) if name in make else np.ones(stop - start)
+                file.write(np.ascontiguousarray(values, dtype).tobytes())
 
 
 @contextlib.contextmanager
@@ -240,9 +240,9 @@ def faults(folder: Path, count: int, every: float) -> dict[str, Any]:
     source = folder / "session.freak.safetensors"
     write_session(source, count)
     options: dict[str, Any] = {"memory": 250, "metadata": METADATA, "seal": False}
-    killed: list[str] = []
+    killed, removed = list[str](), list[Any]()
     with cluster_of([1, 1], 200_000_000) as cluster:
-        build([source], folder / "calm", **options)
+        calm = build([source], folder / "calm", **options)["run"]
 
         def kill() -> None:
             if workers := [w for w in workers_of(cluster) if w[1] != "ray::IDLE"]:
@@ -254,11 +254,14 @@ def faults(folder: Path, count: int, every: float) -> dict[str, Any]:
         with meanwhile(kill, every):
             worker = build([source], folder / "killed", **options)["run"]
         gone = threading.Timer(
-            worker["seconds"] / 4,
-            lambda: cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False),
+            calm["seconds"] / 3,
+            lambda: removed.append(
+                cluster.remove_node(cluster.list_all_nodes()[-1], allow_graceful=False)
+            ),
         )
         gone.start()
         node = build([source], folder / "removed", **options)["run"]
+        assert removed, "the build was done before a node was removed"
         gone.join()
     same = [
         {p.name: p.read_bytes() for p in (folder / name).iterdir()}
@@ -266,6 +269,7 @@ def faults(folder: Path, count: int, every: float) -> dict[str, Any]:
     ]
     return {
         "observations": count,
+        "without faults": calm,
         "killed": len(killed),
         "with kills": worker,
         "with a node removed": node,
