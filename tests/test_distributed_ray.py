@@ -173,9 +173,9 @@ def test_killed_workers(
             with contextlib.suppress(ProcessLookupError):
                 os.kill(killed[-1], signal.SIGKILL)
 
-    with meanwhile(kill, 0.7):
-        built(sessions, tmp_path / "city", piece=500)
-    assert killed
+    with meanwhile(kill, 0.5):
+        while not killed:  # a fast machine may be done before
+            built(sessions, tmp_path / "city", piece=300)
     assert content(tmp_path / "city") == expected
 
 
@@ -190,8 +190,8 @@ def test_a_removed_node(
             removed.append(node)
             cluster.remove_node(node, allow_graceful=False)
 
-    with meanwhile(remove, 0.2):
-        built(sessions, tmp_path / "city", piece=1500)
+    with meanwhile(remove, 0.05):
+        built(sessions, tmp_path / "city", piece=500)
     assert removed
     assert content(tmp_path / "city") == expected
 

@@ -24,7 +24,7 @@ def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     facts = json.loads(facts_file.read_text())
     assert [part["ids"] for part in facts["parts"]] == [[0, 2], [3, 5], [6, 9]]
     names = [f"scene.{i}.pmk" for i in range(3)]
-    assert sorted(file.name for file in (tmp_path / "parts").iterdir()) == names
+    assert sorted(file.name for file in (tmp_path / "parts").glob("*.pmk")) == names
     assert "scene.1.pmk" in done.stdout
     parts = [tmp_path / "parts" / name for name in names]
     done = protomark("merge", *parts, "-o", tmp_path / "joined.pmk", "--json", facts_file)
@@ -36,7 +36,7 @@ def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     done = protomark("split", whole, "--cell-size", 4, "--sealed", "-o", tmp_path / "tiles")
     assert done.returncode == 0, done.stderr
     names = [f"scene.{cell}.sealed.pmk" for cell in ("0_0_0", "1_1_1", "nowhere")]
-    assert sorted(file.name for file in (tmp_path / "tiles").iterdir()) == names
+    assert sorted(file.name for file in (tmp_path / "tiles").glob("*.pmk")) == names
     tile = pm.open(tmp_path / "tiles" / names[1])
     assert isinstance(tile, pm.SealedMap)
     np.testing.assert_array_equal(tile.ids, [4, 5, 6, 7])

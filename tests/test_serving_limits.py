@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import protomark as pm
@@ -17,9 +20,18 @@ from protomark import sample
 from protomark.maps.build import build_map
 
 pytest.importorskip("fastapi_offline")
+from mutation import SEED, mutated
 from protomark.serving import service
-from protomark.serving.reading import Limits, Refusal
+from protomark.serving.answers import answer_of
+from protomark.serving.messages import Settings
+from protomark.serving.reading import Limits, Refusal, Upload
 from protomark.serving.workers import Gone, Workers
+from serving_client import Frame
+
+
+@pytest.fixture(scope="module")
+def localizer() -> pm.Localizer:
+    return pm.Localizer(build_map(sample.load(), pm.Encoder.load("freak"), 32), max_keypoints=100)
 
 
 class Client:
@@ -87,8 +99,29 @@ def test_late_answers_keep_their_slot_until_their_thread_is_free() -> None:
     workers.close()
 
 
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", "tensors", "JSON"])
+def test_broken_bodies_are_refused_in_a_sentence(localizer: pm.Localizer, kind: str) -> None:
+    rng, frame = np.random.default_rng(SEED), Frame.of(3)
+    few = replace(frame, keypoints=frame.keypoints[:9], descriptors=frame.descriptors[:9])
+    whole = few.safetensors() if kind == "tensors" else json.dumps(few.json()).encode()
+    if kind not in ("tensors", "JSON"):
+        noise, file = rng.integers(0, 256, (48, 64), np.uint8), io.BytesIO()
+        pytest.importorskip("PIL.Image").fromarray(noise).save(file, kind)
+        whole = file.getvalue()
+    refusals: list[Refusal] = []
+    for _ in range(60):
+        upload = Upload(mutated(whole, rng), Settings(), kind == "JSON")
+        try:
+            answer_of(localizer, upload, Limits(), 0.0)
+        except Refusal as refusal:
+            refusals.append(refusal)
+    assert {refusal.status for refusal in refusals} <= {413, 422}
+    assert refusals
+    assert not any("\n" in str(refusal) for refusal in refusals)
+
+
 def test_a_fault_is_a_sentence_to_the_client_and_a_place_in_the_log(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    localizer: pm.Localizer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     sent_by_client = "a" * 9  # the log shows lines of code
 
@@ -97,8 +130,7 @@ def test_a_fault_is_a_sentence_to_the_client_and_a_place_in_the_log(
 
     monkeypatch.setattr(service, "answer_of", fail)
     monkeypatch.setattr(logging.getLogger("protomark.serving"), "propagate", True)
-    scene = build_map(sample.load(), pm.Encoder.load("freak"), 32)
-    app = service.make_app(pm.Localizer(scene), Limits(), list)
+    app = service.make_app(localizer, Limits(), list)
     sent: list[dict[str, Any]] = []
     body = [{"type": "http.request", "body": b"x"}]
 

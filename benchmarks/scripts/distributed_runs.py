@@ -101,8 +101,8 @@ def write_session(path: Path, count: int, seed: int = 0) -> None:
             total = header[name]["shape"][0]
             for start in range(0, total, block):
                 stop = min(start + block, total)
-                rows = make.get(name, lambda a, b: np.ones(b - a))(start, stop)
-                file.write(np.ascontiguousarray(rows, dtype).tobytes())
+                values = make[name](start, stop) if name in make else np.ones(stop - start)
+                file.write(np.ascontiguousarray(values, dtype).tobytes())
 
 
 @contextlib.contextmanager

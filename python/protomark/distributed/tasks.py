@@ -258,9 +258,9 @@ def write_shard(
                 name = "nowhere" if cell is None else "_".join(map(str, cell))
                 path = folder / f"{recipe}.{name}.pmk"
                 part.save(path)
-                file = replace(describe_file(path), name=f"{WORK}/{path.name}")
-                output.publish(path, file.name)
-                shards.append(describe_shard(name, part, file))
+                saved = replace(describe_file(path), name=f"{WORK}/{path.name}")
+                output.publish(path, saved.name)
+                shards.append(describe_shard(name, part, saved))
         else:
             scene.metadata = metadata
             path = folder / f"{recipe}.pmk"

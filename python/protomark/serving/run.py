@@ -28,6 +28,8 @@ from protomark.threads import one_blas_thread
 
 # Between two looks at the manifest of a folder of shards.
 _LOOK_SECONDS = 2.0
+# Proxies keep connections for 60 s; one that is closed under their hands fails a request.
+_IDLE_SECONDS = 75
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -83,6 +85,7 @@ def serve_map(
         log_level="error",
         access_log=False,
         server_header=False,
+        timeout_keep_alive=_IDLE_SECONDS,
         timeout_graceful_shutdown=int(limits.seconds) + 1,
     )
     host, port = at.getsockname()[:2]
