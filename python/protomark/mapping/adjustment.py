@@ -20,8 +20,8 @@ _FREE_STEPS = 30
 # The images leave the focal length open if one that is by this factor longer or shorter has at most
 # so many times the loss: on a straight road 1.000 times, elsewhere 1.014 times and more.
 _OTHER, _AS_GOOD = 1.2, 1.01
-# So many landmarks are enough to tell.
-_SAMPLED = 2500
+# So many landmarks and steps are enough to tell.
+_SAMPLED, _STEPS = 2500, 15
 
 
 def adjust_local_bundle(structure: Structure, newest: int, size: int, iterations: int) -> list[int]:
@@ -118,7 +118,7 @@ def other_factors(structure: Structure) -> list[float]:
     def loss(factor: float) -> float:
         lenses = np.where(bundle.refined, bundle.lenses * [factor, 1], bundle.lenses)
         other = replace(bundle, lenses=lenses, refined=bundle.refined & [False, True])
-        return other.adjust(_FREE_STEPS)
+        return other.adjust(_STEPS)
 
     limit = _AS_GOOD * loss(1.0)
     return [factor for factor in (1 / _OTHER, _OTHER) if loss(factor) <= limit]
