@@ -16,7 +16,7 @@ import protomark as pm
 from conftest import random_codebooks, random_descriptors, random_layers
 from evaluation_scene import observations
 from protomark.baselines.binary import (
-    HammingMap,
+    DescriptorMap,
     bitwise_and,
     first_seen,
     majority,
@@ -44,7 +44,7 @@ def groups(data: Observations) -> dict[int, NDArray[np.uint8]]:
     return {i: descriptors[landmarks == i] for i in np.unique(landmarks).tolist()}
 
 
-def as_dict(built: HammingMap) -> dict[int, list[int]]:
+def as_dict(built: DescriptorMap) -> dict[int, list[int]]:
     """Landmark -> its only descriptor."""
     assert len(set(built.landmarks.tolist())) == len(built.landmarks)
     return dict(zip(built.landmarks.tolist(), built.descriptors.tolist(), strict=True))

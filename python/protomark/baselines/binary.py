@@ -6,6 +6,7 @@ That is Hamming distance for bits, and Euclidean distance for vectors.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from protomark._core import hamming_search
 from protomark.baselines.linear import EuclideanMap
 from protomark.baselines.method import Method
 from protomark.baselines.support import Support
-from protomark.features.descriptors import numbers_of
+from protomark.features.descriptors import InputKind, numbers_of
 
 # Medoids of landmarks with the same number of observations are computed together, up to this many
 # numbers at a time.
@@ -23,45 +24,53 @@ _NUMBERS = 1 << 24
 
 
 @dataclass(eq=False)
-class HammingMap(Method):
+class DescriptorMap(Method):
     """Descriptors of landmarks, sorted by landmark id."""
 
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[Any]
     landmarks: NDArray[np.int64]
     bytes_per_landmark: float
+    kind: InputKind = "bits"
 
     def match(
-        self, descriptors: NDArray[np.uint8], threads: int = 1
+        self, descriptors: NDArray[Any], threads: int = 1
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """See `Method.match`."""
+        if self.kind != "bits":
+            return self._vectors.match(descriptors, threads)
         landmarks, distances = hamming_search(
             descriptors, self.descriptors, k=2, landmarks=self.landmarks, threads=threads
         )
         return landmarks, np.where(landmarks >= 0, distances, np.inf).astype(np.float32)
 
+    @cached_property
+    def _vectors(self) -> EuclideanMap:
+        return EuclideanMap(self.descriptors, self.landmarks, self.bytes_per_landmark, self.kind)
 
-def unaggregated(support: Support) -> Method:
+
+def unaggregated(support: Support) -> DescriptorMap:
     """Every descriptor, and one byte per landmark for their number.
 
     With the number of its descriptors, a landmark is found from any of them.
     """
     observations = len(support.descriptors) / len(support.ids)
-    return _kept(support, support.descriptors, support.landmarks, observations, 1)
+    size = observations * support.descriptors[0].nbytes + 1
+    return DescriptorMap(support.descriptors, support.landmarks, size, support.kind)
 
 
-def first_seen(support: Support) -> Method:
+def first_seen(support: Support) -> DescriptorMap:
     """The descriptor of the earliest keyframe."""
     return _one_each(support, support.descriptors[support.starts])
 
 
-def random_sample(support: Support) -> Method:
+def random_sample(support: Support) -> DescriptorMap:
     """A descriptor drawn at random."""
     rng = np.random.default_rng(support.seed)
     rows = support.starts + rng.integers(0, support.counts)
     return _one_each(support, support.descriptors[rows])
 
 
-def majority(support: Support) -> Method:
+def majority(support: Support) -> DescriptorMap:
     """The mean of each bit, quantised at 0.5: a bit that half of the descriptors set is set.
 
     The mean of vectors of bytes is rounded to bytes.
@@ -76,12 +85,12 @@ def majority(support: Support) -> Method:
     return _one_each(support, np.packbits(bits, axis=1, bitorder="little"))
 
 
-def bitwise_and(support: Support) -> Method:
+def bitwise_and(support: Support) -> DescriptorMap:
     """The bits that all of a landmark's descriptors set, which vectors do not have."""
     return _one_each(support, np.bitwise_and.reduceat(support.descriptors, support.starts, axis=0))
 
 
-def medoid(support: Support) -> Method:
+def medoid(support: Support) -> DescriptorMap:
     """The descriptor that ORB-SLAM (Mur-Artal et al. 2015) and stella_vslam keep of a landmark.
 
     It has the least median distance to all of the landmark's descriptors, itself included
@@ -112,19 +121,5 @@ def _least_median(support: Support, rows: NDArray[np.int64]) -> NDArray[np.int64
     return np.argmin(medians, axis=1)
 
 
-def _one_each(support: Support, descriptors: NDArray[Any]) -> Method:
-    return _kept(support, descriptors, support.ids, 1, 0)
-
-
-def _kept(
-    support: Support,
-    descriptors: NDArray[Any],
-    landmarks: NDArray[np.int64],
-    each: float,
-    count: int,
-) -> Method:
-    """The map of these descriptors, `each` of them per landmark, and `count` bytes beside them."""
-    size = each * descriptors.shape[1] * descriptors.itemsize + count
-    if support.kind == "bits":
-        return HammingMap(descriptors, landmarks, size)
-    return EuclideanMap(descriptors, landmarks, size, support.kind)
+def _one_each(support: Support, descriptors: NDArray[Any]) -> DescriptorMap:
+    return DescriptorMap(descriptors, support.ids, descriptors[0].nbytes, support.kind)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protomark.baselines.binary import HammingMap
+from protomark.baselines.binary import DescriptorMap
 from protomark.baselines.linear import Projection, principal_components
 from protomark.baselines.method import Method
 from protomark.baselines.support import Support
@@ -24,14 +24,14 @@ class SignMap(Method):
     """One binary code per landmark; queries are projected and coded alike."""
 
     projection: Projection
-    codes: HammingMap
+    codes: DescriptorMap
     kind: InputKind  # what the descriptors are
 
     @classmethod
     def of(cls, support: Support, projection: Projection) -> SignMap:
         """The codes of the landmarks' means."""
         codes = _signs(support.means, projection)
-        return cls(projection, HammingMap(codes, support.ids, codes.shape[1]), support.kind)
+        return cls(projection, DescriptorMap(codes, support.ids, codes.shape[1]), support.kind)
 
     def __post_init__(self) -> None:
         self.bytes_per_landmark = self.codes.bytes_per_landmark

@@ -131,6 +131,7 @@ def join(
         landmark_ids=ids,
         landmark_positions=positions,
         info=info,
+        input="bits",
     )
     try:
         tracks.check()
