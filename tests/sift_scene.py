@@ -1,4 +1,4 @@
-"""A COLMAP database with SIFT and its model, of rendered images, and an encoder."""
+"""A COLMAP database with SIFT and its model, of rendered images."""
 
 from __future__ import annotations
 
@@ -6,12 +6,7 @@ import sqlite3
 import tempfile
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-import protomark as pm
 from protomark.geometry.colmap import new_reconstruction, pycolmap, quiet, read_model
-from protomark.match_calibration import MatchCalibration, with_calibration
 from tracks_scene import write_sequence
 
 
@@ -56,27 +51,3 @@ def write_sift_scene(folder: Path, count: int = 6) -> Path:
     connection.execute("PRAGMA journal_mode = DELETE")
     connection.close()
     return folder
-
-
-def sift_encoder() -> pm.Encoder:
-    """A random projection to 48 numbers, with codebooks and a rough calibration."""
-    rng = np.random.default_rng(0)
-    weights = np.clip(np.rint(rng.normal(0, 40, (48, 128))), -127, 127).astype(np.int8)
-    # RootSIFT's numbers are 40 on average.
-    bias = (-40 * weights.sum(1, dtype=np.int64)).astype(np.int32)
-    layer = {
-        "weights": weights,
-        "bias": bias,
-        # Sums spread by about 40 * 512 * 0.5.
-        "multipliers": np.full(48, round(2**30 * 50 / 12000), np.int32),
-        "shift": 30,
-        "table": None,
-    }
-    books: list[NDArray[np.int8]] = [
-        rng.integers(-127, 128, (48 // width, 256, width)).astype(np.int8) for width in (1, 2, 4)
-    ]
-    encoder = pm.Encoder([layer], [16, 48], "sift", "sift", 0.02, codebooks=books, input="uint8")
-    fitted = MatchCalibration((-2.0, -1e-4, 3e-4))
-    return with_calibration(
-        encoder, {(d, tuned): fitted for d in (16, 48) for tuned in (False, True)}, "none"
-    )

@@ -26,22 +26,20 @@ from protomark.geometry.similarity import fit_similarity
 from protomark.maps.origin import map_detector
 from protomark.tracks.database import read_features, stored_descriptor, tracks_from_database
 from protomark.tracks.file import Tracks
-from sift_scene import sift_encoder, write_sift_scene
+from sift_scene import write_sift_scene
 
 SHARED = Path(os.environ.get("PROTOMARK_SHARED", Path(__file__).parents[2] / "shared")) / "data"
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_sift_scene(tmp_path_factory.mktemp("sift") / "plane")
-    sift_encoder().save(folder / "sift.pme")
-    return folder
+    return write_sift_scene(tmp_path_factory.mktemp("sift") / "plane")
 
 
 @pytest.fixture(scope="module")
 def built(scene: Path) -> Path:
     sources = (scene / "database.db", scene / "points")
-    done = protomark("build", *sources, "-o", scene / "scene.pmk", "--encoder", scene / "sift.pme")
+    done = protomark("build", *sources, "-o", scene / "scene.pmk")
     assert done.returncode == 0, done.stderr
     return scene / "scene.pmk"
 
@@ -137,7 +135,6 @@ def test_keypoints_without_a_descriptor(scene: Path, tmp_path: Path) -> None:
     assert found.info["source"]["dropped"] == {"keypoints whose descriptor is zero": 30}
     done = protomark(
         *("build", path, scene / "points", "-o", tmp_path / "a.pmk", "--no-seal"),
-        *("--encoder", scene / "sift.pme"),
     )
     assert done.returncode == 0, done.stderr
     assert "30 keypoints" in " ".join(done.stdout.split())
@@ -264,7 +261,7 @@ def test_tracks_of_images(scene: Path, tmp_path: Path) -> None:
 def test_mapping_by_sift(scene: Path, tmp_path: Path) -> None:
     done = protomark(
         *("map", scene / "images", "-o", tmp_path / "map", "-d", "sift", "--max-keypoints", "600"),
-        *("--encoder", scene / "sift.pme", "--camera", "PINHOLE:300,300,160,120"),
+        *("--camera", "PINHOLE:300,300,160,120"),
     )
     assert done.returncode == 0, done.stderr + done.stdout
     mapped, true = read_model(tmp_path / "map" / "sparse"), read_model(scene / "sparse")

@@ -220,6 +220,9 @@ def rows_of(
         (stored_bytes(folder / "database.db"), (folder / "database.db").stat().st_size),
         (size["descriptor bytes"], size["file bytes"]),
     ]
+    ratios = ours.errors(model, both) / theirs.errors(model, both)
+    ratio = np.exp(np.log(ratios).mean(axis=0))
+    print(f"{name}: errors, geometric mean of those by COLMAP's of the same image: {ratio}")
     rows = []
     for program, one, (descriptors, file) in zip(
         ("image_registrator", "Protomark"), (theirs, ours), bytes_of, strict=True
