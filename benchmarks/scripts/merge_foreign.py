@@ -102,8 +102,8 @@ def main() -> None:
         )
     print(ReportTable(HEADS, rows).markdown())
     tried = joined = 0
-    for (i, (one, first)), (j, (other, second)) in permutations(list(enumerate(scenes)), 2):
-        if one != other:
+    for (i, (ours, first)), (j, (theirs, second)) in permutations(list(enumerate(scenes)), 2):
+        if ours != theirs:
             continue
         tried += 1
         try:
