@@ -194,7 +194,7 @@ class TestBadInput:
         self.check(copy, out, "plane", "the poses of these images")
 
     def test_unknown_descriptor(self, copy: Path, out: Path) -> None:
-        self.check(copy, out, "sift", "teblid", options=["-d", "sift"])
+        self.check(copy, out, "surf", "teblid", options=["-d", "surf"])
 
     @pytest.mark.parametrize(
         ("option", "value"),
