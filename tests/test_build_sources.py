@@ -101,6 +101,11 @@ def test_images_with_their_model(tmp_path: Path) -> None:
     for lonely in (first, second):
         with pytest.raises(ValueError, match=f"{lonely.name} (holds images|is a COLMAP model)"):
             find_sources([lonely, sample.path()])
+    # What should have been the other half is to blame if it is nothing that can be read.
+    (cut := tmp_path / "cut.db").write_bytes(b"SQLite format 3\0" + bytes(500))
+    for pair in ([cut, second], [second, cut]):
+        with pytest.raises(ValueError, match=r"cut\.db is a database that is cut off, broken"):
+            find_sources(pair)
 
 
 def test_places_get_ids_apart_whatever_their_order(tmp_path: Path) -> None:

@@ -40,6 +40,12 @@ def test_split_and_merge(encoder: pm.Encoder, tmp_path: Path) -> None:
     tile = pm.open(tmp_path / "tiles" / names[1])
     assert isinstance(tile, pm.SealedMap)
     np.testing.assert_array_equal(tile.ids, [4, 5, 6, 7])
+    # Parts of an earlier split go, but for what somebody put in the place of one.
+    parts[1].write_bytes(whole.read_bytes())
+    done = protomark("split", whole, "--parts", 1, "-o", tmp_path / "parts", "--json", facts_file)
+    assert json.loads(facts_file.read_text())["removed"] == [str(parts[2])]
+    assert "1 files of an earlier split were removed" in done.stdout + done.stderr
+    assert [file.exists() for file in parts] == [True, True, False]
     assert protomark("split", whole, "--ids", "5", "-o", tmp_path / "parts").returncode == 0
     np.testing.assert_array_equal(pm.open(parts[0]).ids, np.arange(5))
 

@@ -76,6 +76,7 @@ def test_every_form_of_features_gets_what_a_localizer_finds(
         )
         np.testing.assert_allclose(answer["covariance"], found.covariance, rtol=1e-9)
         assert answer["confidence"] == pytest.approx(found.confidence)
+        assert answer["accepted"]
         assert (answer["inliers"], answer["matches"]) == (found.inliers, found.evidence.matches)
         assert answer["details"]["landmarks"] == found.landmarks.tolist()
         np.testing.assert_array_equal(answer["details"]["pixels"], found.pixels)
@@ -106,6 +107,7 @@ def test_no_pose_is_an_answer_with_a_reason(server: Server, frame: Frame) -> Non
     few = replace(frame, keypoints=frame.keypoints[:2], descriptors=frame.descriptors[:2])
     answer = server.localize_json(**few.json()).json
     assert (answer["cam_from_world"], answer["confidence"]) == (None, 0.0)
+    assert not answer["accepted"]
     assert answer["reason"] == "only 2 keypoints: blurred, dark or empty"
     # A doubtful camera is named in the answer, to the second client as to the first.
     for _ in range(2):

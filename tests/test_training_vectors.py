@@ -97,7 +97,7 @@ def test_noise_is_a_share_of_the_vectors_own_square(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_tracks_of_vectors_come_back_from_their_file(kind, tmp_path):
-    tracks = replace(small_tracks(), descriptors=vectors(40, kind), input=kind)
+    tracks = replace(small_tracks(), descriptor="vector", descriptors=vectors(40, kind), input=kind)
     tracks.save(tmp_path / "t.safetensors")
     read = Tracks.load(tmp_path / "t.safetensors")
     assert (read.input, read.width) == (kind, 128)
@@ -124,7 +124,7 @@ def test_tracks_of_vectors_come_back_from_their_file(kind, tmp_path):
 def test_tracks_refuse_broken_vectors(kind, change, words):
     x = change(vectors(40, "uint8" if kind == "uint8" else "float32"))
     with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=r".") as caught:
-        replace(small_tracks(), descriptors=x, input=kind).check()
+        replace(small_tracks(), descriptor="vector", descriptors=x, input=kind).check()
     assert words in str(caught.value)
 
 

@@ -96,6 +96,7 @@ class Tuner {
     for (size_t rank = 0; rank < rows_.size(); ++rank) {
       Sum sum{};
       for (size_t d = 0; d < dim_; ++d) {
+        // NOLINTNEXTLINE(bugprone-signed-char-misuse): a number, no character
         sum[d] = rounded_mean<int>(numbers_[rank * dim_ + d], 1 << kFraction);
       }
       tuned_.set(rows_[rank], sum, 1);

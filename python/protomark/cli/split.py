@@ -58,6 +58,8 @@ def split(
     write_json(json_file, facts)
     if replaced := facts["replaced"]:
         note(f"{len(replaced)} files were replaced, such as {replaced[0]}")
+    if removed := facts["removed"]:
+        note(f"{len(removed)} files of an earlier split were removed, such as {removed[0]}")
     rows = []
     for part in facts["parts"]:
         first, last = part["ids"]

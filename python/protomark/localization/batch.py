@@ -34,6 +34,7 @@ from protomark.geometry.pose_files import (
     tum_trajectory,
 )
 from protomark.interrupt import deferred_interrupt
+from protomark.localization.confidence import MIN_CONFIDENCE
 from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.prior import PosePrior
 from protomark.localization.shared_camera import check_shared_cameras
@@ -74,7 +75,7 @@ class LocalizationRequest:
     priors: Path | None = None  # the same of rough poses; None: the whole map is searched
     prior_distance: float = 1.0  # largest error of a prior's position, in world units
     prior_degrees: float = 15.0  # largest error of a prior's orientation
-    min_confidence: float = 0.9  # smallest probability of an accepted pose
+    min_confidence: float = MIN_CONFIDENCE  # smallest probability of an accepted pose
     max_keypoints: int | None = None  # limit on keypoints per image, see `Localizer`
     max_size: int = MAX_SIZE  # larger images are reduced to it before detection
     recall: float | None = None  # see `Localizer`

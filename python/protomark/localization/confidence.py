@@ -77,6 +77,10 @@ def occupied_cells(camera: Camera, pixels: NDArray[np.float64]) -> int:
     return len(np.unique(cell[:, 0] * CELLS + cell[:, 1]))
 
 
+# Smallest probability of a pose that is accepted.
+MIN_CONFIDENCE = 0.9
+
+
 def confidence(evidence: Evidence) -> float:
     """Probability that a pose with this evidence is right."""
     return place_probability(evidence) * _lens(evidence)

@@ -91,8 +91,9 @@ def check_encoder(encoder: Encoder, descriptor: str, kind: InputKind, bits: int)
     """Raise ValueError if an encoder is for other descriptors."""
     if (encoder.descriptor, encoder.input, encoder.bits) != (descriptor, kind, bits):
         raise ValueError(
-            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bytes} bytes, "
-            f"the tracks hold {descriptor} of {bits // 8}: choose an encoder for {descriptor}"
+            f"encoder '{encoder.name}' is for {encoder.descriptor} of {encoder.bytes} bytes "
+            f"({encoder.input}), the tracks hold {descriptor} of {bits // 8} ({kind}): choose an "
+            f"encoder for {descriptor}"
         )
 
 

@@ -117,6 +117,8 @@ class Manifest:
             made = {key: facts[key] for key in ("encoder", "dim", "appearance_bits", "metadata")}
             manifest = cls(**made, shards=shards, build=facts["build"])
             manifest.check()
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"cut off or broken: copy it again ({error})") from None
         except (KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"broken manifest of shards ({error!r})") from None
         return manifest

@@ -62,13 +62,13 @@ def find_sources(paths: Sequence[Path]) -> list[Source]:
             sources.append(replace(other, model=_model_folder(model.path)))
             pending = None
         elif pending:
-            raise _lonely(pending)
+            raise _lonely(pending, paths)
         elif source.kind in ("images", "database", "model"):
             pending = source
         else:
             sources.append(source)
     if pending:
-        raise _lonely(pending)
+        raise _lonely(pending, paths)
     named = [source.path.resolve() for source in sources]
     for source in sources:
         if named.count(source.path.resolve()) > 1:
@@ -96,7 +96,11 @@ def _model_folder(path: Path) -> Path | None:
     return next((p for p in (path, path / "0") if colmap.is_model(p)), None)
 
 
-def _lonely(source: Source) -> ValueError:
+def _lonely(source: Source, paths: Sequence[Path]) -> ValueError:
+    for path in paths:
+        # What should have been the other half says what it is instead.
+        if _kind(path) == "map" and find_importer(path) is None:
+            read_source(path)
     if source.kind == "images":
         check_below(source.path)
     lacking = {

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import protomark as pm
-from protomark.files import check_outputs
+from protomark.files import MANIFEST, check_outputs
 from protomark.geometry.colmap import find_model, landmarks_by_image
 from protomark.maps.open import map_path, open_learning_map
 from protomark.maps.shards import (
@@ -57,6 +57,7 @@ def split_file(
         if file.exists() and file.samefile(path):
             raise ValueError(f"{file} is the map itself: name another folder")
     check_manifest(folder)
+    before = Manifest.load(folder) if (folder / MANIFEST).is_file() else None
     folder.mkdir(parents=True, exist_ok=True)
     replaced = [str(file) for file, _ in files if file.exists()]
     written, shards = [], []
@@ -78,7 +79,27 @@ def split_file(
     Manifest(
         encoder_facts(scene.encoder), scene.dim, scene.appearance_bits, dict(scene.metadata), shards
     ).save(folder)
-    return {"map": str(path), "landmarks": len(scene), "parts": written, "replaced": replaced}
+    removed = _remove_shards(folder, before, {file.name for file, _ in files} | {path.name})
+    return {
+        "map": str(path),
+        "landmarks": len(scene),
+        "parts": written,
+        "replaced": replaced,
+        "removed": removed,
+    }
+
+
+def _remove_shards(folder: Path, before: Manifest | None, kept: set[str]) -> list[str]:
+    """Remove the files of an earlier split, which would be merged with those of this one."""
+    removed = []
+    for shard in before.shards if before else ():
+        for file in shard.files:
+            old = folder / file.name
+            # What the user has put in their place since is the user's.
+            if file.name not in kept and old.is_file() and describe_file(old) == file:
+                old.unlink()
+                removed.append(str(old))
+    return removed
 
 
 def crop_file(

@@ -6,6 +6,7 @@ import time
 
 from protomark.geometry.camera import Camera
 from protomark.geometry.pose import camera_centers, quaternion_from_rotation
+from protomark.localization.confidence import MIN_CONFIDENCE
 from protomark.localization.localizer import ESTIMATE, Localizer
 from protomark.localization.solve import Localization
 from protomark.serving.messages import Answer, CameraMessage, MatchesMessage, Pose
@@ -65,6 +66,7 @@ def answer_of(localizer: Localizer, upload: Upload, limits: Limits, waited: floa
         center=None if pose is None else tuple(camera_centers(pose)),
         covariance=None if found.covariance is None else found.covariance.tolist(),
         confidence=found.confidence,
+        accepted=pose is not None and found.confidence >= MIN_CONFIDENCE,
         inliers=found.inliers,
         matches=found.evidence.matches,
         camera=CameraMessage(**found.camera.as_dict()),

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from protomark.geometry.camera import CAMERA_EXAMPLE
+from protomark.localization.confidence import MIN_CONFIDENCE
 
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Vector4 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
@@ -101,6 +102,9 @@ class Answer(_Message):
         ),
     ]
     confidence: Annotated[float, Field(description="probability that the pose is right")]
+    accepted: Annotated[
+        bool, Field(description=f"whether there is a pose of confidence {MIN_CONFIDENCE:g} or more")
+    ]
     inliers: Annotated[int, Field(description="number of keypoints that agree with the pose")]
     matches: Annotated[int, Field(description="number of accepted matches")]
     camera: Annotated[

@@ -91,7 +91,8 @@ def make_app(localizer: Localizer, limits: Limits, view: TopView) -> FastAPI:
         """
         answered = await answer(request, settings)
         figures.answered(answered)
-        request.state.outcome = "no pose" if answered.cam_from_world is None else "pose"
+        unlikely = "no pose" if answered.cam_from_world is None else "unlikely pose"
+        request.state.outcome = "pose" if answered.accepted else unlikely
         return Response(answered.model_dump_json(), media_type="application/json")
 
     @app.get("/health")

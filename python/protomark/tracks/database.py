@@ -254,8 +254,8 @@ def _each_image(database: Path, kind: DescriptorKind) -> Iterator[tuple[str, Fea
                 guess = [k.name for k in DESCRIPTORS.values() if k.bytes == dc]
                 raise ValueError(
                     f"{database}: image {name} has descriptors of {dc} bytes, but {kind.name} has "
-                    f"{kind.bytes}: name the right descriptor with -d"
-                    + (f" ({' or '.join(guess)})" if guess else "")
+                    f"{kind.bytes}: take "
+                    + (" or ".join(guess) if guess else "the descriptor that it has")
                 )
             if kr != dr or kc < 2 or len(kd) != 4 * kr * kc or len(dd) != dr * dc:
                 raise ValueError(

@@ -204,6 +204,12 @@ class Tracks:
             raise ValueError("tracks: descriptor is not a text")
         if self.input not in INPUTS:
             raise ValueError(f"tracks: input {self.input!r} is none of {', '.join(INPUTS)}")
+        named = DESCRIPTORS.get(self.descriptor)
+        if named and named.input != self.input:
+            raise ValueError(
+                f"tracks: {self.descriptor} descriptors are {named.input}, not {self.input}: "
+                f"give input={named.input!r}"
+            )
         sizes = {
             "m": len(self.keyframe_names),
             "m+1": len(self.keyframe_names) + 1,
@@ -311,7 +317,8 @@ def header_fields(header: dict[str, str]) -> dict[str, Any]:
     if header.get("format") != FORMAT:
         raise ValueError("a safetensors file, but not a Protomark tracks file")
     _check_version(header["version"])
-    kind = header.get("input", "bits")
+    named = DESCRIPTORS.get(header["descriptor"])
+    kind = header.get("input", named.input if named else "bits")
     if kind not in INPUTS:
         raise ValueError(f"tracks of {kind!r}: this Protomark knows {', '.join(INPUTS)}")
     return {
