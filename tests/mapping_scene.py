@@ -13,11 +13,14 @@ import pytest
 from numpy.typing import NDArray
 
 from protomark.geometry.camera import Camera
+from protomark.geometry.pose import transform
 from protomark.interrupt import Interrupted
-from protomark.mapping.frame import InputImage
+from protomark.mapping.frame import Frame, InputImage
 from protomark.mapping.mapper import Mapper
+from protomark.mapping.options import MappingOptions
 from protomark.mapping.request import MapRequest
 from protomark.mapping.session import make_map
+from protomark.mapping.structure import Structure
 from tracks_scene import PINHOLE
 
 # Depth of each wall (it stands parallel to the x axis and y axis), its extent in x, and its seed.
@@ -104,3 +107,20 @@ def interrupted_at(
         patch.setattr(Mapper, "add", stop)
         with pytest.raises(Interrupted):
             make_map(request, note=notes.append)
+
+
+def structure_of(poses: np.ndarray, points: np.ndarray, camera: Camera = PINHOLE) -> Structure:
+    """Frames that all see the same points, exactly."""
+    rng = np.random.default_rng(0)
+    structure = Structure({1: camera}, MappingOptions(max_error=0.01))
+    ids = structure.create(points)
+    for i, pose in enumerate(poses):
+        pixels = camera.project(transform(pose, points)) + 0.3 * rng.normal(size=(len(ids), 2))
+        frame = Frame(
+            *(i, str(i), float(i), 1, pixels.astype(np.float32), camera.rays(pixels)),
+            np.ones(len(ids)),
+        )
+        frame = frame.at(pose)
+        structure.frames.append(frame)
+        structure.observe(frame, np.arange(len(ids)), ids)
+    return structure

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 import protomark as pm
+from conftest import DATA
 from protomark import sample
 from protomark.evaluation.frames import QueryFrame
 from protomark.geometry.camera import Camera
 from protomark.maps.build import build_map
 from protomark.maps.cameras import KEY, cameras_text
 
-IMAGES = Path("/work/shared/data/toy/images")  # those that the sample was made from
+IMAGES = DATA / "toy" / "images"  # those that the sample was made from
 
 
 @dataclass

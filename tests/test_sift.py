@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 from pathlib import Path
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import protomark as pm
-from conftest import protomark
+from conftest import DATA, protomark
 from protomark.features.distances import distances, nearest
 from protomark.features.extractor import Extractor
 from protomark.features.images import read_gray
@@ -27,8 +26,6 @@ from protomark.maps.origin import map_detector
 from protomark.tracks.database import read_features, stored_descriptor, tracks_from_database
 from protomark.tracks.file import Tracks
 from sift_scene import write_sift_scene
-
-SHARED = Path(os.environ.get("PROTOMARK_SHARED", Path(__file__).parents[2] / "shared")) / "data"
 
 
 @pytest.fixture(scope="module")
@@ -239,10 +236,10 @@ def test_root_sift() -> None:
     assert root_sift(np.eye(128)[:1]).max() == 255
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the sequences in ../shared/data")
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs the sequences in ../shared/data")
 @pytest.mark.parametrize("sequence", ["castle", "kitti07", "hololens"])
 def test_real_images_tell_the_norm(sequence: str) -> None:
-    path = sorted((SHARED / sequence / "images").iterdir())[0]
+    path = sorted((DATA / sequence / "images").iterdir())[0]
     rooted = Extractor("sift", 1000)(read_gray(path)).descriptors
     assert is_rooted(rooted) == (True, True)
     assert is_rooted(without_root(rooted)) == (False, True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import BagTopic, JsonFile, MaxSize, Threads
+from protomark.cli.options import BagTopic, JsonFile, MaxQueryKeypoints, MaxSize, Recall, Threads
 
 if TYPE_CHECKING:
     from protomark.localization.batch import LocalizationBatch
@@ -78,24 +78,9 @@ def localize(
     ] = 0.9,
     every: Annotated[int, typer.Option(help="Take every n-th image or frame only.")] = 1,
     topic: BagTopic = None,
-    max_keypoints: Annotated[
-        int | None,
-        typer.Option(
-            min=4,
-            help="Limit on keypoints per image; by default as many as an image of the map had, if "
-            "the map knows, or 2000.",
-        ),
-    ] = None,
+    max_keypoints: MaxQueryKeypoints = None,
     max_size: MaxSize = 1600,
-    recall: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            max=1,
-            help="Search a map with an index approximately: share of nearest landmarks that are "
-            "found, for example 0.98. Without it the search is exact.",
-        ),
-    ] = None,
+    recall: Recall = None,
     threads: Threads = 0,
     mcap: Annotated[
         Path | None,

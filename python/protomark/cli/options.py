@@ -58,6 +58,24 @@ MaxKeypoints = Annotated[
     int,
     typer.Option(min=4, help="Limit on keypoints per image: the strongest, spread over the image."),
 ]
+MaxQueryKeypoints = Annotated[
+    int | None,
+    typer.Option(
+        "--max-keypoints",
+        min=4,
+        help="Limit on keypoints per image; by default as many as an image of the map had, if "
+        "the map knows, or 2000.",
+    ),
+]
+Recall = Annotated[
+    float | None,
+    typer.Option(
+        min=0,
+        max=1,
+        help="Search a map with an index approximately: share of nearest landmarks that are "
+        "found, for example 0.98. Without it the search is exact.",
+    ),
+]
 MaxSize = Annotated[
     int,
     typer.Option(

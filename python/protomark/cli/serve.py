@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protomark.cli.options import MaxKeypoints, MaxSize, Threads
+from protomark.cli.options import MaxQueryKeypoints, MaxSize, Recall, Threads
 
 if TYPE_CHECKING:
     from protomark.maps.sharded_map import ShardedMap
@@ -27,17 +27,9 @@ def serve(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port; 0 for any that is free.")
     ] = 8000,
-    max_keypoints: MaxKeypoints = 2000,
+    max_keypoints: MaxQueryKeypoints = None,
     max_size: MaxSize = 1600,
-    recall: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            max=1,
-            help="Search a map with an index approximately: share of nearest landmarks that are "
-            "found, for example 0.98. Without it the search is exact.",
-        ),
-    ] = None,
+    recall: Recall = None,
     threads: Threads = 0,
     max_megabytes: Annotated[
         float, typer.Option(min=0.001, help="Largest body of a request, 10^6 bytes.")
